@@ -28,7 +28,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.comparison import compare_schemes
 from hdbridge.commissioning.evaluation.stepping import Scheme, quantisation_floor_arcsec
 from hdbridge.drive.drive import Drive
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import simulated_bench
 
@@ -268,8 +268,7 @@ def simulated() -> dict[str, Any]:
     result = {}
     for scheme, measured in comparison.results.items():
         there, back = step_errors(model, scheme.of(model))
-        stands = (*measured.outcome.cw, *measured.outcome.ccw)
-        apart = np.array([each.error_arcsec for each in stands]) - np.array([*there, *back])
+        apart = np.concatenate(measured.errors_arcsec) - np.array([*there, *back])
         result[scheme.value] = {
             **{
                 name: (part.three_sigma_arcsec, part.mean_arcsec)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 from hdbridge.sim import fast
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth

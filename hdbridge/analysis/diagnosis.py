@@ -52,9 +52,8 @@ from hdbridge.axis.effects.kinematics import direction_of
 from hdbridge.axis.effects.motion import missing_error
 from hdbridge.axis.effects.torque import beyond_limit
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.records.given import Given, agreed_ratio, by_name
 from hdbridge.records.record import Record
-from hdbridge.records.recording import Recording
+from hdbridge.records.recording import Given, Recording, agreed_ratio, by_name
 from hdbridge.units import figure
 
 UNCALIBRATED = (

@@ -1,7 +1,7 @@
 """Findings and diagnosis as plain values, and the next experiment in words.
 
 Experiments come from the causes' descriptions and include those that need a person (move a mass, re-clock
-an encoder). Automatic ones: `hdbridge.commissioning.improvement.experiments`.
+an encoder). Automatic ones: `hdbridge.commissioning.improvement.further`.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from pydantic_core.core_schema import ValidationInfo
 from hdbridge.axis.channels import BY_KEY, LoadTorque, MeasuredChannel, OtherChannels, Temperature
 from hdbridge.axis.encoders import INT32_MAX, LoadEncoder, MotorEncoder, NodeId
 from hdbridge.errors import InputError
-from hdbridge.files.bundled import bundled_folder
+from hdbridge.files.profile import bundled_folder
 from hdbridge.files.yamlfile import Document, document_from_text, read_yaml, wrong
 from hdbridge.strictness import Strict
 from hdbridge.units import ARCSEC_PER_DEG

@@ -1,4 +1,4 @@
-"""Command line: one entry point, `hdbridge`; each command is one file and a thin layer over the library.
+"""Command line: one entry point, `hdbridge`; a command is a thin layer over the library.
 
 Exit status: 0 done; 1 an error in hdbridge itself; 2 bad input (nothing was written, nothing moved); 3 the
 bus; 4 the drive; 5 the supervision stopped the axis; 6 a result could not be written (the measured figures
@@ -6,6 +6,7 @@ are printed); 7 the daemon cannot be reached, or refuses this client now; 130 Ct
 the record kept).
 """
 
+import codecs
 import errno
 import io
 import os
@@ -21,7 +22,7 @@ from typer.core import TyperGroup
 from typer.main import get_group
 
 from hdbridge import __version__
-from hdbridge.cli import eventlog, plain, usage
+from hdbridge.cli import eventlog, usage
 from hdbridge.errors import HdbridgeError, InputError, OutputError
 
 PANELS: Final = {
@@ -58,7 +59,7 @@ PANELS: Final = {
         "model": "Manage the models of an axis: the active one, a pending one, and all earlier ones.",
     },
     "Many joints": {
-        "fleet": "Diagnose recordings of many joints on Dask; report which joints to look at first.",
+        "fleet": "Diagnose recordings of many joints on Dask; report which joints to look at first."
     },
     "Day and night": {
         "run": "Run the daemon: hold the drives of a machine and take load angles from clients.",
@@ -82,9 +83,20 @@ PANELS: Final = {
 }
 """Every command under its heading in `hdbridge --help`, with its summary there.
 
-A command is the file of that name in this folder: the function ``command``, with the same summary, or the
-functions in ``COMMANDS``. It is imported only for its own help or to be run, and it imports what it computes
-with when it runs.
+A command is imported only for its own help or to be run, and it imports what it computes with when it runs.
+"""
+_MODULES: Final = {
+    "bringup": ("new", "check", "scan", "doctor", "latency"),
+    "calibration": ("calibrate", "measure", "fit", "report"),
+    "diagnosis": ("diagnose", "improve"),
+    "drive": ("reset", "home", "sdo"),
+    "machine": ("run", "gateway", "simulate", "install-service"),
+    "positioning": ("demo", "move", "step", "motion"),
+    "recordings": ("record",),
+}
+"""Modules with several commands; any other command is the module of its name.
+
+``COMMANDS`` of a module holds the function of a command, or the functions of a group of commands.
 """
 SIGNED: Final = {"move", "sdo set", "ctl move", "ctl jog", "ctl queue", "ctl set"}
 """Commands with a number that may be negative and would otherwise be taken for an option."""
@@ -92,20 +104,21 @@ SIGNED: Final = {"move", "sdo set", "ctl move", "ctl jog", "ctl queue", "ctl set
 
 def load(name: str) -> typer.Typer:
     """Imports a command; returns an app with only that command, which checks its outputs before it runs."""
-    module = import_module(f"{__name__}.{name.replace('-', '_')}")
-    guarded = import_module(f"{__name__}.outputs").guarded
+    place = next((module for module, commands in _MODULES.items() if name in commands), name)
+    command = import_module(f"{__name__}.{place}").COMMANDS[name]
+    guarded = import_module(f"{__name__}.options").guarded
     loaded = typer.Typer(rich_markup_mode="markdown")
 
     def add(group: typer.Typer, called: str, path: str, function: Callable[..., None]) -> None:
         settings = {"ignore_unknown_options": True} if path in SIGNED else None
         group.command(called, context_settings=settings)(guarded(function))
 
-    if hasattr(module, "command"):
-        add(loaded, name, name, module.command)
+    if callable(command):
+        add(loaded, name, name, command)
         return loaded
     summary = next(commands[name] for commands in PANELS.values() if name in commands)
     group = typer.Typer(help=summary, no_args_is_help=True, rich_markup_mode="markdown")
-    for each, function in module.COMMANDS.items():
+    for each, function in command.items():
         add(group, each, f"{name} {each}", function)
     loaded.add_typer(group, name=name)
     return loaded
@@ -183,6 +196,24 @@ def _hdbridge(
         eventlog.tell("command", arguments=sys.argv[1:], version=__version__)
 
 
+_HANDLER: Final = "hdbridge.plain"
+"""Name of the error handler of a text stream that replaces characters which its encoding lacks."""
+_PLAIN: Final = str.maketrans(
+    {"σ": "s", "±": "~", "→": ">", "°": " ", "²": "2", "µ": "u", "–": "-", "…": "~"}
+)
+"""One character for one, so that a table stays aligned."""
+
+
+def _replaced(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    text = error.object[error.start : error.end].translate(_PLAIN)
+    return text.encode("ascii", errors="replace").decode("ascii"), error.end
+
+
+codecs.register_error(_HANDLER, _replaced)
+
+
 def main() -> None:
     """Runs the command line; an error of hdbridge becomes one line and its exit status."""
     for name in ("stdout", "stderr"):  # closed by the parent process: output is discarded
@@ -190,7 +221,7 @@ def main() -> None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors=plain.HANDLER)
+            stream.reconfigure(errors=_HANDLER)
     try:
         status = app(prog_name="hdbridge", standalone_mode=False)
         sys.stdout.flush()

@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
-from rich.table import Table
 
-from hdbridge.cli.options import (
-    BitrateOption,
-    BorrowOption,
-    ForceOption,
-    GatewayAxisOption,
-    JsonOption,
-    SeedOption,
-    SimulateOption,
-    TruthOption,
-    note,
-    print_table,
-    progress_bar,
-    write_json,
-)
+from hdbridge.cli import options as opt
+from hdbridge.cli.printing import note, print_table, progress_bar, write_json
 from hdbridge.cli.session import Session, bare_bus
 from hdbridge.errors import DriveError, InputError
 
@@ -30,7 +18,7 @@ if TYPE_CHECKING:
     from hdbridge.conformance import Check, Result
 
 
-def command(
+def conform(
     profile: Annotated[
         str | None,
         typer.Argument(
@@ -46,7 +34,7 @@ def command(
     channel: Annotated[
         str | None, typer.Option("--channel", help="Channel of the bus, for example can0.")
     ] = None,
-    bitrate_bps: BitrateOption = None,
+    bitrate_bps: opt.Bitrate = None,
     node_id: Annotated[
         int | None, typer.Option("--node", min=1, max=127, help="Node id; else the axis file's.")
     ] = None,
@@ -56,10 +44,9 @@ def command(
             "--eds", metavar="FILE", help="EDS of the node, which is compared with it; else the axis file's."
         ),
     ] = None,
-    axis: GatewayAxisOption = None,
+    axis: opt.GatewayAxis = None,
     motion: Annotated[
-        bool,
-        typer.Option("--motion", help="Also switch power on and move the axis; else power stays off."),
+        bool, typer.Option("--motion", help="Also switch power on and move the axis; else power stays off.")
     ] = False,
     store: Annotated[
         bool,
@@ -83,12 +70,12 @@ def command(
         float, typer.Option("--timeout-ms", min=1.0, max=60_000.0, help="Longest time to an SDO answer.")
     ] = 500.0,
     list_checks: Annotated[bool, typer.Option("--list", help="List the checks and end.")] = False,
-    simulate: SimulateOption = False,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    force: ForceOption = False,
-    borrow: BorrowOption = False,
-    json_file: JsonOption = None,
+    simulate: opt.Simulate = False,
+    truth: opt.Truth = None,
+    seed: opt.Seed = 0,
+    force: opt.Force = False,
+    borrow: opt.Borrow = False,
+    json_file: opt.Json = None,
 ) -> None:
     """Check a node against CiA 301 and CiA 402: NMT, SDO, PDO, SYNC, EMCY, its EDS, the drive profile.
 
@@ -100,8 +87,8 @@ def command(
     Exit status 4 if a check failed, or the node does not answer or is under power.
     """  # fmt: skip
     from hdbridge.axis import BusConfig
-    from hdbridge.cli.gateway import eds_of, gateway_axis
-    from hdbridge.cli.interrupt import deferred_interrupt
+    from hdbridge.cli.machine import eds_of, gateway_axis
+    from hdbridge.cli.session import deferred_interrupt
     from hdbridge.conformance import NodeTester, checks, run
     from hdbridge.conformance.tester import StoppedError, Timing
     from hdbridge.daemon.machine import machine_file
@@ -211,32 +198,32 @@ def _count(results: Sequence[Result]) -> dict[str, int]:
 
 
 def _print_list(checks: Sequence[Check]) -> None:
-    table = Table("id", "check", "clause", "needs")
-    for each in checks:
-        needs = "--motion" if each.moves else "--store" if each.stores else ""
-        table.add_row(each.id, each.text, each.clause, needs)
-    print_table(table)
+    rows = [
+        (each.id, each.text, each.clause, "--motion" if each.moves else "--store" if each.stores else "")
+        for each in checks
+    ]
+    print_table(("id", "check", "clause", "needs"), rows)
 
 
 def _print(results: Sequence[Result]) -> None:
     from hdbridge.conformance import Verdict
 
-    summary = Table("subject", "pass", "fail", "not applicable")
-    subjects = dict.fromkeys(each.check.id.split(".", maxsplit=1)[0] for each in results)
-    for subject in subjects:
-        counts = _count([each for each in results if each.check.id.split(".", maxsplit=1)[0] == subject])
-        summary.add_row(subject, *(str(count) for count in counts.values()))
-    summary.add_section()
-    summary.add_row("all", *(str(count) for count in _count(results).values()))
-    print_table(summary)
-    if failed := [each for each in results if each.verdict is Verdict.FAIL]:
-        table = Table("failed", "check", "found", "expected", "clause")
-        for each in failed:
-            table.add_row(each.check.id, each.check.text, each.found, each.expected, each.check.clause)
-        print_table(table)
-    reasons: dict[str, int] = {}
+    subjects: dict[str, list[Result]] = {}
     for each in results:
-        if each.verdict is Verdict.NOT_APPLICABLE:
-            reasons[each.found] = reasons.get(each.found, 0) + 1
+        subjects.setdefault(each.check.id.split(".", maxsplit=1)[0], []).append(each)
+    counts = {subject: _count(own).values() for subject, own in {**subjects, "all": results}.items()}
+    summary = [(subject, *map(str, own)) for subject, own in counts.items()]
+    print_table(("subject", "pass", "fail", "not applicable"), [*summary[:-1], (), summary[-1]])
+    failed = [
+        (each.check.id, each.check.text, each.found, each.expected, each.check.clause)
+        for each in results
+        if each.verdict is Verdict.FAIL
+    ]
+    if failed:
+        print_table(("failed", "check", "found", "expected", "clause"), failed)
+    reasons = Counter(each.found for each in results if each.verdict is Verdict.NOT_APPLICABLE)
     for reason, count in reasons.items():
         note(f"not applicable, {count} check{'s' * (count > 1)}: {reason}")
+
+
+COMMANDS: Final = {"conform": conform}

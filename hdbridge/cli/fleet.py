@@ -12,18 +12,10 @@ from urllib.parse import unquote
 
 import typer
 
-from hdbridge.cli.interrupt import deferred_interrupt
-from hdbridge.cli.options import (
-    JsonOption,
-    need_extra,
-    note,
-    print_table,
-    progress_bar,
-    say,
-    taking,
-    write_json,
-    write_result,
-)
+from hdbridge.cli import options as opt
+from hdbridge.cli.options import need_extra, taking
+from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_result
+from hdbridge.cli.session import deferred_interrupt
 from hdbridge.errors import InputError
 from hdbridge.files.expectation import nearest
 from hdbridge.files.outputs import Kind
@@ -65,8 +57,7 @@ ModelOption = Annotated[
     typer.Option("--model", metavar="MODEL.yaml", help="Model of joints without one of their own."),
 ]
 ModelsOption = Annotated[
-    Path | None,
-    typer.Option("--models", metavar="FOLDER", help="Folder with a model per joint, JOINT.yaml."),
+    Path | None, typer.Option("--models", metavar="FOLDER", help="Folder with a model per joint, JOINT.yaml.")
 ]
 SchedulerOption = Annotated[
     str | None,
@@ -77,8 +68,7 @@ WorkersOption = Annotated[
     typer.Option("--workers", min=1, max=1000, help="Processes on this computer; else one per core."),
 ]
 PagesOption = Annotated[
-    bool,
-    typer.Option("--pages", help="Also write the page of each listed joint, into OUT/pages."),
+    bool, typer.Option("--pages", help="Also write the page of each listed joint, into OUT/pages.")
 ]
 TimeoutOption = Annotated[
     float,
@@ -154,10 +144,7 @@ class Fleet:
         )
 
     def diagnose(
-        self,
-        found: Sequence[Source],
-        interrupted: Callable[[], bool],
-        retried: Collection[str] | None = None,
+        self, found: Sequence[Source], interrupted: Callable[[], bool], retried: Collection[str] | None = None
     ) -> None:
         """Runs over the recordings with a progress bar."""
         from hdbridge.fleet.engine import RETRIED, Cluster, Progress
@@ -256,12 +243,11 @@ def report(
         typer.Option("--html", metavar="PAGE", help="Write the page here; else OUT/fleet.html."),
         Kind.PAGE,
     ] = None,
-    json_file: JsonOption = None,
+    json_file: opt.Json = None,
     limit_arcsec: LimitOption = 10.0,
     pages: PagesOption = False,
     joints: Annotated[
-        list[str] | None,
-        typer.Option("--joint", metavar="NAME", help="Also write the page of this joint."),
+        list[str] | None, typer.Option("--joint", metavar="NAME", help="Also write the page of this joint.")
     ] = None,
 ) -> None:
     """Write the page of a run again, and print which joints to look at first."""
@@ -283,8 +269,7 @@ def simulate(
     ] = 4,
     seed: Annotated[int, typer.Option("--seed", help="Seed of the fleet.")] = 0,
 ) -> None:
-    """Make recordings of a simulated fleet: known causes that grow over a year, damaged files, exchanged
-    joints.
+    """Make recordings of a simulated fleet: growing known causes, damaged files, exchanged joints.
 
     FOLDER gets the recordings, `manifest.csv`, and the truth, `answers.json`.
     """
@@ -306,11 +291,8 @@ def _summarise(
     joints: Sequence[str] = (),
 ) -> Summary:
     """Prints, writes and returns the summary; writes the pages of these joints and of all listed ones."""
-    from rich.table import Table
-
-    from hdbridge.fleet.pages import shown
     from hdbridge.fleet.prior import write_prior
-    from hdbridge.fleet.report import ROWS, fleet_page, hours_words
+    from hdbridge.fleet.report import ROWS, fleet_page, hours_words, shown
     from hdbridge.fleet.summary import summarise
     from hdbridge.report.page import render
 
@@ -328,17 +310,18 @@ def _summarise(
     write_prior(dataset.folder / PRIOR_NAME, rows)
     listed = [each.joint for each in summary.first[:ROWS]] if pages else []
     found = _with_pages(dataset.folder, latest, dict.fromkeys([*joints, *listed]))
-    table = Table("joint", "cause", "probability", "peak, arcsec", "hours to the limit")
-    for each in summary.first:
-        table.add_row(
-            each.joint,
-            each.cause,
-            f"{each.probability:.2f}",
-            f"{each.peak_arcsec:.1f}",
-            hours_words(each.remaining),
-        )
     if summary.first:
-        print_table(table)
+        first = [
+            (
+                each.joint,
+                each.cause,
+                f"{each.probability:.2f}",
+                f"{each.peak_arcsec:.1f}",
+                hours_words(each.remaining),
+            )
+            for each in summary.first
+        ]
+        print_table(("joint", "cause", "probability", "peak, arcsec", "hours to the limit"), first)
     else:
         say("No joint stands out." if latest else "No recording has a diagnosis.")
     for line in summary.lines():
@@ -355,7 +338,7 @@ def _summarise(
 
 def _with_pages(folder: Path, latest: Mapping[str, Row], wanted: Collection[str]) -> dict[str, str]:
     """Writes the wanted pages of joints that are missing; returns the addresses of all that are there."""
-    from hdbridge.fleet.pages import links, write_page
+    from hdbridge.fleet.report import links, write_page
 
     there = links(folder, latest)
     missing = [each for each in wanted if each not in there]
@@ -387,4 +370,4 @@ def _check_memory(text: str) -> None:
         )
 
 
-COMMANDS: Final = {"run": run, "watch": watch, "report": report, "simulate": simulate}
+COMMANDS: Final = {"fleet": {"run": run, "watch": watch, "report": report, "simulate": simulate}}

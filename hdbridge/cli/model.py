@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
-from rich.markup import escape
+from rich.text import Text
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.difference import Difference, diff
 from hdbridge.axis.model.store import ACTIVE, MODELS, PENDING, Store, Version
-from hdbridge.cli.options import JsonOption, ProfileArgument, figures_table, print_table, say, write_json
+from hdbridge.cli import options as opt
+from hdbridge.cli.printing import print_table, say, write_json
 from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile
 from hdbridge.files.yamlfile import read_yaml
@@ -21,7 +22,7 @@ ReasonOption = Annotated[str, typer.Option("--reason", help="Why, for the log.")
 TwinOption = Annotated[bool, typer.Option("--twin", help="The twins of the axis instead of its models.")]
 
 
-def log(profile: ProfileArgument, twin: TwinOption = False, json_file: JsonOption = None) -> None:
+def log(profile: opt.Profile, twin: TwinOption = False, json_file: opt.Json = None) -> None:
     """List every model of the profile, newest first, with dates and reasons."""
     store = _store(twin)
     versions = store.log(_folder(profile))
@@ -40,7 +41,7 @@ def log(profile: ProfileArgument, twin: TwinOption = False, json_file: JsonOptio
 
 
 def compare(
-    profile: ProfileArgument,
+    profile: opt.Profile,
     before: Annotated[
         str | None,
         typer.Argument(metavar="BEFORE", help="Number, `active` or `pending`; else the active one."),
@@ -49,7 +50,7 @@ def compare(
         str | None, typer.Argument(metavar="AFTER", help="The same; else the pending one.")
     ] = None,
     twin: TwinOption = False,
-    json_file: JsonOption = None,
+    json_file: opt.Json = None,
 ) -> None:
     """Show what changed between two models, parameter by parameter."""
     folder, store = _folder(profile), _store(twin)
@@ -77,7 +78,7 @@ def compare(
     _print_diff(f"{earlier_name} → {later.name}", rows)
 
 
-def commit(profile: ProfileArgument, twin: TwinOption = False) -> None:
+def commit(profile: opt.Profile, twin: TwinOption = False) -> None:
     """Make the pending model the active one; the one before stays in the history."""
     store = _store(twin)
     number = store.commit(_folder(profile), _now())
@@ -85,7 +86,7 @@ def commit(profile: ProfileArgument, twin: TwinOption = False) -> None:
 
 
 def activate(
-    profile: ProfileArgument,
+    profile: opt.Profile,
     version: Annotated[int, typer.Argument(min=1, help="Its number in the log.")],
     reason: ReasonOption = "",
     twin: TwinOption = False,
@@ -96,14 +97,14 @@ def activate(
     say(f"{store.noun} {number} is active")
 
 
-def rollback(profile: ProfileArgument, reason: ReasonOption = "", twin: TwinOption = False) -> None:
+def rollback(profile: opt.Profile, reason: ReasonOption = "", twin: TwinOption = False) -> None:
     """Undo the last activation: the model before it is active again."""
     store = _store(twin)
     number = store.rollback(_folder(profile), reason, _now())
     say(f"{store.noun} {number} is active again")
 
 
-def discard(profile: ProfileArgument, twin: TwinOption = False) -> None:
+def discard(profile: opt.Profile, twin: TwinOption = False) -> None:
     """Throw the pending model away; the recording that it came from stays."""
     store = _store(twin)
     store.discard(_folder(profile))
@@ -128,9 +129,7 @@ def _rows(before: Any, after: Any) -> list[Difference]:
 
 
 def _folder(profile: str) -> Path:
-    """Returns the folder with an axis's models; raises `InputError` unless it has an axis file,
-    valid or not.
-    """
+    """Returns the folder of an axis's models; raises `InputError` without an axis file, valid or not."""
     axis = Profile.find(profile).axis
     data = read_yaml(axis).data
     if not (isinstance(data, dict) and str(data.get("schema")).startswith("hdbridge.axis/")):
@@ -146,17 +145,16 @@ def _print_diff(title: str, rows: Sequence[Difference]) -> None:
     """Prints the differences effect by effect; without the columns of a previous model if there was none."""
     compared = any(row.before is not None for row in rows if row.effect)
     columns = ("before", "after", "change", "± 95 %") if compared else ("value", "± 95 %")
-    table = figures_table(title, "parameter", *columns)
+    table: list[Sequence[str | Text]] = []
     effect = None
     for row in rows:
         if row.effect and row.effect != effect:
             effect = row.effect
-            table.add_section()
-            table.add_row(f"[bold]{escape(effect)}[/bold]")
+            table += [(), (Text(effect, style="bold"),)]
         before, after, change, half_width = _cells(row)
         cells = (before, after, change, half_width) if compared else (after, half_width)
-        table.add_row(f"{'  ' if row.effect else ''}{escape(row.parameter)}", *cells)
-    print_table(table)
+        table.append((f"{'  ' if row.effect else ''}{row.parameter}", *cells))
+    print_table(("parameter", *columns), table, title)
 
 
 def _names(version: Version[Any]) -> set[str]:
@@ -178,7 +176,7 @@ def _cell(value: Any, half_width: float | None) -> tuple[str, str]:
     """Formats a value and half its interval: to the interval's digits, else to four."""
     if isinstance(value, float):
         return (figure(value), "-") if half_width is None else with_interval(value, half_width)
-    return "-" if value is None else escape(str(value)), "-" if half_width is None else figure(half_width, 2)
+    return "-" if value is None else str(value), "-" if half_width is None else figure(half_width, 2)
 
 
 def _version(each: Version[Any]) -> dict[str, Any]:
@@ -194,10 +192,12 @@ def _version(each: Version[Any]) -> dict[str, Any]:
 
 
 COMMANDS: Final = {
-    "log": log,
-    "commit": commit,
-    "activate": activate,
-    "rollback": rollback,
-    "discard": discard,
-    "diff": compare,
+    "model": {
+        "log": log,
+        "commit": commit,
+        "activate": activate,
+        "rollback": rollback,
+        "discard": discard,
+        "diff": compare,
+    }
 }

@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import FrameType
+from typing import TYPE_CHECKING, Any
 
-from hdbridge.cli.interrupt import deferred_interrupt
-from hdbridge.cli.options import (
-    BorrowOption,
-    ChannelOption,
-    ForceOption,
-    InterfaceOption,
-    ProfileArgument,
-    SeedOption,
-    SimulateOption,
-    TruthOption,
-    note,
-    taking,
-)
+from hdbridge.cli import options as opt
+from hdbridge.cli.options import taking
+from hdbridge.cli.printing import note
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.errors import DaemonError, InputError
 from hdbridge.files.profile import Profile
@@ -40,14 +32,14 @@ class Session:
     The fields are the options of every command that reaches an axis: see `on_axis`.
     """
 
-    profile: ProfileArgument
-    simulate: SimulateOption = False
-    truth: TruthOption = None
-    seed: SeedOption = 0
-    interface: InterfaceOption = None
-    channel: ChannelOption = None
-    force: ForceOption = False
-    borrow: BorrowOption = False
+    profile: opt.Profile
+    simulate: opt.Simulate = False
+    truth: opt.Truth = None
+    seed: opt.Seed = 0
+    interface: opt.Interface = None
+    channel: opt.Channel = None
+    force: opt.Force = False
+    borrow: opt.Borrow = False
 
     def __post_init__(self) -> None:
         check_bus_options(self.interface, self.channel, simulate=self.simulate)
@@ -133,6 +125,33 @@ on_axis = taking(Session)
 """Gives a command the options of a `Session`, which it receives as its first argument."""
 
 
+@contextmanager
+def deferred_interrupt() -> Iterator[Callable[[], bool]]:
+    """Defers signals to end: within the block they only set a flag, which the yielded function reports.
+
+    A closed terminal (SIGHUP) or SIGQUIT thus also stops the axis in an orderly way. A signal that was
+    ignored from the start (`nohup`) stays ignored. The third signal interrupts at once.
+    """
+    wishes = 0
+
+    def note(_number: int, _frame: FrameType | None) -> None:
+        nonlocal wishes
+        wishes += 1
+        if wishes >= 3:  # the user insists: end even if something hangs
+            raise KeyboardInterrupt
+
+    before = {
+        each: signal.signal(each, note)
+        for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+        if each is signal.SIGINT or signal.getsignal(each) is not signal.SIG_IGN
+    }
+    try:
+        yield lambda: wishes > 0
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+
+
 def check_bus_options(interface: str | None, channel: str | None, *, simulate: bool) -> None:
     """Refuses a bus option for a simulated drive, which would not use it."""
     if simulate and (interface is not None or channel is not None):
@@ -188,3 +207,57 @@ def bare_bus(settings: BusConfig, *, force: bool) -> Iterator[tuple[can.BusABC, 
     check_interface(settings.interface, "--interface")
     with open_bus(settings, shared=force) as bus:
         yield bus, MonotonicClock()
+
+
+def model_file(text: str) -> Path:
+    """Returns the model file that an option names, directly or through a profile with an active model.
+
+    Raises `InputError` if there is neither, or if the profile has no model yet.
+    """
+    path = Path(text)
+    if path.is_file() and path.name != "axis.yaml":
+        return path
+    try:
+        files = Profile.find(text)
+    except InputError as problem:
+        raise InputError(f"{text}: no such model file, and no such profile: {problem}") from None
+    if not files.axis.is_file():
+        raise InputError(
+            f"{text}: no such model file, and no profile; expected a model file, or a folder "
+            "with an axis.yaml"
+        )
+    if not files.model.is_file():
+        raise InputError(
+            f"{files.folder}: there is no model.yaml; make one: hdbridge calibrate {files.folder}, and "
+            f"commit it: hdbridge model commit {files.folder}; or fit one to a record: hdbridge fit RECORD "
+            f"--axis {files.folder} --out model.yaml, and pass --model model.yaml"
+        )
+    return files.model
+
+
+def compensating_model(files: Profile, profile: str, model: Path | None, otherwise: str = "") -> Path:
+    """Returns the model file to compensate with: the given one, else the profile's.
+
+    Raises `InputError` if there is none; ``otherwise`` is added as an alternative without a model.
+    """
+    if model is None and not files.model.exists():
+        raise InputError(
+            f"{files.model}: there is no model to compensate with; calibrate first: hdbridge calibrate "
+            f"{profile}{otherwise}"
+        )
+    return model or files.model
+
+
+def note_clamped(limits: Any, **wanted: float | None) -> None:
+    """Reports each velocity or acceleration above the axis's limit, which is used instead.
+
+    ``limits`` must have the attributes that are named: ``velocity_deg_s``, ``acceleration_deg_s2``.
+    """
+    for name, value in wanted.items():
+        limit = getattr(limits, name)
+        if value is not None and abs(value) > limit:
+            kind, unit = ("velocity", "deg/s") if name == "velocity_deg_s" else ("acceleration", "deg/s2")
+            note(
+                f"{kind}: {abs(value):g} {unit} is above the axis's limit; {limit:g} {unit} is used "
+                f"(limits.{name})"
+            )

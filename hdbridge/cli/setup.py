@@ -11,16 +11,8 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from hdbridge.cli.options import (
-    BitrateOption,
-    ChannelOption,
-    EdsOption,
-    InterfaceOption,
-    NodeOption,
-    SeedOption,
-    note,
-    say,
-)
+from hdbridge.cli import options as opt
+from hdbridge.cli.printing import note, say
 from hdbridge.errors import BusError, DriveError, HdbridgeError, InputError
 from hdbridge.files.atomic import write_atomically
 
@@ -47,22 +39,22 @@ _UP: Final = 1
 _REMEDY: Final = re.compile(r"axis\.yaml:\d+:\d+: ([a-z_.]+): found (\S+), expected (-?[\d.]+)\b")
 
 
-def command(
+def setup(
     folder: Annotated[
         Path, typer.Argument(metavar="NAME", help="Folder of the axis, new or from an earlier set-up.")
     ],
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    bitrate_bps: BitrateOption = None,
-    node_id: NodeOption = None,
-    eds: EdsOption = None,
+    interface: opt.Interface = None,
+    channel: opt.Channel = None,
+    bitrate_bps: opt.Bitrate = None,
+    node_id: opt.Node = None,
+    eds: opt.Eds = None,
     plan: Annotated[
         str, typer.Option("--plan", metavar="quick|full|FILE", help="Plan of the calibration.")
     ] = "quick",
     simulate: Annotated[
         bool, typer.Option("--simulate", help="Set up a simulated axis, a copy of the profile demo.")
     ] = False,
-    seed: SeedOption = 0,
+    seed: opt.Seed = 0,
     yes: Annotated[
         bool, typer.Option("--yes", help="Answer every yes-or-no question with yes; the axis moves.")
     ] = False,
@@ -312,9 +304,7 @@ def _check_interface(interface: str, channel: str, bitrate_bps: int | None) -> N
 
 
 def value_of(text: str, key: str) -> tuple[str, bool] | None:
-    """Returns the value of ``section.key`` in the text of an axis file, and True if it is marked to be filled
-    in.
-    """
+    """Returns the value of ``section.key`` in an axis file's text, and True if it is to be filled in."""
     match = _line(key).search(text)
     if match is None:
         return None
@@ -341,3 +331,6 @@ def _line(key: str) -> re.Pattern[str]:
         r"(?P<value>[^\n#]*)(?P<comment>[^\n]*)",
         re.MULTILINE,
     )
+
+
+COMMANDS: Final = {"setup": setup}

@@ -4,30 +4,15 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
-from rich.table import Table
 
-from hdbridge.cli.options import (
-    ColumnsOption,
-    HtmlOption,
-    JsonOption,
-    ProfileArgument,
-    TruthOption,
-    UnitsOption,
-    UnwrapOption,
-    load_recordings,
-    note,
-    print_table,
-    progress_bar,
-    say,
-    write_json,
-    write_result,
-)
+from hdbridge.cli import options as opt
+from hdbridge.cli.options import taking
+from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_result
 from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile
-from hdbridge.units import figure
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
@@ -37,8 +22,10 @@ if TYPE_CHECKING:
     from hdbridge.twin.translate import Translation
 
 
-def command(
-    profile: ProfileArgument,
+@taking(opt.CsvFormat)
+def twin(
+    csv: opt.CsvFormat,
+    profile: opt.Profile,
     recordings: Annotated[
         list[Path],
         typer.Argument(metavar="RECORDING...", help="Recording folders or CSV files, in order of time."),
@@ -49,16 +36,10 @@ def command(
     compare: Annotated[
         bool, typer.Option("--compare", help="Only compare the present simulation with the recordings.")
     ] = False,
-    truth: TruthOption = None,
-    afresh: Annotated[
-        bool,
-        typer.Option("--afresh", help="Start from typical values."),
-    ] = False,
-    columns: ColumnsOption = None,
-    units: UnitsOption = None,
-    unwrap: UnwrapOption = None,
-    json_file: JsonOption = None,
-    html_file: HtmlOption = None,
+    truth: opt.Truth = None,
+    afresh: Annotated[bool, typer.Option("--afresh", help="Start from typical values.")] = False,
+    json_file: opt.Json = None,
+    html_file: opt.Html = None,
 ) -> None:
     """Fit the simulated drive to recordings of an axis; report its errors, and keep the twin as pending.
 
@@ -74,7 +55,7 @@ def command(
             "--check holds the recordings against the profile's twin: leave out the other options"
         )
     axis = AxisConfig.load(files.axis)
-    recording = _joined(axis, load_recordings(recordings, columns, units, unwrap))
+    recording = _joined(axis, csv.load(recordings))
     for doubt in doubts(recording, axis):
         note(f"look at the recording: {doubt}")
     if check:
@@ -229,9 +210,7 @@ def _joined(axis: AxisConfig, recordings: dict[Path, Recording]) -> Recording:
 
 
 def _beginning(files: Profile, axis: AxisConfig, truth: Path | None, *, afresh: bool) -> Translation:
-    """Returns the initial simulation: the profile's plant, with the transmission error of the
-    active model.
-    """
+    """Returns the initial simulation: the profile's plant with the active model's transmission error."""
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.sim.truth import Truth
     from hdbridge.twin.translate import translate
@@ -299,9 +278,8 @@ def as_dict(report: TwinReport) -> dict[str, Any]:
 
 def print_report(report: TwinReport) -> None:
     """Prints the verdict, the figures of the whole record, and the findings."""
-    from hdbridge.report.twin import title_of, verdict
-    from hdbridge.report.words import sentence
-    from hdbridge.twin.compare import ALL
+    from hdbridge.report.page import sentence
+    from hdbridge.report.twin import figures, verdict
     from hdbridge.twin.misfit import Values
 
     for effect in report.translated:
@@ -310,20 +288,7 @@ def print_report(report: TwinReport) -> None:
     if report.verdict:
         say(sentence(report.verdict), style="bold")
     say(verdict(report))
-    table = Table("")
-    differences = ["difference before", "difference"] if report.after else ["difference"]
-    for name in ("measured", "simulated", *differences, "of the noise"):
-        table.add_column(name, justify="right")
-    table.add_column("unit")
-    for row in report.now.rows:
-        if row.kind != ALL:
-            continue
-        cells = [figure(row.measured), figure(row.simulated)]
-        if report.after is not None:
-            was = report.before.row(row.channel)
-            cells.append(figure(was.difference) if was else "")
-        table.add_row(title_of(row), *cells, figure(row.difference), figure(row.in_noise, 3), row.unit)
-    print_table(table)
+    print_table(*figures(report))
     for named in report.named:
         say(f"{named.cause}: {named.text}")
     for estimate in report.learned if report.values == Values.AXIS else ():
@@ -331,3 +296,6 @@ def print_report(report: TwinReport) -> None:
             say(estimate.text)
     for each in report.commands:
         say(f"  {each.line}   # {each.purpose}")
+
+
+COMMANDS: Final = {"twin": twin}

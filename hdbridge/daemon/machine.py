@@ -32,8 +32,7 @@ from hdbridge.drive import plan
 from hdbridge.drive.busload import check_bus_load
 from hdbridge.drive.link import unknown_interface
 from hdbridge.errors import InputError
-from hdbridge.files.bundled import bundled_folder
-from hdbridge.files.profile import Profile
+from hdbridge.files.profile import Profile, bundled_folder
 from hdbridge.files.yamlfile import Document, Location, read_yaml
 
 T = TypeVar("T")

@@ -15,8 +15,8 @@ from typing import Any, Final
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
 from hdbridge.errors import InputError
-from hdbridge.files.bundled import bundled_folder
 from hdbridge.files.edsfile import shared_eds
+from hdbridge.files.profile import bundled_folder
 
 BUNDLED: Final = bundled_folder("eds") / "hdbridge-402.eds"
 """EDS of the objects that the firmware works with."""

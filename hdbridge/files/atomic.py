@@ -4,6 +4,7 @@ Pipes and character devices hold nothing that could be kept: they are written di
 a file.
 """
 
+import errno
 import fcntl
 import itertools
 import os
@@ -14,6 +15,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from hdbridge.errors import InputError, OutputError
 
@@ -22,8 +24,7 @@ _DESCRIPTOR = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
 
 
 def write_atomically(path: Path | str, content: str | bytes) -> None:
-    """Replaces a file's content (text as UTF-8): temporary file in the same folder, fsync, rename, fsync of
-    the folder.
+    """Replaces a file's content (text as UTF-8) by a temporary file, fsync, rename, and fsync of the folder.
 
     A reader, or a power cut, finds the old content or the new one. Pipes and character devices are written
     directly. Raises `OutputError` if the location cannot be written; the old file then remains.
@@ -93,9 +94,7 @@ def _try_out(target: Path) -> None:
 
 
 def descriptor_of(path: Path | str) -> int | None:
-    """Returns the number of this process's open file that a path like ``/dev/stdout`` or ``/dev/fd/3`` names,
-    or None.
-    """
+    """Returns the descriptor that a path like ``/dev/stdout`` or ``/dev/fd/3`` names; None for others."""
     if str(path) in _STANDARD:
         return _STANDARD.index(str(path))
     found = _DESCRIPTOR.fullmatch(str(path))
@@ -103,9 +102,7 @@ def descriptor_of(path: Path | str) -> int | None:
 
 
 def is_stream(path: Path | str) -> bool:
-    """Returns True if a path is written directly: a pipe, a character device, an open file of
-    this process.
-    """
+    """Returns True for what is written directly: a pipe, a character device, an open file of this process."""
     if descriptor_of(path) is not None:
         return True
     try:
@@ -141,9 +138,7 @@ def _write_all(descriptor: int, data: bytes) -> None:
 
 
 def make_folder(path: Path | str) -> Path:
-    """Creates a folder with its parents and returns it; raises `InputError` if it cannot be created or
-    written.
-    """
+    """Creates a folder with its parents and returns it; raises `InputError` if it cannot be written."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -229,3 +224,18 @@ def _is_still(name: Path, descriptor: int) -> bool:
         return os.path.samestat(name.stat(), os.fstat(descriptor))
     except FileNotFoundError:
         return False
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Opens a file for reading; raises `OSError` for a named pipe, a device or a folder.
+
+    Open files of this process (``/dev/stdin``, and ``/dev/fd/3`` of ``<(command)``) may be of any kind.
+    """
+    if descriptor_of(path) is None:
+        mode = os.stat(path).st_mode  # noqa: PTH116 - follows links such as those in /proc
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
+        if not stat.S_ISREG(mode):
+            kind = "a named pipe" if stat.S_ISFIFO(mode) else "a device or a socket"
+            raise OSError(errno.EINVAL, f"it is {kind}; expected a file", os.fspath(path))
+    return path.open("rb")

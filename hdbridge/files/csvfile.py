@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.errors import InputError
-from hdbridge.files.atomic import write_atomically
+from hdbridge.files.atomic import open_regular, write_atomically
 from hdbridge.files.expectation import one_line
-from hdbridge.files.regular import open_regular
 
 FloatArray = NDArray[np.float64]
 Column = NDArray[Any]
@@ -277,9 +276,7 @@ def _wrong(text: str) -> InputError:
 
 
 def text_of(path: Path) -> tuple[bytes, str]:
-    """Returns the file's text, decompressed, in UTF-8 without byte-order mark, and its encoding if it was
-    another.
-    """
+    """Returns the file's text, decompressed, as UTF-8 without a mark, and its encoding if it was another."""
     try:
         with open_regular(path) as plain:
             content = _bounded(plain)
@@ -369,9 +366,7 @@ def _head(content: bytes) -> list[_Line]:
 
 
 def _layout(path: Path, content: bytes, wanted: Collection[str]) -> _Layout:
-    """Finds separator and header: the line with most of the ``wanted`` names, else the one
-    above the numbers.
-    """
+    """Finds separator and header: the line with most ``wanted`` names, else the one above the numbers."""
     head = _head(content)
     rows = [line for line in head if not line.comment]
     if not rows:
@@ -432,9 +427,7 @@ def _named_header(head: Sequence[_Line], wanted: Collection[str]) -> tuple[str, 
 
 
 def _guessed_header(head: Sequence[_Line]) -> tuple[str, _Line | None]:
-    """Returns the separator that gives most number cells, and the line of names above them, if
-    there is one.
-    """
+    """Returns the separator that gives most number cells, and the line of names above them, if any."""
     best: tuple[int, str, _Line | None] | None = None
     for separator in _SEPARATORS:
         rows = [line for line in head if not line.comment]

@@ -16,7 +16,7 @@ from canopen.objectdictionary import ObjectDictionary, datatypes
 from canopen.objectdictionary.eds import import_eds
 
 from hdbridge.errors import InputError
-from hdbridge.files.regular import open_regular
+from hdbridge.files.atomic import open_regular
 
 MAX_BYTES: Final = 16 << 20
 _MOST_OBJECTS: Final = 100_000
@@ -155,9 +155,7 @@ class _Reader:
     # -- lines --------------------------------------------------------------------------------------------
 
     def _split(self, text: str) -> None:
-        """Splits the text into sections and keys. Of two equal keys the first counts, as in
-        Windows itself.
-        """
+        """Splits the text into sections and keys. Of two equal keys the first counts, as in Windows."""
         section = None
         end = text.find(_DOS_END)
         for number, raw in enumerate(re.split(r"\r\n|\n|\r", text[:end] if end >= 0 else text), start=1):

@@ -32,9 +32,7 @@ class ForMachines(logging.Formatter):
 
 
 class LogFile(logging.FileHandler):
-    """Log file that stops, with one message, when its disk is full, because the axis matters more than its
-    log.
-    """
+    """Log file that stops with one message on a full disk, because the axis matters more than its log."""
 
     failed = False
 

@@ -208,9 +208,7 @@ def _endless(path: Path) -> bool:
 
 
 def _status(path: Path) -> os.stat_result | None:
-    """Returns the status of the file to be written: ``missing/../file`` is the file, although it cannot be
-    opened.
-    """
+    """Returns the status of the file to be written; ``missing/../file`` is the file."""
     try:
         return _resolved(path).stat()
     except OSError:

@@ -1,11 +1,36 @@
-"""Files of one axis, found from user input or a machine file."""
+"""Files of one axis, found from user input or a machine file, and the location of bundled ones."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Self
+from typing import Final, Literal, Self
 
 from hdbridge.errors import InputError
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.expectation import nearest
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def bundled_folder(kind: Literal["eds", "profiles"], package: Path = _PACKAGE) -> Path:
+    """Returns the folder of bundled EDS files or profiles; it may be missing in a broken installation."""
+    installed = package / "_bundled" / kind
+    beside = package.parent / kind
+    working_copy = (package.parent / "pyproject.toml").is_file() and beside.is_dir()
+    return beside if working_copy and not installed.is_dir() else installed
+
+
+def bundled_profile(name: str) -> Path:
+    """Returns the folder of a bundled profile; raises `InputError` with the existing ones and the nearest."""
+    folder = bundled_folder("profiles")
+    if name and (folder / name / "axis.yaml").is_file():
+        return folder / name
+    known = sorted(each.parent.name for each in folder.glob("*/axis.yaml"))
+    close = nearest(name, known)
+    expected = ", ".join(known) or f"none found in {folder}"
+    hint = f"; did you mean '{close}'?" if close else ""
+    raise InputError(
+        f"{name}: no such file or folder, nor a bundled profile; expected a path or one of: {expected}{hint}"
+    )
+
 
 TWIN_NAME: Final = "twin.yaml"
 
@@ -30,15 +55,12 @@ class Profile:
 
     @property
     def simulated(self) -> Path:
-        """File that describes the simulated drive of this axis: its twin if there is one, else the truth
-        file.
-        """
+        """File that describes the simulated drive: the axis's twin if there is one, else its truth file."""
         return self.twin if self.twin.is_file() else self.truth
 
     @classmethod
     def find(cls, text: str, base: Path = Path()) -> Self:
-        """Finds a profile by folder, axis file, or name of a bundled profile; raises `InputError` if there is
-        none.
+        """Finds a profile by folder, axis file or bundled name; raises `InputError` if there is none.
 
         ``base`` is the folder that a relative path starts from.
         """

@@ -1,19 +1,24 @@
-"""The page of a fleet: joints to inspect first, causes by batch, mistaken and failed recordings, and the
-rates at which causes are named.
-"""
+"""Pages of a fleet and of its single joints."""
 
+import hashlib
 import re
 import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
+from urllib.parse import quote
 
 from hdbridge import __version__
+from hdbridge.errors import InputError
+from hdbridge.files.atomic import make_folder, write_atomically
+from hdbridge.fleet.diagnosing import local_model, read
+from hdbridge.fleet.sources import Source
 from hdbridge.fleet.statistics import Interval
-from hdbridge.fleet.summary import Candidate, Summary
-from hdbridge.report.page import Cell, Command, Heading, Link, Page, Section, Status, Table
+from hdbridge.fleet.summary import Candidate, Row, Summary, counted, own_recordings
+from hdbridge.report.page import Cell, Command, Heading, Link, Page, Section, Status, Table, sentence
 
 ROWS: Final = 200
 """Maximum number of rows of a table, so that the page of ten thousand joints opens quickly."""
@@ -200,3 +205,84 @@ def _words(name: str) -> str:
 def _two(value: float) -> str:
     """Formats a value with two significant digits, without an exponent."""
     return f"{float(f'{value:.2g}'):,.0f}"
+
+
+PAGES = "pages"
+KEY_DIGITS = 12
+
+
+def shown(rows: Sequence[Row]) -> dict[str, Row]:
+    """Returns the recording that the page of each joint shows: the last that is its own.
+
+    Its ``mistaken`` are the joint's recordings of another joint or encoder, or with other orders.
+    """
+    own, mistaken = own_recordings(rows)
+    return {
+        joint: {**each[-1], "mistaken": [one for one in mistaken if one.joint == joint]}
+        for joint, each in own.items()
+    }
+
+
+def links(folder: Path, latest: Mapping[str, Row]) -> dict[str, str]:
+    """Returns the relative address of each joint's page that is there and up to date.
+
+    ``latest`` is from `shown`.
+    """
+    there = {each.name for each in (folder / PAGES).glob("*.html")}
+    names = {joint: _name(row) for joint, row in latest.items()}
+    return {joint: f"{PAGES}/{quote(name)}" for joint, name in names.items() if name in there}
+
+
+def write_page(folder: Path, row: Row) -> None:
+    """Diagnoses the recording to show again and writes the page; removes the joint's older pages.
+
+    InputError if recording or model are not there any more.
+    """
+    from hdbridge.analysis.diagnosis import diagnose
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.report.diagnosis import diagnosis_page
+    from hdbridge.report.page import Section, Table, render
+
+    given = {each.name: row[each.name] for each in fields(Source) if row.get(each.name)}
+    source = Source(**{name: each for name, each in given.items() if name != "model"})
+    where = str(folder / row["model"]) if row["model"].startswith("models/") else row["model"]
+    model = local_model(where)
+    if model.reason:
+        raise InputError(model.reason)
+    recording = replace(read(source), ratio=row["ratio"])
+    result = diagnose(recording, TransmissionModel.from_text(model.text, where))
+    known = {"joint": source.joint, "recording": source.path, "recorded": row["date"], "model": where}
+    known |= {name: row[name] for name in ("gear", "batch", "cell", "lubricant")}
+    known |= {"hours": None if row["hours"] is None else f"{row['hours']:,.0f}"}
+    said = [("--model", where), ("--axis", source.axis if source.is_flight else None)]
+    said += [(f"--{name}", row[name]) for name in ("columns", "units", "unwrap")]
+    options = [word for name, value in said if value for word in (name, value)]
+    page = diagnosis_page(
+        result,
+        title=f"Diagnosis of joint {source.joint}",
+        provenance=[(name, value) for name, value in known.items() if value],
+        command=shlex.join(["hdbridge", "diagnose", source.path, *options]),
+    )
+    if row["mistaken"]:
+        about = f"This is {Path(source.path).name}, the last recording of {source.joint} itself."
+        table = Table(["recording", "why"], [[each.path, each.text] for each in row["mistaken"]])
+        text = "File a recording under its own joint; after an exchange of the encoder, fit a new model."
+        page = replace(
+            page,
+            verdict=f"{about} {sentence('; '.join(counted(row['mistaken'])))} {page.verdict}",
+            sections=[Section("Recordings that do not fit this joint", text, [table]), *page.sections],
+        )
+    pages = make_folder(folder / PAGES)
+    older = [
+        each for each in pages.glob("*.html") if each.name[: -KEY_DIGITS - 5] == _name(row)[: -KEY_DIGITS - 5]
+    ]
+    write_atomically(pages / _name(row), render(page))
+    for each in older:
+        if each.name != _name(row):
+            each.unlink(missing_ok=True)
+
+
+def _name(row: Row) -> str:
+    content = "\n".join([row["key"], *(each.path + each.text for each in row["mistaken"])])
+    digits = hashlib.sha256(content.encode()).hexdigest()[:KEY_DIGITS]
+    return f"{quote(row['joint'], safe='')}-{digits}.html"

@@ -112,11 +112,7 @@ CAUSES: Final[Mapping[str, Callable[[dict[str, Any], float], None]]] = {
 
 
 def simulate(
-    folder: Path,
-    joints: int,
-    recordings: int,
-    seed: int,
-    progress: Callable[[float], None] = lambda _: None,
+    folder: Path, joints: int, recordings: int, seed: int, progress: Callable[[float], None] = lambda _: None
 ) -> None:
     """Writes recordings, `manifest.csv` and `answers.json` to a new folder.
 

@@ -31,9 +31,7 @@ SCHEMA: Final = "hdbridge.fleet-summary/1"
 FALSE_DISCOVERIES: Final = 0.01
 """Maximum expected share of wrong joints in the list."""
 COMMON: Final = 0.4
-"""Share of a gear type's joints above which a cause belongs to the type; joints are then listed only if it
-grows.
-"""
+"""Share of a gear type's joints above which a cause belongs to the type and counts only if it grows."""
 SURE: Final = 0.95
 REPEATED: Final = 2
 """Minimum number of recordings that name a cause."""

@@ -29,10 +29,7 @@ REQUIRED: Final[Mapping[str, str]] = MappingProxyType(
     }
 )
 OPTIONAL: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "motor_target_deg": "commanded motor angle, multi-turn",
-        **{each.value: each.about for each in MEASURED},
-    }
+    {"motor_target_deg": "commanded motor angle, multi-turn", **{each.value: each.about for each in MEASURED}}
 )
 CHANNELS: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -213,12 +210,7 @@ class CsvColumns:
     """Period of each wrapping counter, in the column's unit."""
 
     @classmethod
-    def of(
-        cls,
-        columns: Said = None,
-        units: Said = None,
-        unwrap: Said = None,
-    ) -> Self:
+    def of(cls, columns: Said = None, units: Said = None, unwrap: Said = None) -> Self:
         """Parses ``motor=theta_m,time=t``, ``motor=counts:65536,time=ms`` and ``motor=65536``, or mappings.
 
         Of several texts the later ones take precedence. Raises `InputError` for an impossible channel, unit
@@ -322,12 +314,7 @@ def read(file: CsvFile, said: CsvColumns) -> tuple[dict[str, Column], Origin]:
     used = set(found.values())
     kept = {name: each for name, each in columns.items() if name not in used and name not in converted}
     origin = Origin(
-        file,
-        found,
-        units,
-        frozenset(said.units),
-        frozenset(said.unwrap),
-        (*file.remarks, *remarks),
+        file, found, units, frozenset(said.units), frozenset(said.unwrap), (*file.remarks, *remarks)
     )
     order = {CHANNELS[channel]: None for channel in found}
     return {**{name: converted[name] for name in order}, **kept}, origin

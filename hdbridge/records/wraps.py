@@ -25,9 +25,7 @@ NOMINAL_SHARE: Final = 0.02
 LEAST_TIMES: Final = 3.0
 """Minimum ratio of a jump to any other difference between the steps of the two angles."""
 SAME_SHARE: Final = 0.3
-"""Share of a jump up to which the other angle may leave it unexplained, for both to count as
-having jumped.
-"""
+"""Share of a jump that the other angle may leave unexplained if both have jumped."""
 THERE_AND_BACK: Final = 2
 """Maximum duration of a misreading, in samples."""
 WINDOW: Final = 5
@@ -50,8 +48,7 @@ class Wraps(NamedTuple):
 
 
 def find_wraps(angle_deg: FloatArray, other_deg: FloatArray, starts: Sequence[int] = (0,)) -> Wraps | None:
-    """Finds the constant jumps of an angle that the other angle of the axis does not make; arrays of shape
-    (n,).
+    """Finds the constant jumps of an angle that the axis's other angle does not make; shapes (n,).
 
     Returns None if there are none. A single jump counts if it is a whole number of turns or a power of two of
     counts. A step to the first sample of a record (`starts`) is not a step of the axis.
@@ -85,9 +82,7 @@ def find_wraps(angle_deg: FloatArray, other_deg: FloatArray, starts: Sequence[in
 
 
 def period_in(unit: Unit, wraps: Wraps, angle_deg: FloatArray) -> float:
-    """Returns the period in the unit of the angle's column: the roundest one that the jumps and counts
-    permit.
-    """
+    """Returns the roundest period that jumps and counts permit, in the unit of the angle's column."""
     scale = abs(unit.factor)
     count = count_of(angle_deg / unit.factor)
     binary = 2.0 ** round(math.log2(wraps.jump_deg / scale))

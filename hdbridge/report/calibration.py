@@ -14,6 +14,7 @@ from hdbridge.axis.model.difference import diff
 from hdbridge.commissioning.calibration import Calibration
 from hdbridge.report.motion import motion_sections
 from hdbridge.report.page import (
+    SIGMA,
     Block,
     Chart,
     Command,
@@ -25,11 +26,12 @@ from hdbridge.report.page import (
     Series,
     Status,
     Table,
+    figure,
     histogram,
+    sentence,
+    with_interval,
 )
-from hdbridge.report.validation import stepping_sections
-from hdbridge.report.verdict import of_offer
-from hdbridge.report.words import SIGMA, figure, sentence, with_interval
+from hdbridge.report.stepping import of_offer, stepping_sections
 from hdbridge.units import DEG_PER_TURN, unit_of, without_unit
 
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
@@ -118,9 +120,7 @@ def _verdict(result: Calibration) -> str:
 
 
 def _by_angle(traces: Traces, ratio: float) -> Iterator[Chart]:
-    """Yields charts over the motor angle with the model, and over the load angle with means of whole motor
-    turns.
-    """
+    """Yields charts over the motor angle with the model, and over the load angle with means of turns."""
     sweeps = _of_kind(traces, "sweep")
     chosen = (sweeps if np.any(sweeps) else np.ones_like(sweeps)) & (traces.direction != 0.0)
     if not np.any(chosen):
@@ -212,8 +212,7 @@ def _spectrum(result: Calibration) -> Chart:
 
 
 def _alone(traces: Traces) -> tuple[FloatArray, FloatArray]:
-    """Returns orders and amplitudes of the error averaged in even bins of the motor angle, by FFT; for
-    display.
+    """Returns orders and amplitudes of the error by FFT over even bins of the motor angle, for display.
 
     Empty bins count as zero; amplitudes are scaled by the share of filled bins.
     """

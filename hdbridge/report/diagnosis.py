@@ -8,14 +8,24 @@ from hdbridge.analysis.capability import certainty
 from hdbridge.analysis.findings import UNEXPLAINED, Diagnosis, Finding
 from hdbridge.analysis.views import ResidualViews
 from hdbridge.axis.effects import CATALOGUE
-from hdbridge.commissioning.calibration.result import Offer
+from hdbridge.commissioning.calibration.pipeline import Offer
 from hdbridge.commissioning.calibration.validation import Validation
-from hdbridge.report.page import Block, Command, Facts, Grid, Heading, Page, Section, Status, Table
-from hdbridge.report.partial_residuals import partial_residual
-from hdbridge.report.residuals import beside_charts, partial_residual_chart, residual_charts
-from hdbridge.report.validation import stepping_sections
-from hdbridge.report.verdict import of_offer
-from hdbridge.report.words import SIGMA, sentence, with_interval
+from hdbridge.report.page import (
+    SIGMA,
+    Block,
+    Command,
+    Facts,
+    Grid,
+    Heading,
+    Page,
+    Section,
+    Status,
+    Table,
+    sentence,
+    with_interval,
+)
+from hdbridge.report.residuals import beside_charts, partial_residual, partial_residual_chart, residual_charts
+from hdbridge.report.stepping import of_offer, stepping_sections
 from hdbridge.units import without_unit
 
 TOLD: Final = 3

@@ -7,6 +7,7 @@ from hdbridge.axis.model.response import Response
 from hdbridge.commissioning.calibration.motion import MotionTest, Ripple
 from hdbridge.report.page import Chart, Grid, Mark, Page, Section, Series, Table
 
+RIPPLE_COLUMNS = ("deg/s", "none", "static", "removed", "filtered", "removed", "orders faded out")
 PATH_COLUMNS = ("path", "correction", "path error", "with wind-up", "at rest", "settled after, ms")
 PATH_WORDS = (
     "Errors of the load over a move at the limits and over a sine, rms arcsec. The path error is without the "
@@ -30,7 +31,9 @@ def motion_page(axis_name: str, result: MotionTest) -> Page:
 def motion_sections(result: MotionTest) -> list[Section]:
     """Returns the ripple over speed, the path errors, and the response if there is one."""
     sections = [
-        Section("Ripple over speed", blocks=[Grid([_ripple(result)]), _table(result)]),
+        Section(
+            "Ripple over speed", blocks=[Grid([_ripple(result)]), Table(RIPPLE_COLUMNS, ripple_rows(result))]
+        ),
         Section(
             "Motor orders",
             "Amplitude of each motor order of the load error.",
@@ -38,13 +41,7 @@ def motion_sections(result: MotionTest) -> list[Section]:
         ),
     ]
     if result.paths:
-        sections.append(
-            Section(
-                "Path error",
-                PATH_WORDS,
-                [Table([*PATH_COLUMNS], path_rows(result))],
-            )
-        )
+        sections.append(Section("Path error", PATH_WORDS, [Table(PATH_COLUMNS, path_rows(result))]))
     if result.response is not None:
         sections.append(
             Section(
@@ -80,19 +77,29 @@ def _ripple(result: MotionTest) -> Chart:
     return Chart("Ripple of the load", "speed, deg/s", "rms, arcsec", series)
 
 
-def _table(result: MotionTest) -> Table:
-    rows = [
+def ripple_rows(result: MotionTest) -> list[list[str]]:
+    """Returns a row of `RIPPLE_COLUMNS` for each speed."""
+    return [
         [
             f"{each.speed_deg_s:g}",
-            f"{each.none_arcsec:.2f}",
-            "" if each.static_arcsec is None else f"{each.static_arcsec:.2f}",
-            "" if each.filtered_arcsec is None else f"{each.filtered_arcsec:.2f}",
-            "" if each.removed_percent is None else f"{each.removed_percent:.0f} %",
+            figure(each.none_arcsec),
+            figure(each.static_arcsec),
+            _percent(each.removed_static_percent),
+            figure(each.filtered_arcsec),
+            _percent(each.removed_percent),
             " ".join(map(str, each.faded_orders)),
         ]
         for each in result.ripples
     ]
-    return Table(["deg/s", "none", "static", "filtered", "removed", "orders faded out"], rows)
+
+
+def figure(value: float | None) -> str:
+    """Formats two decimals; empty for None."""
+    return "" if value is None else f"{value:.2f}"
+
+
+def _percent(value: float | None) -> str:
+    return "" if value is None else f"{value:.0f} %"
 
 
 def _spectrum(ripple: Ripple) -> Chart:

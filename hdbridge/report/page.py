@@ -22,15 +22,39 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
+from hdbridge import units
 from hdbridge.axis.effects import FloatArray
+
+SIGMA: Final = "3\N{GREEK SMALL LETTER SIGMA}"
+SCATTER: Final = (f"pooled {SIGMA}", "mean", f"CW {SIGMA}", "mean", f"CCW {SIGMA}", "mean")
+"""Columns of a stepping test. Pooled comes first as the result, because a telephone shows two columns."""
+
+
+def sentence(text: str) -> str:
+    """Adds a capital letter and exactly one full stop."""
+    return text[:1].upper() + text[1:].rstrip(".") + "."
+
+
+def figure(value: float, digits: int = 4) -> str:
+    """Formats a number with ``digits`` significant digits and a typographic minus sign."""
+    return _typeset(units.figure(value, digits))
+
+
+def with_interval(value: float, half_width: float) -> tuple[str, str]:
+    """Formats the half width with two digits, and the value with as many decimals."""
+    text, half = units.with_interval(value, half_width)
+    return _typeset(text), _typeset(half)
+
+
+def _typeset(number: str) -> str:
+    return number.replace("-", "\N{MINUS SIGN}")
+
 
 POINTS_MAXIMUM: Final = 4000
 """Maximum points of one series in a page; longer ones are thinned to keep a page below a megabyte."""
 _FIGURE: Final = re.compile(r"\(?[-+\N{MINUS SIGN}\N{PLUS-MINUS SIGN}]?\d[\d,.]*(e[-+]\d+)?\)?( ?%)?$")
 DIGITS: Final = 5
-"""Significant digits of a series' span: a hundredth of the screen resolution; more would only enlarge the
-page.
-"""
+"""Significant digits of a series' span, a hundredth of the screen resolution; more only enlarge the page."""
 
 
 class Mark(Enum):
@@ -243,9 +267,7 @@ def sampled(x: FloatArray, y: FloatArray, most: int = POINTS_MAXIMUM) -> tuple[F
 
 
 def _extremes(y: FloatArray, most: int) -> list[int] | None:
-    """Returns the indices of the least and greatest of each of ``most / 2`` runs; None if no thinning is
-    needed.
-    """
+    """Returns the indices of the extremes of ``most / 2`` runs; None if no thinning is needed."""
     if len(y) <= most:
         return None
     low, high = np.where(np.isnan(y), np.inf, y), np.where(np.isnan(y), -np.inf, y)

@@ -1,13 +1,19 @@
-"""Report page of a stepping test under several compensation schemes."""
+"""Stepping tests: the page of several schemes, and the sections of a test before and after."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from hdbridge import __version__
-from hdbridge.commissioning.evaluation.stepping import Scheme, SchemeResult
+from hdbridge.commissioning.calibration.pipeline import Offer
+from hdbridge.commissioning.calibration.validation import Validation
+from hdbridge.commissioning.evaluation.stepping import Scheme, Stepped
 from hdbridge.report.page import (
+    SCATTER,
+    SIGMA,
+    Block,
     Chart,
+    Command,
     Facts,
     Grid,
     Heading,
@@ -16,13 +22,113 @@ from hdbridge.report.page import (
     Page,
     Section,
     Series,
+    Status,
     Table,
     histogram,
 )
-from hdbridge.report.words import SCATTER, SIGMA
 
 X_LABEL: Final = "load target, deg"
 Y_LABEL: Final = "load error, arcsec"
+WAYS: Final = ("there (CW)", "back (CCW)")
+ISO_FIGURES: Final = (
+    ("accuracy", "accuracy A"),
+    ("repeatability", "repeatability R"),
+    ("reversal", "reversal B"),
+    ("systematic", "systematic E"),
+    ("range", "range M"),
+)
+
+
+def stepping_sections(checked: Validation) -> list[Section]:
+    """Returns the stepping test, and the ISO 230-2 figures if the plan had a positioning test."""
+    return [Section("Stepping test", _stepping_text(checked), [*_stepping(checked)]), *_iso_section(checked)]
+
+
+def _stepping_text(checked: Validation) -> str:
+    share = checked.after.pooled.three_sigma_arcsec / checked.floor.three_sigma_arcsec
+    return (
+        f"The axis stepped both ways, before and after. This axis's counts and noise allow {SIGMA} = "
+        f"{checked.floor.three_sigma_arcsec:.2f} arcsec at best; with the new model it is {share:.2f} times "
+        f"that.{''.join(f' It got {each}.' for each in checked.worse)}"
+        f"{''.join(f' Noted: {each}.' for each in checked.survived)}"
+    )
+
+
+def _stepping(checked: Validation) -> Iterator[Block]:
+    tests = {"before": checked.before, "after": checked.after}
+    range_ = _range(tests.values())
+    charts = [
+        Chart(
+            f"{when.capitalize()}: {each.model}", X_LABEL, Y_LABEL, _ways(each), height_px=240, y_range=range_
+        )
+        for when, each in tests.items()
+    ]
+    remains = _ways(checked.after)
+    rows: list[list[str | float]] = [
+        [f"{when}: {each.model}", *_scatter(each)] for when, each in tests.items()
+    ]
+    yield Table(["with", *(Heading(each) for each in SCATTER)], rows)
+    after = Chart("After, enlarged", X_LABEL, Y_LABEL, remains, height_px=240)
+    yield Grid([*charts, after, _histogram("After: error histogram", remains, 240)])
+
+
+def _range(tests: Iterable[Stepped]) -> tuple[float, float]:
+    """Returns a range of errors that holds all tests, so that they are drawn to one scale."""
+    errors = [abs(error) for each in tests for way in each.errors_arcsec for error in way]
+    reach = 1.08 * max(errors, default=1.0)
+    return -reach, reach
+
+
+def _ways(test: Stepped) -> list[Series]:
+    return [
+        Series(name, targets, errors, Mark.POINTS)
+        for name, targets, errors in zip(WAYS, test.targets_deg, test.errors_arcsec, strict=True)
+    ]
+
+
+def _scatter(test: Stepped) -> list[float]:
+    """Returns the figures of the columns `SCATTER`."""
+    parts = (test.pooled, test.cw, test.ccw)
+    return [value for each in parts for value in (each.three_sigma_arcsec, each.mean_arcsec)]
+
+
+def _histogram(caption: str, ways: Sequence[Series], height_px: int) -> Chart:
+    return histogram(caption, Y_LABEL, {each.label: each.y for each in ways}, height_px=height_px)
+
+
+def _iso_section(checked: Validation) -> list[Section]:
+    given = [
+        (when, each)
+        for when, each in (("before", checked.accuracy_before), ("after", checked.accuracy_after))
+        if each is not None
+    ]
+    if not given:
+        return []
+    rows = [[when, *(getattr(each, name) for name, _ in ISO_FIGURES)] for when, each in given]
+    tested = given[-1][1]
+    text = (
+        f"The figures of ISO 230-2 for a rotary axis: {tested.targets} targets, each approached "
+        f"{tested.runs} times from either side."
+    )
+    headings = [Heading(words) for _, words in ISO_FIGURES]
+    return [Section("Accuracy and repeatability", text, [Table(["with", *headings], rows)])]
+
+
+def of_offer(offer: Offer) -> tuple[Status, tuple[Command, ...]]:
+    """Returns status and commands for a model that was measured for commit."""
+    if not offer.made:
+        return Status.REFUSED, ()
+    if offer.pending is None:
+        return Status.OFFERED, (
+            Command("hdbridge model log PROFILE", "says whether this model waits, or was committed since"),
+        )
+    profile = offer.pending.parent
+    return Status.PENDING, (
+        Command(f"hdbridge model diff {profile}", "shows what would change"),
+        Command(f"hdbridge model commit {profile}", "makes it the active model"),
+    )
+
+
 NAMES: Final = {
     Scheme.NONE: "no compensation",
     Scheme.SYNCHRONOUS: "synchronous compensation",
@@ -42,7 +148,7 @@ ARTICLE_TABLE_3 = {
 
 def stepping_page(
     axis_name: str,
-    results: Mapping[Scheme, SchemeResult],
+    results: Mapping[Scheme, Stepped],
     floor_arcsec: float,
     facts: Mapping[str, str],
     *,
@@ -50,11 +156,7 @@ def stepping_page(
 ) -> Page:
     """Returns the page; ``with_article`` adds the article's Table 3 to the result."""
     best = _best(results)
-    reach = 1.08 * max(
-        abs(stand.error_arcsec)
-        for result in results.values()
-        for stand in (*result.outcome.cw, *result.outcome.ccw)
-    )
+    range_ = _range(results.values())
     return Page(
         title=f"Stepping test of axis '{axis_name}'",
         verdict=_verdict(results, floor_arcsec),
@@ -65,10 +167,10 @@ def stepping_page(
                 "Each point is one step: what the load encoder read at rest, minus the target. The two "
                 "directions are apart where the gear's hysteresis is not compensated; the wave along the "
                 "angle is the synchronous error. All schemes are drawn to one scale.",
-                [Grid([_errors(scheme, result, reach) for scheme, result in results.items()])],
+                [Grid([_errors(scheme, result, range_) for scheme, result in results.items()])],
             ),
             Section(
-                f"What remains: {_name(best)}",
+                f"What remains: {NAMES[best]}",
                 "The same points, enlarged. A motor target is a whole number of counts, so even a perfect "
                 "compensation leaves errors spread evenly over one count, from minus half a count to half a "
                 "count.",
@@ -81,19 +183,15 @@ def stepping_page(
     )
 
 
-def _best(results: Mapping[Scheme, SchemeResult]) -> Scheme:
+def _best(results: Mapping[Scheme, Stepped]) -> Scheme:
     return min(results, key=lambda scheme: results[scheme].pooled.three_sigma_arcsec)
 
 
-def _name(scheme: Scheme) -> str:
-    return NAMES[scheme]
-
-
-def _verdict(results: Mapping[Scheme, SchemeResult], floor_arcsec: float) -> str:
+def _verdict(results: Mapping[Scheme, Stepped], floor_arcsec: float) -> str:
     best = _best(results)
     pooled = results[best].pooled
     text = (
-        f"With {_name(best)}, the load's error at rest is {pooled.three_sigma_arcsec:.2f} arcsec ({SIGMA}) "
+        f"With {NAMES[best]}, the load's error at rest is {pooled.three_sigma_arcsec:.2f} arcsec ({SIGMA}) "
         f"about a mean of {_signed(pooled.mean_arcsec)}: {pooled.three_sigma_arcsec / floor_arcsec:.2f} "
         f"times the {floor_arcsec:.2f} that one motor count allows"
     )
@@ -103,31 +201,22 @@ def _verdict(results: Mapping[Scheme, SchemeResult], floor_arcsec: float) -> str
     return text + "."
 
 
-def _errors(scheme: Scheme, result: SchemeResult, reach_arcsec: float) -> Chart:
+def _errors(scheme: Scheme, result: Stepped, range_: tuple[float, float]) -> Chart:
     pooled = result.pooled
     caption = (
-        f"{_name(scheme).capitalize()}: {SIGMA} {pooled.three_sigma_arcsec:.1f} arcsec, "
+        f"{NAMES[scheme].capitalize()}: {SIGMA} {pooled.three_sigma_arcsec:.1f} arcsec, "
         f"mean {_signed(pooled.mean_arcsec)} arcsec"
     )
-    return Chart(
-        caption, X_LABEL, Y_LABEL, _by_way(result), height_px=250, y_range=(-reach_arcsec, reach_arcsec)
-    )
+    return Chart(caption, X_LABEL, Y_LABEL, _ways(result), height_px=250, y_range=range_)
 
 
-def _remaining(result: SchemeResult, floor_arcsec: float) -> list[Chart]:
+def _remaining(result: Stepped, floor_arcsec: float) -> list[Chart]:
     half_count = floor_arcsec / math.sqrt(3.0)
     levels = [Level("\N{PLUS-MINUS SIGN} half a motor count", half_count), Level("", -half_count)]
-    ways = _by_way(result)
+    ways = _ways(result)
     return [
         Chart("Error of each step", X_LABEL, Y_LABEL, ways, height_px=280, levels=levels),
-        histogram("Error histogram", Y_LABEL, {each.label: each.y for each in ways}, height_px=280),
-    ]
-
-
-def _by_way(result: SchemeResult) -> list[Series]:
-    return [
-        Series(label, [s.target_deg for s in stands], [s.error_arcsec for s in stands], Mark.POINTS)
-        for label, stands in (("there (CW)", result.outcome.cw), ("back (CCW)", result.outcome.ccw))
+        _histogram("Error histogram", ways, 280),
     ]
 
 
@@ -137,15 +226,13 @@ def _signed(value: float) -> str:
     return text.lstrip("-") if float(text) == 0.0 else text.replace("-", "\N{MINUS SIGN}")
 
 
-def _table(results: Mapping[Scheme, SchemeResult], with_article: bool) -> Table:
+def _table(results: Mapping[Scheme, Stepped], with_article: bool) -> Table:
     header: list[str | Heading] = ["compensation", *(Heading(each) for each in SCATTER)]
     if with_article:
         header += [Heading(f"article {SIGMA}"), Heading("mean")]
     rows: list[list[str | float]] = []
     for scheme, result in results.items():
-        row: list[str | float] = [scheme.value]
-        for part in (result.pooled, result.cw, result.ccw):
-            row += [part.three_sigma_arcsec, part.mean_arcsec]
+        row: list[str | float] = [scheme.value, *_scatter(result)]
         if with_article:
             row += ARTICLE_TABLE_3.get(scheme.value, ("", ""))
         rows.append(row)

@@ -1,9 +1,7 @@
-"""Report page of a twin: measured and simulated signals, errors found, fitted values,
-unexplained residual.
-"""
+"""Report page of a twin: measured and simulated signals, errors found, fitted values."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -24,8 +22,9 @@ from hdbridge.report.page import (
     Series,
     Status,
     Table,
+    figure,
+    sentence,
 )
-from hdbridge.report.words import figure, sentence
 from hdbridge.twin.compare import ALL, TITLES, UNITS, Comparison, Row, Spectrum, Trace
 from hdbridge.twin.misfit import Left, Values
 from hdbridge.twin.naming import Alike, Finding
@@ -90,7 +89,7 @@ def twin_page(report: TwinReport) -> Page:
             "How far simulation and axis are apart",
             "Each figure is the rms difference of the two records, sample by sample or stop by stop, also "
             "in units of the noise of the measured channel. Two equal axes differ by less than one.",
-            [_figures(report)],
+            [Table(*figures(report))],
         )
     ]
     if report.named:
@@ -101,7 +100,7 @@ def twin_page(report: TwinReport) -> Page:
         Section(
             "By kind of motion",
             "The same figures, leg by leg of one kind.",
-            [_by_kind(report)],
+            [Table(*figures(report, by_kind=True))],
         )
     )
     if report.learned:
@@ -112,7 +111,7 @@ def twin_page(report: TwinReport) -> Page:
                 if report.values == Values.AXIS
                 else "These values replay the recording. They are not the axis's, so they have no intervals.",
                 [_learned(report.learned)],
-            ),
+            )
         )
     if report.translated:
         rows = [[each.effect, each.counterpart or "none", each.note] for each in report.translated]
@@ -163,41 +162,29 @@ def _figure(value: float) -> str:
     return figure(value, 3)
 
 
-def title_of(row: Row) -> str:
-    """Returns the name of a channel, as text."""
+def _title(row: Row) -> str:
     name, _, signal = row.channel.partition(":")
     return f"{TITLES[name]}, {TITLES[signal]}" if signal else TITLES[name]
 
 
-def _figures(report: TwinReport) -> Table:
-    """Returns the figures of the whole record, channel by channel."""
-    return Table(_header(report), [_cells(report, row, title_of(row)) for row in _rows(report, ALL)])
-
-
-def _by_kind(report: TwinReport) -> Table:
+def figures(report: TwinReport, *, by_kind: bool = False) -> tuple[list[str], list[list[str]]]:
+    """Returns header and rows of the figures of each channel: of the whole record, or by kind of motion."""
+    before = ["difference before"] if report.after is not None else []
+    header = ["", "measured", "simulated", *before, "difference", "of the noise", "unit"]
+    if not by_kind:
+        return header, [_cells(report, row, _title(row)) for row in report.now.rows if row.kind == ALL]
     kinds = [kind for kind in dict.fromkeys(row.kind for row in report.now.rows) if kind != ALL]
     rows = [
-        _cells(report, row, f"{kind}: {title_of(row)}")
+        _cells(report, row, f"{kind}: {_title(row)}")
         for kind in kinds
-        for row in _rows(report, kind)
-        if ":" not in row.channel
+        for row in report.now.rows
+        if row.kind == kind and ":" not in row.channel
     ]
-    return Table(_header(report), rows)
+    return header, rows
 
 
-def _rows(report: TwinReport, kind: str) -> Iterator[Row]:
-    return (row for row in report.now.rows if row.kind == kind)
-
-
-def _header(report: TwinReport) -> list[str | Heading]:
-    header: list[str | Heading] = ["", Heading("measured", ""), Heading("simulated", "")]
-    if report.after is not None:
-        header.append(Heading("difference before", ""))
-    return [*header, Heading("difference", ""), Heading("of the noise", ""), "unit"]
-
-
-def _cells(report: TwinReport, row: Row, title: str) -> list[str | float]:
-    cells: list[str | float] = [title, _figure(row.measured), _figure(row.simulated)]
+def _cells(report: TwinReport, row: Row, title: str) -> list[str]:
+    cells = [title, _figure(row.measured), _figure(row.simulated)]
     if report.after is not None:
         before = report.before.row(row.channel, row.kind)
         cells.append(_figure(before.difference) if before is not None else "")

@@ -5,8 +5,7 @@ simulated_drive("article") as drive:``. docs/ci.md has a complete example. These
 of `hdbridge` itself.
 """
 
-from hdbridge.testing.history import Event, Frame, TrueState
 from hdbridge.testing.simulateddrive import DriveTime, SimulatedDrive, simulated_drive
-from hdbridge.testing.watched import Fault
+from hdbridge.testing.watched import Event, Fault, Frame, TrueState
 
 __all__ = ["DriveTime", "Event", "Fault", "Frame", "SimulatedDrive", "TrueState", "simulated_drive"]

@@ -1,26 +1,122 @@
-"""Bus of simulated drives: in lockstep or in real time, within this process or on the computer."""
+"""Bus of simulated drives, in lockstep or in real time, and the settings of a drive."""
 
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from types import MappingProxyType
+from typing import Any, Final, Self
 from uuid import uuid4
 
 import can
+from pydantic import ValidationError
 
+from hdbridge.axis import AxisConfig
 from hdbridge.axis.config import BusConfig
 from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.device.behaviour import Behaviour
 from hdbridge.device.run import run
 from hdbridge.drive.interfacelock import InterfaceLock
 from hdbridge.drive.link import open_bus
 from hdbridge.errors import BusInUseError, HdbridgeError, InputError
+from hdbridge.files.expectation import nearest
+from hdbridge.files.profile import Profile
+from hdbridge.sim.truth import Truth
 from hdbridge.testing.port import INTERFACE, Port, StallingClock
-from hdbridge.testing.settings import LOCKSTEP, BusChoice, Settings
 from hdbridge.testing.watched import WatchedDrive
+
+VIRTUAL, LOCKSTEP = "virtual", "lockstep"
+EXAMPLES: Final = (VIRTUAL, LOCKSTEP, "socketcan:vcan0", "udp_multicast:239.74.163.2")
+"""Examples of bus names."""
+
+
+@dataclass(frozen=True)
+class BusChoice:
+    """A bus: one of this process, or an interface of python-can with its channel."""
+
+    interface: str
+    channel: str = ""
+
+    @property
+    def in_process(self) -> bool:
+        """True if only this process can reach it."""
+        return self.interface in (VIRTUAL, LOCKSTEP)
+
+    def __str__(self) -> str:
+        return f"{self.interface}:{self.channel}" if self.channel else self.interface
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Parses ``virtual``, ``lockstep`` or ``INTERFACE:CHANNEL``; raises `InputError` for others."""
+        interface, colon, channel = text.partition(":")
+        known = [each.partition(":")[0] for each in EXAMPLES]
+        if interface in (VIRTUAL, LOCKSTEP) and not colon:
+            return cls(interface)
+        if interface and channel and interface not in (VIRTUAL, LOCKSTEP):
+            return cls(interface, channel)
+        close = nearest(interface, known)
+        example = next((each for each in EXAMPLES if each.startswith(f"{close}:") or each == close), None)
+        hint = f"; did you mean '{example}'?" if example else ""
+        raise InputError(
+            f"the bus {text!r}; expected {', '.join(EXAMPLES)} or another INTERFACE:CHANNEL{hint}"
+        )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """One drive, loaded and checked."""
+
+    axis: AxisConfig
+    truth: Truth
+    truth_path: Path
+    seed: int
+    bus: BusChoice
+
+    @classmethod
+    def load(
+        cls,
+        profile: str,
+        bus: str,
+        seed: int,
+        truth: str | Path | None = None,
+        folder: Path | None = None,
+        firmware: Mapping[str, Any] = MappingProxyType({}),
+    ) -> Self:
+        """Loads and checks the settings; raises a one-line `InputError`.
+
+        ``folder`` is the base of relative paths, by default the present one. Without ``truth``, the profile's
+        ``twin.yaml`` is used if it has one, else its ``truth.yaml``. ``firmware`` has keys of the truth
+        file's section of that name.
+        """
+        folder = folder or Path()
+        choice = BusChoice.parse(bus)
+        if isinstance(seed, bool) or not isinstance(seed, int):
+            raise InputError(f"the seed {seed!r}; expected an integer")
+        files = Profile.find(str(profile), folder)
+        axis = AxisConfig.load(files.axis)
+        path = folder / truth if truth is not None else files.simulated
+        if truth is None and not path.is_file():
+            raise InputError(
+                f"{path}: no such file, and no twin.yaml beside it, so nothing says what the simulated axis "
+                "is like; make a twin of the axis, or name a truth file"
+            )
+        known = Truth.load(path)
+        behaviour = _behaviour({**known.firmware.model_dump(), **firmware})
+        return cls(axis, known.model_copy(update={"firmware": behaviour}), path, seed, choice)
+
+
+def _behaviour(keys: Mapping[str, Any]) -> Behaviour:
+    try:
+        return Behaviour.model_validate(keys)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        name = ".".join(map(str, problem["loc"]))
+        known = ", ".join(Behaviour.model_fields)
+        raise InputError(f"firmware: '{name}': {problem['msg']}; expected keys are {known}") from error
+
 
 LONGEST_WAIT_S: Final = 0.005
 """Maximum delay of a requested fault in real time; s."""
@@ -108,9 +204,7 @@ class Line:
 
 @contextmanager
 def open_line(choice: BusChoice) -> Iterator[Line]:
-    """Yields a bus for drives, waiting for a bus of the computer to become free; raises `BusError` if it
-    cannot be opened.
-    """
+    """Yields a bus for drives, waiting until it is free; raises `BusError` if it cannot be opened."""
     if not choice.in_process:
         settings = BusConfig(interface=choice.interface, channel=choice.channel, bitrate_bps=None)
         with _turn(choice):
@@ -137,9 +231,7 @@ def open_line(choice: BusChoice) -> Iterator[Line]:
 
 @contextmanager
 def _turn(choice: BusChoice) -> Iterator[None]:
-    """Waits until no other test on this computer has a drive on the bus, because pytest-xdist workers share
-    it.
-    """
+    """Waits until no other test of this computer, such as one of pytest-xdist, has a drive on the bus."""
     name = str(choice)
     if _IN_USE.get(name) == threading.get_ident():
         raise InputError(

@@ -12,10 +12,8 @@ import can
 from hdbridge.clock import Clock
 from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.testing.faulttable import FAULTS, Reach, find
-from hdbridge.testing.history import Event, Frame, TrueState
-from hdbridge.testing.line import Line, open_line
-from hdbridge.testing.settings import LOCKSTEP, Settings
-from hdbridge.testing.watched import Fault, WatchedDrive, When, words
+from hdbridge.testing.line import LOCKSTEP, Line, Settings, open_line
+from hdbridge.testing.watched import Event, Fault, Frame, TrueState, WatchedDrive, When, words
 
 POLL_S: Final = 0.005
 
@@ -201,9 +199,7 @@ class SimulatedDrive:
         self._check()
 
     def wait_until(self, condition: Callable[[], object], timeout_s: float = 5.0, what: str = "it") -> None:
-        """Runs the drive until a condition is true; raises `TimeoutError` with the log after
-        ``timeout_s``.
-        """
+        """Runs the drive until a condition is true; raises `TimeoutError` with the log."""
         __tracebackhide__ = True  # pytest shows the test's line
         end_s = self._clock.now() + timeout_s
         while not condition():

@@ -14,7 +14,7 @@ from hdbridge.drive import plan
 from hdbridge.drive.bootplan import left_to_drive, sent_along
 from hdbridge.drive.bootup import BootReport
 from hdbridge.errors import DriveError, InputError
-from hdbridge.files.bundled import bundled_folder
+from hdbridge.files.profile import bundled_folder
 from hdbridge.records.record import Record
 from hdbridge.sim.lockstep import simulated_bench
 from tests.support.eds import OWN, fixed, mapped, profile_with, section, stating, without

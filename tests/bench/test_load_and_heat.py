@@ -12,7 +12,7 @@ from support.two_channels import CHANNELS, resumes, stops
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import AmplitudeDrift, Compliance, TorqueModulation
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.stepping import SchemeResult, quantisation_floor_arcsec
+from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_floor_arcsec
 from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.supervision import Fault
@@ -86,7 +86,7 @@ def test_a_mass_on_the_axis_is_compensated_with_load_torque():
         with loaded(axis) as (drive, _):
             bench = Bench(drive, compensation_for(axis, model))
             run = bench.run(Stepping(count=33))
-        pooled = SchemeResult.of(run.outcome).pooled
+        pooled = Stepped.of("", run.outcome).pooled
         three_sigma[len(model.effects)], mean[len(model.effects)] = (
             pooled.three_sigma_arcsec,
             pooled.mean_arcsec,
@@ -110,7 +110,7 @@ def test_load_dependent_ripple_is_compensated_with_load_torque():
     for model in (model_with(compliance()), model_with(compliance(), growth)):
         with loaded(axis, gear="  torque_growth_per_nm: 0.05\n") as (drive, _):
             run = Bench(drive, compensation_for(axis, model)).run(stepping)
-        three_sigma.append(SchemeResult.of(run.outcome).pooled.three_sigma_arcsec)
+        three_sigma.append(Stepped.of("", run.outcome).pooled.three_sigma_arcsec)
     floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
     assert three_sigma[0] > 3 * floor  # a third more ripple
     assert three_sigma[1] < 1.3 * floor
@@ -125,7 +125,7 @@ def test_a_warm_gear_is_compensated_with_temperature():
     for model in (model_with(compliance()), model_with(compliance(), drift)):
         with loaded(axis, WARM) as (drive, _):
             run = Bench(drive, compensation_for(axis, model)).run(Stepping(count=33))
-        three_sigma.append(SchemeResult.of(run.outcome).pooled.three_sigma_arcsec)
+        three_sigma.append(Stepped.of("", run.outcome).pooled.three_sigma_arcsec)
     floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
     assert three_sigma[0] > 2 * floor  # a fifth more ripple, at 20 K above the reference
     assert three_sigma[1] < 1.3 * floor

@@ -24,7 +24,7 @@ from hdbridge.axis.effects.base import Angleless, Linear
 from hdbridge.axis.effects.described import Compensable
 from hdbridge.axis.effects.motion import SLOT
 from hdbridge.errors import InputError
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.record import Record

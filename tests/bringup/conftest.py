@@ -11,11 +11,10 @@ import pytest
 
 from hdbridge.axis import AxisConfig
 from hdbridge.clock import Clock
-from hdbridge.commissioning.bringup.checks import Row, Verdict, run_checks
-from hdbridge.commissioning.bringup.context import BringUpContext
+from hdbridge.commissioning.bringup.checks import BringUpContext, Row, Verdict, run_checks
 from hdbridge.commissioning.bringup.doctor import CHECKS
 from hdbridge.device.node import DriveNode
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 from hdbridge.sim.lockstep import lockstep_bench, nameplate_of
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth

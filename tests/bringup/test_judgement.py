@@ -9,6 +9,11 @@ from hypothesis import strategies as st
 from hdbridge.axis import AxisConfig
 from hdbridge.commissioning.bringup.checks import Check, Outcome, failed, passed, run_checks
 from hdbridge.commissioning.bringup.judge import (
+    LOAD_COUNTS,
+    MOTOR_COUNTS,
+    RATIO,
+    Turned,
+    accuse,
     judge_following,
     judge_hold,
     judge_nudge,
@@ -16,11 +21,11 @@ from hdbridge.commissioning.bringup.judge import (
     judge_settling,
     judge_stop,
     judge_torque,
+    judge_turn,
 )
-from hdbridge.commissioning.bringup.scale import LOAD_COUNTS, MOTOR_COUNTS, RATIO, Turned, accuse, judge_turn
 from hdbridge.commissioning.bringup.slow import plan_travel
 from hdbridge.errors import DriveError
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 
 ARTICLE = (bundled_profile("article") / "axis.yaml").read_text()
 TEETH = "  teeth: {flexspline: 100, circular_spline: 102, output: flexspline}\n"

@@ -8,13 +8,12 @@ import can
 import pytest
 
 from hdbridge.axis import AxisConfig
-from hdbridge.commissioning.bringup.match import axis_lines, compare
-from hdbridge.commissioning.bringup.scan import Node, Scan, scan_bus
+from hdbridge.commissioning.bringup.scan import Node, Scan, axis_lines, compare, scan_bus
 from hdbridge.device.node import DriveNode
 from hdbridge.drive import objects
 from hdbridge.drive.link import Link
 from hdbridge.errors import BusInUseError
-from hdbridge.files.bundled import bundled_folder, bundled_profile
+from hdbridge.files.profile import bundled_folder, bundled_profile
 from hdbridge.sim.lockstep import LockstepBus, lockstep_bench
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth

@@ -7,7 +7,7 @@ from hdbridge.commissioning.bringup.newprofile import axis_text
 from hdbridge.commissioning.bringup.scan import scan_bus
 from hdbridge.drive import Link
 from hdbridge.errors import InputError
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 from hdbridge.sim.lockstep import simulated_bench
 
 

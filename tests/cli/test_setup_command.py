@@ -18,7 +18,7 @@ from support.command import run_here
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.cli.setup import QUESTIONS, value_of, with_value
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 
 PLAN = """schema: hdbridge.plan/1
 name: short

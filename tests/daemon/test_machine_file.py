@@ -10,7 +10,7 @@ import pytest
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.machine import Machine, machine_file
 from hdbridge.errors import InputError
-from hdbridge.files.bundled import bundled_folder, bundled_profile
+from hdbridge.files.profile import bundled_folder, bundled_profile
 
 GOOD = """\
 schema: hdbridge.machine/1

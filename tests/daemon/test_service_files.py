@@ -12,7 +12,7 @@ from support.command import run_here
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.systemd import MARKER, ServiceFile, service_files
 from hdbridge.errors import InputError
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from hdbridge.analysis.views import ResidualViews, folds, predicted
 from hdbridge.axis.effects import Motion
 from hdbridge.axis.effects import coordinate as over
 from hdbridge.axis.effects.coordinate import SMALLEST_TIME_S, SMALLEST_WAY_DEG, Coordinate, Spacing
-from hdbridge.report.bins import binned
+from hdbridge.report.residuals import binned
 
 COUNT = 8000
 TIME_S = np.arange(COUNT) * 0.1

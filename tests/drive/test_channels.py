@@ -14,7 +14,7 @@ from hdbridge.drive import Drive, ProcessImage, load_eds, plan
 from hdbridge.drive.channels import ChannelFollower
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import SdoError
-from hdbridge.files.bundled import bundled_folder
+from hdbridge.files.profile import bundled_folder
 
 TORQUE = {"source": {"index": 0x2101, "type": "int32"}, "newton_metres_per_count": 0.001, "maximum_nm": 50}
 TEMPERATURE = {"source": {"index": 0x2100, "type": "int16"}, "celsius_per_count": 0.1}

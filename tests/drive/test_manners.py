@@ -17,7 +17,7 @@ from hdbridge.drive.drive import Drive
 from hdbridge.drive.interfacelock import InterfaceLock, holders
 from hdbridge.drive.link import open_bus
 from hdbridge.errors import BusError, BusInUseError
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 from hdbridge.sim.lockstep import VirtualClock, lockstep_bench, simulated_bench
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth

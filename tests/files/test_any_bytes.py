@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
-from hdbridge.files.bundled import bundled_folder
 from hdbridge.files.edsfile import read_eds
+from hdbridge.files.profile import bundled_folder
 from hdbridge.files.yamlfile import load_yaml
 from hdbridge.records.record import Record
 from hdbridge.records.recording import RecordingFile

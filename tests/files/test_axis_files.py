@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hdbridge.axis import AxisConfig, MotorEncoder
 from hdbridge.errors import InputError
-from hdbridge.files.bundled import bundled_folder, bundled_profile
+from hdbridge.files.profile import bundled_folder, bundled_profile
 
 GOOD = """\
 schema: hdbridge.axis/1

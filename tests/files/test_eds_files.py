@@ -7,8 +7,8 @@ import re
 import pytest
 
 from hdbridge.errors import InputError
-from hdbridge.files.bundled import bundled_folder
 from hdbridge.files.edsfile import read_eds
+from hdbridge.files.profile import bundled_folder
 
 TEXT = (bundled_folder("eds") / "hdbridge-402.eds").read_text()
 SECTIONS = re.split(r"^(?=\[)", TEXT, flags=re.MULTILINE)[1:]

@@ -7,7 +7,7 @@ import pytest
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from hdbridge.axis import AxisConfig, Identity
 from hdbridge.axis.effects import CATALOGUE, Hysteresis, Motion, MotorOrder, Start, Synchronous
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
-from hdbridge.files.bundled import bundled_profile
 from hdbridge.files.expectation import expected_words, field_at
+from hdbridge.files.profile import bundled_profile
 
 GOOD = """\
 schema: hdbridge.model/1

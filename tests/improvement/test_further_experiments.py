@@ -8,7 +8,7 @@ from hdbridge.analysis.findings import Finding
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.improvement import choose, unseparated
-from hdbridge.commissioning.improvement.experiments import machine_for_unexplained, machine_plans
+from hdbridge.commissioning.improvement.further import machine_for_unexplained, machine_plans
 from hdbridge.control.bench import axis_view
 from hdbridge.motion.procedures.plan import Plan
 

@@ -9,10 +9,11 @@ import pytest
 import yaml
 from support.patience import until
 
-from hdbridge.commissioning.calibration.validation import Floor, Stepped, Validation
+from hdbridge.commissioning.calibration.validation import Floor, Validation
+from hdbridge.commissioning.evaluation.stepping import Stepped
 from hdbridge.commissioning.improvement import Trial
 from hdbridge.motion.procedures.stepping import Standing, SteppingOutcome
-from hdbridge.report.validation import stepping_sections
+from hdbridge.report.stepping import stepping_sections
 
 
 def refused(err, *texts):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hdbridge import Bench, InputError, Trajectory, TransmissionModel, simulated
 from hdbridge.axis import AxisConfig
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 from hdbridge.motion.procedures.moves import AxisView, MotionLimits
 from hdbridge.motion.procedures.rehearsal import rehearse
 

@@ -24,7 +24,8 @@ from hdbridge.analysis.orders import Line, Order
 from hdbridge.axis.effects import Hysteresis, MotorOrder, Synchronous
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration import Calibration, Offer
-from hdbridge.commissioning.calibration.validation import Floor, Stepped, Validation
+from hdbridge.commissioning.calibration.validation import Floor, Validation
+from hdbridge.commissioning.evaluation.stepping import Stepped
 from hdbridge.report.calibration import calibration_page
 from hdbridge.report.page import render
 

@@ -28,8 +28,9 @@ from hdbridge.axis.effects import (
     extended,
 )
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.calibration.result import Offer
-from hdbridge.commissioning.calibration.validation import Floor, Stepped, Validation
+from hdbridge.commissioning.calibration.pipeline import Offer
+from hdbridge.commissioning.calibration.validation import Floor, Validation
+from hdbridge.commissioning.evaluation.stepping import Stepped
 from hdbridge.report.diagnosis import diagnosis_page
 from hdbridge.report.page import render
 

@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 
 from hdbridge.axis import AxisConfig
-from hdbridge.files.bundled import bundled_folder, bundled_profile
+from hdbridge.files.profile import bundled_folder, bundled_profile
 
 OWN = (bundled_folder("eds") / "hdbridge-402.eds").read_text()
 

@@ -19,7 +19,7 @@ from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.stepping import SchemeResult, quantisation_floor_arcsec
+from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_floor_arcsec
 from hdbridge.control.bench import Bench, axis_view, compensation_for
 from hdbridge.drive.drive import Drive
 from hdbridge.motion.procedures.chain import Chain
@@ -163,7 +163,7 @@ class Cell:
     def step(self, model: TransmissionModel) -> float:
         """Returns the pooled three sigma of the load error at rest with a model, arcsec."""
         run = Bench(self.drive, compensation_for(self.drive.axis, model)).run(self.stepping)
-        return SchemeResult.of(run.outcome).pooled.three_sigma_arcsec
+        return Stepped.of("", run.outcome).pooled.three_sigma_arcsec
 
     @property
     def floor_arcsec(self) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 import can
 import pytest
 
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 from hdbridge.testing import SimulatedDrive, simulated_drive
 
 PERIOD_S = 0.004

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 
 STRICT = ("--strict-markers", "-W", "error", "-p", "no:cacheprovider")
 IN_PROCESS = ("-W", "ignore:Module already imported:pytest.PytestAssertRewriteWarning")

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge import AxisConfig, Bench, Recording, Stepping, TransmissionModel, simulated
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 from hdbridge.sim.truth import Truth
 
 PLAN = """

@@ -22,7 +22,7 @@ from support.hidden.site import ARCSEC_PER_RAD, ARCSEC_PER_TURN
 from hdbridge.axis import AxisConfig
 from hdbridge.commissioning.calibration.measure import outlook
 from hdbridge.control.bench import axis_view
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 from hdbridge.motion.procedures.moves import MoveTo
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.sim.hysteresis_laws import law_of

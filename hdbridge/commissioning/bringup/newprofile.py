@@ -4,11 +4,10 @@ import re
 from pathlib import Path
 
 from hdbridge.axis import BusConfig
-from hdbridge.commissioning.bringup.match import axis_lines
-from hdbridge.commissioning.bringup.scan import Node
+from hdbridge.commissioning.bringup.scan import Node, axis_lines
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_folder
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 
 FILES = ("axis.yaml", "model.yaml", "truth.yaml")
 _TO_FILL_IN = {

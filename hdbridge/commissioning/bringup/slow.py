@@ -16,7 +16,7 @@ import can
 
 from hdbridge.axis import AxisConfig
 from hdbridge.clock import Clock
-from hdbridge.commissioning.bringup.scale import Turned
+from hdbridge.commissioning.bringup.judge import Turned
 from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive import objects
 from hdbridge.drive.drive import Drive
@@ -239,9 +239,7 @@ class SlowAxis:
     # -- stops --------------------------------------------------------------------------------------------
 
     def stop_on_the_way(self, motor_deg: float) -> tuple[float, float, float]:
-        """Moves and quick-stops half-way; returns the speed before, and travel and time of the stop (motor
-        degrees, s).
-        """
+        """Quick-stops half-way; returns the speed before, and travel and time of the stop (motor deg, s)."""
         moved = self._half_way(self._follow(motor_deg), motor_deg)
         speed = self._measured_speed(moved)
         stopping = self.stop()
@@ -290,9 +288,7 @@ class SlowAxis:
         )
 
     def lose_set_points(self, motor_deg: float, patience_s: float) -> tuple[float, Silence]:
-        """Moves and stops sending SYNC and set-points half-way; the heartbeat continues. Returns speed and
-        reaction.
-        """
+        """Stops sending SYNC and set-points half-way, with heartbeat; returns speed and reaction."""
         moved = self._half_way(self._follow(motor_deg), motor_deg)
         speed, start, drive = self._measured_speed(moved), moved[-1], self._drive
         last_s = self.link.now()
@@ -329,11 +325,7 @@ class SlowAxis:
         self.link.clock.sleep_until(self.link.now() + duration_s)
 
     def _after_silence(
-        self,
-        start_counts: int,
-        noticed_s: float | None,
-        event: Event | None,
-        pause: Callable[[float], None],
+        self, start_counts: int, noticed_s: float | None, event: Event | None, pause: Callable[[float], None]
     ) -> Silence:
         """Reads position and standstill by SDO, because the drive may have stopped sending PDOs."""
         sdo, clock = self._drive.sdo, self.link.clock
@@ -346,9 +338,5 @@ class SlowAxis:
             stands, last = abs(wrap_int32(position - last)) <= 2, position
         way = wrap_int32(last - wrap_int32(start_counts))
         return Silence(
-            noticed_s,
-            event,
-            sdo.fetch(objects.STATUSWORD),
-            stands,
-            abs(self.axis.motor_encoder.degrees(way)),
+            noticed_s, event, sdo.fetch(objects.STATUSWORD), stands, abs(self.axis.motor_encoder.degrees(way))
         )

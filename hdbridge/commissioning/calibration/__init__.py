@@ -8,19 +8,16 @@
 `calibrate` does all four. Bench and drive are passed in, real or simulated.
 """
 
-from hdbridge.commissioning.calibration.fit import fit
 from hdbridge.commissioning.calibration.identification import identify, measured_of
 from hdbridge.commissioning.calibration.journal import Journal
 from hdbridge.commissioning.calibration.measure import measure, start_journal
-from hdbridge.commissioning.calibration.pipeline import calibrate, concluded
-from hdbridge.commissioning.calibration.result import Calibration, Offer, Stepped
+from hdbridge.commissioning.calibration.pipeline import Calibration, Offer, calibrate, concluded, fit
 from hdbridge.commissioning.calibration.validation import Validation, validate
 
 __all__ = [
     "Calibration",
     "Journal",
     "Offer",
-    "Stepped",
     "Validation",
     "calibrate",
     "concluded",

@@ -74,10 +74,7 @@ def measured_of(recordings: Sequence[Recording], *, independent_zeros: bool = Fa
 def standings(recording: Recording, ratio: float) -> list[tuple[float, float]]:
     """Returns time (s) and error (arcsec, relative to the first) of each visit to the reference pose."""
     found = [
-        (
-            float(np.mean(piece.time_s)),
-            float(np.mean(piece.transmission_error_arcsec(ratio))),
-        )
+        (float(np.mean(piece.time_s)), float(np.mean(piece.transmission_error_arcsec(ratio))))
         for _, piece in recording.pieces("reference")
         if len(piece)
     ]
@@ -99,9 +96,7 @@ def resting(recording: Recording, window_s: float) -> FloatArray:
 
 
 def provenance(
-    paths: Iterable[Path | str],
-    recordings: Sequence[Recording],
-    held_out: Mapping[str, Any] | str,
+    paths: Iterable[Path | str], recordings: Sequence[Recording], held_out: Mapping[str, Any] | str
 ) -> dict[str, Any]:
     """Returns the provenance that a model file records.
 

@@ -48,8 +48,7 @@ class TaskEntry(BaseModel):
         description="channels of the axis file that failed during the test; the samples do not contain them",
     )
     survived: tuple[Survived, ...] = Field(
-        (),
-        description="faults that the run tolerated, and the one that ended it",
+        (), description="faults that the run tolerated, and the one that ended it"
     )
 
 

@@ -75,9 +75,7 @@ class OrderRipple:
 
 @dataclass(frozen=True, slots=True)
 class PathResult:
-    """Error on one path without correction, with the static one, with the filtered one, and with the
-    wind-up compensated as well.
-    """
+    """Errors on one path: uncorrected, static, filtered, and with the wind-up compensated as well."""
 
     name: str
     none: PathError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration.identification import resting
 from hdbridge.commissioning.calibration.measure import Pace
 from hdbridge.commissioning.evaluation.accuracy import AxisAccuracy, axis_accuracy
-from hdbridge.commissioning.evaluation.stepping import Scatter, quantisation_floor_arcsec
+from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_floor_arcsec
 from hdbridge.control.bench import Bench, axis_view, compensation_for
 from hdbridge.control.rig import Rig, bench_on
 from hdbridge.control.survived import Survived, lines
@@ -25,7 +25,6 @@ from hdbridge.drive.drive import Drive
 from hdbridge.files.outputs import writing
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.motion.procedures.rehearsal import rehearse
-from hdbridge.motion.procedures.stepping import SteppingOutcome
 from hdbridge.records.recording import Recording
 from hdbridge.units import figure
 
@@ -33,46 +32,6 @@ WINDOW_S = 0.06
 """Averaging time of the stepping test at rest."""
 CHANCE = 2.0
 """Number of standard errors by which a stepping test must be worse to count as worse."""
-
-
-@dataclass(frozen=True, slots=True)
-class Stepped:
-    """Result of a stepping test with one model."""
-
-    model: str
-    """Description of the model."""
-    errors_arcsec: tuple[tuple[float, ...], tuple[float, ...]]
-    """Error of each step, outward and back."""
-    targets_deg: tuple[tuple[float, ...], tuple[float, ...]]
-
-    @classmethod
-    def of(cls, model: str, outcome: SteppingOutcome) -> Stepped:
-        """Creates it from the procedure's outcome."""
-        cw, ccw = outcome.cw, outcome.ccw
-        return cls(
-            model,
-            (tuple(each.error_arcsec for each in cw), tuple(each.error_arcsec for each in ccw)),
-            (tuple(each.target_deg for each in cw), tuple(each.target_deg for each in ccw)),
-        )
-
-    @property
-    def cw(self) -> Scatter:
-        """Scatter outward."""
-        return Scatter.of(self.errors_arcsec[0])
-
-    @property
-    def ccw(self) -> Scatter:
-        """Scatter on the way back."""
-        return Scatter.of(self.errors_arcsec[1])
-
-    @property
-    def pooled(self) -> Scatter:
-        """Scatter of both directions together."""
-        return Scatter.of(sum(self.errors_arcsec, ()))
-
-    def as_dict(self) -> dict[str, Any]:
-        """Returns plain data, which `Validation.from_dict` reads."""
-        return {**asdict(self), **{name: asdict(getattr(self, name)) for name in ("cw", "ccw", "pooled")}}
 
 
 def worse_ways(before: Stepped, after: Stepped) -> tuple[str, ...]:

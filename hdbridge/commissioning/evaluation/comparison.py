@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.stepping import Scheme, SchemeResult, quantisation_floor_arcsec
+from hdbridge.commissioning.evaluation.stepping import Scheme, Stepped, quantisation_floor_arcsec
 from hdbridge.control.bench import Run, compensation_for
 from hdbridge.control.rig import Rig, bench_on
 from hdbridge.control.survived import lines
@@ -20,7 +20,7 @@ from hdbridge.records.record import Record
 class Comparison:
     """Results of the stepping test under each scheme."""
 
-    results: dict[Scheme, SchemeResult]
+    results: dict[Scheme, Stepped]
     runs: dict[Scheme, Run[SteppingOutcome]]
     quantisation_floor_arcsec: float
 
@@ -28,7 +28,8 @@ class Comparison:
     def of(cls, axis: AxisConfig, runs: dict[Scheme, Run[SteppingOutcome]]) -> Self:
         """Evaluates the completed runs."""
         floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
-        return cls({scheme: SchemeResult.of(run.outcome) for scheme, run in runs.items()}, runs, floor)
+        results = {scheme: Stepped.of(scheme.value, run.outcome) for scheme, run in runs.items()}
+        return cls(results, runs, floor)
 
     @property
     def survived(self) -> tuple[str, ...]:
@@ -39,10 +40,20 @@ class Comparison:
         """Returns the document of ``hdbridge step --json``."""
         return {
             "schema": "hdbridge.stepping/1",
-            **{scheme.value: result.as_dict() for scheme, result in self.results.items()},
+            **{scheme.value: self._figures(scheme) for scheme in self.results},
             "survived": list(self.survived),
             "quantisation_floor_arcsec": self.quantisation_floor_arcsec,
         }
+
+    def _figures(self, scheme: Scheme) -> dict[str, Any]:
+        result = self.results[scheme]
+        steps = {
+            way: {"target_deg": list(targets), "error_arcsec": list(errors)}
+            for way, targets, errors in zip(
+                ("cw", "ccw"), result.targets_deg, result.errors_arcsec, strict=True
+            )
+        }
+        return {**result.scatter, "steps": steps}
 
 
 def compare_schemes(
@@ -56,8 +67,7 @@ def compare_schemes(
     finished: Callable[[Scheme, Run[SteppingOutcome]], None] = lambda *_: None,
     stopped: Callable[[Scheme, Record], None] = lambda *_: None,
 ) -> Comparison:
-    """Runs the stepping test under each scheme on a booted drive, which is enabled for each and disabled
-    after it.
+    """Runs the stepping test under each scheme on a booted drive, which is disabled after each.
 
     ``progress`` receives the completed share of the present scheme, ``finished`` each completed run, and
     ``stopped`` the measurements of an interrupted one, so that nothing measured is lost.

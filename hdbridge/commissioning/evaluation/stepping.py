@@ -40,9 +40,7 @@ class Scheme(Enum):
 
     @staticmethod
     def offered_by(model: TransmissionModel) -> tuple[Scheme, ...]:
-        """Returns the article's four schemes, and `EXTENDED` if the model has more than the two
-        basic parts.
-        """
+        """Returns the article's four schemes, and `EXTENDED` if the model has more than their two parts."""
         four = (Scheme.NONE, Scheme.SYNCHRONOUS, Scheme.HYSTERESIS, Scheme.BOTH)
         more = any(each.name not in {"synchronous", "hysteresis"} for each in model.effects)
         return (*four, Scheme.EXTENDED) if more else four
@@ -63,39 +61,52 @@ class Scatter:
 
 
 @dataclass(frozen=True, slots=True)
-class SchemeResult:
-    """Stepping test of one scheme."""
+class Stepped:
+    """Result of a stepping test with one model or scheme."""
 
-    cw: Scatter
-    ccw: Scatter
-    pooled: Scatter
-    outcome: SteppingOutcome
+    model: str
+    """Description of the model, or the scheme."""
+    errors_arcsec: tuple[tuple[float, ...], tuple[float, ...]]
+    """Error of each step, outward and back."""
+    targets_deg: tuple[tuple[float, ...], tuple[float, ...]]
 
     @classmethod
-    def of(cls, outcome: SteppingOutcome) -> SchemeResult:
-        """Computes the statistics per direction, and of both directions together."""
-        cw = [each.error_arcsec for each in outcome.cw]
-        ccw = [each.error_arcsec for each in outcome.ccw]
-        return cls(Scatter.of(cw), Scatter.of(ccw), Scatter.of(cw + ccw), outcome)
+    def of(cls, model: str, outcome: SteppingOutcome) -> Stepped:
+        """Creates it from the procedure's outcome."""
+        cw, ccw = outcome.cw, outcome.ccw
+        return cls(
+            model,
+            (tuple(each.error_arcsec for each in cw), tuple(each.error_arcsec for each in ccw)),
+            (tuple(each.target_deg for each in cw), tuple(each.target_deg for each in ccw)),
+        )
+
+    @property
+    def cw(self) -> Scatter:
+        """Scatter outward."""
+        return Scatter.of(self.errors_arcsec[0])
+
+    @property
+    def ccw(self) -> Scatter:
+        """Scatter on the way back."""
+        return Scatter.of(self.errors_arcsec[1])
+
+    @property
+    def pooled(self) -> Scatter:
+        """Scatter of both directions together."""
+        return Scatter.of(sum(self.errors_arcsec, ()))
+
+    @property
+    def scatter(self) -> dict[str, dict[str, float]]:
+        """Three sigma and mean of each direction and of both, as data."""
+        return {name: asdict(getattr(self, name)) for name in ("cw", "ccw", "pooled")}
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns the part of ``hdbridge step --json``; ``steps`` has each step's target and
-        error, in order.
-        """
-        scatter = {name: asdict(getattr(self, name)) for name in ("cw", "ccw", "pooled")}
-        steps = {
-            name: {
-                "target_deg": [each.target_deg for each in stands],
-                "error_arcsec": [each.error_arcsec for each in stands],
-            }
-            for name, stands in (("cw", self.outcome.cw), ("ccw", self.outcome.ccw))
-        }
-        return {**scatter, "steps": steps}
+        """Returns plain data, which `hdbridge.commissioning.calibration.Validation.from_dict` reads."""
+        return {**asdict(self), **self.scatter}
 
 
 def quantisation_floor_arcsec(motor_counts_per_turn: float, ratio: float) -> float:
-    """Returns three sigma at the load of a motor target rounded to whole counts: a uniform error of one
-    count.
+    """Returns three sigma at the load of motor targets rounded to whole counts, a uniform error.
 
     No compensation by motor targets can be more accurate, however good its model.
     """

@@ -11,17 +11,7 @@ Drive and dates are passed in; nothing here depends on whether the drive is simu
 
 from hdbridge.commissioning.improvement.extension import extension_of
 from hdbridge.commissioning.improvement.further import Choice, choose, unseparated
-from hdbridge.commissioning.improvement.improve import Source, improve
-from hdbridge.commissioning.improvement.result import Improvement
+from hdbridge.commissioning.improvement.improve import Improvement, Source, improve
 from hdbridge.commissioning.improvement.trial import Trial
 
-__all__ = [
-    "Choice",
-    "Improvement",
-    "Source",
-    "Trial",
-    "choose",
-    "extension_of",
-    "improve",
-    "unseparated",
-]
+__all__ = ["Choice", "Improvement", "Source", "Trial", "choose", "extension_of", "improve", "unseparated"]

@@ -1,8 +1,8 @@
-"""Complete workflow, from a booted drive to a pending model that improves positioning."""
+"""Complete workflow, from a booted drive to a pending model that improves positioning, and its result."""
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,10 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration.identification import provenance, with_provenance
 from hdbridge.commissioning.calibration.journal import Journal, survived_in, tasks_of
 from hdbridge.commissioning.calibration.measure import measure, start_journal
-from hdbridge.commissioning.calibration.pipeline import ACTIVE_NAME, MODEL_NAME, proposed
-from hdbridge.commissioning.calibration.result import Offer
+from hdbridge.commissioning.calibration.pipeline import ACTIVE_NAME, MODEL_NAME, Offer, proposed
 from hdbridge.commissioning.calibration.validation import floor_of
-from hdbridge.commissioning.improvement.extension import alternatives, extension_of, named
-from hdbridge.commissioning.improvement.further import advice, choose, unseparated
-from hdbridge.commissioning.improvement.result import Improvement, Round
+from hdbridge.commissioning.improvement.extension import Extension, alternatives, extension_of, named
+from hdbridge.commissioning.improvement.further import Choice, advice, choose, unseparated
 from hdbridge.commissioning.improvement.trial import Trial, try_out
 from hdbridge.control.bench import axis_view
 from hdbridge.control.caps import cap_remark
@@ -31,6 +29,70 @@ from hdbridge.files.atomic import write_atomically
 from hdbridge.files.outputs import writing
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.records.recording import ABOUT_NAME, Recording
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """A further experiment that the axis has run."""
+
+    experiment: str
+    about: str
+    recording: str
+    separates: tuple[str, ...]
+    """Alternatives that it was predicted to separate; empty if it existed already."""
+    found: tuple[str, ...]
+    """Findings after it, each with its alternatives."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Improvement:
+    """Result of diagnosis, extension and trial, with the decision about the offer."""
+
+    axis: str
+    recordings: tuple[str, ...]
+    date: str | None
+    """Date of the first recording, ISO 8601."""
+    plan: str
+    active: TransmissionModel
+    diagnosis: Diagnosis
+    extension: Extension
+    unseparated: Mapping[str, tuple[str, ...]]
+    """For each cause found, the other causes from which it has not been separated."""
+    rounds: tuple[Round, ...]
+    further: Choice | None
+    """Experiment that the axis could run on its own to learn more."""
+    advice: tuple[str, ...]
+    """Advice to the user about open questions."""
+    trial: Trial | None
+    offer: Offer
+    survived: tuple[str, ...] = ()
+    """One line for each file that was measured despite tolerated faults."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns the document of ``--json``: schema ``hdbridge.improvement/1``."""
+        trial = (
+            self.trial.as_dict() if self.trial else {"stepping": None, "small_steps": None, "improves": None}
+        )
+        return {
+            "schema": "hdbridge.improvement/1",
+            "axis": self.axis,
+            "recordings": list(self.recordings),
+            "date": self.date,
+            "plan": self.plan,
+            "offered": self.offer.made,
+            "reason": self.offer.reason,
+            "pending": str(self.offer.pending) if self.offer.pending else None,
+            "compensated": [each.cause for each in self.extension.carried],
+            "not_compensated": list(self.extension.left),
+            "not_told_from": {name: list(each) for name, each in self.unseparated.items()},
+            "rounds": [asdict(each) for each in self.rounds],
+            "further": self.further.as_dict() if self.further else None,
+            "advice": list(self.advice),
+            "survived": list(self.survived),
+            **trial,
+            "diagnosis": self.diagnosis.as_dict(),
+        }
+
 
 RESULT_NAME = "improvement.json"
 Progress = Callable[[str, float, float], None]
@@ -133,9 +195,7 @@ class _Bench:
 
 
 def _begin(source: Source, bench: _Bench) -> tuple[dict[Path, Recording], bool]:
-    """Returns the recordings to diagnose first, and True if an encoder may have lost its zero
-    between them.
-    """
+    """Returns the recordings to diagnose first, and True if an encoder may have lost its zero in between."""
     if source.journal is not None:
         apart = bench.run(source.journal)
         return {source.journal.folder: source.journal.recording()}, apart

@@ -15,11 +15,11 @@ from hdbridge.commissioning.calibration.measure import Pace
 from hdbridge.commissioning.calibration.validation import (
     CHANCE,
     Floor,
-    Stepped,
     Validation,
     record_kept,
     worse_ways,
 )
+from hdbridge.commissioning.evaluation.stepping import Stepped
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.rig import Rig, bench_on
 from hdbridge.control.survived import Survived, lines
@@ -50,10 +50,7 @@ class Trial:
     @property
     def improves(self) -> bool:
         """True if positioning improves in one of the two tests and worsens in neither, beyond chance."""
-        gains = [
-            _gain(self.stepping.before, self.stepping.after),
-            _gain(*self.small),
-        ]
+        gains = [_gain(self.stepping.before, self.stepping.after), _gain(*self.small)]
         return any(each > CHANCE for each in gains) and all(each > -CHANCE for each in gains)
 
     @property
@@ -64,9 +61,7 @@ class Trial:
 
     @property
     def of_floor(self) -> float:
-        """Ratio of the stepping test's three sigma with the extended model to the best possible
-        on this axis.
-        """
+        """Three sigma of stepping with the extended model over the best possible on this axis."""
         return self.stepping.after.pooled.three_sigma_arcsec / self.stepping.floor.three_sigma_arcsec
 
     def as_dict(self) -> dict[str, Any]:
@@ -163,9 +158,7 @@ def _together(outcomes: Sequence[SteppingOutcome]) -> SteppingOutcome:
 
 
 def _gain(before: Stepped, after: Stepped) -> float:
-    """Returns the decrease of the mean square about the mean, in standard errors; both stood at the same
-    places.
-    """
+    """Returns the decrease of the variance at equal places, in standard errors."""
     squares = []
     for stepped in (before, after):
         errors = np.concatenate([np.asarray(each) for each in stepped.errors_arcsec])

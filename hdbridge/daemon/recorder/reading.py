@@ -23,7 +23,7 @@ from zstandard import ZstdError
 from hdbridge.daemon.recorder.flightfile import EVENTS, KEPT, MACHINE_TOPIC, MODEL, PART, About, axis_topic
 from hdbridge.daemon.recorder.wire import AXIS, MACHINE
 from hdbridge.errors import InputError
-from hdbridge.files.regular import open_regular
+from hdbridge.files.atomic import open_regular
 
 T = TypeVar("T")
 SUFFIX: Final = ".mcap"

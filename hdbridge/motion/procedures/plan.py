@@ -18,8 +18,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from hdbridge.errors import InputError
-from hdbridge.files.bundled import bundled_folder
 from hdbridge.files.expectation import nearest
+from hdbridge.files.profile import bundled_folder
 from hdbridge.files.yamlfile import read_yaml, wrong
 from hdbridge.motion.procedures.chain import Chain
 from hdbridge.motion.procedures.moves import AxisView, Procedure

@@ -19,7 +19,7 @@ from support.running import Daemon, running
 
 from hdbridge.axis.model import TransmissionModel, store
 from hdbridge.drive.interfacelock import InterfaceLock
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 from tests.support.patience import until
 
 LISTENING = ("scan", "--listen", 600, "--borrow")

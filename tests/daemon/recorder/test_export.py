@@ -224,7 +224,7 @@ def test_bad_input_is_one_line_and_status_2(worked, tmp_path):
 
 
 def test_missing_extra_is_named(worked, tmp_path, monkeypatch):
-    monkeypatch.setattr("hdbridge.cli.flights._EXTRA", ("mcap", "no_such_package"))
+    monkeypatch.setattr("hdbridge.cli.recordings._EXTRA", ("mcap", "no_such_package"))
     done = command("record", "list", str(worked))
     assert done.returncode == 2
     assert "pip install 'hdbridge[daemon]'" in done.stderr

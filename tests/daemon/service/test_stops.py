@@ -6,7 +6,7 @@ import pytest
 from support.daemon import SteppedDaemon
 from support.service import Service, until
 
-from hdbridge.cli.ctl.look import _event as printed
+from hdbridge.cli.ctl import _event_line as printed
 from hdbridge.client import messages
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.drive.supervision import Fault

@@ -1,48 +1,41 @@
-"""``hdbridge diagnose``: errors of a model and their causes."""
+"""Commands that name what a model lacks: `diagnose`, `improve`."""
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
-from rich.markup import escape
-from rich.table import Table
 
-from hdbridge.cli.flights import AxisOption, FromOption, ToOption, is_flight, read_flights, remarks
-from hdbridge.cli.options import (
-    ColumnsOption,
-    HtmlOption,
-    IndependentZerosOption,
-    JsonOption,
-    UnitsOption,
-    UnwrapOption,
-    figures_table,
-    load_recordings,
-    model_file,
-    need_extra,
-    note,
-    print_table,
-    say,
-    write_json,
-    write_result,
-)
+from hdbridge.cli import options as opt
+from hdbridge.cli.calibration import Measured, print_next, print_stepping, print_steps, print_worse
+from hdbridge.cli.options import need_extra, taking
+from hdbridge.cli.printing import note, print_table, say, write_json, write_result
+from hdbridge.cli.recordings import Part, is_flight, remarks
+from hdbridge.cli.session import Session, model_file
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
+from hdbridge.files.profile import Profile
 from hdbridge.units import figure
 
 if TYPE_CHECKING:
     from hdbridge.analysis.findings import Diagnosis, Finding, Parameter
     from hdbridge.analysis.probability import Prior
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.commissioning.improvement import Improvement
     from hdbridge.records.recording import Recording
+
 
 WORTH_TELLING = 0.01
 """Minimum share of the difference for a coordinate to be printed."""
 
 
-def command(
+@taking(Part, opt.CsvFormat)
+def diagnose(
+    part: Part,
+    csv: opt.CsvFormat,
     records: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -59,20 +52,14 @@ def command(
             help="Model to test, or its profile. Flight recordings: else the model used last.",
         ),
     ] = None,
-    axis: AxisOption = None,
-    begin: FromOption = None,
-    end: ToOption = None,
-    columns: ColumnsOption = None,
-    units: UnitsOption = None,
-    unwrap: UnwrapOption = None,
-    json_file: JsonOption = None,
-    html_file: HtmlOption = None,
+    json_file: opt.Json = None,
+    html_file: opt.Html = None,
     extend: Annotated[
         Path | None,
         typer.Option("--extend", metavar="NEW_MODEL.yaml", help="Write the extended model."),
         Kind.MODEL,
     ] = None,
-    independent_zeros: IndependentZerosOption = False,
+    independent_zeros: opt.IndependentZeros = False,
     prior: Annotated[
         Path | None,
         typer.Option(
@@ -108,11 +95,10 @@ def command(
     from hdbridge.report.page import render
 
     flights = [each for each in records or () if is_flight(each)]
-    if not flights and (
-        name := next((n for n, t in (("--axis", axis), ("--from", begin), ("--to", end)) if t), "")
-    ):
+    chosen = {"--axis": part.axis, "--from": part.begin, "--to": part.end}
+    if not flights and (name := next((name for name, text in chosen.items() if text), "")):
         raise InputError(f"{name} is for flight recordings; expected an MCAP file or a folder of them")
-    flown, used = read_flights(flights, axis, begin, end) if flights else (None, None)
+    flown, used = part.read(flights) if flights else (None, None)
     if model is None and used is not None and used.text:
         path = flights[0] / f"model {used.version}"
         known = TransmissionModel.from_text(used.text, path)
@@ -135,7 +121,7 @@ def command(
         return
     if not records:
         raise InputError("no record; name CSV files or recording folders, or a plan with --plan")
-    recordings = load_recordings([each for each in records if each not in flights], columns, units, unwrap)
+    recordings = csv.load([each for each in records if each not in flights])
     if flown is not None:
         recordings[flights[0]] = flown
         for each in remarks(flown):
@@ -148,10 +134,9 @@ def command(
         progress=lambda words: note(f"{words} ..."),
     )
     recording = Recording.joined(list(recordings.values()))
-    options = {"--columns": columns, "--units": units, "--unwrap": unwrap}
-    said = [word for name, texts in options.items() for text in texts or () for word in (name, text)]
-    single = {"--model": model, "--axis": axis, "--from": begin, "--to": end, "--prior": prior}
-    said += [word for text in group or () for word in ("--group", text)]
+    lists = {**{f"--{name}": texts for name, texts in vars(csv).items()}, "--group": group}
+    said = [word for name, texts in lists.items() for text in texts or () for word in (name, text)]
+    single = {"--model": model, **chosen, "--prior": prior}
     said += [word for name, text in single.items() if text for word in (name, str(text))]
     document = result.as_dict()
     # Files first, because the reader of the tables may close the pipe (`| head`).
@@ -195,9 +180,8 @@ def print_diagnosis(result: Diagnosis) -> None:
     """Prints verdict, findings, next experiments, and causes that were not named."""
     say(result.verdict())
     if result.findings:
-        table = Table("cause", "probability", "size, arcsec", "held out, arcsec rms")
-        for each in result.findings:
-            table.add_row(
+        rows = [
+            (
                 each.cause,
                 f"{each.probability:.2f}",
                 figure(each.peak_arcsec, 3),
@@ -205,7 +189,9 @@ def print_diagnosis(result: Diagnosis) -> None:
                 if each.gain
                 else "not made",
             )
-        print_table(table)
+            for each in result.findings
+        ]
+        print_table(("cause", "probability", "size, arcsec", "held out, arcsec rms"), rows)
     for each in result.findings:
         for line in _details(each):
             say(line)
@@ -237,22 +223,21 @@ def _number(parameter: Parameter) -> str:
 
 
 def _print_figures(result: Diagnosis) -> None:
-    columns = ("as given, rms", "3σ", "extended, rms", "3σ")
-    table = figures_table("model and measurement, arcsec", "", *columns)
-    rows = {"overall": (result.baseline, result.extended), **result.by_kind}
-    for name, pair in rows.items():
-        figures = [value for each in pair for value in (each.rms_arcsec, each.three_sigma_arcsec)]
-        table.add_row(escape(name), *(f"{value:.2f}" for value in figures))
-    print_table(table)
+    rows = [
+        (name, *(f"{value:.2f}" for each in pair for value in (each.rms_arcsec, each.three_sigma_arcsec)))
+        for name, pair in {"overall": (result.baseline, result.extended), **result.by_kind}.items()
+    ]
+    columns = ("", "as given, rms", "3σ", "extended, rms", "3σ")
+    print_table(columns, rows, "model and measurement, arcsec")
 
 
 def _print_shares(shares: dict[str, dict[str, float]]) -> None:
-    ranked = sorted(shares.items(), key=lambda each: -each[1]["share_of_baseline"])
-    table = figures_table("share of the difference explained by", "", "as given", "extended")
-    for name, each in ranked:
-        if max(each.values()) >= WORTH_TELLING:
-            table.add_row(name, *(f"{100.0 * value:.1f} %" for value in each.values()))
-    print_table(table)
+    rows = [
+        (name, *(f"{100.0 * value:.1f} %" for value in each.values()))
+        for name, each in sorted(shares.items(), key=lambda each: -each[1]["share_of_baseline"])
+        if max(each.values()) >= WORTH_TELLING
+    ]
+    print_table(("", "as given", "extended"), rows, "share of the difference explained by")
 
 
 def _title(recording: Recording, records: Sequence[Path]) -> str:
@@ -276,13 +261,148 @@ def _provenance(recording: Recording, records: Sequence[Path], model: Path) -> l
 
 def _print_plan(report: dict[str, Any]) -> None:
     say(report["record"]["sentence"].replace("record", "plan", 1))
-    table = Table("cause", "detected from", "not distinguished from")
+    rows = []
     for name, each in report["identifiability"].items():
         limit = each["detection_limit_arcsec"]
         words = (
             f"{limit:.2g} arcsec" if each["detectable"] else f"no: {each.get('reason') or 'limit too high'}"
         )
-        table.add_row(name, words, ", ".join(each["aliases"]))
-    print_table(table)
+        rows.append((name, words, ", ".join(each["aliases"])))
+    print_table(("cause", "detected from", "not distinguished from"), rows)
     for each in report["notes"]:
         note(each)
+
+
+LEFT_OF_FLOOR = 1.5
+"""Ratio of a stepping test to its floor above which a further cause is suspected."""
+
+
+@taking(Session, Measured, opt.CsvFormat)
+def improve(
+    session: Session,
+    measured: Measured,
+    csv: opt.CsvFormat,
+    given: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--from",
+            metavar="RECORDING",
+            help="Diagnose this and measure nothing; may be repeated, in order of time.",
+        ),
+    ] = None,
+    independent_zeros: opt.IndependentZeros = False,
+    auto: Annotated[
+        bool, typer.Option("--auto", help="Run further experiments if causes cannot be separated.")
+    ] = False,
+    rounds: Annotated[
+        int, typer.Option("--rounds", min=1, max=20, help="With --auto: maximum number of experiments.")
+    ] = 3,
+    json_file: opt.Json = None,
+    html_file: opt.Html = None,
+) -> None:
+    """Diagnose the active model, extend it, step with both, and keep the better one as pending.
+
+    The axis moves within the limits of its axis file. Ctrl-C stops it and keeps what was measured.
+    """
+    from hdbridge.commissioning.improvement import Source, improve
+    from hdbridge.commissioning.improvement.trial import trial_s
+
+    active = _active(session.files)
+    if given and measured.resume is not None:
+        raise InputError("--from and --resume exclude each other: leave one of them out")
+    recordings = csv.load(given or ())  # refused before anything is connected
+    work = measured.of(session)
+    test_min = trial_s(work.plan, session.axis, active) / 60
+    trial = f"{test_min:.1f} min to step with both models, if something is found"
+    if recordings:
+        note(f"nothing is measured first; {trial}")
+    else:
+        work.announce(trial)
+    with work.booted() as (drive, progress, interrupted):
+        journal = None if recordings else work.begun(drive)
+        result = improve(
+            drive,
+            Source(work.plan, work.folder, journal, recordings, independent_zeros),
+            session.files.folder,
+            active,
+            work.date,
+            rounds=rounds if auto else 0,
+            progress=progress,
+            interrupted=interrupted,
+            tell=note,
+        )
+    _conclude(result, work.folder, session, json_file, html_file)
+
+
+def _conclude(
+    result: Improvement, folder: Path, session: Session, json_file: Path | None, html_file: Path | None
+) -> None:
+    """Writes and prints the result and the next steps."""
+    from hdbridge.commissioning.calibration.validation import worse_ways
+
+    page = html_file or (folder / "report.html" if folder.is_dir() else None)
+    write_json(json_file, result.as_dict())
+    if page is not None:
+        _write_improvement_page(page, result)
+    print_diagnosis(result.diagnosis)
+    for line in result.extension.left:
+        say(line)
+    for line in result.survived:
+        say(f"note: {line}")
+    if result.further is not None:
+        further = result.further
+        say(
+            f"the axis could separate {', '.join(further.separates)} on its own (--auto), in "
+            f"{further.duration_s / 60:.0f} min: {further.plan.about}"
+        )
+    if result.trial is not None:
+        print_stepping(result.trial.stepping)
+        print_steps("Small steps, within the hysteresis: load error at rest, arcsec", result.trial.small)
+        print_worse("small steps", worse_ways(*result.trial.small))
+        if result.trial.of_floor > LEFT_OF_FLOOR:
+            say(
+                f"stepping is still {result.trial.of_floor:.1f} times the floor: something is left that "
+                "these data do not show; --auto, or a plan with two load turns, shows more"
+            )
+    say(result.offer.reason, style=None if result.offer.made else "bold")
+    say(f"\nrecordings: {', '.join(result.recordings)}")
+    if page is not None:
+        say(f"report: {page}")
+    print_next(result.offer, session)
+
+
+def _write_improvement_page(path: Path, result: Improvement) -> None:
+    """Writes the diagnosis with the stepping test as a self-contained page."""
+    from hdbridge.report.diagnosis import diagnosis_page
+    from hdbridge.report.page import render
+
+    provenance = {
+        "axis": result.axis,
+        "recordings": ", ".join(result.recordings),
+        "recorded": result.date or "not known",
+        "plan": result.plan,
+        **{f"round {number}": each.about for number, each in enumerate(result.rounds, 1)},
+        **({"survived": "; ".join(result.survived)} if result.survived else {}),
+    }
+    page = diagnosis_page(
+        result.diagnosis,
+        title=f"Improvement of axis '{result.axis}'",
+        provenance=provenance,
+        stepping=result.trial.stepping if result.trial else None,
+        offer=result.offer,
+    )
+    write_result(path, render(page))
+
+
+def _active(files: Profile) -> TransmissionModel:
+    from hdbridge.axis.model import TransmissionModel
+
+    if not files.model.exists():
+        raise InputError(
+            f"{files.model}: there is no active model to improve; calibrate first: hdbridge calibrate "
+            f"{files.folder}"
+        )
+    return TransmissionModel.load(files.model)
+
+
+COMMANDS: Final = {"diagnose": diagnose, "improve": improve}

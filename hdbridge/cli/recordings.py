@@ -2,68 +2,173 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
-from rich.markup import escape
-from rich.table import Table
 
-from hdbridge.cli.flights import AxisOption, FromOption, ToOption, need_reader, read_flights, remarks
-from hdbridge.cli.options import JsonOption, note, print_table, say, write_json, write_result
+from hdbridge.cli import options as opt
+from hdbridge.cli.options import need_extra, taking
+from hdbridge.cli.printing import note, print_table, say, write_json, write_result
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import check_writable
 from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
-    from hdbridge.daemon.recorder.reading import Flight
+    from hdbridge.daemon.recorder.reading import Flight, ModelUsed
     from hdbridge.records.recording import Recording
 
+
+_EXTRA = ("mcap", "google.protobuf")
 _NS = 10**9
 
 FlightsArgument = Annotated[
-    list[Path],
-    typer.Argument(metavar="FILE.mcap|FOLDER...", help="Flight recordings, or folders of them."),
-]
-OutOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--out",
-        metavar="FOLDER|FILE.csv",
-        help="New or empty folder of a recording, or a file .csv or .csv.gz.",
-    ),
-]
-AllStatesOption = Annotated[
-    bool, typer.Option("--all-states", help="Include samples in which the axis was not enabled.")
+    list[Path], typer.Argument(metavar="FILE.mcap|FOLDER...", help="Flight recordings, or folders of them.")
 ]
 
 
-def overviews(flights: FlightsArgument, json_file: JsonOption = None) -> None:
+@dataclass(frozen=True)
+class Part:
+    """Options that select one axis and a time of flight recordings."""
+
+    axis: Annotated[
+        str | None,
+        typer.Option(
+            "--axis", metavar="NAME", help="Axis of the flight recordings; needed if they have several."
+        ),
+    ] = None
+    begin: Annotated[
+        str | None,
+        typer.Option("--from", metavar="TIME", help="Start of the flight, ISO 8601; UTC without an offset."),
+    ] = None
+    end: Annotated[
+        str | None,
+        typer.Option("--to", metavar="TIME", help="End of the flight, ISO 8601; UTC without an offset."),
+    ] = None
+
+    def read(self, paths: Sequence[Path], *, all_states: bool = False) -> tuple[Recording, ModelUsed | None]:
+        """Reads MCAP files and folders of them, and the model that was used at the end; None if none was.
+
+        Raises `InputError` if the axis or the time is not in the recordings.
+        """
+        need_reader()
+        from hdbridge.daemon.recorder.export import axis_of, exported, last_model
+        from hdbridge.daemon.recorder.reading import each_flight, overview, read
+
+        begin_ns, end_ns = _time_ns(self.begin, "--from"), _time_ns(self.end, "--to")
+
+        def wanted(path: Path) -> Flight | None:
+            about = overview(path)
+            if (begin_ns is not None and about.last_ns < begin_ns) or (
+                end_ns is not None and about.first_ns > end_ns
+            ):
+                return None
+            return read(about.path, (axis_of(about.about, self.axis, path)[1].name,))
+
+        found = [each for each in each_flight(paths, wanted) if each is not None]
+        if not found:
+            raise InputError(f"{paths[0]}: nothing was recorded between --from and --to")
+        found.sort(key=lambda each: each.first_ns)
+        recording = exported(found, self.axis, all_states=all_states, start_ns=begin_ns, end_ns=end_ns)
+        assert recording.axis is not None
+        return recording, last_model(found, recording.axis)
+
+
+@dataclass(frozen=True)
+class Export:
+    """Options for the record that a command makes."""
+
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FOLDER|FILE.csv",
+            help="New or empty folder of a recording, or a file .csv or .csv.gz.",
+        ),
+    ] = None
+    all_states: Annotated[
+        bool, typer.Option("--all-states", help="Include samples in which the axis was not enabled.")
+    ] = False
+
+    def checked(self) -> Path:
+        """Returns ``--out``; raises `InputError` unless a new record can be written there."""
+        out = self.out
+        if out is None:
+            raise InputError("--out is missing; name a new folder, or a file that ends in .csv or .csv.gz")
+        if _is_csv(out):
+            check_writable(out)
+            if out.exists():
+                raise InputError(f"{out}: there is a file already; expected a new one: raw data stay")
+        elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise InputError(f"{out}: is not an empty folder; expected a new or an empty one")
+        return out
+
+
+def is_flight(path: Path) -> bool:
+    """Returns True for an MCAP file, and for a folder that has some and is not a recording."""
+    if path.is_dir():
+        return not (path / "recording.yaml").exists() and next(path.rglob("*.mcap*"), None) is not None
+    return path.name.endswith((".mcap", ".mcap.part"))
+
+
+def remarks(recording: Recording) -> Iterator[str]:
+    """Yields remarks on a recording from flights or a bus log."""
+    about = recording.notes
+    if count := about.get("cycles_missing_within_parts"):
+        yield f"{count} cycles are missing within parts: the time goes on over them"
+    if count := about.get("parts_too_short"):
+        yield f"{count} parts were too short and are left out"
+    if about.get("zeros_may_differ"):
+        yield (
+            "the drive was booted or homed meanwhile: if its encoders lose their zeros then, pass "
+            "--independent-zeros to fit and diagnose"
+        )
+
+
+def need_reader() -> None:
+    """Raises `InputError` if a package that reads flight recordings is not installed."""
+    need_extra("flight recordings need", _EXTRA, "daemon")
+
+
+def _time_ns(text: str | None, option: str) -> int | None:
+    if text is None:
+        return None
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise InputError(f"{option}: found '{text}'; expected a time such as 2026-03-01T12:30:00") from None
+    return round((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp() * _NS)
+
+
+def overviews(flights: FlightsArgument, json_file: opt.Json = None) -> None:
     """List recordings: period, size, and stops in them."""
     need_reader()
     from hdbridge.daemon.recorder.reading import each_flight, overview
 
     found = list(each_flight(flights, overview))
     write_json(json_file, {"schema": "hdbridge.flights/1", "flights": [_overview(each) for each in found]})
-    table = Table("recording", "begins", "duration", "MB", "faults and marks")
+    rows = []
     for each in found:
-        name = each.path.name + ("" if each.finished else " (not finished)")
         stops = [event for event in each.events if event.kind in {"STOPPED", "BUS_DOWN", "MARK"}]
-        table.add_row(
-            escape(name),
-            f"{_date(each.first_ns):%Y-%m-%d %H:%M:%S}",
-            f"{(each.last_ns - each.first_ns) / _NS:,.0f} s",
-            f"{each.size / 1e6:.1f}",
-            escape("; ".join(f"{event.name}: {event.text or event.kind.lower()}" for event in stops[:3])),
+        rows.append(
+            (
+                each.path.name + ("" if each.finished else " (not finished)"),
+                f"{_date(each.first_ns):%Y-%m-%d %H:%M:%S}",
+                f"{(each.last_ns - each.first_ns) / _NS:,.0f} s",
+                f"{each.size / 1e6:.1f}",
+                "; ".join(f"{event.name}: {event.text or event.kind.lower()}" for event in stops[:3]),
+            )
         )
-    print_table(table)
+    print_table(("recording", "begins", "duration", "MB", "faults and marks"), rows)
 
 
 def info(
     flight: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="Flight recording.")],
-    json_file: JsonOption = None,
+    json_file: opt.Json = None,
 ) -> None:
     """Report the content of a recording: machine, axes, models, missing cycles, events."""
     need_reader()
@@ -154,13 +259,11 @@ def mend(flights: FlightsArgument) -> None:
         pass
 
 
+@taking(Part, Export)
 def export(
+    part: Part,
+    to: Export,
     flights: FlightsArgument,
-    axis: AxisOption = None,
-    out: OutOption = None,
-    begin: FromOption = None,
-    end: ToOption = None,
-    all_states: AllStatesOption = False,
     model: Annotated[
         Path | None,
         typer.Option(
@@ -173,8 +276,8 @@ def export(
 
     Missing cycles or a disabled axis begin a new part, which needs a recording folder.
     """
-    out = _checked_out(out)
-    recording, used = read_flights(flights, axis, begin, end, all_states=all_states)
+    out = to.checked()
+    recording, used = part.read(flights, all_states=to.all_states)
     if model is not None and (used is None or not used.text):
         raise InputError(f"{flights[0]}: no model was in use; leave out --model-out")
     _write(recording, out)
@@ -183,18 +286,17 @@ def export(
     _print_export(recording, out)
 
 
+@taking(Export)
 def import_(
+    to: Export,
     log: Annotated[
-        Path,
-        typer.Argument(metavar="LOG", help="Bus log: candump (.log), .asc, .blf, .trc, .mf4; also .gz."),
+        Path, typer.Argument(metavar="LOG", help="Bus log: candump (.log), .asc, .blf, .trc, .mf4; also .gz.")
     ],
     profile: Annotated[str, typer.Argument(metavar="PROFILE", help="Axis that was on the bus.")],
-    out: OutOption = None,
     channel: Annotated[
         str | None,
         typer.Option("--channel", metavar="NAME", help="The bus, if the node is on several in the log."),
     ] = None,
-    all_states: AllStatesOption = False,
 ) -> None:
     """Make a record of a bus log, as `fit` and `diagnose` read it. Any master may have driven the axis.
 
@@ -203,9 +305,9 @@ def import_(
     from hdbridge.axis import AxisConfig
     from hdbridge.control.buslog import import_log
 
-    out = _checked_out(out)
+    out = to.checked()
     axis = AxisConfig.load(Profile.find(profile).axis)
-    recording = import_log(log, axis, channel=channel, all_states=all_states)
+    recording = import_log(log, axis, channel=channel, all_states=to.all_states)
     _write(recording, out)
     note(f"PDO mapping {recording.notes['mapping']}")
     if cut_off := recording.notes.get("cut_off"):
@@ -239,18 +341,6 @@ def _print_export(recording: Recording, out: Path) -> None:
         note(each)
 
 
-def _checked_out(out: Path | None) -> Path:
-    if out is None:
-        raise InputError("--out is missing; name a new folder, or a file that ends in .csv or .csv.gz")
-    if _is_csv(out):
-        check_writable(out)
-        if out.exists():
-            raise InputError(f"{out}: there is a file already; expected a new one: raw data stay")
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out}: is not an empty folder; expected a new or an empty one")
-    return out
-
-
 def _is_csv(path: Path) -> bool:
     return path.name.endswith((".csv", ".csv.gz"))
 
@@ -282,4 +372,6 @@ def _event(event: Any) -> dict[str, Any]:
     }
 
 
-COMMANDS: Final = {"list": overviews, "info": info, "mend": mend, "export": export, "import": import_}
+COMMANDS: Final = {
+    "record": {"list": overviews, "info": info, "mend": mend, "export": export, "import": import_}
+}

@@ -1,0 +1,432 @@
+"""Commands that fit a model: `calibrate`, `measure`, `fit`, `report`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from hdbridge.cli import options as opt
+from hdbridge.cli.options import taking
+from hdbridge.cli.printing import (
+    note,
+    print_table,
+    progress_bar,
+    say,
+    write_json,
+    write_result,
+)
+from hdbridge.cli.session import Session, model_file
+from hdbridge.errors import InputError
+from hdbridge.files.atomic import make_folder, new_folder
+from hdbridge.files.outputs import Kind
+from hdbridge.files.profile import Profile
+
+if TYPE_CHECKING:
+    from hdbridge.cli.session import Session
+    from hdbridge.commissioning.calibration import Calibration, Journal, Validation
+    from hdbridge.commissioning.calibration.pipeline import Offer
+    from hdbridge.commissioning.evaluation.stepping import Stepped
+    from hdbridge.drive.drive import Drive
+    from hdbridge.motion.procedures.plan import Plan
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Options of a command that measures by a plan."""
+
+    plan: Annotated[
+        str,
+        typer.Option(
+            "--plan",
+            metavar="quick|full|dynamics|FILE",
+            help="What is measured: a bundled plan, or a file. A twin needs dynamics, too.",
+        ),
+    ] = "quick"
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="FOLDER", help="Where the recordings go; else recordings/AXIS-DATE-TIME."
+        ),
+        Kind.FOLDER,
+    ] = None
+    resume: Annotated[
+        Path | None,
+        typer.Option("--resume", metavar="FOLDER", help="Continue what was interrupted in this folder."),
+    ] = None
+
+    def of(self, session: Session) -> Measurement:
+        """Returns the measurement; raises `InputError` if options contradict each other or the recording.
+
+        Also creates the folder, so that an unwritable location is refused before a drive is connected.
+        """
+        from hdbridge.commissioning.calibration import Journal
+        from hdbridge.commissioning.calibration.measure import outlook
+        from hdbridge.motion.procedures.plan import Plan
+
+        axis, date = session.axis, datetime.now().astimezone()
+        if self.resume is None:
+            plan = Plan.load(self.plan)
+            outlook(plan, axis)  # refused before a folder is made
+            default = Path("recordings") / f"{axis.name}-{date:%Y%m%d-%H%M%S}"
+            folder = make_folder(self.out) if self.out else new_folder(default)
+            return Measurement(session, plan, folder, date, None)
+        if self.out is not None:
+            raise InputError("--resume continues in its own folder: leave out --out")
+        journal = Journal.open(self.resume)
+        journal.check_is_of(axis)
+        return Measurement(session, journal.plan, self.resume, date, journal)
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """Plan to be measured into a folder, or the rest of one that was begun there."""
+
+    session: Session
+    plan: Plan
+    folder: Path
+    date: datetime
+    journal: Journal | None
+    """Journal of the recording to continue; None for a new one."""
+
+    def announce(self, after: str = "") -> None:
+        """Prints what is left of the plan and its duration; ``after`` describes what follows."""
+        from hdbridge.commissioning.calibration.measure import outlook
+
+        done = self.journal.done if self.journal else ()
+        left = outlook(self.plan, self.session.axis, done)
+        for each in left.notes:
+            note(f"plan '{self.plan.name}': {each}")
+        there = f" ({len(done)} tasks are there already)" if self.journal else ""
+        note(
+            f"plan '{self.plan.name}': {len(left.tasks)} tasks{there}, {left.duration_s / 60:.1f} min of the "
+            f"axis{f', and {after}' if after else ''}"
+        )
+
+    def begun(self, drive: Drive) -> Journal:
+        """Returns the journal to continue, else a new one for this booted drive."""
+        from hdbridge.commissioning.calibration import start_journal
+
+        if self.journal is not None:
+            return self.journal
+        seed = self.session.simulated_seed
+        about = {} if seed is None else {"simulated": True, "seed": seed}
+        return start_journal(self.folder, self.session.axis, self.plan, self.date, drive.identity, about)
+
+    @contextmanager
+    def booted(self) -> Iterator[tuple[Drive, Callable[[str, float, float], None], Callable[[], bool]]]:
+        """Yields the booted drive, and functions that show progress and report a request to end.
+
+        Locks the axis against other measurements. If the measurement fails, the place of its record is
+        printed; an empty folder is removed.
+        """
+        from hdbridge.axis.model.store import measuring
+
+        try:
+            with (
+                measuring(self.session.files.axis),
+                self.session.booted() as (drive, interrupted),
+                phases() as progress,
+            ):
+                yield drive, progress, interrupted
+        except BaseException:
+            if (self.folder / "recording.yaml").exists():
+                note(f"what was measured is kept; go on with --resume {self.folder}")
+            raise
+        finally:
+            with suppress(OSError):
+                self.folder.rmdir()
+
+
+@contextmanager
+def phases() -> Iterator[Callable[[str, float, float], None]]:
+    """Yields a progress function with one bar per phase; a phase is identified by its total duration, s."""
+    with progress_bar() as bar:
+        bars: dict[float, int] = {}
+
+        def show(name: str, done_s: float, total_s: float) -> None:
+            if total_s not in bars:
+                bars[total_s] = bar.add_task("", total=total_s)
+            bar.update(bars[total_s], completed=done_s, description=f"{name:>18}")  # type: ignore[arg-type]
+
+        yield show
+
+
+@taking(Session, Measured)
+def calibrate(
+    session: Session, measured: Measured, json_file: opt.Json = None, html_file: opt.Html = None
+) -> None:
+    """Measure an axis by a plan, fit its model, test it on the axis, and keep it as pending.
+
+    The axis moves within the limits of its axis file, without compensation. Ctrl-C stops it and keeps what
+    was measured. A model that does not improve on held-out data is not offered.
+    """
+    from hdbridge.commissioning.calibration import calibrate
+    from hdbridge.commissioning.calibration.motion import motion_test_s
+    from hdbridge.commissioning.calibration.validation import validation_s
+
+    work, axis = measured.of(session), session.axis
+    test_s = validation_s(work.plan, axis)
+    if work.plan.validation.motion:
+        with suppress(InputError):  # too little travel: the calibration reports it and skips the test
+            test_s += motion_test_s(axis)
+    work.announce(f"{test_s / 60:.1f} min to test the model")
+    with work.booted() as (drive, progress, interrupted):
+        result = calibrate(
+            drive,
+            work.begun(drive),
+            session.files.folder,
+            work.date,
+            progress=progress,
+            interrupted=interrupted,
+            tell=note,
+        )
+    _conclude(result, work.folder, json_file, html_file, session)
+
+
+def _conclude(
+    result: Calibration,
+    folder: Path,
+    json_file: Path | None,
+    html_file: Path | None,
+    session: Session | None = None,
+) -> None:
+    """Writes and prints the result; for a measurement of a session, also the next steps."""
+    page = html_file or folder / "report.html"
+    write_json(json_file, result.as_dict())
+    write_calibration_page(page, result)
+    print_calibration(result)
+    if session is not None:
+        say(f"\nrecording: {folder}")
+    say(f"report: {page}")
+    if session is not None:
+        print_next(result.offer, session)
+
+
+@taking(Session, Measured)
+def measure(session: Session, measured: Measured) -> None:
+    """Move an axis by a plan and keep the recording, for diagnose, twin and fit.
+
+    The axis moves as in a calibration, without compensation. No model is fitted or changed.
+    """
+    from hdbridge.commissioning.calibration import measure
+
+    work, files = measured.of(session), session.files
+    work.announce()
+    with work.booted() as (drive, progress, interrupted):
+        journal = work.begun(drive)
+        measure(drive, journal, progress=progress, interrupted=interrupted)
+    recording = journal.recording()
+    say(f"recording: {work.folder}, {len(journal.done)} tasks, {len(recording.record)} samples")
+    if files.model.exists():
+        say(f"what the model lacks: hdbridge diagnose {work.folder} --model {files.model}")
+    say(f"what the simulated drive gets wrong: hdbridge twin {session.profile} {work.folder}")
+
+
+@taking(opt.CsvFormat)
+def fit(
+    csv: opt.CsvFormat,
+    records: Annotated[
+        list[Path],
+        typer.Argument(metavar="RECORD...", help="Recording folders or CSV files, in order of time."),
+    ],
+    ratio: Annotated[
+        float | None,
+        typer.Option("--ratio", min=1, max=1000, help="Motor turns per load turn; else the recording's."),
+    ] = None,
+    axis: Annotated[
+        str | None,
+        typer.Option("--axis", metavar="PROFILE", help="The axis that was recorded: ratio and binding."),
+    ] = None,
+    active: Annotated[
+        str | None,
+        typer.Option(
+            "--model", metavar="MODEL.yaml|PROFILE", help="Model to compare with, and to fall back on."
+        ),
+    ] = None,
+    independent_zeros: opt.IndependentZeros = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="MODEL.yaml", help="Write the model file."), Kind.MODEL
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Write the model even if it is worse on held-out data.")
+    ] = False,
+    json_file: opt.Json = None,
+    html_file: opt.Html = None,
+) -> None:
+    """Fit a model to recordings; report parameter intervals and what the data cannot determine.
+
+    A CSV file needs `time_s`, `motor_position_deg` and `load_position_deg` (multi-turn), or other names by
+    --columns; `motor_target_deg` helps. Nothing is activated. A model that is worse on held-out data than
+    that of --model, or than none, is not written.
+    """
+    from hdbridge.axis import AxisConfig
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.commissioning.calibration import fit
+
+    config = AxisConfig.load(Profile.find(axis).axis) if axis else None
+    loaded = csv.load(records)
+    compared = TransmissionModel.load(model_file(active)) if active else None
+    if compared and config:
+        compared.check_bound_to(config)
+    found = fit(loaded, ratio=ratio, axis=config, active=compared, independent_zeros=independent_zeros)
+    held_out = found.fit.held_out
+    refused = out is not None and held_out.worse and not force
+    if out is not None and not refused:
+        write_result(out, found.model.dump())
+    write_json(json_file, found.as_dict())
+    if html_file is not None:
+        write_calibration_page(html_file, found)
+    print_calibration(found)
+    if out is not None and not refused:
+        say(f"model: {out}")
+    if html_file is not None:
+        say(f"report: {html_file}")
+    if refused:
+        raise InputError(
+            f"{out}: not written: the model is worse on held-out data; it {held_out.text}; record more, or "
+            "write it anyway with --force"
+        )
+
+
+def report(
+    recording: Annotated[
+        Path, typer.Argument(metavar="RECORDING", help="Folder of a calibration's recording.")
+    ],
+    json_file: opt.Json = None,
+    html_file: opt.Html = None,
+) -> None:
+    """Fit a recording again and report the result; nothing moves."""
+    from hdbridge.commissioning.calibration import concluded
+
+    _conclude(concluded(recording), recording, json_file, html_file)
+
+
+TAKEN_OFF = 0.95
+"""Terms fitted in addition to the model are reported if they reduce the residual to this share or less."""
+
+
+def print_calibration(result: Calibration) -> None:
+    """Prints parameters with intervals, held-out figures, undetermined parameters and the stepping test."""
+    from hdbridge.axis.model.difference import diff
+    from hdbridge.units import figure, unit_of, with_interval
+
+    fit = result.fit
+    before = (
+        {(each.effect, each.parameter): each.before for each in diff(result.active, result.model)}
+        if result.active
+        else {}
+    )
+    rows = []
+    for each in fit.intervals:
+        was = before.get((each.effect, each.parameter))
+        value, half_width = with_interval(each.value, each.half_width)
+        known = (value, half_width) if each.identifiable else (f"({figure(each.value)})", "not known")
+        # With a previous model there is no space for the unit column; the names contain the units.
+        last = "-" if was is None else with_interval(was, each.half_width)[0]
+        rows.append((each.effect, each.parameter, *known, last if before else unit_of(each.parameter)))
+    axis = f"axis '{result.axis}'" if result.axis else ", ".join(result.recordings)
+    columns = ("effect", "parameter", "value", "± 95 %", "was" if before else "unit")
+    print_table(columns, rows, f"Model of {axis}, ratio {result.model.ratio:g}")
+    noise = fit.noise
+    standing = "not measured" if noise.standing_arcsec is None else f"{noise.standing_arcsec:.2f}"
+    apart = ""
+    if noise.fitted_arcsec < TAKEN_OFF * noise.residual_arcsec:
+        apart = f"; {noise.fitted_arcsec:.2f} with what was fitted in addition to the model taken off"
+    say(f"noise at rest {standing}, residual {noise.residual_arcsec:.2f} arcsec rms{apart}")
+    say(f"held out: {fit.held_out.text}")
+    if len(result.drift) > 1:
+        errors = [error for _, error in result.drift]
+        say(f"reference pose: {max(errors) - min(errors):.2f} arcsec of drift over {len(errors)} visits")
+    for test in fit.residual_tests:
+        if not test.passed:
+            say(f"residual: {test.text}")
+    for warning in fit.warnings:
+        say(f"note: {warning}")
+    if result.validation:
+        print_stepping(result.validation)
+    if result.motion:
+        from hdbridge.cli.positioning import print_motion
+
+        print_motion(result.motion)
+    if result.offer:
+        say(result.offer.reason, style=None if result.offer.made else "bold")
+
+
+def write_calibration_page(path: Path, result: Calibration) -> None:
+    """Writes the result as a self-contained page."""
+    from hdbridge.report.calibration import calibration_page
+    from hdbridge.report.page import render
+
+    write_result(path, render(calibration_page(result)))
+
+
+def print_next(offer: Offer | None, session: Session) -> None:
+    """Prints the commands for a pending model. The daemon that lent its bus commits it, and uses it."""
+    if offer is not None and offer.made:
+        folder = session.files.axis.parent
+        daemon = f"hdbridge ctl model {session.axis.name} pending"
+        use = daemon if session.borrow else f"hdbridge model commit {folder}"
+        say(f"pending: {offer.pending}\nreview it: hdbridge model diff {folder}\nuse it: {use}")
+
+
+def print_stepping(checked: Validation) -> None:
+    """Prints the stepping test with the previous and the new model, next to the floor of the axis."""
+    print_steps("Stepping test: load error at rest, arcsec", (checked.before, checked.after))
+    print_worse("stepping", checked.worse)
+    _print_accuracy(checked)
+    for line in checked.survived:
+        say(f"note: {line}")
+    floor = checked.floor
+    say(
+        f"best possible on this axis: {floor.three_sigma_arcsec:.2f} arcsec; new model: "
+        f"{checked.after.pooled.three_sigma_arcsec / floor.three_sigma_arcsec:.2f} times that"
+    )
+
+
+def print_steps(title: str, tests: Iterable[Stepped], first: str = "with") -> None:
+    """Prints scatter and mean of stepping tests, one line each; ``first`` heads the column of their names."""
+    columns = (first, "CW 3σ", "mean", "CCW 3σ", "mean", "pooled 3σ", "mean")
+    rows = []
+    for test in tests:
+        parts = (test.cw, test.ccw, test.pooled)
+        figures = (value for part in parts for value in (part.three_sigma_arcsec, part.mean_arcsec))
+        rows.append((test.model, *(f"{value:z.2f}" for value in figures)))
+    print_table(columns, rows, title)
+
+
+def print_worse(test: str, ways: Iterable[str]) -> None:
+    """Prints what got worse in one direction."""
+    for each in ways:
+        say(f"{test}: {each}", style="bold")
+
+
+def _print_accuracy(checked: Validation) -> None:
+    found = ((checked.before.model, checked.accuracy_before), (checked.after.model, checked.accuracy_after))
+    rows = [(model, each) for model, each in found if each is not None]
+    if not rows:
+        return
+    figures = [
+        (
+            model,
+            *(
+                f"{value:z.2f}"
+                for value in (each.accuracy, each.repeatability, each.reversal, each.systematic, each.range)
+            ),
+        )
+        for model, each in rows
+    ]
+    print_table(
+        ("with", "accuracy\nA", "repeatability\nR", "reversal\nB", "systematic\nE", "range\nM"),
+        figures,
+        f"Positioning test (ISO 230-2), arcsec: {rows[0][1].targets} targets, {rows[0][1].runs} "
+        "approaches from each side",
+    )
+
+
+COMMANDS: Final = {"calibrate": calibrate, "measure": measure, "fit": fit, "report": report}

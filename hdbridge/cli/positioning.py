@@ -1,0 +1,489 @@
+"""Commands that position the load: `move`, `step`, `motion`, `demo`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
+from hdbridge.cli import options as opt
+from hdbridge.cli.calibration import phases, print_steps
+from hdbridge.cli.printing import (
+    note,
+    print_table,
+    progress_bar,
+    say,
+    write_json,
+    write_result,
+)
+from hdbridge.cli.session import Session, compensating_model, note_clamped, on_axis
+from hdbridge.commissioning.evaluation.stepping import Scheme
+from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.files.atomic import make_folder, new_folder
+from hdbridge.files.outputs import Kind, writing
+from hdbridge.files.profile import Profile
+
+if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.commissioning.calibration.motion import MotionTest
+    from hdbridge.commissioning.evaluation.comparison import Comparison
+    from hdbridge.control.bench import Run
+    from hdbridge.drive.drive import Drive
+    from hdbridge.motion.procedures.stepping import Standing, Stepping, SteppingOutcome
+    from hdbridge.records.record import Record
+
+
+# ---------------------------------------------------------------- move
+
+KEPT_S = 60.0
+"""Duration of the samples kept while the axis holds; s."""
+
+
+@on_axis
+def move(
+    session: Session,
+    angles_deg: opt.Angles,
+    relative: Annotated[
+        bool, typer.Option("--relative", help="Each angle is relative to the previous position.")
+    ] = False,
+    velocity_deg_s: opt.Velocity = None,
+    hold_s: Annotated[
+        float | None,
+        typer.Option(
+            "--hold",
+            min=0.0,
+            help="Seconds to hold the last angle; else until Ctrl-C (a simulated axis: not at all).",
+        ),
+    ] = None,
+    model: opt.Model = None,
+    compensated: Annotated[
+        bool, typer.Option("--compensated/--uncompensated", help="Use the active model, if there is one.")
+    ] = True,
+    json_file: opt.Json = None,
+) -> None:
+    """Move the load to one angle or to several, compensated by the active model, and hold the last.
+
+    A move outside the limits of the axis file is refused before anything moves. Ctrl-C stops the axis (exit
+    status 130), or ends the hold. Power is then switched off: a suspended load needs a brake.
+    """
+    from hdbridge.control.bench import Bench, axis_view, compensation_for
+    from hdbridge.motion.procedures.rehearsal import rehearse
+    from hdbridge.motion.procedures.waypoints import Hold, WayPoints
+
+    files, axis = session.files, session.axis
+    if not relative:  # refused before anything is connected
+        rehearse(WayPoints(tuple(angles_deg)), axis_view(axis), angles_deg[0])
+    chosen = _compensating(files, model, axis.gear.ratio, compensated=compensated)
+    compensation = compensation_for(axis, chosen)  # refused before anything is connected
+    note_clamped(axis.limits, velocity_deg_s=velocity_deg_s)
+    with session.booted() as (drive, interrupted):
+        if session.simulate and hold_s is None:
+            hold_s = 0.0  # a simulated axis need not hold
+        hold = Hold(math.inf if hold_s is None else hold_s, released=interrupted)
+        stands_deg = drive.read_positions().motor_deg / axis.gear.ratio
+        targets_deg = _absolute(angles_deg, stands_deg) if relative else angles_deg
+        way = WayPoints(tuple(targets_deg), hold, velocity_deg_s)
+        bench = Bench(drive, compensation, interrupted=lambda: interrupted() and not hold.begun)
+        with progress_bar() as bar:
+            task = bar.add_task("moving", total=1.0)
+
+            def show(share: float) -> None:
+                there = share >= 1.0
+                words = (
+                    f"holding {targets_deg[-1]:g} deg; Ctrl-C ends it"
+                    if there and hold_s is None
+                    else "moving"
+                )
+                bar.update(task, completed=share, description=words)
+
+            try:
+                run = bench.run(way, show, keep_s=KEPT_S)
+            except KeyboardInterrupt:
+                _tell_where_it_stands(drive)
+                raise
+    write_json(json_file, _move_document(axis.name, chosen, run.outcome))
+    _print_move(axis.name, chosen, run.outcome)
+
+
+def _tell_where_it_stands(drive: Drive) -> None:
+    """Prints the position after a stop on the way; nothing if the drive does not answer any more."""
+    with suppress(HdbridgeError):
+        stands_deg = drive.read_positions().motor_deg / drive.axis.gear.ratio
+        note(f"stopped on the way, at {stands_deg:.4f} deg by the motor encoder; power is off")
+
+
+def _compensating(
+    files: Profile, given: Path | None, ratio: float, *, compensated: bool
+) -> TransmissionModel:
+    """Returns the compensating model; one without effects if there is none or none is wanted."""
+    from hdbridge.axis.model import TransmissionModel
+
+    if not compensated:
+        if given is not None:
+            raise InputError("--uncompensated uses no model: leave out --model")
+        return TransmissionModel(ratio)
+    if given is None and not files.model.exists():
+        note(f"not compensated: {files.model} does not exist")
+        return TransmissionModel(ratio)
+    return TransmissionModel.load(given or files.model)
+
+
+def _absolute(steps_deg: list[float], start_deg: float) -> list[float]:
+    targets = []
+    for step_deg in steps_deg:
+        start_deg += step_deg
+        targets.append(start_deg)
+    return targets
+
+
+def _move_document(axis: str, model: TransmissionModel, stands: tuple[Standing, ...]) -> dict[str, Any]:
+    return {
+        "schema": "hdbridge.move/1",
+        "axis": axis,
+        "model": str(model.path) if model.effects else None,
+        "stands": [
+            {
+                "target_deg": each.target_deg,
+                "load_position_deg": each.load_deg,
+                "error_arcsec": each.error_arcsec,
+                "settle_s": each.settle_s,
+            }
+            for each in stands
+        ],
+    }
+
+
+def _print_move(axis: str, model: TransmissionModel, stands: tuple[Standing, ...]) -> None:
+    rows = [
+        (
+            f"{each.target_deg:.4f}",
+            f"{each.load_deg:.4f}",
+            f"{each.error_arcsec:z.2f}",
+            f"{each.settle_s:.2f}",
+        )
+        for each in stands
+    ]
+    columns = ("target, deg", "load encoder, deg", "error, arcsec", "settled in, s")
+    print_table(columns, rows, f"Axis '{axis}' at rest")
+    how = f"compensated by {model.path}" if model.effects else "not compensated"
+    say(f"{how}; power is off")
+
+
+@on_axis
+def step(
+    session: Session,
+    model: opt.Model = None,
+    scheme: Annotated[
+        list[Scheme] | None,
+        typer.Option("--scheme", help="Only this scheme; may be repeated. Else all of the model."),
+    ] = None,
+    count: Annotated[int, typer.Option("--count", min=2, max=100_000, help="Steps each way.")] = 240,
+    step_deg: Annotated[float, typer.Option("--step-deg", help="Step, motor degrees.")] = 43.56,
+    start_deg: Annotated[float, typer.Option("--start-deg", help="Load angle of the start, deg.")] = 0.0,
+    json_file: opt.Json = None,
+    html_file: opt.Html = None,
+    record: Annotated[
+        Path | None,
+        typer.Option("--record", metavar="FOLDER", help="Keep what was measured: one CSV file per scheme."),
+        Kind.FOLDER,
+    ] = None,
+) -> None:
+    """Step the axis both ways under each compensation scheme; print what the load encoder measured.
+
+    Uses the article's four schemes, and the whole model if it has more than their two parts.
+    """
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.control.bench import axis_view
+    from hdbridge.motion.procedures.rehearsal import rehearse
+    from hdbridge.motion.procedures.stepping import Stepping
+
+    files, axis = session.files, session.axis
+    stepping = Stepping(count=count, step_deg=step_deg, start_deg=start_deg)
+    rehearse(stepping, axis_view(axis), start_deg)  # refused before anything is connected
+    chosen: Path | None = None
+    if model is not None or not scheme or set(scheme) != {Scheme.NONE}:  # the scheme none needs no model
+        chosen = compensating_model(files, session.profile, model, ", or step without one: --scheme none")
+
+    def tell(comparison: Comparison) -> None:
+        write_json(json_file, comparison.as_dict())
+        if html_file is not None:
+            _write_stepping_page(html_file, axis, chosen, comparison, stepping, session.simulated_seed)
+        _print_stepping(axis, comparison)
+
+    run_comparison(
+        session,
+        TransmissionModel.load(chosen) if chosen else TransmissionModel(axis.gear.ratio),
+        stepping,
+        scheme,
+        record=record,
+        tell=tell,
+    )
+
+
+def run_comparison(
+    session: Session,
+    model: TransmissionModel,
+    stepping: Stepping,
+    schemes: list[Scheme] | None,
+    *,
+    record: Path | None = None,
+    tell: Callable[[Comparison], None],
+) -> None:
+    """Connects, boots and compares; keeps each scheme's record as soon as it is complete.
+
+    ``tell`` receives the result, also of an interrupted test: then that of the completed schemes.
+    """
+    from hdbridge.commissioning.evaluation.comparison import compare_schemes
+    from hdbridge.control.bench import compensation_for
+    from hdbridge.control.caps import cap_remark
+
+    axis = session.axis
+    offered = Scheme.offered_by(model)
+    wanted = tuple(schemes) if schemes else offered
+    if Scheme.EXTENDED in wanted and Scheme.EXTENDED not in offered:
+        raise InputError("--scheme extended: the model has no effect beyond its two parts; leave it out")
+    if record is not None:
+        make_folder(record)  # before the axis moves, not after
+
+    for each in wanted:
+        compensation_for(axis, each.of(model))  # refused before anything is connected
+    if remark := cap_remark(axis, model):
+        note(remark)
+
+    done: dict[Scheme, Run[SteppingOutcome]] = {}
+
+    def keep(scheme: Scheme, run: Run[SteppingOutcome]) -> None:
+        done[scheme] = run
+        if record is not None:
+            with writing():
+                run.record.write_csv(record / f"stepping-{scheme.value}.csv.gz")
+
+    def stopped(scheme: Scheme, measured: Record) -> None:
+        path = None if record is None else record / f"stepping-{scheme.value}-stopped.csv.gz"
+        if path is not None:
+            with writing():
+                measured.write_csv(path)
+        kept = f"kept in {path}" if path else "not kept: it takes --record FOLDER"
+        seconds = float(measured.time_s[-1] - measured.time_s[0])
+        note(f"stopped in '{scheme.value}' after {seconds:.1f} s, {kept}")
+
+    with (
+        _told_when_stopped(axis, done, tell),
+        session.booted() as (drive, interrupted),
+        progress_bar() as bar,
+    ):
+        bars = {each: bar.add_task(f"{each.value:>12}", total=1.0, visible=False) for each in wanted}
+
+        begun: set[Scheme] = set()
+
+        def show(scheme: Scheme, share: float) -> None:
+            if scheme not in begun:
+                begun.add(scheme)
+                bar.reset(bars[scheme])  # the progress time starts here
+                for each in bars.values():  # no progress bar for a refused test
+                    bar.update(each, visible=True)
+            bar.update(bars[scheme], completed=share)
+
+        comparison = compare_schemes(
+            drive,
+            model,
+            wanted,
+            stepping,
+            progress=show,
+            interrupted=interrupted,
+            finished=keep,
+            stopped=stopped,
+        )
+    tell(comparison)
+
+
+@contextmanager
+def _told_when_stopped(
+    axis: AxisConfig, done: dict[Scheme, Run[SteppingOutcome]], tell: Callable[[Comparison], None]
+) -> Iterator[None]:
+    """Reports the results of the completed schemes if a test is interrupted."""
+    from hdbridge.commissioning.evaluation.comparison import Comparison
+
+    try:
+        yield
+    except BaseException:
+        if done:
+            tell(Comparison.of(axis, done))
+        raise
+
+
+def _print_stepping(axis: AxisConfig, comparison: Comparison) -> None:
+    """Prints the result."""
+    title = f"Load error at rest, arcsec: axis '{axis.name}'"
+    print_steps(title, comparison.results.values(), "compensation")
+    for line in comparison.survived:
+        say(f"note: {line}")
+    best, result = min(comparison.results.items(), key=lambda item: item[1].pooled.three_sigma_arcsec)
+    floor = comparison.quantisation_floor_arcsec
+    say(
+        f"quantisation floor (3 sigma of one motor count): {floor:.2f}; "
+        f"'{best.value}' is at {result.pooled.three_sigma_arcsec / floor:.2f} times that"
+    )
+
+
+def _write_stepping_page(
+    path: Path,
+    axis: AxisConfig,
+    model: Path | None,
+    comparison: Comparison,
+    stepping: Stepping,
+    simulated_seed: int | None,
+) -> None:
+    """Writes the result as a self-contained page, with what was stepped, when, and by which model."""
+    from hdbridge.report.page import render
+    from hdbridge.report.stepping import stepping_page
+
+    cycle = f"cycle {axis.drive.cycle_ms:g} ms"
+    drive = (
+        f"node {axis.drive.node_id} on {axis.bus.interface}:{axis.bus.channel}, {cycle}"
+        if simulated_seed is None
+        else f"simulated, seed {simulated_seed}, {cycle}"
+    )
+    facts = {
+        "axis": f"{axis.name} ({axis.path})",
+        "model": str(model or "none"),
+        "drive": drive,
+        "date": f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}",
+        "steps": f"{stepping.count} of {stepping.step_deg:g} motor degrees each way",
+        "gear ratio": f"{axis.gear.ratio:g}",
+        "motor encoder": f"{axis.motor_encoder.counts_per_turn:,} counts per turn",
+        "load encoder": f"{axis.load_encoder.counts_per_turn:,} counts per turn",
+    }
+    if comparison.survived:
+        facts["survived"] = "; ".join(comparison.survived)
+    page = stepping_page(
+        axis.name,
+        comparison.results,
+        comparison.quantisation_floor_arcsec,
+        facts,
+        with_article=axis.name == "article",
+    )
+    write_result(path, render(page))
+
+
+@on_axis
+def motion(
+    session: Session,
+    model: opt.Model = None,
+    measure: Annotated[
+        bool,
+        typer.Option(
+            "--measure/--no-measure",
+            help="Measure the response of the axis, or test the one of the model file.",
+        ),
+    ] = True,
+    propose: Annotated[
+        bool, typer.Option("--propose", help="Keep the model with the measured response as pending.")
+    ] = False,
+    json_file: opt.Json = None,
+    html_file: opt.Html = None,
+) -> None:
+    """Run the axis at several speeds; print the ripple of the load without and with compensation.
+
+    Measures the response to a correction in motion, and compensates for it.
+    """
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.axis.model.store import propose as keep
+    from hdbridge.commissioning.calibration.motion import motion_test, motion_test_s
+
+    files, axis = session.files, session.axis
+    chosen = compensating_model(files, session.profile, model)
+    if propose and not measure:
+        raise InputError("--propose needs a measured response: leave --no-measure out")
+    used = TransmissionModel.load(chosen)
+    used.check_bound_to(axis)
+    note(f"motion test: {motion_test_s(axis) / 60.0:.1f} min at most")
+    with session.booted() as (drive, interrupted), phases() as progress:
+        result = motion_test(drive, used, measure=measure, progress=progress, interrupted=interrupted)
+        identity = drive.identity
+    write_json(json_file, result.as_dict())
+    if html_file is not None:
+        from hdbridge.report.motion import motion_page
+        from hdbridge.report.page import render
+
+        write_result(html_file, render(motion_page(axis.name, result)))
+    print_motion(result)
+    if propose and result.response is not None:
+        pending = keep(
+            files.axis.parent,
+            result.applied(used),
+            f"response in motion, known up to {result.response.known_to_hz:.0f} Hz",
+            datetime.now().astimezone(),
+            identity,
+        )
+        say(f"pending: {pending}; commit it with: hdbridge model commit {session.profile}")
+
+
+def print_motion(result: MotionTest) -> None:
+    """Prints the result."""
+    from hdbridge.report.motion import PATH_COLUMNS, RIPPLE_COLUMNS, figure, path_rows, ripple_rows
+
+    print_table(RIPPLE_COLUMNS, ripple_rows(result), "Ripple of the load at constant speed, rms arcsec")
+    fastest = result.ripples[-1]
+    orders = [
+        (
+            str(each.order),
+            f"{each.frequency_hz:.0f}",
+            *map(figure, (each.none_arcsec, each.static_arcsec, each.filtered_arcsec)),
+        )
+        for each in fastest.orders
+    ]
+    columns = ("order", "Hz", "none", "static", "filtered")
+    print_table(columns, orders, f"Motor orders at {fastest.speed_deg_s:g} deg/s, arcsec")
+    if result.paths:
+        print_table(PATH_COLUMNS, path_rows(result), "Errors on a path, rms arcsec")
+    if result.response is not None:
+        say(
+            f"response known up to {result.response.known_to_hz:.0f} Hz, "
+            f"following lag {result.response.following_lag_ms:.2f} ms"
+        )
+    if result.wind_up is not None:
+        say(f"wind-up J / K {result.wind_up.inertia_over_stiffness_s2:.3g} s2: compensated in acceleration")
+    if (reached := result.helps_to_deg_s) is not None:
+        say(f"the compensation removes half of the ripple or more up to {reached:g} deg/s")
+    for line in result.remarks:
+        say(f"note: {line}")
+
+
+def demo(
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FOLDER", help="Where the results go; else demo-output, numbered."),
+        Kind.FOLDER,
+    ] = None,
+    count: Annotated[int, typer.Option("--count", min=2, max=2000, help="Steps each way.")] = 240,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the simulated axis.")] = 0,
+) -> None:
+    """Step a simulated axis 240 times each way under four compensation schemes.
+
+    Table, JSON, records and a page go to FOLDER.
+    """
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.motion.procedures.stepping import Stepping
+
+    session = Session("article", simulate=True, seed=seed)
+    files, axis = session.files, session.axis
+    stepping = Stepping(count=count)
+    folder = new_folder(Path("demo-output")) if out is None else make_folder(out)
+
+    def tell(comparison: Comparison) -> None:
+        write_json(folder / "stepping.json", comparison.as_dict())
+        _write_stepping_page(folder / "stepping.html", axis, files.model, comparison, stepping, seed)
+        _print_stepping(axis, comparison)
+
+    run_comparison(session, TransmissionModel.load(files.model), stepping, None, record=folder, tell=tell)
+    say(f"\nopen {folder / 'stepping.html'} in a browser for the picture; next: docs/tutorial.md")
+
+
+COMMANDS: Final = {"move": move, "step": step, "motion": motion, "demo": demo}

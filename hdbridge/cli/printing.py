@@ -1,0 +1,123 @@
+"""Printing of every command: lines and tables of the result, remarks, progress, result files."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from rich.console import Console
+from rich.measure import Measurement
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from hdbridge.files.atomic import is_stream, write_atomically
+from hdbridge.files.outputs import writing
+
+Cell = str | Text
+_FIGURE: Final = re.compile(r"\(?[-+~<]?\d[\d,.]*(e[-+]?\d+)?\)?( (s|%))?|not known|-|")
+"""Cell of a column of figures, which is right-aligned."""
+
+
+class _Console(Console):
+    """Console that discards its output once the reader has closed the pipe (`| head`)."""
+
+    def on_broken_pipe(self) -> None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
+
+
+console = _Console(highlight=False)
+"""Tables, on standard output."""
+notes = _Console(stderr=True, highlight=False)
+"""Progress and remarks, on standard error, so that they stay out of a pipe."""
+
+
+def say(line: str, style: str | None = None) -> None:
+    """Prints a line of the result, unwrapped and without markup."""
+    console.print(line, markup=False, soft_wrap=True, style=style)
+
+
+def note(line: str) -> None:
+    """Prints a remark, unwrapped and without markup."""
+    notes.print(line, markup=False, soft_wrap=True)
+
+
+def progress_bar() -> Progress:
+    """Returns a progress bar with the time left, on standard error; plain lines if that is not a terminal."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:3.0f} %"),
+        TimeRemainingColumn(compact=True, elapsed_when_finished=True),
+        console=notes,
+        refresh_per_second=4,
+    )
+
+
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str = "") -> None:
+    """Prints a table uncropped; always as one table into a pipe or a file. An empty row ends a section."""
+    for each in tables(columns, rows, title):
+        console.print(each, crop=False)
+
+
+def tables(columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str = "") -> list[Table]:
+    """Returns a table at its natural width; on a narrow terminal several, each with the first column.
+
+    No figure is cut off.
+    """
+    parts: list[Table] = []
+    rest = [*range(1, len(columns))]
+    widest = console.width if console.is_terminal else 10_000
+    while rest or not parts:
+        count = len(rest)
+        while True:
+            part = _table(columns, rows, title, [0, *rest[:count]])
+            width = Measurement.get(console, console.options.update(width=10_000), part).maximum
+            if width <= widest or count <= 1:
+                break
+            count -= 1
+        part.width = min(width, widest)
+        parts.append(part)
+        rest = rest[count:]
+    return parts
+
+
+def _table(columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str, shown: Sequence[int]) -> Table:
+    """Returns a table of some of the columns."""
+    table = Table(title=title or None, title_justify="left")
+    for place in shown:
+        cells = [str(row[place]) for row in rows if place < len(row)]
+        right = place > 0 and any(cells) and all(map(_FIGURE.fullmatch, cells))
+        table.add_column(columns[place], justify="right" if right else "left", overflow="fold")
+    for row in rows:
+        if row:
+            shown_cells = (row[place] for place in shown if place < len(row))
+            table.add_row(*(each if isinstance(each, Text) else Text(each) for each in shown_cells))
+        else:
+            table.add_section()
+    return table
+
+
+def print_object(name: str, value: object, type_name: str) -> None:
+    """Prints an object of a drive: a natural number also in hexadecimal."""
+    whole = isinstance(value, int) and not isinstance(value, bool) and value >= 0
+    also = f" ({value:#x})" if whole else ""
+    say(f"{name}: {value}{also}  {type_name}")
+
+
+def write_json(path: Path | None, result: dict[str, Any]) -> None:
+    """Writes the JSON result if requested."""
+    if path is not None:
+        write_result(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
+
+
+def write_result(path: Path, text: str) -> None:
+    """Writes a result file; a failure is reported after everything has been printed."""
+    with writing():
+        write_atomically(path, text)
+        if not is_stream(path):
+            note(f"wrote {path}")
