@@ -104,7 +104,7 @@ def diagnose(
     if swing is None:  # a larger cause may hide it; wind-up in acceleration is its slow part
         others = [each for each in found.hypothesis.effects if each.channels != {Channel.ACCELERATION}]
         swing = seen_swing(data.full, others, scales)
-        if swing is not None and not swing.soft:
+        if swing is not None:
             search, found = _searched(data, model, scales, swing)
     progress("judging what was found")
     diagnosis = _Judge(search, model, prior).of(found)
@@ -114,17 +114,16 @@ def diagnose(
 def _searched(
     data: Observed, model: TransmissionModel, scales: Scales, swing: Swing | None
 ) -> tuple[Search, Fitted]:
-    """Returns the search and its result on the data less the swing; a soft one is a cause to be found."""
-    ordinary = None if swing is None or swing.soft else swing
-    if ordinary is not None:
-        data = without(data, ordinary)
+    """Returns the search and its result on the data less the swing."""
+    if swing is not None:
+        data = without(data, swing)
     search = _search(data, model, scales)
-    if swing is None or ordinary is not None:
-        search = _search(settled(search.estimator, search.begun(), ordinary), model, scales)
+    if swing is None or not swing.soft:
+        search = _search(settled(search.estimator, search.begun(), swing), model, scales)
     estimator = search.estimator
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)
-    dynamics = () if ordinary is None else (ordinary.remark(),)
+    dynamics = () if swing is None else (swing.remark(),)
     of_record = (*((first,) if first else ()), *held, *data.remarks, *dynamics)
     estimator.data = replace(estimator.data, remarks=of_record)
     return search, search.run()
@@ -174,7 +173,9 @@ class _Judge:
     def of(self, fitted: Fitted) -> Diagnosis:
         """Turns the result of the search into a diagnosis."""
         estimator, given = self.estimator, self.model.effects
-        fitted = self.search.eliminated(fitted, self._stopped, self.considered)
+        while (passed := self.search.eliminated(fitted, self._stopped, self.considered)) is not fitted:
+            names = [{each.name for each in one.hypothesis.effects} for one in (fitted, passed)]
+            fitted = self.search.instead(passed, names[0] - names[1])
         fitted = with_measured(self.search, fitted)
         fitted = as_calibrated(estimator, fitted, given)
         judged = self._likely_only(fitted)

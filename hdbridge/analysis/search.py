@@ -51,6 +51,8 @@ class Search:
         self._screens: dict[object, Screen] = {}
         self.refusals: dict[str, str] = {}
         """Reason for each cause that was rejected although it improved the fit."""
+        self._stopped: set[str] = set()
+        """Causes that failed a test of the result."""
         law = next((each for each in self._base if each.part is Part.LOOP), None)
         if law is not None:
             estimator.loop_sign = -1.0 if law.coefficients()[0] < 0.0 else 1.0
@@ -77,6 +79,16 @@ class Search:
         if len(fitted.hypothesis.effects) - self.base <= self.scales.few:
             fitted = self._swapped(fitted)
         return self._with_best_law(self.eliminated(fitted, self._least, []))
+
+    def instead(self, fitted: Fitted, stopped: Set[str]) -> Fitted:
+        """Adds causes in place of those that were ``stopped`` by a test of the result."""
+        self._stopped |= stopped
+        while len(fitted.hypothesis.effects) < self.base + MOST:
+            found = self._best_addition(fitted)
+            if found is None:
+                break
+            fitted = found
+        return self.eliminated(fitted, self._least, [])
 
     def begun(self) -> Fitted:
         """Fits the model alone, from the best elastic state at the start."""
@@ -192,7 +204,8 @@ class Search:
 
         A rejected cause may be acceptable next to a later one, so no rejection is final.
         """
-        scores, refused = self._scores(fitted), set[object]()
+        scores = [each for each in self._scores(fitted) if each.effect.name not in self._stopped]
+        refused = set[object]()
         while shortlist := self._shortlist(fitted, [each for each in scores if _key(each) not in refused]):
             best: tuple[float, Fitted] | None = None
             for score in shortlist:

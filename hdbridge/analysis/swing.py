@@ -59,17 +59,23 @@ class Swing:
     waves_arcsec2: FloatArray
     """Squared amplitudes of the part in waves too fast for the sampling, shape (n,)."""
 
+    def wind_up_arcsec(self, full: Samples) -> FloatArray:
+        """Returns the slow part: the wind-up by the motor's acceleration, shape (n,)."""
+        acceleration = full.motion.motor_acceleration_deg_s2
+        assert acceleration is not None
+        return -acceleration * ARCSEC_PER_DEG / full.ratio / (math.tau * self.frequency_hz) ** 2
+
     @property
     def soft(self) -> bool:
-        """True for a load that is softer than an ordinary one, which is a cause to be found."""
+        """True for a load that is softer than an ordinary one, whose wind-up is a cause to be found."""
         return self.frequency_hz <= ORDINARY_HZ
 
     def remark(self) -> str:
         """Describes it for the report."""
         return (
             f"the load swings on its spring at {self.frequency_hz:.0f} Hz (damping ratio "
-            f"{self.damping:.2f}) by up to {np.max(np.abs(self.does_arcsec)):.2g} arcsec: ordinary dynamics, "
-            "which are allowed for"
+            f"{self.damping:.2f}) by up to {np.max(np.abs(self.does_arcsec)):.2g} arcsec: "
+            + ("its ringing is allowed for" if self.soft else "ordinary dynamics, which are allowed for")
         )
 
 
@@ -202,8 +208,10 @@ def _fast_waves(full: Samples, effects: Sequence[Effect], period_s: float) -> It
 
 
 def without(data: Observed, found: Swing) -> Observed:
-    """Returns the data less the swing."""
-    return data.having(replace(data.full, error_arcsec=data.full.error_arcsec - found.does_arcsec))
+    """Returns the data less the swing, but with the wind-up of a soft load, which is a cause to be found."""
+    full = data.full
+    does = found.does_arcsec - found.wind_up_arcsec(full) if found.soft else found.does_arcsec
+    return data.having(replace(full, error_arcsec=full.error_arcsec - does))
 
 
 def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observed:
