@@ -10,6 +10,12 @@ import pytest
 from hdbridge.control.realtime import left_realtime, prepare_realtime, resumed_realtime
 
 
+@pytest.fixture(autouse=True)
+def heap_of_a_small_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spares the tests full collections of everything that a test process has loaded."""
+    monkeypatch.setattr(gc, "collect", lambda: 0)
+
+
 def state() -> tuple[int, int, bool, int, set[int]]:
     return (
         os.sched_getscheduler(0),

@@ -12,9 +12,9 @@ T = TypeVar("T")
 
 def until(met: Callable[[], T], why: Callable[[], object] = lambda: "it did not come about") -> T:
     """Polls until ``met`` returns something true, and returns it; fails with ``why()`` after `PATIENCE_S`."""
-    end_s, pause_s = time.monotonic() + PATIENCE_S, 0.005
+    end_s, pause_s = time.monotonic() + PATIENCE_S, 0.01
     while not (found := met()):
         assert time.monotonic() < end_s, why()
         time.sleep(pause_s)
-        pause_s = min(1.2 * pause_s, 0.25)  # frequent polling would slow down the work it waits for
+        pause_s = min(2.0 * pause_s, 0.25)  # frequent polling would slow down the work it waits for
     return found
