@@ -50,7 +50,7 @@ class AgeFactor:
 class WornTeeth:
     """Tooth error by motor angle, caused by wear."""
 
-    BY_MOTOR_ONLY: ClassVar[bool] = False
+    by_motor_only: ClassVar[bool] = False
     _age: Age
     _orders: Orders
 
@@ -59,5 +59,4 @@ class WornTeeth:
         self._orders = Orders(truth.motor_orders)
 
     def arcsec(self, now: Conditions) -> float:
-        """See `gear.Piece`."""
         return self._age.grown() * self._orders.at(math.radians(now.motor_deg))

@@ -5,19 +5,47 @@ whole and advanced by one call per cycle.
 """
 
 import math
+from typing import NamedTuple
 
 from hdbridge.sim.encoder import FixedErrors, Losses
 from hdbridge.sim.heat import Heat
-from hdbridge.sim.loops import Loops, Seen, Slow
+from hdbridge.sim.loops import Loops
 from hdbridge.sim.state import state
 from hdbridge.sim.truth import Truth
 from hdbridge.units import DEG_PER_TURN
 
-Told = tuple[float, float, float, int, float, float, int, int, float, float, float, float, float]
-"""Measurements at the end of a cycle: motor and load encoder in counts, before rounding; the motor's
-torque (Nm) and in thousandths of the rated one; the temperature; the torque on the load (Nm); both
-encoders in whole counts; the motor's speed as measured by the drive (counts/s); the time since
-switch-on; the true angles of the motor, the load and the gear's output (deg)."""
+
+class Measured(NamedTuple):
+    """Measurements at the end of a cycle."""
+
+    motor_reading: float
+    """Motor encoder in counts, before rounding."""
+    load_reading: float
+    """Load encoder in counts, before rounding; includes noise."""
+    torque_nm: float
+    """Motor torque, not rounded, in the sense of the motor encoder."""
+    torque_permille: int
+    """Motor torque, in thousandths of the rated one, in the sense of the motor encoder."""
+    temperature_c: float
+    """Temperature of motor and gear."""
+    load_torque_nm: float
+    """Torque of gravity and external torque on the load, as measured at the load's flange, with the sign
+    that the truth file states. Friction of the gear's bearings and the load's inertia are not included.
+    """
+    motor_counts: int
+    """Motor encoder: whole counts, multi-turn, never wrapped. The middle of a count is its angle."""
+    load_counts: int
+    """Load encoder: whole counts, multi-turn, never wrapped."""
+    velocity_counts_s: float
+    """Motor speed as measured by the drive."""
+    elapsed_s: float
+    """Time since the axis was switched on."""
+    true_motor_deg: float
+    """True motor angle, for tests."""
+    true_load_deg: float
+    """True load angle, for tests."""
+    true_output_deg: float
+    """True output of the gear before its spring, for tests: the angle at which the load comes to rest."""
 
 
 @state
@@ -62,9 +90,9 @@ class Axis:
         self._sense_permille = 1000.0 * motor.direction
         self._torque_sense = float(truth.load_.torque_sense)
 
-    def at_first(self) -> Told:
+    def at_first(self) -> Measured:
         """Returns the initial state."""
-        return self._told(self.loops.seen(), 0.0, 0.0, 0.0)
+        return self._readings(0.0, 0.0, 0.0)
 
     def drive(
         self,
@@ -74,21 +102,21 @@ class Axis:
         limit_nm: float,
         noise_deg: float,
         outer_nm: float,
-    ) -> Told:
+    ) -> Measured:
         """Runs a closed-loop cycle in which the demand moves linearly from start to end, in motor counts.
 
         ``limit_nm`` is the torque limit, ``noise_deg`` the noise of the load encoder at the end,
         ``outer_nm`` the external torque on the load.
         """
         loops, per_deg = self.loops, self.motor_counts_per_deg
-        slow = self._slow(limit_nm, outer_nm)
+        self._prepare(limit_nm, outer_nm)
         demand_deg = (start_counts - self._motor_zero) / per_deg
         elapsed_s = substeps * loops.dt_s
         speed_deg_s = (end_counts - start_counts) / per_deg / elapsed_s
         engaged = not self._powered
         if engaged:
             self._powered = True
-            self._hold_deg = loops.power_on(slow)
+            self._hold_deg = loops.switch_on()
             self._hold_counts = start_counts
             self._holds = abs(self._motor_reading(loops.plant.now.motor_deg) - start_counts) <= 1.0
         if self._holds:
@@ -98,62 +126,52 @@ class Axis:
                 self._holds = False
         if engaged:
             loops.begin_demand(demand_deg)
-        seen = loops.follow(demand_deg, speed_deg_s, substeps, slow)
-        return self._told(seen, elapsed_s, noise_deg, outer_nm)
+        loops.follow(demand_deg, speed_deg_s, substeps)
+        return self._readings(elapsed_s, noise_deg, outer_nm)
 
     def roll(
         self, brake_nm: float, substeps: int, limit_nm: float, noise_deg: float, outer_nm: float
-    ) -> Told:
+    ) -> Measured:
         """Runs a cycle with the power stage off: friction and the brake slow the motor and hold it."""
         self._powered = False
-        seen = self.loops.coast(brake_nm, substeps, self._slow(limit_nm, outer_nm))
-        return self._told(seen, substeps * self.loops.dt_s, noise_deg, outer_nm)
+        self._prepare(limit_nm, outer_nm)
+        self.loops.coast(brake_nm, substeps)
+        return self._readings(substeps * self.loops.dt_s, noise_deg, outer_nm)
 
     def hold(self, torque_nm: float) -> None:
         """Sets the torque by which the loops hold the axis at rest."""
         self.loops.hold(torque_nm)
 
-    def _slow(self, limit_nm: float, outer_nm: float) -> Slow:
-        """Returns the slowly varying inputs of the loops for the next cycle."""
-        return self.heat.body_c, self.heat.rub, limit_nm, self._lost_deg(), outer_nm
+    def _prepare(self, limit_nm: float, outer_nm: float) -> None:
+        """Passes the slowly varying inputs to the loops, for the next cycle."""
+        self.loops.take(self.heat.body_c, self.heat.rub, limit_nm, self._lost_deg(), outer_nm)
 
-    def _told(self, seen: Seen, elapsed_s: float, noise_deg: float, outer_nm: float) -> Told:
+    def _readings(self, elapsed_s: float, noise_deg: float, outer_nm: float) -> Measured:
         """Returns the drive's measurements at the end of a cycle, from the state of the loops."""
-        (
-            motor_deg,
-            sampled_motor_deg,
-            load_deg,
-            sampled_load_deg,
-            body_deg,
-            output_deg,
-            measured_deg_s,
-            weight_nm,
-            torque_nm,
-            torque_squares,
-            friction_j,
-        ) = seen
-        heat = self.heat
+        heat, loops, plant = self.heat, self.loops, self.loops.plant
         if elapsed_s > 0.0:
-            heat.warm(torque_squares, friction_j, elapsed_s)
-        motor_reading = self._motor_reading(sampled_motor_deg)
-        read_deg = sampled_load_deg + self._load_errors.at_deg(sampled_load_deg) + body_deg + noise_deg
+            heat.warm(loops.torque_squares, plant.loss_j, elapsed_s)
+        plant.loss_j = 0.0
+        motor_reading = self._motor_reading(loops.sampled_motor_deg())
+        load_deg = loops.sampled_load_deg()
+        read_deg = load_deg + self._load_errors.at_deg(load_deg) + loops.body.deg + noise_deg
         load_reading = read_deg * self._load_counts_per_deg + self._load_zero
         load_reading += self._load_losses.counts(heat.since_s)
-        return (
+        return Measured(
             motor_reading,
             load_reading,
-            self._motor_sense * torque_nm,
-            round(self._sense_permille * torque_nm / self._rated_nm),
+            self._motor_sense * loops.torque_nm,
+            round(self._sense_permille * loops.torque_nm / self._rated_nm),
             heat.body_c,
-            self._torque_sense * (weight_nm + outer_nm),
+            self._torque_sense * (plant.weight_nm(plant.now.load_deg) + outer_nm),
             # Multi-turn, never wrapped. The middle of a count is its angle.
             math.floor(motor_reading + 0.5),
             math.floor(load_reading + 0.5),
-            measured_deg_s * self.motor_counts_per_deg,
+            loops.servo.measured_deg_s * self.motor_counts_per_deg,
             heat.since_s,
-            motor_deg,
-            load_deg,
-            output_deg,
+            plant.now.motor_deg,
+            plant.now.load_deg,
+            plant.output_deg,
         )
 
     def _motor_reading(self, motor_deg: float) -> float:

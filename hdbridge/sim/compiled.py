@@ -26,7 +26,7 @@ from numba.core.typing.arraydecl import RecordAttribute
 from numba.extending import overload, overload_method
 
 from hdbridge.sim import ageing, encoder, gear, gear_pieces, hysteresis_laws
-from hdbridge.sim.axis import Axis, Told
+from hdbridge.sim.axis import Axis, Measured
 from hdbridge.sim.fast import FloatArray, IntArray
 from hdbridge.sim.plant import Plant
 from hdbridge.sim.state import STATES
@@ -63,10 +63,8 @@ KINDS: Final[dict[Any, Kinds]] = {
     gear.Piece: Kinds(
         (
             gear.MotorOrders,
-            gear.VaryingOrders,
             gear.LoadOrders,
             gear.ElasticHysteresis,
-            gear.VaryingHysteresis,
             gear.ZeroDrift,
             gear.SlowZeroDrift,
             gear_pieces.Wear,
@@ -76,7 +74,7 @@ KINDS: Final[dict[Any, Kinds]] = {
             gear_pieces.Damage,
             gear_pieces.Roller,
         ),
-        13,
+        11,
         0.0,
     ),
     gear.Factor: Kinds(
@@ -103,20 +101,10 @@ class CompiledAxis:
         self._entry_point = partial(_entry_point, plant, room)
         self._drive = self._entry_point("drive")
 
-    def drive(
-        self,
-        start_counts: float,
-        end_counts: float,
-        substeps: int,
-        limit_nm: float,
-        noise_deg: float,
-        outer_nm: float,
-    ) -> Told:
+    def drive(self, *inputs: float) -> Measured:
         """Runs a closed-loop cycle; see `Axis`."""
-        told: Told = self._drive(
-            self._record, start_counts, end_counts, substeps, limit_nm, noise_deg, outer_nm
-        )
-        return told
+        measured: Measured = self._drive(self._record, *inputs)
+        return measured
 
     def drive_all(
         self,
@@ -127,24 +115,20 @@ class CompiledAxis:
         outer_nm: FloatArray,
         held_nm: FloatArray,
         told: FloatArray,
-    ) -> Told:
+    ) -> Measured:
         """Runs `Axis.drive` over many cycles, each from the demand before it, and first held by ``held_nm``.
 
         ``told`` receives the first six values of each cycle (`machine.Cycles`).
         """
-        last: Told = _methods()["drive_all"](
+        last: Measured = _methods()["drive_all"](
             self._record, counts, substeps, limit_nm, noise_deg, outer_nm, held_nm, told
         )
         return last
 
-    def roll(
-        self, brake_nm: float, substeps: int, limit_nm: float, noise_deg: float, outer_nm: float
-    ) -> Told:
+    def roll(self, *inputs: float) -> Measured:
         """Runs a cycle with the power stage off; see `Axis`."""
-        told: Told = self._entry_point("roll")(
-            self._record, brake_nm, substeps, limit_nm, noise_deg, outer_nm
-        )
-        return told
+        measured: Measured = self._entry_point("roll")(self._record, *inputs)
+        return measured
 
     def hold(self, torque_nm: float) -> None:
         """Sets the holding torque; see `Axis`."""

@@ -51,7 +51,6 @@ class Disc:
         self._oval_rad = math.radians(truth.oval_at_deg)
 
     def error_deg(self, shaft_deg: float) -> float:
-        """See `ReadingError`."""
         angle = math.radians(shaft_deg)
         turned, e = angle - self._eccentric_rad, self._relative
         off = math.atan2(e * math.sin(turned), 1.0 + e * math.cos(turned))
@@ -81,7 +80,6 @@ class Signals:
         self._third = truth.third_harmonic
 
     def error_deg(self, shaft_deg: float) -> float:
-        """See `ReadingError`."""
         phase = math.fmod(shaft_deg * self._lines, 360.0) * (math.pi / 180.0)
         sine = self._gain * math.sin(phase) - self._third * math.sin(3.0 * phase) + self._sine_offset
         cosine = math.cos(phase + self._phase_rad) + self._third * math.cos(3.0 * phase) + self._cosine_offset
@@ -108,7 +106,6 @@ class Cable:
         self._way = 0.0
 
     def error_deg(self, shaft_deg: float) -> float:
-        """See `ReadingError`."""
         if self._led:
             travel = (shaft_deg - self._last_deg) / BACK_DEG
             self._way = min(1.0, max(-1.0, self._way + travel))
@@ -140,7 +137,6 @@ class SensorWarming:
         self._shift_deg = 0.0
 
     def error_deg(self, shaft_deg: float) -> float:
-        """See `ReadingError`."""
         if self._led:
             speed_deg_s = abs(shaft_deg - self._last_deg) / self._interval_s
             goal_deg = self._goal * speed_deg_s**self._exponent

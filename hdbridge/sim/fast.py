@@ -10,13 +10,16 @@ from __future__ import annotations
 import copy
 import importlib.util
 import os
-from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from hdbridge.sim.axis import Axis, Told
+    from hdbridge.sim.axis import Axis
+    from hdbridge.sim.compiled import CompiledAxis
     from hdbridge.sim.plant import Plant
+
+    AnyAxis: TypeAlias = Axis | CompiledAxis
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
@@ -28,40 +31,6 @@ SWITCH: Final = "HDBRIDGE_COMPILE"
 """Environment variable that keeps everything in Python if it is ``0``."""
 _PROOF_CYCLES: Final = 100
 _PROOF_STEP_DEG: Final = 0.9
-
-
-class AnyAxis(Protocol):
-    """Interface of `Axis`, compiled or not."""
-
-    def drive(
-        self,
-        start_counts: float,
-        end_counts: float,
-        substeps: int,
-        limit_nm: float,
-        noise_deg: float,
-        outer_nm: float,
-    ) -> Told: ...
-    def roll(
-        self, brake_nm: float, substeps: int, limit_nm: float, noise_deg: float, outer_nm: float
-    ) -> Told: ...
-    def hold(self, torque_nm: float) -> None: ...
-
-
-@runtime_checkable
-class EvenAxis(AnyAxis, Protocol):
-    """Interface of an `Axis` that runs many cycles in one call; see `compiled.CompiledAxis`."""
-
-    def drive_all(
-        self,
-        counts: FloatArray,
-        substeps: IntArray,
-        limit_nm: float,
-        noise_deg: FloatArray,
-        outer_nm: FloatArray,
-        held_nm: FloatArray,
-        told: FloatArray,
-    ) -> Told: ...
 
 
 class _Waiting:

@@ -41,8 +41,10 @@ class Factor(Protocol):
 class Piece(Protocol):
     """One cause of transmission error, with its state."""
 
-    BY_MOTOR_ONLY: ClassVar[bool]
-    """True if it cannot change while the motor stands still."""
+    @property
+    def by_motor_only(self) -> bool:
+        """True if it cannot change while the motor stands still."""
+        ...
 
     def arcsec(self, now: Conditions) -> float:
         """Returns its part of the output error under the new conditions, arcsec."""
@@ -51,45 +53,37 @@ class Piece(Protocol):
 
 @state
 class MotorOrders:
-    """Tooth error by motor angle, or by the angle between wave generator and flexspline."""
+    """Tooth error by motor angle, or by the angle between wave generator and flexspline.
 
-    BY_MOTOR_ONLY: ClassVar[bool] = True
-    _orders: Orders
-    _rad_per_deg: float
+    It may also depend on the loaded flank, the torque and the temperature.
+    """
 
-    def __init__(self, orders: tuple[TrueOrder, ...], turns: float) -> None:
-        self._orders = Orders(orders)
-        self._rad_per_deg = math.radians(turns)
-
-    def arcsec(self, now: Conditions) -> float:
-        """See `Piece`."""
-        return self._orders.at(now.motor_deg * self._rad_per_deg)
-
-
-@state
-class VaryingOrders:
-    """Tooth error by motor angle that also depends on the loaded flank, the torque and the temperature."""
-
-    BY_MOTOR_ONLY: ClassVar[bool] = False
+    by_motor_only: bool
     _factors: tuple[Factor, ...]
     _flank: Flank
     _flanked: bool
     _orders: Orders
+    _rad_per_deg: float
 
     def __init__(
-        self, orders: tuple[TrueOrder, ...], flank: TrueFlank | None, factors: tuple[Factor, ...]
+        self,
+        orders: tuple[TrueOrder, ...],
+        turns: float = 1.0,
+        flank: TrueFlank | None = None,
+        factors: tuple[Factor, ...] = (),
     ) -> None:
         self._orders = Orders(orders)
+        self._rad_per_deg = math.radians(turns)
         self._flanked = flank is not None
         self._flank = Flank(flank if flank is not None else TrueFlank(shift_deg=0.0, travel_deg=1.0))
         self._factors = factors
+        self.by_motor_only = flank is None and not factors
 
     def arcsec(self, now: Conditions) -> float:
-        """See `Piece`."""
         angle_deg = now.motor_deg
         if self._flanked:
             angle_deg += self._flank.shift_deg(angle_deg)
-        error = self._orders.at(math.radians(angle_deg))
+        error = self._orders.at(angle_deg * self._rad_per_deg)
         for factor in self._factors:
             error *= factor.factor(now)
         return error
@@ -99,46 +93,30 @@ class VaryingOrders:
 class LoadOrders:
     """Tooth error by load angle."""
 
-    BY_MOTOR_ONLY: ClassVar[bool] = False
+    by_motor_only: ClassVar[bool] = False
     _orders: Orders
 
     def __init__(self, orders: tuple[TrueOrder, ...]) -> None:
         self._orders = Orders(orders)
 
     def arcsec(self, now: Conditions) -> float:
-        """See `Piece`."""
         return self._orders.at(math.radians(now.load_deg))
 
 
 @state
 class ElasticHysteresis:
-    """Elastic hysteresis, by the travel of the motor."""
+    """Elastic hysteresis, by the travel of the motor; it may also depend on speed, temperature or age."""
 
-    BY_MOTOR_ONLY: ClassVar[bool] = True
-    _law: Law
-
-    def __init__(self, law: Law) -> None:
-        self._law = law
-
-    def arcsec(self, now: Conditions) -> float:
-        """See `Piece`."""
-        return self._law.advance(now.motor_deg)
-
-
-@state
-class VaryingHysteresis:
-    """Elastic hysteresis that also depends on speed, temperature or age."""
-
-    BY_MOTOR_ONLY: ClassVar[bool] = False
+    by_motor_only: bool
     _factors: tuple[Factor, ...]
     _law: Law
 
     def __init__(self, law: Law, factors: tuple[Factor, ...]) -> None:
         self._law = law
         self._factors = factors
+        self.by_motor_only = not factors
 
     def arcsec(self, now: Conditions) -> float:
-        """See `Piece`."""
         error = self._law.advance(now.motor_deg)
         for factor in self._factors:
             error *= factor.factor(now)
@@ -149,7 +127,7 @@ class VaryingHysteresis:
 class ZeroDrift:
     """Shift proportional to the temperature."""
 
-    BY_MOTOR_ONLY: ClassVar[bool] = False
+    by_motor_only: ClassVar[bool] = False
     _ambient_c: float
     _arcsec_per_k: float
 
@@ -158,7 +136,6 @@ class ZeroDrift:
         self._arcsec_per_k = arcsec_per_k
 
     def arcsec(self, now: Conditions) -> float:
-        """See `Piece`."""
         return self._arcsec_per_k * (now.temperature_c - self._ambient_c)
 
 
@@ -166,7 +143,7 @@ class ZeroDrift:
 class SlowZeroDrift:
     """Shift by the temperature of a housing that lags the measured one."""
 
-    BY_MOTOR_ONLY: ClassVar[bool] = False
+    by_motor_only: ClassVar[bool] = False
     _ambient_c: float
     _arcsec_per_k: float
     _housing_c: float
@@ -179,7 +156,6 @@ class SlowZeroDrift:
         self._nearer = nearer
 
     def arcsec(self, now: Conditions) -> float:
-        """See `Piece`."""
         self._housing_c += (now.temperature_c - self._housing_c) * self._nearer
         return self._arcsec_per_k * (self._housing_c - self._ambient_c)
 
@@ -224,9 +200,7 @@ def _motor_orders(truth: Truth) -> Piece:
     torque = TorqueFactor(gear.torque_growth_per_nm) if gear.torque_growth_per_nm else None
     warmth = warmth_factor(truth, truth.temperature.tooth_growth_per_k)
     factors = tuple(factor for factor in (torque, warmth) if factor is not None)
-    if flank is None and not factors:
-        return MotorOrders(gear.motor_orders, 1.0)
-    return VaryingOrders(gear.motor_orders, flank, factors)
+    return MotorOrders(gear.motor_orders, flank=flank, factors=factors)
 
 
 def _hysteresis(truth: Truth) -> list[Piece]:
@@ -241,7 +215,7 @@ def _hysteresis(truth: Truth) -> list[Piece]:
         ageing = gear.ageing if gear.ageing is not None and gear.ageing.hysteresis_growth else None
         age = AgeFactor(ageing, truth.substep_s) if ageing is not None else None
         factors = tuple(factor for factor in (rate, warmth, age) if factor is not None)
-        pieces.append(VaryingHysteresis(law, factors) if factors else ElasticHysteresis(law))
+        pieces.append(ElasticHysteresis(law, factors))
     return pieces
 
 
@@ -269,7 +243,7 @@ class Gear:
         pieces = pieces_of(truth)
         self._ratio = truth.gear.ratio
         self._pieces = tuple(pieces)
-        self.by_motor_only = all(piece.BY_MOTOR_ONLY for piece in pieces)
+        self.by_motor_only = all(piece.by_motor_only for piece in pieces)
         """True if the output cannot change while the motor stands still."""
 
     def turned_deg(self, now: Conditions) -> float:

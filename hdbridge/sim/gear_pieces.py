@@ -114,7 +114,7 @@ class WarmthFactor:
 class Wear:
     """Lost motion between the teeth: the output lags in either direction, and the lag grows with wear."""
 
-    BY_MOTOR_ONLY: ClassVar[bool] = True
+    by_motor_only: ClassVar[bool] = True
     _exponent: float
     _follower_deg: float
     _last_deg: float
@@ -131,7 +131,6 @@ class Wear:
         self._follower_deg = 0.0
 
     def arcsec(self, now: Conditions) -> float:
-        """See `Piece`."""
         motor_deg = now.motor_deg
         self._turns += abs(motor_deg - self._last_deg) / DEG_PER_TURN
         self._last_deg = motor_deg
@@ -149,7 +148,7 @@ class Creep:
     after a stop. A torque at the load acts for as long as it lasts.
     """
 
-    BY_MOTOR_ONLY: ClassVar[bool] = False
+    by_motor_only: ClassVar[bool] = False
     _amplitudes: tuple[float, ...]
     _dt: float
     _last_deg: float
@@ -166,7 +165,6 @@ class Creep:
         self._last_deg = 0.0
 
     def arcsec(self, now: Conditions) -> float:
-        """See `Piece`."""
         speed_deg_s = (now.motor_deg - self._last_deg) / self._dt
         self._last_deg = now.motor_deg
         sliding = speed_deg_s / (abs(speed_deg_s) + SLIDING_DEG_S)
@@ -184,7 +182,7 @@ class Creep:
 class Jumps:
     """Jumped teeth, each over its duration."""
 
-    BY_MOTOR_ONLY: ClassVar[bool] = False
+    by_motor_only: ClassVar[bool] = False
     _dt: float
     _duration_s: tuple[float, ...]
     _step: int
@@ -201,7 +199,6 @@ class Jumps:
         self._step = -1
 
     def arcsec(self, now: Conditions) -> float:
-        """See `Piece`."""
         self._step += 1
         time_s = self._step * self._dt
         done = 0.0
@@ -216,7 +213,7 @@ class Jumps:
 class Damage:
     """Damaged teeth: smooth bumps by load angle."""
 
-    BY_MOTOR_ONLY: ClassVar[bool] = False
+    by_motor_only: ClassVar[bool] = False
     _at_deg: tuple[float, ...]
     _height: tuple[float, ...]
     _reach_deg: tuple[float, ...]
@@ -227,7 +224,6 @@ class Damage:
         self._height = tuple(each.height_arcsec for each in teeth)
 
     def arcsec(self, now: Conditions) -> float:
-        """See `Piece`."""
         error = 0.0
         for bump in range(len(self._height)):
             if self._height[bump]:
@@ -242,7 +238,7 @@ class Damage:
 class Roller:
     """Roller on the motor's hub: an error by its own angle, largest at the load angle that presses it on."""
 
-    BY_MOTOR_ONLY: ClassVar[bool] = False
+    by_motor_only: ClassVar[bool] = False
     _amplitude: float
     _order: float
     _phase_rad: float
@@ -257,7 +253,6 @@ class Roller:
         self._sharpness = truth.sharpness
 
     def arcsec(self, now: Conditions) -> float:
-        """See `Piece`."""
         pressed = 0.5 * (1.0 + math.cos(math.radians(now.load_deg - self._pressed_at_deg)))
         turned = math.radians(now.motor_deg * self._order) + self._phase_rad
         return float(self._amplitude * pressed**self._sharpness * math.cos(turned))
@@ -266,7 +261,7 @@ class Roller:
 class Seat:
     """Bearing ring that is carried along by the motion and slips back at random angles."""
 
-    BY_MOTOR_ONLY: ClassVar[bool] = True
+    by_motor_only: ClassVar[bool] = True
 
     def __init__(self, truth: TrueSeat) -> None:
         self._random = random.Random(f"seat {truth.seed}")
@@ -277,7 +272,6 @@ class Seat:
         self._slips_at = self._drawn()
 
     def arcsec(self, now: Conditions) -> float:
-        """See `Piece`."""
         self._carried += self._per_deg * (now.motor_deg - self._last_deg)
         self._last_deg = now.motor_deg
         if abs(self._carried) > self._slips_at:

@@ -64,7 +64,6 @@ class RollingFrictionLaw:
         self._saturated = False
 
     def advance(self, motor_deg: float) -> float:
-        """See `Law`."""
         before_deg = self._motor_deg
         if motor_deg == before_deg:
             return self._error
@@ -111,7 +110,6 @@ class MaxwellSlipLaw:
         self._error = 0.0
 
     def advance(self, motor_deg: float) -> float:
-        """See `Law`."""
         travel = motor_deg - self._motor_deg
         if travel == 0.0:
             return self._error
@@ -155,7 +153,6 @@ class BoucWenLaw:
         self._z = 0.0
 
     def advance(self, motor_deg: float) -> float:
-        """See `Law`."""
         travel = (motor_deg - self._motor_deg) / self._yield
         z = self._z
         if travel != 0.0:
@@ -192,7 +189,6 @@ class DahlLaw:
         self._z = 0.0
 
     def advance(self, motor_deg: float) -> float:
-        """See `Law`."""
         travel = (motor_deg - self._motor_deg) / self._yield
         if travel != 0.0:
             self._motor_deg = motor_deg

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hdbridge.sim import fast
-from hdbridge.sim.axis import Axis, Told
+from hdbridge.sim.axis import Axis, Measured
 from hdbridge.sim.response import Response
 from hdbridge.sim.truth import Truth
 from hdbridge.units import ARCSEC_PER_DEG
@@ -32,36 +32,24 @@ class Cycles(NamedTuple):
 
 
 class Machine:
-    """Servo axis, initially at rest at the angle zero with its power stage off."""
+    """Servo axis, initially at rest at the angle zero with its power stage off.
 
-    motor_counts: int
-    """Motor encoder: whole counts, multi-turn, never wrapped. The middle of a count is its angle."""
-    load_counts: int
-    """Load encoder: whole counts, multi-turn, never wrapped; includes noise."""
-    torque_permille: int
-    """Motor torque, in thousandths of the rated one, in the sense of the motor encoder."""
+    It has the attributes of `Measured`.
+    """
+
     motor_reading: float
-    """Motor encoder in counts, before rounding."""
     load_reading: float
-    """Load encoder in counts, before rounding."""
-    velocity_counts_s: float
-    """Motor speed as measured by the drive."""
     torque_nm: float
-    """Motor torque, not rounded, in the sense of the motor encoder."""
+    torque_permille: int
     temperature_c: float
-    """Temperature of motor and gear."""
     load_torque_nm: float
-    """Torque of gravity and external torque on the load, as measured at the load's flange, with the sign
-    that the truth file states. Friction of the gear's bearings and the load's inertia are not
-    included."""
+    motor_counts: int
+    load_counts: int
+    velocity_counts_s: float
     elapsed_s: float
-    """Time since the axis was switched on."""
     true_motor_deg: float
-    """True motor angle, for tests."""
     true_load_deg: float
-    """True load angle, for tests."""
     true_output_deg: float
-    """True output of the gear before its spring, for tests: the angle at which the load comes to rest."""
 
     def __init__(self, truth: Truth, seed: int, *, may_compile: bool = False, loaded: bool = False) -> None:
         """``may_compile`` allows a pause of some seconds, after which it runs faster; see `sim.fast`.
@@ -121,7 +109,7 @@ class Machine:
         held_nm = np.full(len(substeps), np.nan) if held_nm is None else held_nm
         told = np.empty((len(substeps), len(Cycles._fields)))
         for cycle, count in enumerate(substeps):
-            if isinstance(self._axis, fast.EvenAxis) and min(substeps[cycle:]) > 0:
+            if not isinstance(self._axis, Axis) and min(substeps[cycle:]) > 0:
                 counts, torque_nm = self._responded(counts, substeps, cycle)
                 noise_deg = np.zeros(len(substeps) - cycle)
                 if self._noise_deg:
@@ -180,7 +168,7 @@ class Machine:
         """Returns a sample of the load encoder's noise."""
         return self._noise.gauss(0.0, self._noise_deg) if self._noise_deg else 0.0
 
-    def _take(self, told: Told) -> None:
+    def _take(self, measured: Measured) -> None:
         """Stores the axis's measurements after a cycle."""
         (
             self.motor_reading,
@@ -196,7 +184,7 @@ class Machine:
             self.true_motor_deg,
             self.true_load_deg,
             self.true_output_deg,
-        ) = told
+        ) = measured
         if self._response is not None and self._response.torque_nm:
             self.torque_nm += self._sense * self._response.torque_nm
             self.torque_permille = round(1000.0 * self.torque_nm / self._rated_nm)

@@ -8,7 +8,7 @@ other temperature the drift would come with an apparent change of the model's ow
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final, Self
+from typing import Final, Self
 
 import numpy as np
 from pydantic import Field
@@ -142,16 +142,12 @@ class AmplitudeDrift(Modulating, Warmed):
     """Growth of 0.5 % per kelvin, with a falling loop."""
 
     orders: Orders
-    loop: Annotated[Loop, Field(description="the model's loop")]
-    under_load: Annotated[
-        TorqueGrowth | None, Field(description="growth of the model's orders with torque (torque_modulation)")
-    ] = None
-    ripple_percent_per_k: Annotated[
-        float, Field(ge=-10, le=10, description="growth of the orders per kelvin")
-    ]
-    friction_percent_per_k: Annotated[
-        float, Field(ge=-10, le=10, description="growth of the loop per kelvin")
-    ]
+    loop: Loop = Field(description="the model's loop")
+    under_load: TorqueGrowth | None = Field(
+        None, description="growth of the model's orders with torque (torque_modulation)"
+    )
+    ripple_percent_per_k: float = Field(ge=-10, le=10, description="growth of the orders per kelvin")
+    friction_percent_per_k: float = Field(ge=-10, le=10, description="growth of the loop per kelvin")
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

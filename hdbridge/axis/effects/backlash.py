@@ -1,7 +1,7 @@
 """Dead zone behind the gear: a loose key, a worn coupling, a gear stage on the output."""
 
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -57,10 +57,10 @@ class Backlash(Linear):
     linear = ("gap_arcsec",)
     typical = {"gap_arcsec": 10.0, "crossing_deg": 0.02}
 
-    gap_arcsec: Annotated[float, Field(ge=0, le=3600, description="width of the dead zone, at the load")]
-    crossing_deg: Annotated[
-        float, Field(gt=0, le=360, description="motor angle that crosses it; at least gap N / 3600")
-    ]
+    gap_arcsec: float = Field(ge=0, le=3600, description="width of the dead zone, at the load")
+    crossing_deg: float = Field(
+        gt=0, le=360, description="motor angle that crosses it; at least gap N / 3600"
+    )
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

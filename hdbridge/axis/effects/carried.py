@@ -6,7 +6,7 @@ created; `combine.refreshed` keeps the copy up to date.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 from pydantic import Field
 
@@ -23,12 +23,12 @@ from hdbridge.strictness import Strict
 class Loop(Strict):
     """The modulated elastic loop: parameters of `hysteresis`, and the law it follows."""
 
-    offset_arcsec: Annotated[
-        float, Field(ge=-3600, le=3600, description="half the height, at the load; negative where it lags")
-    ]
-    width_deg: Annotated[float, Field(gt=0, le=3600, description="motor angle of a full crossing")]
-    exponent: Annotated[float, Field(gt=1, le=6, description="shape n of the branch")]
-    memory: Annotated[bool, Field(description="with return-point memory (hysteresis_memory)")] = False
+    offset_arcsec: float = Field(
+        ge=-3600, le=3600, description="half the height, at the load; negative where it lags"
+    )
+    width_deg: float = Field(gt=0, le=3600, description="motor angle of a full crossing")
+    exponent: float = Field(gt=1, le=6, description="shape n of the branch")
+    memory: bool = Field(False, description="with return-point memory (hysteresis_memory)")
 
     def law(self) -> Hysteresis | HysteresisMemory:
         kind = HysteresisMemory if self.memory else Hysteresis

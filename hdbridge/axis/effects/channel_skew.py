@@ -1,7 +1,7 @@
 """Time skew between the samples of the two encoders."""
 
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -54,24 +54,17 @@ class ChannelSkew(Angleless, Linear):
     typical = {"delay_ms": 0.5, "second_order_ms2": 0.25}
 
     ratio: Ratio
-    delay_ms: Annotated[
-        float,
-        Field(ge=-1000, le=1000, description="how much later the load encoder is sampled than the motor's"),
-    ]
-    second_order_ms2: Annotated[
-        float,
-        Field(
-            ge=-1e6,
-            le=1e6,
-            description="coefficient of half the acceleration; delay squared for a pure delay",
-        ),
-    ] = 0.0
-    limit_deg_s: Annotated[float, Field(gt=0, le=1e6, description="motor speed beyond which it is held")] = (
-        1e5
+    delay_ms: float = Field(
+        ge=-1000, le=1000, description="how much later the load encoder is sampled than the motor's"
     )
-    limit_deg_s2: Annotated[
-        float, Field(gt=0, le=1e8, description="motor acceleration beyond which it is held")
-    ] = 1e6
+    second_order_ms2: float = Field(
+        0.0,
+        ge=-1e6,
+        le=1e6,
+        description="coefficient of half the acceleration; delay squared for a pure delay",
+    )
+    limit_deg_s: float = Field(1e5, gt=0, le=1e6, description="motor speed beyond which it is held")
+    limit_deg_s2: float = Field(1e6, gt=0, le=1e8, description="motor acceleration beyond which it is held")
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

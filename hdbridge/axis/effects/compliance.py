@@ -60,17 +60,14 @@ class Compliance(Angleless, Linear):
     }
     """Size 20, ratio 50: K1, K2, K3 of 1.3, 1.8 and 2.3e4 Nm/rad, T1 and T2 of 7 and 25 Nm."""
 
-    c1_arcsec_per_nm: Annotated[
-        _Softness, Field(description="compliance up to T1: 206265 / K1, K1 in Nm/rad")
-    ]
-    c2_arcsec_per_nm: Annotated[_Softness, Field(description="compliance from T1 to T2")]
-    c3_arcsec_per_nm: Annotated[_Softness, Field(description="compliance beyond T2")]
-    torque1_nm: Annotated[float, Field(gt=0, le=1e5, description="T1")]
-    torque2_nm: Annotated[float, Field(gt=0, le=1e5, description="T2, above T1")]
-    sense: Annotated[
-        Literal[1, -1],
-        Field(description="1: a positive torque pushes the load forward; -1: it is what the gear delivers"),
-    ] = 1
+    c1_arcsec_per_nm: _Softness = Field(description="compliance up to T1: 206265 / K1, K1 in Nm/rad")
+    c2_arcsec_per_nm: _Softness = Field(description="compliance from T1 to T2")
+    c3_arcsec_per_nm: _Softness = Field(description="compliance beyond T2")
+    torque1_nm: float = Field(gt=0, le=1e5, description="T1")
+    torque2_nm: float = Field(gt=0, le=1e5, description="T2, above T1")
+    sense: Literal[1, -1] = Field(
+        1, description="1: a positive torque pushes the load forward; -1: it is what the gear delivers"
+    )
     torque: TorqueChannel = "load_torque_nm"
     limit_nm: TorqueLimit = 1000.0
 

@@ -1,7 +1,7 @@
 """Counts lost by an encoder, or a tooth jumped: a persistent step at one time."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -28,8 +28,8 @@ NEAR_S, LEAST_NEAR = 1.0, 5
 class Step(Strict):
     """One loss: from this time on the error is larger by its size."""
 
-    time_s: Annotated[float, Field(ge=-1e10, le=1e10, description="when it happened, on the record's clock")]
-    size_arcsec: Annotated[float, Field(ge=-1e6, le=1e6, description="the step, at the load")]
+    time_s: float = Field(ge=-1e10, le=1e10, description="when it happened, on the record's clock")
+    size_arcsec: float = Field(ge=-1e6, le=1e6, description="the step, at the load")
 
 
 class CountLoss(Angleless):
@@ -63,9 +63,9 @@ class CountLoss(Angleless):
     typical = {"steps": (Step(time_s=0.0, size_arcsec=10.0),)}
     """One step of 10 arcsec at time zero."""
 
-    steps: Annotated[
-        tuple[Step, ...], Field(min_length=1, max_length=100, description="losses: time_s, size_arcsec each")
-    ]
+    steps: tuple[Step, ...] = Field(
+        min_length=1, max_length=100, description="losses: time_s, size_arcsec each"
+    )
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -32,10 +32,10 @@ RESTS = 3.0
 class Relaxation(Strict):
     """One exponential."""
 
-    amplitude_arcsec: Annotated[
-        float, Field(ge=-3600, le=3600, description="strain after a long move forward, at the load")
-    ]
-    tau_s: Annotated[float, Field(gt=0, le=1e6, description="time constant at rest")]
+    amplitude_arcsec: float = Field(
+        ge=-3600, le=3600, description="strain after a long move forward, at the load"
+    )
+    tau_s: float = Field(gt=0, le=1e6, description="time constant at rest")
 
 
 class Creep(Effect):
@@ -74,13 +74,12 @@ class Creep(Effect):
         "build_up": 0.1,
     }
 
-    parts: Annotated[
-        tuple[Relaxation, ...],
-        Field(min_length=1, max_length=8, description="exponentials: amplitude_arcsec, tau_s each"),
-    ]
-    build_up: Annotated[
-        float, Field(gt=0, le=10, description="time constants in motion, relative to those at rest")
-    ] = 1.0
+    parts: tuple[Relaxation, ...] = Field(
+        min_length=1, max_length=8, description="exponentials: amplitude_arcsec, tau_s each"
+    )
+    build_up: float = Field(
+        1.0, gt=0, le=10, description="time constants in motion, relative to those at rest"
+    )
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

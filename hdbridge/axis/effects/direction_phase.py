@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -52,10 +52,9 @@ class DirectionPhase(Modulating):
     """A shift of 1 degree of the base's orders."""
 
     orders: Orders
-    shift_deg: Annotated[
-        float,
-        Field(ge=-45, le=45, description="shift of the motor angle, forward ahead of backward by twice this"),
-    ]
+    shift_deg: float = Field(
+        ge=-45, le=45, description="shift of the motor angle, forward ahead of backward by twice this"
+    )
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

@@ -12,7 +12,7 @@ inverse uses a slope that it can invert (`gentle_tracker`).
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -67,16 +67,13 @@ class ElasticLoop(Effect):
     drifting = ("offset_arcsec",)
     """The offset, because preload settles and friction changes; width and exponent stay."""
 
-    offset_arcsec: Annotated[
-        float,
-        Field(
-            ge=-3600,
-            le=3600,
-            description="half the height of the loop, at the load; negative where the load lags",
-        ),
-    ]
-    width_deg: Annotated[float, Field(gt=0, le=3600, description="motor angle that a full crossing takes")]
-    exponent: Annotated[float, Field(gt=1, le=6, description="shape n of the branch")]
+    offset_arcsec: float = Field(
+        ge=-3600,
+        le=3600,
+        description="half the height of the loop, at the load; negative where the load lags",
+    )
+    width_deg: float = Field(gt=0, le=3600, description="motor angle that a full crossing takes")
+    exponent: float = Field(gt=1, le=6, description="shape n of the branch")
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         return self.offset_arcsec * self._loop(motion.motor_deg, start)

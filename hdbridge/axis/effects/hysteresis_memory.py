@@ -47,8 +47,7 @@ class HysteresisMemory(ElasticLoop):
         title="hysteresis with return-point memory",
         subject="hysteresis",
         equation="theta_rev + sgn(omega) 2 offset g(|theta_M - theta_M,rev| / width) from each reversal; "
-        "back at the angle "
-        "of the reversal before, both are forgotten and the outer branch goes on",
+        "back at the angle of the reversal before, both are forgotten and the outer branch goes on",
         signature="nested loops close; the plain law misses by 10 to 30 arcsec after small back-steps",
         consequence="after a small move back and forth the plain law predicts another position",
         remedy="use this law in place of the plain one",

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
 import numpy as np
 from pydantic import Field
@@ -42,12 +42,10 @@ class HysteresisParameters(Effect):
     changes = Part.LOOP
     shape = Hysteresis.shape
 
-    base: Annotated[Loop, Field(description="the model's loop")]
-    offset_arcsec: Annotated[
-        float, Field(ge=-3600, le=3600, description="new offset; negative where the load lags")
-    ]
-    width_deg: Annotated[float, Field(gt=0, le=3600, description="new width")]
-    exponent: Annotated[float, Field(gt=1, le=6, description="new exponent")]
+    base: Loop = Field(description="the model's loop")
+    offset_arcsec: float = Field(ge=-3600, le=3600, description="new offset; negative where the load lags")
+    width_deg: float = Field(gt=0, le=3600, description="new width")
+    exponent: float = Field(gt=1, le=6, description="new exponent")
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

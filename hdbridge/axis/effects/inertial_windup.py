@@ -1,7 +1,7 @@
 """Wind-up of the gear by the load's own inertia during acceleration."""
 
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -42,12 +42,10 @@ class InertialWindup(Angleless, Linear):
     """A resonance at 50 Hz."""
 
     ratio: Ratio
-    inertia_over_stiffness_s2: Annotated[
-        float, Field(ge=0, le=0.1, description="J / K at the load, 1 / (2 pi f)^2 of its resonance")
-    ]
-    limit_deg_s2: Annotated[
-        float, Field(gt=0, le=1e8, description="motor acceleration beyond which it is held")
-    ] = 1e6
+    inertia_over_stiffness_s2: float = Field(
+        ge=0, le=0.1, description="J / K at the load, 1 / (2 pi f)^2 of its resonance"
+    )
+    limit_deg_s2: float = Field(1e6, gt=0, le=1e8, description="motor acceleration beyond which it is held")
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

@@ -53,10 +53,9 @@ class LoadOrders(OrderSeries):
     searched = range(1, 5)
 
     ratio: Ratio
-    origin: Annotated[
-        Literal["unknown", "gear", "load_encoder"],
-        Field(description="where it comes from; only the gear's is compensated"),
-    ] = "unknown"
+    origin: Literal["unknown", "gear", "load_encoder"] = Field(
+        "unknown", description="where it comes from; only the gear's is compensated"
+    )
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
         return replace(over.load_angle(motion, ratio), bins=120)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -61,11 +61,9 @@ class LocalDefect(Momentary, Linear):
     """Height of 5 arcsec, tooth half width of 3.6 degrees."""
 
     ratio: Ratio
-    height_arcsec: Annotated[float, Field(ge=-3600, le=3600, description="height of the bump")]
-    centre_deg: Annotated[float, Field(ge=-360, le=360, description="load angle of its centre")]
-    half_width_deg: Annotated[
-        float, Field(gt=0, le=180, description="load angle from its centre to its foot")
-    ]
+    height_arcsec: float = Field(ge=-3600, le=3600, description="height of the bump")
+    centre_deg: float = Field(ge=-360, le=360, description="load angle of its centre")
+    half_width_deg: float = Field(gt=0, le=180, description="load angle from its centre to its foot")
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

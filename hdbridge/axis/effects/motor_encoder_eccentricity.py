@@ -18,8 +18,7 @@ class MotorEncoderEccentricity(OrderSeries):
         title="eccentric motor encoder disc",
         subject="orders",
         equation="A_1 cos(theta_M + phi_1) + A_2 cos(2 theta_M + phi_2); A_1 = (e / r) / N for a disc of "
-        "radius r "
-        "that is out of centre by e",
+        "radius r that is out of centre by e",
         signature="order 1 (eccentric) and 2 (tilted or oval) of the motor angle",
         consequence="the drive follows the encoder, so motor and load really run ahead and behind once per "
         "motor turn",

@@ -29,9 +29,9 @@ _Phasor = TypeVar("_Phasor", complex, _ComplexArray)
 class MotorOrder(Strict):
     """One harmonic: amplitude * cos(order * angle + phase)."""
 
-    order: Annotated[int, Field(ge=1, le=1000, description="periods per turn")]
-    amplitude_arcsec: Annotated[float, Field(ge=0, le=3600, description="amplitude at the load")]
-    phase_deg: Annotated[float, Field(ge=-360, le=360, description="phase of the cosine")]
+    order: int = Field(ge=1, le=1000, description="periods per turn")
+    amplitude_arcsec: float = Field(ge=0, le=3600, description="amplitude at the load")
+    phase_deg: float = Field(ge=-360, le=360, description="phase of the cosine")
 
 
 Orders = Annotated[

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -39,12 +39,10 @@ class RateDependence(Modulating):
     typical = {"growth_percent": 10.0, "reference_deg_s": 30.0}
     """10 % per decade."""
 
-    loop: Annotated[Loop, Field(description="the model's loop")]
-    growth_percent: Annotated[float, Field(ge=0, le=200, description="growth per decade of speed")]
-    reference_deg_s: Annotated[float, Field(gt=0, le=1e5, description="motor speed from which on it grows")]
-    limit_deg_s: Annotated[float, Field(gt=0, le=1e6, description="motor speed beyond which it is held")] = (
-        20_000.0
-    )
+    loop: Loop = Field(description="the model's loop")
+    growth_percent: float = Field(ge=0, le=200, description="growth per decade of speed")
+    reference_deg_s: float = Field(gt=0, le=1e5, description="motor speed from which on it grows")
+    limit_deg_s: float = Field(20_000.0, gt=0, le=1e6, description="motor speed beyond which it is held")
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

@@ -1,7 +1,7 @@
 """Gear ratio that differs from the model's."""
 
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -47,8 +47,8 @@ class RatioError(Momentary, Linear):
     typical = {"ramp_arcsec_per_turn": 2.592}
     """0.01 % of a ratio of 50."""
 
-    ramp_arcsec_per_turn: Annotated[float, Field(ge=-1e6, le=1e6, description="ramp per motor turn")]
-    limit_deg: Annotated[float, Field(gt=0, le=1e9, description="motor angle beyond which it is held")] = 1e6
+    ramp_arcsec_per_turn: float = Field(ge=-1e6, le=1e6, description="ramp per motor turn")
+    limit_deg: float = Field(1e6, gt=0, le=1e9, description="motor angle beyond which it is held")
 
     def true_ratio(self, ratio: float) -> float:
         """Returns the ratio that would leave no ramp, for a model with ``ratio``."""

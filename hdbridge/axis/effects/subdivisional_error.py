@@ -2,7 +2,7 @@
 
 import cmath
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -58,7 +58,7 @@ class SubdivisionalError(HarmonicSum):
     typical = {"lines_per_turn": 9000, "orders": orders_from(_HARMONICS, 0.5)}
     """9000 lines, as an example; the real line count comes from a search or the data sheet."""
 
-    lines_per_turn: Annotated[int, Field(ge=16, le=10_000_000, description="signal periods per load turn")]
+    lines_per_turn: int = Field(ge=16, le=10_000_000, description="signal periods per load turn")
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

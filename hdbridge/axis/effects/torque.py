@@ -57,10 +57,10 @@ def beyond_limit(effects: Iterable[object], motion: Motion) -> tuple[str, ...]:
 class TorqueGrowth(Strict):
     """Growth of amplitudes with torque; `torque_modulation` has the same fields."""
 
-    growth_percent_per_nm: Annotated[
-        float, Field(ge=-1000, le=1000, description="growth of the amplitudes per Nm of the torque channel")
-    ]
-    signed: Annotated[bool, Field(description="grows with the torque rather than with its magnitude")] = False
+    growth_percent_per_nm: float = Field(
+        ge=-1000, le=1000, description="growth of the amplitudes per Nm of the torque channel"
+    )
+    signed: bool = Field(False, description="grows with the torque rather than with its magnitude")
     torque: TorqueChannel = "load_torque_nm"
     limit_nm: TorqueLimit = 100.0
 

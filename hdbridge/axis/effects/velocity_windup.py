@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -58,18 +58,12 @@ class VelocityWindup(Angleless, Linear):
     }
     """About 10 arcsec at 1000 motor degrees per second."""
 
-    coulomb_arcsec: Annotated[
-        float, Field(ge=0, le=3600, description="dry drag over stiffness, while it moves")
-    ]
-    viscous_arcsec_s_per_deg: Annotated[
-        float, Field(ge=0, le=100, description="slope at low speed, per motor degree per second")
-    ]
-    shear_deg_s: Annotated[
-        float, Field(gt=0, le=1e7, description="motor speed at which it has fallen off by half")
-    ]
-    limit_deg_s: Annotated[float, Field(gt=0, le=1e6, description="motor speed beyond which it is held")] = (
-        50_000.0
+    coulomb_arcsec: float = Field(ge=0, le=3600, description="dry drag over stiffness, while it moves")
+    viscous_arcsec_s_per_deg: float = Field(
+        ge=0, le=100, description="slope at low speed, per motor degree per second"
     )
+    shear_deg_s: float = Field(gt=0, le=1e7, description="motor speed at which it has fallen off by half")
+    limit_deg_s: float = Field(50_000.0, gt=0, le=1e6, description="motor speed beyond which it is held")
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

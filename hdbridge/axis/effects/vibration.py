@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -55,11 +55,9 @@ class Vibration(Angleless):
     typical = {"frequency_hz": 50.0, "amplitude_arcsec": 1.0, "phase_deg": 0.0}
     """1 arcsec at 50 Hz, as an example; the real frequency comes from a search."""
 
-    frequency_hz: Annotated[float, Field(gt=0, le=1e5, description="frequency")]
-    amplitude_arcsec: Annotated[float, Field(ge=0, le=3600, description="amplitude at the load")]
-    phase_deg: Annotated[
-        float, Field(ge=-360, le=360, description="phase of the cosine at the record's time zero")
-    ]
+    frequency_hz: float = Field(gt=0, le=1e5, description="frequency")
+    amplitude_arcsec: float = Field(ge=0, le=3600, description="amplitude at the load")
+    phase_deg: float = Field(ge=-360, le=360, description="phase of the cosine at the record's time zero")
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

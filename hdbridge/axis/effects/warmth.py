@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 from pydantic import Field
@@ -32,20 +32,17 @@ class Warmed(Effect):
     channels = frozenset({Channel.TIME})
     shape = (Shape("tau_s", 2.0, 3 * 3600.0, logarithmic=True),)
 
-    tau_s: Annotated[float, Field(gt=0, le=1e6, description="time constant of the gear's temperature")]
-    driven_by: Annotated[
-        Literal["temperature", "time"],
-        Field(description="the temperature channel, or time since a cold start"),
-    ] = "temperature"
-    reference_c: Annotated[
-        float, Field(ge=-60, le=200, description="temperature at which the effect is zero")
-    ] = 20.0
-    warm_up_k: Annotated[
-        float, Field(gt=0, le=200, description="warmth in the end, where driven by time (assumed)")
-    ] = 10.0
-    limit_k: Annotated[
-        float, Field(gt=0, le=200, description="warmth in either direction beyond which the effect is held")
-    ] = 60.0
+    tau_s: float = Field(gt=0, le=1e6, description="time constant of the gear's temperature")
+    driven_by: Literal["temperature", "time"] = Field(
+        "temperature", description="the temperature channel, or time since a cold start"
+    )
+    reference_c: float = Field(20.0, ge=-60, le=200, description="temperature at which the effect is zero")
+    warm_up_k: float = Field(
+        10.0, gt=0, le=200, description="warmth in the end, where driven by time (assumed)"
+    )
+    limit_k: float = Field(
+        60.0, gt=0, le=200, description="warmth in either direction beyond which the effect is held"
+    )
 
     @classmethod
     def lags(cls, observations: Observations) -> Iterator[tuple[Literal["temperature", "time"], float]]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -47,19 +47,15 @@ class Wear(Linear):
     typical = {"growth_arcsec_per_kiloturn": 1.0, "width_deg": 2.0}
     """1 arcsec per thousand turns, crossed in 2 degrees."""
 
-    growth_arcsec_per_kiloturn: Annotated[
-        float, Field(ge=-1000, le=1000, description="growth of the loop's height in the first 1000 turns")
-    ]
-    width_deg: Annotated[float, Field(gt=0, le=360, description="motor angle of a full crossing")]
-    exponent: Annotated[
-        float, Field(ge=0.1, le=3, description="1 for steady wear, below 1 while it runs in")
-    ] = 1.0
-    turns_before: Annotated[
-        float, Field(ge=0, le=1e9, description="motor turns run before the first sample")
-    ] = 0.0
-    turns_limit: Annotated[
-        float, Field(gt=0, le=1e9, description="motor turns from which on the height is held")
-    ] = 10_000.0
+    growth_arcsec_per_kiloturn: float = Field(
+        ge=-1000, le=1000, description="growth of the loop's height in the first 1000 turns"
+    )
+    width_deg: float = Field(gt=0, le=360, description="motor angle of a full crossing")
+    exponent: float = Field(1.0, ge=0.1, le=3, description="1 for steady wear, below 1 while it runs in")
+    turns_before: float = Field(0.0, ge=0, le=1e9, description="motor turns run before the first sample")
+    turns_limit: float = Field(
+        10_000.0, gt=0, le=1e9, description="motor turns from which on the height is held"
+    )
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

@@ -1,7 +1,7 @@
 """Zero shift with temperature, because housing, encoder mount and gear expand differently."""
 
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -54,7 +54,7 @@ class ZeroDrift(Linear, Warmed):
     typical = {"drift_arcsec_per_k": 1.0, "tau_s": 1800.0}
     """1 arcsec per kelvin, with a time constant of half an hour."""
 
-    drift_arcsec_per_k: Annotated[float, Field(ge=-1000, le=1000, description="shift per kelvin")]
+    drift_arcsec_per_k: float = Field(ge=-1000, le=1000, description="shift per kelvin")
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
