@@ -458,6 +458,7 @@ class Keeper:
     def _look_after(self, now_s: float) -> None:
         """Kills hung children; reports readiness, sign of life and status to the service manager."""
         status = self._memory.status
+        axes = ", ".join(axis.name for axis in self._start.machine.axes)
         running = self._turns.look(status.loop_count)
         self._kill_hung(self._control, self._turns, self._times.hung_s)
         serving = True
@@ -468,13 +469,15 @@ class Keeper:
         if not self._ready and self._turns.begun and serving:
             self._ready = True
             self._notifier.ready()
-            _log.info("ready", self._facts())
+            machine, names = self._start.machine, [each.getsockname() for each in self._listeners]
+            addresses = [each if isinstance(each, str) else f"{each[0]}:{each[1]}" for each in names]
+            about = {"machine": machine.name, "axes": axes, "api": ", ".join(addresses)}
+            _log.info("ready", about)
         running |= bool(status[Cell.BUS_LENT])
         if running and now_s - self._fed_s >= (self._notifier.watchdog_s or 0.0) / 4.0:
             self._fed_s = now_s
             self._notifier.alive()
         restarts = ", ".join(f"{name} restarted {n} times" for name, n in self._restarts.items() if n)
-        axes = ", ".join(axis.name for axis in self._start.machine.axes)
         words = f"holds {axes}" if self._ready else "begins"
         self._notifier.status(f"{words}; {restarts}" if restarts else words)
 
@@ -484,14 +487,6 @@ class Keeper:
         ):
             _log.error("process hangs", {"pid": child.pid, "for_s": heartbeat.misses * TICK_S})
             child.send(signal.SIGKILL)
-
-    def _facts(self) -> dict[str, object]:
-        machine = self._start.machine
-        return {
-            "machine": machine.name,
-            "axes": ", ".join(axis.name for axis in machine.axes),
-            "api": ", ".join(_address(each) for each in self._listeners),
-        }
 
     # ------------------------------------------------------------------ the end
 
@@ -571,8 +566,3 @@ class Keeper:
                 for number, handler in before.items():
                     signal.signal(number, handler)
                 signal.set_wakeup_fd(woken)
-
-
-def _address(listener: socket.socket) -> str:
-    name = listener.getsockname()
-    return name if isinstance(name, str) else f"{name[0]}:{name[1]}"

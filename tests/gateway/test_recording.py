@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from support.gateway import COUNTS_PER_DEG, gateway_bench, swing
-from support.service import play
+from support.gateway import COUNTS_PER_DEG, swing
 
 from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.recorder.export import exported
@@ -12,30 +11,23 @@ from hdbridge.daemon.recorder.flightlog import Batch, FlightLog
 from hdbridge.daemon.recorder.reading import flight_files, read
 
 
-def test_a_recording_has_the_targets_and_the_words_of_the_other_master(tmp_path):
-    async def scenario(bench):
-        async with bench.service.ready() as bridge:
-            await bench.configure()
-            await bench.wait(0.5)
-            plc, period_s = bench.plc, bench.daemon.period_s
-            reader = bench.daemon.memory.reader()
-            await bench.enable()
-            await swing(bench)
-            await bench.wait(1.0)
-            outer = bridge.axes["axis1"].state().outer
-            # By design one cycle of the inner bus, and up to another one until the next frame.
-            assert period_s <= outer.latency_s <= outer.latency_99_s <= 2.01 * period_s
-            plc.plan = lambda cycle: round(1000 * COUNTS_PER_DEG)  # beyond the limits of the axis
-            await bench.wait(0.2)
-            plc.cycling = False
-            await bench.wait(1.0)
-            assert bridge.axes["axis1"].state().outer.latency_s is None
-            return plc.seen, reader.read()[0]
-
-    with gateway_bench(tmp_path, period_s=0.01) as bench:
-        sent, samples = play(scenario(bench))
-        period_s = bench.daemon.period_s
-        about = About.of("cell", (AxisAbout.of(bench.daemon.axes[0].config),), period_s)
+@pytest.mark.parametrize("bench", [{"period_s": 0.01}], indirect=True)
+async def test_a_recording_has_the_targets_and_the_words_of_the_other_master(bench, tmp_path):
+    plc, period_s = bench.plc, bench.daemon.period_s
+    reader = bench.daemon.memory.reader()
+    await bench.enable()
+    await swing(bench)
+    await bench.wait(1.0)
+    outer = bench.bridge.axes["axis1"].state().outer
+    # By design one cycle of the inner bus, and up to another one until the next frame.
+    assert period_s <= outer.latency_s <= outer.latency_99_s <= 2.01 * period_s
+    plc.plan = lambda cycle: round(1000 * COUNTS_PER_DEG)  # beyond the limits of the axis
+    await bench.wait(0.2)
+    plc.cycling = False
+    await bench.wait(1.0)
+    assert bench.bridge.axes["axis1"].state().outer.latency_s is None
+    sent, samples = plc.seen, reader.read()[0]
+    about = About.of("cell", (AxisAbout.of(bench.daemon.axes[0].config),), period_s)
     log = FlightLog(tmp_path / "flights", RecorderSettings(), about)
     log.put(Batch(samples))
     log.close()

@@ -4,9 +4,7 @@ from http import HTTPStatus
 from typing import Any, Final
 
 from fastapi import FastAPI
-from fastapi.openapi.utils import get_openapi
 from fastapi.responses import JSONResponse, Response
-from fastapi.routing import APIRoute
 from prometheus_client import CONTENT_TYPE_LATEST
 
 from hdbridge import __version__
@@ -49,7 +47,7 @@ def create_app(bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> Fas
         docs_url=None,
         redoc_url=None,
         openapi_tags=[{"name": name, "description": about} for name, about in TAGS],
-        generate_unique_id_function=_operation,
+        generate_unique_id_function=lambda route: route.name,
         redirect_slashes=False,
     )
     problems.register(app)
@@ -99,21 +97,10 @@ def _static(name: str) -> Response:
     return Response(content, media_type=kind, headers={"Content-Security-Policy": POLICY})
 
 
-def _operation(route: APIRoute) -> str:
-    return route.name
-
-
 def _schema(app: FastAPI) -> dict[str, Any]:
     """Returns the OpenAPI description, with the media type of errors and the authentication scheme."""
     if app.openapi_schema is None:
-        schema = get_openapi(
-            title=app.title,
-            version=app.version,
-            summary=app.summary,
-            description=app.description,
-            routes=app.routes,
-            tags=app.openapi_tags,
-        )
+        schema = FastAPI.openapi(app)
         for path in schema["paths"].values():
             for operation in path.values():
                 for status, response in operation["responses"].items():
@@ -124,5 +111,4 @@ def _schema(app: FastAPI) -> dict[str, Any]:
             "token": {"type": "http", "scheme": "bearer", "description": "Over TCP only."}
         }
         schema["security"] = [{}, {"token": []}]
-        app.openapi_schema = schema
-    return app.openapi_schema
+    return app.openapi_schema or {}

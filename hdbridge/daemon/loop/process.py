@@ -89,8 +89,9 @@ def run(start: Start) -> None:
     terminated = when_terminated()
     setups = [setup_of(axis) for axis in machine.axes]
     realtime = machine.realtime
+    bitrate = machine.bus.bitrate_bps if start.simulation is None else SIMULATED_BITRATE_BPS
     with Memory.attach(start.memory_fd) as memory, _bus(start) as (link, clock, interface):
-        cycle = BusCycle(link, clock, machine.cycle_s, bitrate_bps=_bitrate(start))
+        cycle = BusCycle(link, clock, machine.cycle_s, bitrate_bps=bitrate)
         reopen = interface.reopen if interface is not None else lambda: None
         controller = Controller(cycle, setups, memory, reopen)
         status = memory.status
@@ -113,10 +114,6 @@ def setup_of(axis: Axis) -> AxisSetup:
     """Returns an uncompensated setup; the service sends the setting before the axis can be enabled."""
     nothing = compensation_for(axis.config, TransmissionModel(axis.config.gear.ratio))
     return AxisSetup(axis.config, nothing, compensating=False, load_loop=axis.load_loop)
-
-
-def _bitrate(start: Start) -> int | None:
-    return SIMULATED_BITRATE_BPS if start.simulation is not None else start.machine.bus.bitrate_bps
 
 
 @contextmanager

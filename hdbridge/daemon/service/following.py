@@ -8,13 +8,14 @@ import asyncio
 import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.client import messages
 from hdbridge.daemon.following.follower import NOTHING, Follower, Outcome
-from hdbridge.daemon.following.judging import WINDOW_S, Raised, Verdict
+from hdbridge.daemon.following.judging import WINDOW_S, Verdict
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import Event, SampleArray
@@ -185,17 +186,13 @@ class Following:
             self.advice = verdict + self._unwatched()
             self._note("WATCH", raised.text)
             if self._diagnosis is not None and raised.verdict in DIAGNOSED:
-                self._diagnose(self._diagnosis, raised, model)
+                self._diagnosis.start(
+                    name, model.dump(), WINDOW_S / 60.0, raised.text, partial(self._note, "DIAGNOSIS")
+                )
 
     def _unwatched(self) -> list[str]:
         follower = self._follower
         return [follower.unwatched] if follower is not None and follower.unwatched else []
-
-    def _diagnose(self, diagnosis: AutoDiagnosis, raised: Raised, model: TransmissionModel) -> None:
-        minutes = WINDOW_S / 60.0
-        diagnosis.start(
-            self._axis.name, model.dump(), minutes, raised.text, lambda text: self._note("DIAGNOSIS", text)
-        )
 
     def _note(self, kind: str, text: str) -> None:
         if self._recorder is not None:

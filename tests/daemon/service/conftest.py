@@ -9,8 +9,9 @@ from support.service import Service, play, stepped_service
 
 
 @pytest.fixture
-def service(tmp_path: Path) -> Iterator[Service]:
-    with stepped_service(tmp_path) as made:
+def service(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Service]:
+    """A parameter has other arguments of `stepped_service`."""
+    with stepped_service(tmp_path, **getattr(request, "param", {})) as made:
         yield made
 
 

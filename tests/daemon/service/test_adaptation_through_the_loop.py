@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from support.adapting import truth_of
-from support.service import AtOnce, Service, play, stepped_service, until
+from support.service import AtOnce, Service, stepped_service, until
 
 from hdbridge.axis.effects import Hysteresis
 from hdbridge.client import messages
@@ -118,16 +118,12 @@ async def test_the_adaptation_survives_another_scheme_and_a_new_loop(service: Se
         assert offset_arcsec(bridge) == learnt
 
 
-def test_an_impossible_adaptation_does_not_block_the_axis(service: Service) -> None:
+async def test_an_impossible_adaptation_does_not_block_the_axis(service: Service) -> None:
     settings = QUICK.model_copy(update={"parameters": ("backlash.gap_arcsec",)})
     axes = tuple(replace(each, adaptation=settings) for each in service.machine.axes)
     service.machine = replace(service.machine, axes=axes)
-
-    async def story() -> None:
-        async with adapting(service) as (bridge, token, _):
-            await work(bridge, token, 1)
-            frozen = bridge.axis_state("axis1").adaptation.frozen
-            assert frozen is not None
-            assert "'backlash.gap_arcsec' is nothing that wear or temperature moves" in frozen
-
-    play(story())
+    async with adapting(service) as (bridge, token, _):
+        await work(bridge, token, 1)
+        frozen = bridge.axis_state("axis1").adaptation.frozen
+        assert frozen is not None
+        assert "'backlash.gap_arcsec' is nothing that wear or temperature moves" in frozen

@@ -11,7 +11,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 from support.axis_samples import SampleMaker, moves_and_rests
-from support.service import play, stepped_service, until
+from support.service import Service, until
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Hysteresis
@@ -41,72 +41,54 @@ def changes(bridge: ServiceBridge) -> int:
     return sum(each.event is not None and each.event.kind is EventKind.CHANGED for each in entries)
 
 
-def test_a_disabled_adaptation_learns_and_writes_nothing(tmp_path: Path) -> None:
+async def test_a_disabled_adaptation_learns_and_writes_nothing(service: Service, tmp_path: Path) -> None:
     folder = tmp_path / "adaptation"
-    with stepped_service(tmp_path) as service:
-
-        async def story() -> None:
-            async with service.ready() as bridge:
-                made = following(bridge, AdaptationSettings(), folder)
-                before = changes(bridge)
-                await until(bridge, lambda: bridge.core.observer.cycle > 100)
-                await made.apply()
-                assert made.state.mode is AdaptationMode.OFF
-                assert changes(bridge) == before
-                assert not folder.exists()
-                await made.set_mode(AdaptationMode.OBSERVE)
-                await until(bridge, folder.exists)
-                assert made.state.mode is AdaptationMode.OBSERVE
-                made.close()
-
-        play(story())
+    async with service.ready() as bridge:
+        made = following(bridge, AdaptationSettings(), folder)
+        before = changes(bridge)
+        await until(bridge, lambda: bridge.core.observer.cycle > 100)
+        await made.apply()
+        assert made.state.mode is AdaptationMode.OFF
+        assert changes(bridge) == before
+        assert not folder.exists()
+        await made.set_mode(AdaptationMode.OBSERVE)
+        await until(bridge, folder.exists)
+        assert made.state.mode is AdaptationMode.OBSERVE
+        made.close()
 
 
-def test_without_a_model_a_calibration_is_requested(tmp_path: Path) -> None:
-    with stepped_service(tmp_path) as service:
-        service.machine.axes[0].profile.model.unlink()
-
-        async def story() -> None:
-            async with service.ready() as bridge:
-                made = following(bridge, AdaptationSettings(mode="on"), tmp_path / "adaptation")
-                await until(bridge, lambda: made.state.frozen is not None)
-                assert made.state.frozen == "there is no model to follow: calibrate first"
-                await made.apply()
-
-        play(story())
+async def test_without_a_model_a_calibration_is_requested(service: Service, tmp_path: Path) -> None:
+    service.machine.axes[0].profile.model.unlink()
+    async with service.ready() as bridge:
+        made = following(bridge, AdaptationSettings(mode="on"), tmp_path / "adaptation")
+        await until(bridge, lambda: made.state.frozen is not None)
+        assert made.state.frozen == "there is no model to follow: calibrate first"
+        await made.apply()
 
 
-def test_an_unwritable_folder_is_reported_and_the_axis_works(tmp_path: Path) -> None:
+async def test_an_unwritable_folder_is_reported_and_the_axis_works(service: Service, tmp_path: Path) -> None:
     folder = tmp_path / "adaptation"
     folder.write_text("not a folder")
-    with stepped_service(tmp_path) as service:
-
-        async def story() -> None:
-            async with service.ready() as bridge:
-                made = following(bridge, AdaptationSettings(mode="on"), folder)
-                await until(bridge, lambda: made.state.frozen is not None)
-                assert str(folder) in (made.state.frozen or "")
-
-        play(story())
+    async with service.ready() as bridge:
+        made = following(bridge, AdaptationSettings(mode="on"), folder)
+        await until(bridge, lambda: made.state.frozen is not None)
+        assert str(folder) in (made.state.frozen or "")
 
 
-def test_each_axis_is_watched_in_its_own_thread_that_ends(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("service", [{"axes": 2}], indirect=True)
+async def test_each_axis_is_watched_in_its_own_thread_that_ends(
+    service: Service, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with stepped_service(tmp_path, axes=2) as service, caplog.at_level(logging.ERROR):
-
-        async def story() -> None:
-            async with service.enabled() as (bridge, token), AsyncExitStack() as stack:
-                for each in follow(service.machine, bridge, None, stack):
-                    bridge.core.observer.add(each)
-                first, second = bridge.axes.values()
-                await first.motion.move(token, 5.0)
-                await second.compensate(token, Scheme.SYNCHRONOUS)
-                begun = bridge.core.observer.cycle
-                await until(bridge, lambda: bridge.core.observer.cycle > begun + 500)
-                assert (first.state().advice, second.state().advice) == ([], [])
-
-        play(story())
+    with caplog.at_level(logging.ERROR):
+        async with service.enabled() as (bridge, token), AsyncExitStack() as stack:
+            for each in follow(service.machine, bridge, None, stack):
+                bridge.core.observer.add(each)
+            first, second = bridge.axes.values()
+            await first.motion.move(token, 5.0)
+            await second.compensate(token, Scheme.SYNCHRONOUS)
+            begun = bridge.core.observer.cycle
+            await until(bridge, lambda: bridge.core.observer.cycle > begun + 500)
+            assert (first.state().advice, second.state().advice) == ([], [])
     assert caplog.records == []
     assert not [each for each in threading.enumerate() if each.name.startswith("following")]
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effect_examples import EXAMPLES
-from support.service import Service, play, stepped_service, until
+from support.service import Service, stepped_service, until
 
 from hdbridge.axis.effects import Hysteresis
 from hdbridge.axis.model import TransmissionModel, store
@@ -109,19 +109,16 @@ async def test_a_missing_or_foreign_model_changes_nothing(service: Service) -> N
         assert (after.version, after.effects, after.file) == (before.version, before.effects, before.file)
 
 
-def test_an_axis_without_a_model_runs_uncompensated(tmp_path: Path) -> None:
-    async def story(service: Service) -> None:
-        service.machine.axes[0].profile.model.unlink()
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            assert axis.state().model is None
-            await axis.motion.move(token, 5.0)
-            with pytest.raises(InputError, match="calibrate"):
-                await axis.compensate(token, Scheme.EXTENDED)
-            await axis.compensate(token, Scheme.NONE)
-
-    with stepped_service(tmp_path, model=TransmissionModel(50.0)) as service:
-        play(story(service))
+@pytest.mark.parametrize("service", [{"model": TransmissionModel(50.0)}], indirect=True)
+async def test_an_axis_without_a_model_runs_uncompensated(service: Service) -> None:
+    service.machine.axes[0].profile.model.unlink()
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        assert axis.state().model is None
+        await axis.motion.move(token, 5.0)
+        with pytest.raises(InputError, match="calibrate"):
+            await axis.compensate(token, Scheme.EXTENDED)
+        await axis.compensate(token, Scheme.NONE)
 
 
 SCHEMES = {"axis1": "synchronous", "axis2": "hysteresis"}
@@ -291,29 +288,29 @@ def test_a_setting_reads_back_exactly(data: st.DataObject) -> None:
     assert CompensationSetting.from_json(setting.to_json()) == setting
 
 
-def test_an_inactive_load_loop_reports_its_reason(tmp_path: Path) -> None:
-    loop = LoadLoopSettings(gain_1_s=0.5, maximum_arcsec=20.0)
-    with stepped_service(tmp_path, setup=lambda _, made: replace(made, load_loop=loop)) as made:
-        made.machine = replace(made.machine, axes=(replace(made.machine.axes[0], load_loop=loop),))
+LOAD_LOOP = LoadLoopSettings(gain_1_s=0.5, maximum_arcsec=20.0)
 
-        async def story() -> None:
-            async with made.enabled() as (bridge, token):
-                axis, encoder = bridge.axes["axis1"], made.daemon.nodes[0].faults
-                await bridge.core.timing.sleep(3.0)
-                assert axis.state().load_loop.doubt is None
-                for _ in range(2):
-                    encoder.load_jump_counts = 150
-                    await until(bridge, lambda: axis.state().load_loop.doubt is not None)
-                    assert "the load encoder moved by" in axis.state().load_loop.doubt
-                    encoder.load_jump_counts = 0
-                    await until(bridge, lambda: axis.state().load_loop.doubt is None)
-                events = [each for each in bridge.events().events if each.kind == "load-loop"]
-                assert ["acts again" in each.text for each in events] == [False, True, False, True]
-                assert {each.axis for each in events} == {"axis1"}
-                encoder.load_jump_counts = 150
-                await until(bridge, lambda: axis.state().load_loop.doubt is not None)
-                for on in (False, True):
-                    await axis.switch_load_loop(token, on=on)
-                await until(bridge, lambda: axis.state().load_loop.doubt is None, timeout_s=1.0)
 
-        play(story())
+@pytest.mark.parametrize(
+    "service", [{"setup": lambda _, made: replace(made, load_loop=LOAD_LOOP)}], indirect=True, ids=["loop"]
+)
+async def test_an_inactive_load_loop_reports_its_reason(service: Service) -> None:
+    service.machine = replace(service.machine, axes=(replace(service.machine.axes[0], load_loop=LOAD_LOOP),))
+    async with service.enabled() as (bridge, token):
+        axis, encoder = bridge.axes["axis1"], service.daemon.nodes[0].faults
+        await bridge.core.timing.sleep(3.0)
+        assert axis.state().load_loop.doubt is None
+        for _ in range(2):
+            encoder.load_jump_counts = 150
+            await until(bridge, lambda: axis.state().load_loop.doubt is not None)
+            assert "the load encoder moved by" in axis.state().load_loop.doubt
+            encoder.load_jump_counts = 0
+            await until(bridge, lambda: axis.state().load_loop.doubt is None)
+        events = [each for each in bridge.events().events if each.kind == "load-loop"]
+        assert ["acts again" in each.text for each in events] == [False, True, False, True]
+        assert {each.axis for each in events} == {"axis1"}
+        encoder.load_jump_counts = 150
+        await until(bridge, lambda: axis.state().load_loop.doubt is not None)
+        for on in (False, True):
+            await axis.switch_load_loop(token, on=on)
+        await until(bridge, lambda: axis.state().load_loop.doubt is None, timeout_s=1.0)

@@ -2,11 +2,10 @@
 
 import asyncio
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
-from support.service import Service, play, stepped_service, until
+from support.service import Service, until
 
 from hdbridge.client.messages import QueueItem, StreamPoint
 from hdbridge.errors import InputError, LeaseError, RefusedError
@@ -80,30 +79,27 @@ async def test_a_cleared_queue_ends_after_the_present_move(service: Service) -> 
         assert axis.state().load_target_deg == pytest.approx(4.0)
 
 
-def test_the_end_of_a_lease_stops_a_queue_and_not_a_move(tmp_path: Path) -> None:
-    async def story(service: Service) -> None:
-        async with service.enabled() as (bridge, token):
-            axis, timing = bridge.axes["axis1"], bridge.core.timing
-            await axis.motion.move(token, 60.0, velocity_deg_s=15.0, wait=False)
-            await until(bridge, lambda: bridge.lease.holder is None)
-            assert not axis.state().at_rest
-            await until(bridge, lambda: axis.state().at_rest)
-            assert axis.state().load_target_deg == pytest.approx(60.0)
+@pytest.mark.parametrize("service", [{"lease_s": 1.0}], indirect=True)
+async def test_the_end_of_a_lease_stops_a_queue_and_not_a_move(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis, timing = bridge.axes["axis1"], bridge.core.timing
+        await axis.motion.move(token, 60.0, velocity_deg_s=15.0, wait=False)
+        await until(bridge, lambda: bridge.lease.holder is None)
+        assert not axis.state().at_rest
+        await until(bridge, lambda: axis.state().at_rest)
+        assert axis.state().load_target_deg == pytest.approx(60.0)
 
-            again = bridge.lease.take("test")
-            await axis.motion.queue(again, [way_point(0.0, velocity_deg_s=10.0), way_point(60.0)])
-            await timing.sleep(1.5)
-            await until(bridge, lambda: axis.state().at_rest, 2.0)
-            stopped_deg = axis.state().load_target_deg
-            assert 10.0 < stopped_deg < 55.0
-            await timing.sleep(2.0)
-            assert axis.state().load_target_deg == stopped_deg
-            assert axis.state().state == "enabled"
-            told = [each.text for each in bridge.events().events if each.kind == "note"]
-            assert "a queue of moves was stopped: the lease of its client has ended" in told
-
-    with stepped_service(tmp_path, lease_s=1.0) as service:
-        play(story(service))
+        again = bridge.lease.take("test")
+        await axis.motion.queue(again, [way_point(0.0, velocity_deg_s=10.0), way_point(60.0)])
+        await timing.sleep(1.5)
+        await until(bridge, lambda: axis.state().at_rest, 2.0)
+        stopped_deg = axis.state().load_target_deg
+        assert 10.0 < stopped_deg < 55.0
+        await timing.sleep(2.0)
+        assert axis.state().load_target_deg == stopped_deg
+        assert axis.state().state == "enabled"
+        told = [each.text for each in bridge.events().events if each.kind == "note"]
+        assert "a queue of moves was stopped: the lease of its client has ended" in told
 
 
 async def test_a_lease_taken_by_force_stops_the_jog_of_the_other(service: Service) -> None:
@@ -194,23 +190,18 @@ async def test_set_points_beyond_the_limits_end_the_stream_braking(service: Serv
         assert axis.state().load_target_deg < 10.0
 
 
-def test_coordinated_axes_arrive_together(tmp_path: Path) -> None:
-    async def story(service: Service) -> None:
-        async with service.enabled() as (bridge, token):
-            reader = service.daemon.memory.reader()
-            before = [each.state().load_target_deg for each in bridge.axes.values()]
-            await bridge.coordinated(token, {"axis1": 20.0, "axis2": -5.0})
-            assert [each.state().load_target_deg for each in bridge.axes.values()] == pytest.approx(
-                [20.0, -5.0]
-            )
-            samples, _ = reader.read()
-            targets = samples["axes"]["load_target_deg"]
-            way = (targets - before) / (np.array([20.0, -5.0]) - before)
-            assert np.max(np.abs(way[:, 0] - way[:, 1])) < 1e-6
-            with pytest.raises(InputError, match="'axis3'"):
-                await bridge.coordinated(token, {"axis1": 0.0, "axis3": 1.0})
-            with pytest.raises(InputError, match="limits"):
-                await bridge.coordinated(token, {"axis1": 0.0, "axis2": 1e5})
-
-    with stepped_service(tmp_path, axes=2) as service:
-        play(story(service))
+@pytest.mark.parametrize("service", [{"axes": 2}], indirect=True)
+async def test_coordinated_axes_arrive_together(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        reader = service.daemon.memory.reader()
+        before = [each.state().load_target_deg for each in bridge.axes.values()]
+        await bridge.coordinated(token, {"axis1": 20.0, "axis2": -5.0})
+        assert [each.state().load_target_deg for each in bridge.axes.values()] == pytest.approx([20.0, -5.0])
+        samples, _ = reader.read()
+        targets = samples["axes"]["load_target_deg"]
+        way = (targets - before) / (np.array([20.0, -5.0]) - before)
+        assert np.max(np.abs(way[:, 0] - way[:, 1])) < 1e-6
+        with pytest.raises(InputError, match="'axis3'"):
+            await bridge.coordinated(token, {"axis1": 0.0, "axis3": 1.0})
+        with pytest.raises(InputError, match="limits"):
+            await bridge.coordinated(token, {"axis1": 0.0, "axis2": 1e5})

@@ -1,7 +1,7 @@
 """The service dies and another takes its place; the control process dies; the axes are found as they are."""
 
 import pytest
-from support.service import Service, play, until
+from support.service import Service, until
 
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.loop.states import AxisState
@@ -9,37 +9,29 @@ from hdbridge.daemon.memory import Cell, CommandKind
 from hdbridge.errors import LeaseError, RefusedError
 
 
-def test_a_new_service_finds_the_axis_where_it_is(service: Service) -> None:
-    async def first() -> str:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            await axis.compensate(token, Scheme.SYNCHRONOUS)
-            await axis.motion.move(token, 30.0, wait=False)
-            await bridge.core.timing.sleep(0.3)
-            return token
-
-    token = play(first())
+async def test_a_new_service_finds_the_axis_where_it_is(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        await axis.compensate(token, Scheme.SYNCHRONOUS)
+        await axis.motion.move(token, 30.0, wait=False)
+        await bridge.core.timing.sleep(0.3)
     service.daemon.run(3.0)  # nobody is there; the move goes to its end
     assert service.daemon.states == [AxisState.ENABLED]
-
-    async def second() -> None:
-        async with service.bridge() as bridge:
-            axis = bridge.axes["axis1"]
-            await until(bridge, lambda: axis.commissioning.report is not None)
-            state = axis.state()
-            assert state.state == "enabled"
-            assert state.load_target_deg == pytest.approx(30.0)
-            assert state.scheme == "synchronous"
-            with pytest.raises(LeaseError):
-                await axis.motion.move(token, 0.0)
-            own = bridge.lease.take("another")
-            await axis.motion.move(own, 31.0)
-            await axis.disable(own)
-
-    play(second())
+    async with service.bridge() as bridge:
+        axis = bridge.axes["axis1"]
+        await until(bridge, lambda: axis.commissioning.report is not None)
+        state = axis.state()
+        assert state.state == "enabled"
+        assert state.load_target_deg == pytest.approx(30.0)
+        assert state.scheme == "synchronous"
+        with pytest.raises(LeaseError):
+            await axis.motion.move(token, 0.0)
+        own = bridge.lease.take("another")
+        await axis.motion.move(own, 31.0)
+        await axis.disable(own)
 
 
-def test_no_request_is_made_before_the_axis_state_is_known(service: Service) -> None:
+async def test_no_request_is_made_before_the_axis_state_is_known(service: Service) -> None:
     """A drive that still holds its axis after a quick stop is not booted because the service is young."""
     daemon = service.daemon
     daemon.verify()
@@ -50,17 +42,13 @@ def test_no_request_is_made_before_the_axis_state_is_known(service: Service) -> 
     daemon.run(0.5)
     sent: set[int] = set()
     daemon.bus.spy = lambda can_id, _: sent.add(can_id)
-
-    async def story() -> None:
-        async with service.bridge() as bridge:
-            axis = bridge.axes["axis1"]
-            token = bridge.lease.take("at once")
-            await axis.reset(token)  # waits until it is
-            assert axis.commissioning.report is not None
-            assert daemon.states == [AxisState.DISABLED]
-            assert 0x000 not in sent  # no NMT command
-
-    play(story())
+    async with service.bridge() as bridge:
+        axis = bridge.axes["axis1"]
+        token = bridge.lease.take("at once")
+        await axis.reset(token)  # waits until it is
+        assert axis.commissioning.report is not None
+        assert daemon.states == [AxisState.DISABLED]
+        assert 0x000 not in sent  # no NMT command
 
 
 async def test_without_a_control_process_nothing_is_sent(service: Service) -> None:

@@ -13,26 +13,6 @@ from hdbridge.drive.supervision import Fault
 from hdbridge.errors import HdbridgeError, RefusedError, SafetyStop
 
 
-def lost_tpdos(daemon: SteppedDaemon) -> None:
-    daemon.nodes[0].faults.drop_tpdos = 4
-
-
-def drive_fault(daemon: SteppedDaemon) -> None:
-    daemon.nodes[0].faults.raise_error(0x3210)
-
-
-def encoder_jump(daemon: SteppedDaemon) -> None:
-    daemon.nodes[0].faults.load_jump_counts = 100_000
-
-
-def foreign_sync(daemon: SteppedDaemon) -> None:
-    daemon.interfere(0x080)
-
-
-def no_room(daemon: SteppedDaemon) -> None:
-    daemon.bus.no_room_for = 0x201
-
-
 def said_once(bridge: ServiceBridge, fault: messages.Fault | None, *more: str) -> None:
     """Whatever a person reads about a stop says once what to do about it."""
     assert fault is not None
@@ -44,11 +24,11 @@ def said_once(bridge: ServiceBridge, fault: messages.Fault | None, *more: str) -
 
 
 LATCHED = [
-    (lost_tpdos, Fault.LOST_TPDO),
-    (drive_fault, Fault.DRIVE_FAULT),
-    (encoder_jump, Fault.ENCODER_JUMP),
-    (foreign_sync, Fault.FOREIGN_SYNC),
-    (no_room, Fault.TRANSMIT_FULL),
+    (lambda daemon: setattr(daemon.nodes[0].faults, "drop_tpdos", 4), Fault.LOST_TPDO),
+    (lambda daemon: daemon.nodes[0].faults.raise_error(0x3210), Fault.DRIVE_FAULT),
+    (lambda daemon: setattr(daemon.nodes[0].faults, "load_jump_counts", 100_000), Fault.ENCODER_JUMP),
+    (lambda daemon: daemon.interfere(0x080), Fault.FOREIGN_SYNC),
+    (lambda daemon: setattr(daemon.bus, "no_room_for", 0x201), Fault.TRANSMIT_FULL),
 ]
 
 
@@ -85,15 +65,11 @@ async def test_a_quick_stop_is_latched_until_a_reset(
         await axis.motion.move(token, place_deg + 1.0)
 
 
-def boot_up(daemon: SteppedDaemon) -> None:
-    daemon.nodes[0].faults.boot_up()
-
-
-def pre_operational(daemon: SteppedDaemon) -> None:
-    daemon.interfere(0x000, bytes((0x80, 1)))
-
-
-@pytest.mark.parametrize("spoil", [boot_up, pre_operational])
+@pytest.mark.parametrize(
+    "spoil",
+    [lambda daemon: daemon.nodes[0].faults.boot_up(), lambda daemon: daemon.interfere(0x000, b"\x80\x01")],
+    ids=["boot-up", "pre-operational"],
+)
 async def test_a_drive_that_restarts_is_verified_again_and_stays_disabled(
     service: Service, spoil: Callable[[SteppedDaemon], None]
 ) -> None:

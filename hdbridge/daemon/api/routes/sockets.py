@@ -5,7 +5,7 @@ set-points are accepted only as the buffer empties.
 """
 
 import asyncio
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -57,8 +57,31 @@ _AS_THEY_ARE: Final = (
 async def live(bridge: Bridge, websocket: WebSocket) -> None:
     """Sends samples in batches; the client may change its `LiveOptions` at any time."""
     await _accept(websocket)
-    feed = _Feed(bridge, websocket)
-    sides = asyncio.ensure_future(feed.listen()), asyncio.ensure_future(feed.tell())
+    options = LiveOptions()
+
+    async def listen() -> None:
+        """Receives the client's options until it disconnects; raises InputError for invalid ones."""
+        nonlocal options
+        while True:
+            wanted = await _receive(websocket, LiveOptions)
+            for each in wanted.axes or ():
+                port(bridge, each)
+            options = wanted
+
+    async def tell() -> None:
+        """Sends batches; while one is being sent, the subscription keeps only the newest samples."""
+        lost, known = 0, bridge.events(_NEWEST).newest
+        async for batch in bridge.subscribe():
+            lost += batch.lost
+            happened = bridge.events(known)
+            known = max(known, happened.newest)
+            told = columns(batch.samples, list(bridge.axes), options, happened.events, lost)
+            if told.time_s or told.events:
+                await _send(websocket, told)
+                lost = 0
+            await asyncio.sleep(BATCH_S)  # collects samples, so that messages are fewer and larger
+
+    sides = asyncio.ensure_future(listen()), asyncio.ensure_future(tell())
     await asyncio.wait(sides, return_when=asyncio.FIRST_COMPLETED)
     for each in sides:
         each.cancel()
@@ -79,45 +102,6 @@ async def stream(bridge: Bridge, websocket: WebSocket, axis: str) -> None:
     except HdbridgeError as error:
         await _send(websocket, StreamAnswer(accepted=0, problem=Problem.of(error, axis)))
         await _close(websocket, str(error))
-
-
-class _Feed:
-    """One client of the live samples."""
-
-    def __init__(self, bridge: ServiceBridge, websocket: WebSocket) -> None:
-        self._bridge = bridge
-        self._websocket = websocket
-        self._options = LiveOptions()
-
-    async def listen(self) -> None:
-        """Receives the client's options until it disconnects; raises InputError for invalid ones."""
-        while True:
-            options = await _receive(self._websocket, LiveOptions)
-            for each in options.axes or ():
-                port(self._bridge, each)
-            self._options = options
-
-    async def tell(self) -> None:
-        """Sends batches; while one is being sent, the subscription keeps only the newest samples."""
-        names = list(self._bridge.axes)
-        lost, known = 0, self._bridge.events(_NEWEST).newest
-        async for batch in self._bridge.subscribe():
-            lost += batch.lost
-            options = self._options
-            happened = self._bridge.events(known)
-            known = max(known, happened.newest)
-            told = columns(
-                batch.samples,
-                names,
-                every=options.every,
-                wanted=options.axes,
-                events=happened.events,
-                lost=lost,
-            )
-            if told.time_s or told.events:
-                await _send(self._websocket, told)
-                lost = 0
-            await asyncio.sleep(BATCH_S)  # collects samples, so that messages are fewer and larger
 
 
 async def _stream(bridge: ServiceBridge, websocket: WebSocket, axis: str) -> None:
@@ -174,20 +158,14 @@ async def _close(websocket: WebSocket, reason: str) -> None:
 
 
 def columns(
-    samples: NDArray[np.void],
-    names: Sequence[str],
-    *,
-    every: int = 1,
-    wanted: Collection[str] | None = None,
-    events: Sequence[Event] = (),
-    lost: int = 0,
+    samples: NDArray[np.void], names: Sequence[str], options: LiveOptions, events: Sequence[Event], lost: int
 ) -> Samples:
-    """Returns a batch as columns: the cycles whose number ``every`` divides, of the ``wanted`` axes.
+    """Returns a batch as columns, with the cycles and axes of the options.
 
     ``names`` are the axes in the order of the samples. NaN stays NaN here and becomes ``null`` in JSON.
     """
-    if every > 1:
-        samples = samples[samples["cycle"] % every == 0]
+    if options.every > 1:
+        samples = samples[samples["cycle"] % options.every == 0]
     # Not validated, because these are the daemon's own values, thousands per second.
     return Samples.model_construct(
         time_s=(samples["time_ns"] / 1e9).tolist(),
@@ -199,7 +177,7 @@ def columns(
         axes={
             name: _axis(samples["axes"][:, place])
             for place, name in enumerate(names)
-            if wanted is None or name in wanted
+            if options.axes is None or name in options.axes
         },
         events=list(events),
         lost=lost,
