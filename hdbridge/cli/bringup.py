@@ -20,8 +20,9 @@ from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig, BusConfig
-    from hdbridge.commissioning.bringup.checks import BringUpContext, Row
+    from hdbridge.commissioning.bringup.checks import Row
     from hdbridge.commissioning.bringup.scan import Node, Scan
+    from hdbridge.commissioning.bringup.slow import BringUpContext
     from hdbridge.control.latency import Measurement
     from hdbridge.daemon.machine import Machine
 
@@ -444,8 +445,9 @@ def doctor(
     Exit status 0 if all checks passed, 4 if one failed or motion was not confirmed, 2 if the first failure
     is a file, 3 if it is the bus. This is not a safety function: the emergency stop must be in hardware.
     """
-    from hdbridge.commissioning.bringup.checks import BringUpContext, run_checks
+    from hdbridge.commissioning.bringup.checks import run_checks
     from hdbridge.commissioning.bringup.doctor import CHECKS
+    from hdbridge.commissioning.bringup.slow import BringUpContext
 
     files = session.files
     refused: list[str] = []
@@ -465,7 +467,8 @@ def doctor(
         force=session.force,
         interruptible=deferred_interrupt,
     ) as context:
-        checks = (*CHECKS, SERVO) if servo else CHECKS
+        moving = next(place for place, each in enumerate(CHECKS) if each.moves)
+        checks = (*CHECKS[:moving], RESPONSE, *CHECKS[moving:], SERVO) if servo else CHECKS
         rows = run_checks(context, checks, permitted=permitted, tell=_print_row)
     failures = [row for row in rows if row.verdict.outcome is Outcome.FAIL]
     write_json(
@@ -506,6 +509,20 @@ def _print_row(row: Row[BringUpContext]) -> None:
         say(f"              -> {remedy}")
 
 
+def _stored_response(context: BringUpContext) -> Verdict:
+    """Checks, before anything moves, that the model's response is one of this drive, axis and cycle."""
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.control.bench import compensation_for
+
+    path = context.axis.path.with_name("model.yaml")
+    model = TransmissionModel.load(path) if path.exists() else None
+    if model is None or model.response is None:
+        return not_possible("there is no model with a response in motion: hdbridge motion --propose")
+    model.check_bound_to(context.axis, context.drive.identity)
+    compensation_for(context.axis, model)
+    return passed(f"{path}: known up to {model.response.known_to_hz:.0f} Hz")
+
+
 def _servo_as_measured(context: BringUpContext) -> Verdict:
     """Runs the axis at constant speeds without and with its correction, and compares the response.
 
@@ -514,10 +531,7 @@ def _servo_as_measured(context: BringUpContext) -> Verdict:
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.commissioning.calibration.motion import servo_check
 
-    path = context.axis.path.with_name("model.yaml")
-    model = TransmissionModel.load(path) if path.exists() else None
-    if model is None or model.response is None:
-        return not_possible("there is no model with a response in motion: hdbridge motion --propose")
+    model = TransmissionModel.load(context.axis.path.with_name("model.yaml"))
     with context.interruptible() as interrupted:
         found = servo_check(context.boot(), model, interrupted)
     text = (
@@ -536,8 +550,9 @@ def _servo_as_measured(context: BringUpContext) -> Verdict:
     )
 
 
+RESPONSE: Final[Check[Any]] = Check("response", "the stored response", _stored_response, ("boot",))
 SERVO: Final[Check[Any]] = Check(
-    "servo", "servo as measured", _servo_as_measured, ("turn", "quick_stop", "off"), moves=True
+    "servo", "servo as measured", _servo_as_measured, ("response", "turn", "quick_stop", "off"), moves=True
 )
 
 

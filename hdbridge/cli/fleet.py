@@ -185,8 +185,8 @@ class Fleet:
 def run(fleet: Fleet) -> None:
     """Diagnose every recording that is not in FOLDER yet, and write Parquet and a page there.
 
-    Ctrl-C keeps finished results; the same command continues. Exit status 2 if no recording could be
-    diagnosed.
+    Ctrl-C keeps finished results; the same command continues. Exit status 2 if a recording in FOLDER has no
+    diagnosis; the error gives their number, and everything is written.
     """
     found = fleet.find(fleet.dataset.stored())
     fleet.dataset.create()
@@ -197,9 +197,11 @@ def run(fleet: Fleet) -> None:
             fleet.say_interrupted()
             raise
     summary = fleet.summarise()
-    if len(summary.failed) == summary.recordings:
-        reason = summary.failed[0][2]
-        raise InputError(f"none of {summary.recordings} recordings has a diagnosis; the first: {reason}")
+    if summary.failed:
+        raise InputError(
+            f"recordings without a diagnosis: {len(summary.failed)} of {summary.recordings}; the first: "
+            f"{summary.failed[0][2]}"
+        )
 
 
 @taking(Fleet)

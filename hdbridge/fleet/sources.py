@@ -150,7 +150,7 @@ def find_sources(
         for each in [*files]:
             if posixpath.basename(each) in MANIFEST_NAMES or each == own:
                 if not manifest:
-                    raise InputError(f"{place}: contains a manifest; pass it as well: --manifest {each}")
+                    raise InputError(f"{place}: contains a manifest; {_advice(each)}")
                 del files[each]
         marked = _recordings(files, described)
         if not marked and not may_be_empty:
@@ -169,6 +169,14 @@ def find_sources(
         for each in found.values()
     ]
     return sorted(sources, key=lambda each: (each.path, each.axis or ""))
+
+
+def _advice(manifest: str) -> str:
+    """Returns how to pass a manifest that was found among recordings; ``--manifest`` is a local file."""
+    if "://" not in manifest:
+        return f"pass it as well: --manifest {manifest}"
+    name = posixpath.basename(manifest)
+    return f"copy {manifest} to this computer, with URLs as paths, and pass the copy: --manifest {name}"
 
 
 def _recordings(files: Mapping[str, str], described: Collection[str]) -> dict[str, str]:

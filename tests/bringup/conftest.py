@@ -11,8 +11,9 @@ import pytest
 
 from hdbridge.axis import AxisConfig
 from hdbridge.clock import Clock
-from hdbridge.commissioning.bringup.checks import BringUpContext, Row, Verdict, run_checks
+from hdbridge.commissioning.bringup.checks import Row, Verdict, run_checks
 from hdbridge.commissioning.bringup.doctor import CHECKS
+from hdbridge.commissioning.bringup.slow import BringUpContext
 from hdbridge.device.node import DriveNode
 from hdbridge.files.profile import bundled_profile
 from hdbridge.sim.lockstep import lockstep_bench, nameplate_of

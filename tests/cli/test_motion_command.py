@@ -23,6 +23,9 @@ OF_ANOTHER_CYCLE = Response(
 )  # fmt: skip
 
 
+OF_THIS_CYCLE = OF_ANOTHER_CYCLE.model_copy(update={"cycle_ms": 4.0})
+
+
 @pytest.fixture
 def fast(tmp_path):
     return raised_profile(tmp_path / "fast")
@@ -82,6 +85,24 @@ def test_measures_and_proposes_the_response_and_the_committed_model_uses_it(hdbr
         checks = json.loads((tmp_path / "doctor.json").read_text())["checks"]
         assert [each["name"] for each in checks if each["outcome"] != "pass"] == ["servo"]
         assert "measure it again" in done.stdout, tuned
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"response": OF_ANOTHER_CYCLE}, "measured with a cycle of 3 ms"),
+        ({"response": OF_THIS_CYCLE, "provenance": {"axis": "another"}}, "'another'"),
+    ],
+)
+def test_doctor_reports_a_stale_response_before_anything_moves(hdbridge, fast, tmp_path, changes, complaint):
+    replace(TransmissionModel.load(fast / "model.yaml"), **changes).save(fast / "model.yaml")
+    done = hdbridge("doctor", "fast", "--simulate", "--servo", "--no-motion", "--json", "doctor.json")
+    assert done.returncode == 2, done.stdout
+    checks = json.loads((tmp_path / "doctor.json").read_text())["checks"]
+    (stale,) = [each for each in checks if each["outcome"] == "fail"]
+    assert stale["name"] == "response"
+    assert complaint in stale["measured"]
+    assert "'the stored response'" in checks[-1]["measured"]
 
 
 def test_a_model_without_orders_and_a_proposal_without_a_measurement_are_refused(hdbridge, tmp_path):

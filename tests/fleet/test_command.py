@@ -13,8 +13,10 @@ def test_run_and_report_print_and_write_the_named_files(fleet, scheduler, tmp_pa
         tmp_path, "fleet", "run", "--manifest", manifest, "--out", "out", "--model", model,
         "--scheduler", scheduler,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 2, done.stderr
     assert "12 recordings, 0 of them known already, 2 newly failed" in done.stdout
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("hdbridge: recordings without a diagnosis: 2 of 12; the first: ")
     page = (tmp_path / "out" / "fleet.html").read_text()
     assert "<!doctype html>" in page
     assert "broken.csv" in page
@@ -32,7 +34,7 @@ def test_a_run_without_any_diagnosis_is_bad_input(scheduler, tmp_path):
         (tmp_path / f"{name}.csv").write_text("time_s\n1\n")
     done = run_here(tmp_path, "fleet", "run", ".", "--out", "out", "--scheduler", scheduler)
     assert done.returncode == 2
-    words = "hdbridge: none of 2 recordings has a diagnosis; the first: .*: columns .* are missing"
+    words = "hdbridge: recordings without a diagnosis: 2 of 2; the first: .*: columns .* are missing"
     assert re.match(words, done.stderr.splitlines()[-1])
     assert (tmp_path / "out" / "fleet.html").exists()
 

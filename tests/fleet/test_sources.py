@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 
+import fsspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -112,6 +113,14 @@ def test_a_manifest_in_a_folder_is_not_a_recording(tmp_path):
     (tmp_path / "manifest.csv").rename(tmp_path / "other.csv")
     (found,) = find_sources([str(tmp_path)], tmp_path / "other.csv")
     assert found.joint == "J"
+
+
+def test_advice_about_a_remote_manifest_is_not_for_local_files(tmp_path):
+    """`--manifest` takes a file of this computer, so that a URL must not be passed to it."""
+    fsspec.filesystem("memory").pipe("/joints/manifest.csv", b"path,joint\na.csv,J\n")
+    with pytest.raises(InputError, match=r"copy memory://joints/manifest\.csv to") as refused:
+        find_sources(["memory://joints"])
+    assert "://" not in str(refused.value).partition("--manifest ")[2]
 
 
 def test_places_without_a_recording_are_refused(tmp_path):

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.bringup.checks import BringUpContext, Check, Verdict, failed, not_possible, passed
+from hdbridge.commissioning.bringup.checks import Check, Verdict, failed, not_possible, passed
 from hdbridge.commissioning.bringup.judge import (
     LOAD_COUNTS,
     MOTOR_COUNTS,
@@ -21,7 +21,7 @@ from hdbridge.commissioning.bringup.judge import (
     judge_turn,
 )
 from hdbridge.commissioning.bringup.scan import compare, scan_bus
-from hdbridge.commissioning.bringup.slow import Silence, SlowAxis, TravelPlan, plan_travel
+from hdbridge.commissioning.bringup.slow import BringUpContext, Silence, SlowAxis, TravelPlan, plan_travel
 from hdbridge.drive import objects
 from hdbridge.drive.bootplan import left_to_drive, plan
 from hdbridge.drive.bootup import await_sdo
