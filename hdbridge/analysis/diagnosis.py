@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -174,7 +175,7 @@ class _Judge:
         """Turns the result of the search into a diagnosis."""
         estimator, given = self.estimator, self.model.effects
         while (passed := self.search.eliminated(fitted, self._stopped, self.considered)) is not fitted:
-            names = [{each.name for each in one.hypothesis.effects} for one in (fitted, passed)]
+            names = [Counter(each.name for each in one.hypothesis.effects) for one in (fitted, passed)]
             fitted = self.search.instead(passed, names[0] - names[1])
         fitted = with_measured(self.search, fitted)
         fitted = as_calibrated(estimator, fitted, given)

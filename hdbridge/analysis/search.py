@@ -7,7 +7,7 @@ first additions. At the end, causes that no longer bring that gain are removed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container, Iterator, Sequence, Set
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -80,9 +80,9 @@ class Search:
             fitted = self._swapped(fitted)
         return self._with_best_law(self.eliminated(fitted, self._least, []))
 
-    def instead(self, fitted: Fitted, stopped: Set[str]) -> Fitted:
+    def instead(self, fitted: Fitted, stopped: Iterable[str]) -> Fitted:
         """Adds causes in place of those that were ``stopped`` by a test of the result."""
-        self._stopped |= stopped
+        self._stopped.update(stopped)
         while len(fitted.hypothesis.effects) < self.base + MOST:
             found = self._best_addition(fitted)
             if found is None:
