@@ -307,12 +307,12 @@ def improve(
     from hdbridge.commissioning.improvement import Source, improve
     from hdbridge.commissioning.improvement.trial import trial_s
 
-    active = _active(session.files)
+    axis, active = session.axis, _active(session.files)
     if given and measured.resume is not None:
         raise InputError("--from and --resume exclude each other: leave one of them out")
     recordings = csv.load(given or ())  # refused before anything is connected
     work = measured.of(session)
-    test_min = trial_s(work.plan, session.axis, active) / 60
+    test_min = trial_s(work.plan, axis, active) / 60
     trial = f"{test_min:.1f} min to step with both models, if something is found"
     if recordings:
         note(f"nothing is measured first; {trial}")
