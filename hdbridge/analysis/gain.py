@@ -126,24 +126,31 @@ def of_written(
 ) -> Gain | None:
     """Compares the ``given`` model with the ``others`` of its findings to the written model.
 
-    Both are places of effects in the fit. Nothing else of the given model is refitted, so a fresh record can
-    repeat the comparison.
+    Both are places of effects in the fit. The others are not fitted again without the finding, so a fresh
+    record can repeat the comparison.
     """
-    before, after = (_as_written(estimator, fitted, given, places) for places in (others, written))
-    return _compared(estimator, before, after)
+    before = _as_written(estimator, fitted, given, others, ())
+    return _compared(estimator, before, _as_written(estimator, fitted, given, written, written))
 
 
 def _as_written(
-    estimator: Estimator, fitted: Fitted, given: Sequence[Effect], places: Collection[int]
+    estimator: Estimator,
+    fitted: Fitted,
+    given: Sequence[Effect],
+    places: Collection[int],
+    free: Collection[int],
 ) -> Linearised:
-    """Returns the fit of the zeros and of the effects at ``places``; the others are as given, or absent."""
+    """Returns the fit of the zeros and the ``free`` effects, of those at ``places``.
+
+    Effects at other places are as given, or absent.
+    """
     effects, full = fitted.hypothesis.effects, fitted.linearised
     used = [
         effects[at] if at in places else given[at]
         for at in range(len(effects))
         if at in places or at < len(given)
     ]
-    columns = np.concatenate([np.arange(len(fitted.zeros)), *(fitted.places(at) for at in sorted(places))])
+    columns = np.concatenate([np.arange(len(fitted.zeros)), *(fitted.places(at) for at in sorted(free))])
     left, _ = estimator.left_by(used)
     return Linearised(full.columns[:, columns], left * estimator.weight, full.known[columns])
 

@@ -113,13 +113,22 @@ class Search:
         return self.begun()
 
     def _with_best_law(self, fitted: Fitted) -> Fitted:
-        """Exchanges the hysteresis law for an equivalent one if that fits better."""
+        """Exchanges the hysteresis law for an equivalent one that fits better.
+
+        Another law than the model's must be better by as much as a cause.
+        """
         for place, effect in enumerate(fitted.hypothesis.effects[: self.base]):
             laws = in_place(effect, CATALOGUE.values()) if effect.part is Part.LOOP else ()
             if laws:
                 trials = [self.estimator.fit(fitted.hypothesis.instead(place, law)) for law in laws]
-                return min((fitted, *trials), key=lambda each: each.chi_square)
+                return min(
+                    (fitted, *trials), key=lambda each: each.chi_square + self._toll_of_law(each, place)
+                )
         return fitted
+
+    def _toll_of_law(self, fitted: Fitted, place: int) -> float:
+        same = type(fitted.hypothesis.effects[place]) is type(self._base[place])
+        return 0.0 if same else self.scales.enter + self.scales.penalty
 
     def _with_free_loop(self, fitted: Fitted, found: Fitted | None) -> Fitted | None:
         """Adds a free-form hysteresis, or returns None if the best cause explains more."""
