@@ -94,42 +94,12 @@ def test_a_correct_master_has_no_findings(outer):
     assert {each[-1] for each in configured if "COB-ID" in each} == {"h"}
 
 
-def lost_sync(outer):
-    outer.begin()
-    outer.enable()
-    outer.listen(0.012)
-    outer.cycle(0x0F, 1_000_000)
-
-
 def no_targets(outer):
     outer.begin()
     outer.enable()
     for _ in range(3):
         outer.send(0x080)
         outer.listen(0.004)
-
-
-def jump_at_enabling(outer):
-    outer.begin()
-    outer.cycle(0x06, 1_000_000, 3)
-    outer.cycle(0x07, 5_000_000, 3)
-    outer.cycle(0x0F, 5_000_000, 3)
-
-
-def too_fast(outer):
-    outer.begin()
-    outer.enable()
-    outer.cycle(0x0F, 1_500_000)
-
-
-def beyond_the_limits(outer):
-    outer.begin()
-    outer.cycle(0x00, 2_000_000_000)
-
-
-def enabled_at_once(outer):
-    outer.begin()
-    outer.cycle(0x0F, 1_000_000, 2)
 
 
 def held_reset(outer):
@@ -142,38 +112,8 @@ def held_reset(outer):
     outer.cycle(0x8F, 1_000_000, 100)
 
 
-def reset_and_enabled_at_once(outer):
-    outer.begin()
-    outer.cycle(0x80, 1_000_000, 5)
-    outer.cycle(0x8F, 1_000_000, 5)
-
-
-def short_rpdo(outer):
-    outer.begin()
-    outer.send(0x205, b"\x06\0")
-
-
-def mapped_while_valid(outer):
-    outer.put(0x1A00, 0, 0, 1)
-
-
 def no_such_mode(outer):
     outer.put(0x6060, 0, 9, 1)
-
-
-def no_such_object(outer):
-    outer.put(0x2345, 0, 1, 1)
-
-
-def beyond_a_range(outer):
-    outer.put(0x605A, 0, 9, 2)
-
-
-def no_heartbeat(outer):
-    outer.put(0x1016, 1, 126 << 16 | 100, 4)
-    outer.get(0x6041)
-    outer.listen(1.5)
-    outer.get(0x6041)
 
 
 def stored_by_lss(outer):
@@ -186,34 +126,56 @@ def stored_by_lss(outer):
     assert texts[-3:-1] == ["LSS: a node is selected by its identity", "LSS node id 9"]
 
 
-def rpdo_too_early(outer):
-    outer.begin()
-    outer.put(0x1017, 0, 10, 2)
-    outer.send(0, bytes((128, NODE)))
-    outer.listen(0.05)
-    outer.send(0x205, bytes(6))
-
-
 @pytest.mark.parametrize(
     ("does", "words"),
     [
-        (lost_sync, "SYNC must be periodic"),
+        (
+            lambda o: (o.begin(), o.enable(), o.listen(0.012), o.cycle(0x0F, 1_000_000)),
+            "SYNC must be periodic",
+        ),
         (no_targets, "send a target before every SYNC"),
-        (jump_at_enabling, "the target is 4000000 increments from 6064h"),
-        (too_fast, "the axis is not faster than 607Fh"),
-        (beyond_the_limits, "the software limits (607Dh) are -14400000 to 14400000"),
-        (enabled_at_once, "no transition from switch on disabled"),
+        (
+            lambda o: (
+                o.begin(),
+                o.cycle(0x06, 1_000_000, 3),
+                o.cycle(0x07, 5_000_000, 3),
+                o.cycle(0x0F, 5_000_000, 3),
+            ),
+            "the target is 4000000 increments from 6064h",
+        ),
+        (lambda o: (o.begin(), o.enable(), o.cycle(0x0F, 1_500_000)), "the axis is not faster than 607Fh"),
+        (
+            lambda o: (o.begin(), o.cycle(0x00, 2_000_000_000)),
+            "the software limits (607Dh) are -14400000 to 14400000",
+        ),
+        (lambda o: (o.begin(), o.cycle(0x0F, 1_000_000, 2)), "no transition from switch on disabled"),
         (held_reset, "bit 7 acts by its rising edge"),
-        (reset_and_enabled_at_once, "bit 7 acts by its rising edge"),
-        (short_rpdo, "6 bytes are mapped in 1600h"),
-        (mapped_while_valid, "to change a PDO: set bit 31"),
+        (
+            lambda o: (o.begin(), o.cycle(0x80, 1_000_000, 5), o.cycle(0x8F, 1_000_000, 5)),
+            "bit 7 acts by its rising edge",
+        ),
+        (lambda o: (o.begin(), o.send(0x205, b"\x06\0")), "6 bytes are mapped in 1600h"),
+        (lambda o: o.put(0x1A00, 0, 0, 1), "to change a PDO: set bit 31"),
         (no_such_mode, "the modes are 1, 6, 7, 8 (6502h)"),
-        (no_such_object, "use the EDS of 'hdbridge gateway eds'"),
-        (beyond_a_range, "expected 0 to 8"),
-        (no_heartbeat, "let the master send its heartbeat"),
-        (rpdo_too_early, "NMT start first"),
+        (lambda o: o.put(0x2345, 0, 1, 1), "use the EDS of 'hdbridge gateway eds'"),
+        (lambda o: o.put(0x605A, 0, 9, 2), "expected 0 to 8"),
+        (
+            lambda o: (o.put(0x1016, 1, 126 << 16 | 100, 4), o.get(0x6041), o.listen(1.5), o.get(0x6041)),
+            "let the master send its heartbeat",
+        ),
+        (
+            lambda o: (
+                o.begin(),
+                o.put(0x1017, 0, 10, 2),
+                o.send(0, bytes((128, NODE))),
+                o.listen(0.05),
+                o.send(0x205, bytes(6)),
+            ),
+            "NMT start first",
+        ),
         (stored_by_lss, "the node id that lasts is that of the machine file"),
     ],
+    ids=lambda each: each if isinstance(each, str) else "",
 )
 def test_each_mistake_is_reported_once_with_its_remedy(outer, does, words):
     does(outer)

@@ -8,7 +8,7 @@ from typing import Final, Unpack
 from hdbridge.axis import AxisConfig
 from hdbridge.daemon.loop.faultlog import fault_of
 from hdbridge.daemon.loop.states import STOPPED, AxisState
-from hdbridge.daemon.memory import CommandKind, Event, EventKind, SampleFlag
+from hdbridge.daemon.memory import CommandKind, Event, EventKind
 from hdbridge.daemon.service.core import ANSWER_S, Arguments, Core
 from hdbridge.daemon.service.timing import POLL_S
 from hdbridge.drive.states import State
@@ -67,10 +67,6 @@ class AxisLink:
         """Returns a field of `AXIS_SAMPLE` in the newest cycle; 0 before the first."""
         newest = self.core.observer.newest
         return float(newest[0]["axes"][self.index][field]) if newest is not None else 0.0
-
-    def flag(self, flag: SampleFlag) -> bool:
-        """Returns True if the flag is set in the newest cycle."""
-        return bool(int(self.value("flags")) & flag)
 
     @property
     def state(self) -> AxisState:

@@ -31,32 +31,24 @@ class Holder:
 
 
 class Lease:
-    """The lease. Not thread-safe: use it from one thread.
+    """The lease. Not thread-safe: use it from one thread."""
 
-    ``now`` returns the seconds of a monotonic clock; ``new_token`` can be replaced in tests.
-    """
-
-    def __init__(
-        self,
-        timeout_s: float,
-        now: Callable[[], float],
-        new_token: Callable[[], str] = lambda: secrets.token_urlsafe(TOKEN_BYTES),
-    ) -> None:
+    def __init__(self, timeout_s: float, now: Callable[[], float]) -> None:
+        """``now`` returns the seconds of a monotonic clock."""
         self.timeout_s = timeout_s
         self._now = now
-        self._new_token = new_token
         self._token: str | None = None
         self._client = ""
         self._taken_s = self._heard_s = 0.0
         self._lasts = False
-        self._ended: list[str] = []
         self.doing: Callable[[], str] = lambda: ""
         """Returns what the machine does at present and how to end it, in words, for refusals."""
 
     @property
     def holder(self) -> Holder | None:
         """Present holder; None if the lease is free."""
-        self._expire()
+        if not self._lasts and self._now() - self._heard_s >= self.timeout_s:
+            self._token = None
         if self._token is None:
             return None
         return Holder(
@@ -84,22 +76,14 @@ class Lease:
                 f"'{holder.client}' holds the right to move{until}{self._doing()}; {advice} the command with "
                 "--force"
             )
-        if holder is not None:
-            self._end()
-        self._token, self._client, self._lasts = self._new_token(), client, lasts
+        self._token, self._client, self._lasts = secrets.token_urlsafe(TOKEN_BYTES), client, lasts
         self._taken_s = self._heard_s = self._now()
         return self._token
-
-    def renew(self, token: str) -> Holder:
-        """Extends the lease by its time-out. Raises LeaseError as `check` does."""
-        self.check(token)
-        assert self.holder is not None
-        return self.holder
 
     def release(self, token: str) -> None:
         """Releases the lease. Raises LeaseError as `check` does, so that only its holder can release it."""
         self.check(token)
-        self._end()
+        self._token = None
 
     def check(self, token: str) -> None:
         """Raises LeaseError unless ``token`` is the present holder's; extends the lease by its time-out."""
@@ -117,23 +101,6 @@ class Lease:
         """Returns True if ``token`` is the present holder's; does not extend the lease."""
         return self.holder is not None and token == self._token
 
-    def ended(self) -> tuple[str, ...]:
-        """Returns the clients whose leases have ended since the last call, in order.
-
-        A lease ends when it is released, expires or is taken by force.
-        """
-        self._expire()
-        ended, self._ended = tuple(self._ended), []
-        return ended
-
-    def _expire(self) -> None:
-        if self._token is not None and not self._lasts and self._now() - self._heard_s >= self.timeout_s:
-            self._end()
-
     def _doing(self) -> str:
         doing = self.doing()
         return f"; {doing}" if doing else ""
-
-    def _end(self) -> None:
-        self._token = None
-        self._ended.append(self._client)

@@ -68,7 +68,7 @@ async def work(bridge: ServiceBridge, token: str, stands: int, seed: int = 0) ->
     axis, place = bridge.axes["axis1"], 10.0
     for step in np.random.default_rng(seed).normal(0.0, 3.0, stands).tolist():
         place = abs(place + step)
-        bridge.lease.renew(token)
+        bridge.lease.check(token)
         await axis.motion.move(token, place)
         await bridge.core.timing.sleep(0.2)
 

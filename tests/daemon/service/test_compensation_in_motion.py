@@ -91,7 +91,7 @@ def test_adaptation_removes_the_ripple_of_a_retuned_servo(profile: Path, tmp_pat
             before = await ripple(service, bridge, token, goto)
             for speed in (60.0, 45.0) * 2:
                 for target in (0.0, FAR_DEG):
-                    bridge.lease.renew(token)
+                    bridge.lease.check(token)
                     await axis.motion.move(token, target, speed)
                     await following.apply()
             await axis.motion.move(token, -FAR_DEG)

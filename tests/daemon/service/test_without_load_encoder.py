@@ -35,7 +35,7 @@ def at_work(blind: Path, folder: Path, **servo: float) -> tuple[messages.AxisSta
             bridge.following["axis1"] = made
             bridge.core.observer.add(made)
             for target in (FAR_DEG, -FAR_DEG, FAR_DEG):
-                bridge.lease.renew(token)
+                bridge.lease.check(token)
                 await axis.motion.move(token, target, SPEED_DEG_S)
             await axis.disable(token)
             return axis.state(), [each.text for each in bridge.events().events]

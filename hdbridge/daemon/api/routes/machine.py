@@ -62,7 +62,7 @@ async def take_lease(bridge: Bridge, wanted: messages.LeaseRequest, request: Req
 @routes.put("/lease", tags=["Lease"], responses=refusals((422, 423)))
 async def renew_lease(bridge: Bridge, holder: Holder = "") -> messages.LeaseState:
     """Renew the lease without a motion."""
-    bridge.lease.renew(holder)
+    bridge.lease.check(holder)
     return bridge.state().lease
 
 

@@ -93,7 +93,7 @@ async def _kept(bridge: Bridge, request: Request, holder: Holder = "") -> AsyncI
                 await asyncio.sleep(bridge.lease.timeout_s / RENEWALS)
                 if await request.is_disconnected():
                     return
-                bridge.lease.renew(holder)
+                bridge.lease.check(holder)
 
     renewing = asyncio.ensure_future(renew())
     try:

@@ -115,7 +115,7 @@ async def _stream(bridge: ServiceBridge, websocket: WebSocket, axis: str) -> Non
         await _send(websocket, StreamAnswer(accepted=0))
         while True:
             given = await _receive(websocket, StreamPoints)
-            bridge.lease.renew(begin.lease)
+            bridge.lease.check(begin.lease)
             if given.points:
                 await stream.put(given.points)
             if given.end:
