@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from hdbridge.cli import options as opt
+from hdbridge.cli.options import taking
 from hdbridge.cli.printing import console, note, progress_bar, say, write_json
-from hdbridge.cli.session import Session, bare_bus, deferred_interrupt, on_axis
+from hdbridge.cli.session import BusOptions, Session, deferred_interrupt, on_axis
 from hdbridge.clock import MonotonicClock
 from hdbridge.commissioning.bringup import ASK_TIMEOUT_S, LISTEN_S, TORQUE_PERCENT
 from hdbridge.commissioning.bringup.checks import Check, Outcome, Verdict, failed, not_possible, passed
@@ -251,7 +252,9 @@ class _Report:
             note(self.remark)
 
 
+@taking(BusOptions)
 def scan(
+    reach: BusOptions,
     profile: Annotated[
         str | None,
         typer.Argument(
@@ -260,10 +263,6 @@ def scan(
             "--channel.",
         ),
     ] = None,
-    interface: opt.Interface = None,
-    channel: opt.Channel = None,
-    force: opt.Force = False,
-    borrow: opt.Borrow = False,
     bitrate_bps: opt.Bitrate = None,
     listen_s: Annotated[
         float,
@@ -272,9 +271,6 @@ def scan(
     timeout_ms: Annotated[
         float, typer.Option("--timeout-ms", min=1.0, max=5000.0, help="Time for each node id to answer.")
     ] = 1000.0 * ASK_TIMEOUT_S,
-    simulate: opt.Simulate = False,
-    truth: opt.Truth = None,
-    seed: opt.Seed = 0,
     json_file: opt.Json = None,
 ) -> None:
     """List the nodes on a CAN bus: type, identity, state, and lines for an axis file.
@@ -290,13 +286,13 @@ def scan(
 
     axis = None
     if profile is not None:
-        session = Session(profile, simulate, truth, seed, interface, channel, force, borrow)
+        session = reach.of(profile)
         axis, opened = session.axis, session.connected()
-    elif simulate or interface is None or channel is None:
+    elif reach.simulate or reach.interface is None or reach.channel is None:
         raise InputError("scan needs a bus: give a PROFILE, or --interface and --channel (socketcan, can0)")
     else:
-        named = BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps)
-        opened = bare_bus(named, force=force)
+        named = BusConfig(interface=reach.interface, channel=reach.channel, bitrate_bps=bitrate_bps)
+        opened = reach.bare(named)
     with opened as (bus, clock), progress_bar() as bar:
         link = Link(bus, clock)
         task = bar.add_task("asking nodes", total=1.0)
@@ -304,7 +300,7 @@ def scan(
             link,
             listen_s=listen_s,
             timeout_s=timeout_ms / 1000.0,
-            force=force,
+            force=reach.force,
             progress=lambda share: bar.update(task, completed=share),
         )
     matches, lines = (False, []) if axis is None else compare(axis, found)

@@ -40,60 +40,62 @@ LimitOption = Annotated[
         help="Limit on the peak of a cause; the page predicts the hours until then.",
     ),
 ]
-JoinsOption = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="SOURCE...", help="Folders, globs or URLs (s3://, sftp://, ...) of recordings."),
-]
-OutOption = Annotated[
-    Path | None,
-    typer.Option("--out", metavar="FOLDER", help="Folder of the results; an earlier run in it is continued."),
-]
-ManifestOption = Annotated[
-    Path | None,
-    typer.Option("--manifest", metavar="M.csv|M.parquet", help="Table of the recordings: docs/fleet.md."),
-]
-ModelOption = Annotated[
-    Path | None,
-    typer.Option("--model", metavar="MODEL.yaml", help="Model of joints without one of their own."),
-]
-ModelsOption = Annotated[
-    Path | None, typer.Option("--models", metavar="FOLDER", help="Folder with a model per joint, JOINT.yaml.")
-]
-SchedulerOption = Annotated[
-    str | None,
-    typer.Option("--scheduler", metavar="ADDRESS", help="Running Dask scheduler: tcp://HOST:8786."),
-]
-WorkersOption = Annotated[
-    int | None,
-    typer.Option("--workers", min=1, max=1000, help="Processes on this computer; else one per core."),
-]
 PagesOption = Annotated[
     bool, typer.Option("--pages", help="Also write the page of each listed joint, into OUT/pages.")
 ]
-TimeoutOption = Annotated[
-    float,
-    typer.Option(
-        "--timeout", metavar="SECONDS", min=0.1, max=3600.0, help="Longest wait for a server of SOURCE, s."
-    ),
-]
-MemoryOption = Annotated[str, typer.Option("--memory", metavar="SIZE", help="Memory limit of each process.")]
 
 
 @dataclass(frozen=True)
 class Fleet:
     """Recordings to diagnose, as the user of `run` or `watch` names them; InputError names a wrong option."""
 
-    sources: JoinsOption = None
-    out: OutOption = None
-    manifest: ManifestOption = None
-    model: ModelOption = None
-    models: ModelsOption = None
-    scheduler: SchedulerOption = None
-    workers: WorkersOption = None
-    memory: MemoryOption = "2GB"
+    sources: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="SOURCE...", help="Folders, globs or URLs (s3://, sftp://, ...) of recordings."
+        ),
+    ] = None
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="FOLDER", help="Folder of the results; an earlier run in it is continued."
+        ),
+    ] = None
+    manifest: Annotated[
+        Path | None,
+        typer.Option("--manifest", metavar="M.csv|M.parquet", help="Table of the recordings: docs/fleet.md."),
+    ] = None
+    model: Annotated[
+        Path | None,
+        typer.Option("--model", metavar="MODEL.yaml", help="Model of joints without one of their own."),
+    ] = None
+    models: Annotated[
+        Path | None,
+        typer.Option("--models", metavar="FOLDER", help="Folder with a model per joint, JOINT.yaml."),
+    ] = None
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="Running Dask scheduler: tcp://HOST:8786."),
+    ] = None
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", min=1, max=1000, help="Processes on this computer; else one per core."),
+    ] = None
+    memory: Annotated[str, typer.Option("--memory", metavar="SIZE", help="Memory limit of each process.")] = (
+        "2GB"
+    )
     limit_arcsec: LimitOption = 10.0
     pages: PagesOption = False
-    timeout_s: TimeoutOption = 20.0
+    timeout_s: Annotated[
+        float,
+        typer.Option(
+            "--timeout",
+            metavar="SECONDS",
+            min=0.1,
+            max=3600.0,
+            help="Longest wait for a server of SOURCE, s.",
+        ),
+    ] = 20.0
 
     def __post_init__(self) -> None:
         from hdbridge.axis.model import TransmissionModel
@@ -111,10 +113,6 @@ class Fleet:
                 "--workers: a running cluster has its own workers; leave out --workers or --scheduler"
             )
         _check_memory(self.memory)
-        if self.scheduler == "":
-            raise InputError("--scheduler: found no address; expected one such as tcp://HOST:8786")
-        if "" in (self.sources or []):
-            raise InputError("SOURCE: found an empty name; expected a folder, a glob or a URL")
         if self.model is not None:
             TransmissionModel.load(self.model)
         if self.models is not None and not self.models.is_dir():

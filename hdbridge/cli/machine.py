@@ -415,7 +415,7 @@ def _simulated(
     from hdbridge.sim.machine import Machine
     from hdbridge.sim.truth import Truth
 
-    session = Session(profile, interface=interface, channel=channel)
+    session = Session(profile=profile, interface=interface, channel=channel)
     axis = session.axis
     if axis.bus.interface == "virtual":
         raise InputError(

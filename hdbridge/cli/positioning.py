@@ -472,7 +472,7 @@ def demo(
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.motion.procedures.stepping import Stepping
 
-    session = Session("article", simulate=True, seed=seed)
+    session = Session(profile="article", simulate=True, seed=seed)
     files, axis = session.files, session.axis
     stepping = Stepping(count=count)
     folder = new_folder(Path("demo-output")) if out is None else make_folder(out)
