@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import typer
+from typer import Argument, Option
 
 from hdbridge.cli import options as opt
 from hdbridge.cli.options import taking
@@ -24,7 +24,7 @@ def conform(
     reach: BusOptions,
     profile: Annotated[
         str | None,
-        typer.Argument(
+        Argument(
             metavar="PROFILE",
             help="Axis whose drive is checked, or machine whose gateway is checked. Without it: --channel, "
             "--node and --eds.",
@@ -32,27 +32,27 @@ def conform(
     ] = None,
     bitrate_bps: opt.Bitrate = None,
     node_id: Annotated[
-        int | None, typer.Option("--node", min=1, max=127, help="Node id; else the axis file's.")
+        int | None, Option("--node", min=1, max=127, help="Node id; else the axis file's.")
     ] = None,
     eds: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--eds", metavar="FILE", help="EDS of the node, which is compared with it; else the axis file's."
         ),
     ] = None,
     axis: opt.GatewayAxis = None,
     motion: Annotated[
-        bool, typer.Option("--motion", help="Also switch power on and move the axis; else power stays off.")
+        bool, Option("--motion", help="Also switch power on and move the axis; else power stays off.")
     ] = False,
     store: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--store", help="Also save parameters (1010h) and restore defaults (1011h): stored ones are lost."
         ),
     ] = False,
     travel: Annotated[
         int | None,
-        typer.Option(
+        Option(
             "--travel",
             min=1,
             metavar="UNITS",
@@ -60,12 +60,12 @@ def conform(
         ),
     ] = None,
     only: Annotated[
-        list[str] | None, typer.Option("--only", metavar="ID", help="Only checks whose id begins so.")
+        list[str] | None, Option("--only", metavar="ID", help="Only checks whose id begins so.")
     ] = None,
     timeout_ms: Annotated[
-        float, typer.Option("--timeout-ms", min=1.0, max=60_000.0, help="Longest time to an SDO answer.")
+        float, Option("--timeout-ms", min=1.0, max=60_000.0, help="Longest time to an SDO answer.")
     ] = 500.0,
-    list_checks: Annotated[bool, typer.Option("--list", help="List the checks and end.")] = False,
+    list_checks: Annotated[bool, Option("--list", help="List the checks and end.")] = False,
     json_file: opt.Json = None,
 ) -> None:
     """Check a node against CiA 301 and CiA 402: NMT, SDO, PDO, SYNC, EMCY, its EDS, the drive profile.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 from urllib.parse import unquote
 
-import typer
+from typer import Argument, Option
 
 from hdbridge.cli import options as opt
 from hdbridge.cli.options import need_extra, taking
@@ -29,10 +29,10 @@ PAGE_NAME = "fleet.html"
 PRIOR_NAME = "fleet.parquet"
 _EXTRA = ("distributed", "pyarrow", "fsspec")
 
-OutArgument = Annotated[Path, typer.Argument(metavar="OUT", help="The --out folder of a run.")]
+OutArgument = Annotated[Path, Argument(metavar="OUT", help="The --out folder of a run.")]
 LimitOption = Annotated[
     float,
-    typer.Option(
+    Option(
         "--limit",
         metavar="ARCSEC",
         min=0.1,
@@ -41,7 +41,7 @@ LimitOption = Annotated[
     ),
 ]
 PagesOption = Annotated[
-    bool, typer.Option("--pages", help="Also write the page of each listed joint, into OUT/pages.")
+    bool, Option("--pages", help="Also write the page of each listed joint, into OUT/pages.")
 ]
 
 
@@ -51,44 +51,35 @@ class Fleet:
 
     sources: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="SOURCE...", help="Folders, globs or URLs (s3://, sftp://, ...) of recordings."
-        ),
+        Argument(metavar="SOURCE...", help="Folders, globs or URLs (s3://, sftp://, ...) of recordings."),
     ] = None
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", metavar="FOLDER", help="Folder of the results; an earlier run in it is continued."
-        ),
+        Option("--out", metavar="FOLDER", help="Folder of the results; an earlier run in it is continued."),
     ] = None
     manifest: Annotated[
         Path | None,
-        typer.Option("--manifest", metavar="M.csv|M.parquet", help="Table of the recordings: docs/fleet.md."),
+        Option("--manifest", metavar="M.csv|M.parquet", help="Table of the recordings: docs/fleet.md."),
     ] = None
     model: Annotated[
-        Path | None,
-        typer.Option("--model", metavar="MODEL.yaml", help="Model of joints without one of their own."),
+        Path | None, Option("--model", metavar="MODEL.yaml", help="Model of joints without one of their own.")
     ] = None
     models: Annotated[
-        Path | None,
-        typer.Option("--models", metavar="FOLDER", help="Folder with a model per joint, JOINT.yaml."),
+        Path | None, Option("--models", metavar="FOLDER", help="Folder with a model per joint, JOINT.yaml.")
     ] = None
     scheduler: Annotated[
-        str | None,
-        typer.Option("--scheduler", metavar="ADDRESS", help="Running Dask scheduler: tcp://HOST:8786."),
+        str | None, Option("--scheduler", metavar="ADDRESS", help="Running Dask scheduler: tcp://HOST:8786.")
     ] = None
     workers: Annotated[
         int | None,
-        typer.Option("--workers", min=1, max=1000, help="Processes on this computer; else one per core."),
+        Option("--workers", min=1, max=1000, help="Processes on this computer; else one per core."),
     ] = None
-    memory: Annotated[str, typer.Option("--memory", metavar="SIZE", help="Memory limit of each process.")] = (
-        "2GB"
-    )
+    memory: Annotated[str, Option("--memory", metavar="SIZE", help="Memory limit of each process.")] = "2GB"
     limit_arcsec: LimitOption = 10.0
     pages: PagesOption = False
     timeout_s: Annotated[
         float,
-        typer.Option(
+        Option(
             "--timeout",
             metavar="SECONDS",
             min=0.1,
@@ -207,13 +198,9 @@ def watch(
     fleet: Fleet,
     interval_s: Annotated[
         float,
-        typer.Option(
-            "--interval", metavar="SECONDS", min=0.1, max=86_400.0, help="Time between two listings, s."
-        ),
+        Option("--interval", metavar="SECONDS", min=0.1, max=86_400.0, help="Time between two listings, s."),
     ] = 60.0,
-    once: Annotated[
-        bool, typer.Option("--once", help="End after one round, for a timer such as cron.")
-    ] = False,
+    once: Annotated[bool, Option("--once", help="End after one round, for a timer such as cron.")] = False,
 ) -> None:
     """Diagnose new recordings as they arrive, and update Parquet and page in FOLDER.
 
@@ -240,14 +227,14 @@ def report(
     out: OutArgument,
     html_file: Annotated[
         Path | None,
-        typer.Option("--html", metavar="PAGE", help="Write the page here; else OUT/fleet.html."),
+        Option("--html", metavar="PAGE", help="Write the page here; else OUT/fleet.html."),
         Kind.PAGE,
     ] = None,
     json_file: opt.Json = None,
     limit_arcsec: LimitOption = 10.0,
     pages: PagesOption = False,
     joints: Annotated[
-        list[str] | None, typer.Option("--joint", metavar="NAME", help="Also write the page of this joint.")
+        list[str] | None, Option("--joint", metavar="NAME", help="Also write the page of this joint.")
     ] = None,
 ) -> None:
     """Write the page of a run again, and print which joints to look at first."""
@@ -261,13 +248,11 @@ def report(
 
 def simulate(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="Write the fleet here: a new folder."), Kind.FOLDER
+        Path, Argument(metavar="FOLDER", help="Write the fleet here: a new folder."), Kind.FOLDER
     ],
-    joints: Annotated[int, typer.Option("--joints", min=4, max=100_000, help="Number of joints.")] = 12,
-    recordings: Annotated[
-        int, typer.Option("--recordings", min=3, max=1000, help="Recordings per joint.")
-    ] = 4,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the fleet.")] = 0,
+    joints: Annotated[int, Option("--joints", min=4, max=100_000, help="Number of joints.")] = 12,
+    recordings: Annotated[int, Option("--recordings", min=3, max=1000, help="Recordings per joint.")] = 4,
+    seed: Annotated[int, Option("--seed", help="Seed of the fleet.")] = 0,
 ) -> None:
     """Make recordings of a simulated fleet: growing known causes, damaged files, exchanged joints.
 
