@@ -357,7 +357,7 @@ class NodeTester:
     # ---------------------------------------------------------------- SDO
 
     def ask(self, request: bytes, timeout_s: float | None = None) -> bytes | None:
-        """Sends an SDO request; returns the answer, or None if there is none in time."""
+        """Sends an SDO request; returns the answer; None without one in time."""
         since = self.mark()
         self.send(0x600 + self.node_id, request)
         frame = self.hears(0x580 + self.node_id, timeout_s, since)
