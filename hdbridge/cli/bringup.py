@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+from typer import Argument, Option
 
 from hdbridge.cli import options as opt
+from hdbridge.cli.options import taking
 from hdbridge.cli.printing import console, note, progress_bar, say, write_json
-from hdbridge.cli.session import Session, bare_bus, deferred_interrupt, on_axis
+from hdbridge.cli.session import BusOptions, Session, deferred_interrupt, on_axis
 from hdbridge.clock import MonotonicClock
 from hdbridge.commissioning.bringup import ASK_TIMEOUT_S, LISTEN_S, TORQUE_PERCENT
 from hdbridge.commissioning.bringup.checks import Check, Outcome, Verdict, failed, not_possible, passed
@@ -39,9 +41,9 @@ class Source(Enum):
 
 
 def new(
-    name: Annotated[Path, typer.Argument(metavar="NAME", help="New folder; its name is the axis's.")],
+    name: Annotated[Path, Argument(metavar="NAME", help="New folder; its name is the axis's.")],
     source: Annotated[
-        Source, typer.Option("--from", help="Bundled profile to copy, or the drive that answers on a bus.")
+        Source, Option("--from", help="Bundled profile to copy, or the drive that answers on a bus.")
     ] = Source.DEMO,
     interface: opt.Interface = None,
     channel: opt.Channel = None,
@@ -113,7 +115,7 @@ def _only_usable(bus: str, nodes: tuple[Node, ...], node_id: int | None) -> Node
 
 CheckedArgument = Annotated[
     str,
-    typer.Argument(
+    Argument(
         metavar="PROFILE",
         help="Folder with axis.yaml (and model.yaml), axis file, machine file, or a bundled one: "
         "article, demo, cell.",
@@ -251,30 +253,24 @@ class _Report:
             note(self.remark)
 
 
+@taking(BusOptions)
 def scan(
+    reach: BusOptions,
     profile: Annotated[
         str | None,
-        typer.Argument(
+        Argument(
             metavar="PROFILE",
             help="Axis whose bus is scanned and whose drive is expected. Without it: --interface and "
             "--channel.",
         ),
     ] = None,
-    interface: opt.Interface = None,
-    channel: opt.Channel = None,
-    force: opt.Force = False,
-    borrow: opt.Borrow = False,
     bitrate_bps: opt.Bitrate = None,
     listen_s: Annotated[
-        float,
-        typer.Option("--listen", min=0.0, max=3600.0, help="Seconds to listen before asking; at least 0.51."),
+        float, Option("--listen", min=0.0, max=3600.0, help="Seconds to listen before asking; at least 0.51.")
     ] = LISTEN_S,
     timeout_ms: Annotated[
-        float, typer.Option("--timeout-ms", min=1.0, max=5000.0, help="Time for each node id to answer.")
+        float, Option("--timeout-ms", min=1.0, max=5000.0, help="Time for each node id to answer.")
     ] = 1000.0 * ASK_TIMEOUT_S,
-    simulate: opt.Simulate = False,
-    truth: opt.Truth = None,
-    seed: opt.Seed = 0,
     json_file: opt.Json = None,
 ) -> None:
     """List the nodes on a CAN bus: type, identity, state, and lines for an axis file.
@@ -290,13 +286,13 @@ def scan(
 
     axis = None
     if profile is not None:
-        session = Session(profile, simulate, truth, seed, interface, channel, force, borrow)
+        session = reach.of(profile)
         axis, opened = session.axis, session.connected()
-    elif simulate or interface is None or channel is None:
+    elif reach.simulate or reach.interface is None or reach.channel is None:
         raise InputError("scan needs a bus: give a PROFILE, or --interface and --channel (socketcan, can0)")
     else:
-        named = BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps)
-        opened = bare_bus(named, force=force)
+        named = BusConfig(interface=reach.interface, channel=reach.channel, bitrate_bps=bitrate_bps)
+        opened = reach.bare(named)
     with opened as (bus, clock), progress_bar() as bar:
         link = Link(bus, clock)
         task = bar.add_task("asking nodes", total=1.0)
@@ -304,7 +300,7 @@ def scan(
             link,
             listen_s=listen_s,
             timeout_s=timeout_ms / 1000.0,
-            force=force,
+            force=reach.force,
             progress=lambda share: bar.update(task, completed=share),
         )
     matches, lines = (False, []) if axis is None else compare(axis, found)
@@ -418,20 +414,20 @@ def doctor(
     session: Session,
     torque_percent: Annotated[
         float,
-        typer.Option(
+        Option(
             "--torque-percent",
             min=1.0,
             max=500.0,
             help="Highest motor torque, of the rated one; never above limits.torque_percent.",
         ),
     ] = TORQUE_PERCENT,
-    yes: Annotated[bool, typer.Option("--yes", help="Move the axis without asking.")] = False,
+    yes: Annotated[bool, Option("--yes", help="Move the axis without asking.")] = False,
     motion: Annotated[
-        bool, typer.Option("--motion/--no-motion", help="--no-motion: only checks without power.")
+        bool, Option("--motion/--no-motion", help="--no-motion: only checks without power.")
     ] = True,
     servo: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--servo",
             help="Also run at up to 64 % of the speed limit and compare the servo with the model's response.",
         ),
@@ -558,14 +554,14 @@ SERVO: Final[Check[Any]] = Check(
 
 def latency(
     duration_s: Annotated[
-        float, typer.Option("--duration", min=0.1, max=86_400, help="Seconds for each cycle time.")
+        float, Option("--duration", min=0.1, max=86_400, help="Seconds for each cycle time.")
     ] = 10.0,
     cycle_ms: Annotated[
         list[float] | None,
-        typer.Option("--cycle-ms", min=0.1, max=1000, help="Only this cycle time; may be repeated."),
+        Option("--cycle-ms", min=0.1, max=1000, help="Only this cycle time; may be repeated."),
     ] = None,
     realtime: Annotated[
-        bool, typer.Option(help="Ask for real-time priority and locked memory, as the control loop does.")
+        bool, Option(help="Ask for real-time priority and locked memory, as the control loop does.")
     ] = True,
     json_file: opt.Json = None,
 ) -> None:

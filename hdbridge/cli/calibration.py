@@ -9,18 +9,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
-import typer
+from typer import Argument, Option
 
 from hdbridge.cli import options as opt
 from hdbridge.cli.options import taking
-from hdbridge.cli.printing import (
-    note,
-    print_table,
-    progress_bar,
-    say,
-    write_json,
-    write_result,
-)
+from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_result
 from hdbridge.cli.session import Session, model_file
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import make_folder, new_folder
@@ -42,7 +35,7 @@ class Measured:
 
     plan: Annotated[
         str,
-        typer.Option(
+        Option(
             "--plan",
             metavar="quick|full|dynamics|FILE",
             help="What is measured: a bundled plan, or a file. A twin needs dynamics, too.",
@@ -50,14 +43,12 @@ class Measured:
     ] = "quick"
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", metavar="FOLDER", help="Where the recordings go; else recordings/AXIS-DATE-TIME."
-        ),
+        Option("--out", metavar="FOLDER", help="Where the recordings go; else recordings/AXIS-DATE-TIME."),
         Kind.FOLDER,
     ] = None
     resume: Annotated[
         Path | None,
-        typer.Option("--resume", metavar="FOLDER", help="Continue what was interrupted in this folder."),
+        Option("--resume", metavar="FOLDER", help="Continue what was interrupted in this folder."),
     ] = None
 
     def of(self, session: Session) -> Measurement:
@@ -232,29 +223,25 @@ def measure(session: Session, measured: Measured) -> None:
 def fit(
     csv: opt.CsvFormat,
     records: Annotated[
-        list[Path],
-        typer.Argument(metavar="RECORD...", help="Recording folders or CSV files, in order of time."),
+        list[Path], Argument(metavar="RECORD...", help="Recording folders or CSV files, in order of time.")
     ],
     ratio: Annotated[
         float | None,
-        typer.Option("--ratio", min=1, max=1000, help="Motor turns per load turn; else the recording's."),
+        Option("--ratio", min=1, max=1000, help="Motor turns per load turn; else the recording's."),
     ] = None,
     axis: Annotated[
-        str | None,
-        typer.Option("--axis", metavar="PROFILE", help="The axis that was recorded: ratio and binding."),
+        str | None, Option("--axis", metavar="PROFILE", help="The axis that was recorded: ratio and binding.")
     ] = None,
     active: Annotated[
         str | None,
-        typer.Option(
-            "--model", metavar="MODEL.yaml|PROFILE", help="Model to compare with, and to fall back on."
-        ),
+        Option("--model", metavar="MODEL.yaml|PROFILE", help="Model to compare with, and to fall back on."),
     ] = None,
     independent_zeros: opt.IndependentZeros = False,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="MODEL.yaml", help="Write the model file."), Kind.MODEL
+        Path | None, Option("--out", metavar="MODEL.yaml", help="Write the model file."), Kind.MODEL
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Write the model even if it is worse on held-out data.")
+        bool, Option("--force", help="Write the model even if it is worse on held-out data.")
     ] = False,
     json_file: opt.Json = None,
     html_file: opt.Html = None,
@@ -295,9 +282,7 @@ def fit(
 
 
 def report(
-    recording: Annotated[
-        Path, typer.Argument(metavar="RECORDING", help="Folder of a calibration's recording.")
-    ],
+    recording: Annotated[Path, Argument(metavar="RECORDING", help="Folder of a calibration's recording.")],
     json_file: opt.Json = None,
     html_file: opt.Html = None,
 ) -> None:

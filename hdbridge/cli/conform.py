@@ -7,56 +7,52 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import typer
+from typer import Argument, Option
 
 from hdbridge.cli import options as opt
+from hdbridge.cli.options import taking
 from hdbridge.cli.printing import note, print_table, progress_bar, write_json
-from hdbridge.cli.session import Session, bare_bus
+from hdbridge.cli.session import BusOptions, deferred_interrupt
 from hdbridge.errors import DriveError, InputError
 
 if TYPE_CHECKING:
     from hdbridge.conformance import Check, Result
 
 
+@taking(BusOptions)
 def conform(
+    reach: BusOptions,
     profile: Annotated[
         str | None,
-        typer.Argument(
+        Argument(
             metavar="PROFILE",
             help="Axis whose drive is checked, or machine whose gateway is checked. Without it: --channel, "
             "--node and --eds.",
         ),
     ] = None,
-    interface: Annotated[
-        str | None,
-        typer.Option("--interface", help="python-can interface; else the axis file's, or socketcan."),
-    ] = None,
-    channel: Annotated[
-        str | None, typer.Option("--channel", help="Channel of the bus, for example can0.")
-    ] = None,
     bitrate_bps: opt.Bitrate = None,
     node_id: Annotated[
-        int | None, typer.Option("--node", min=1, max=127, help="Node id; else the axis file's.")
+        int | None, Option("--node", min=1, max=127, help="Node id; else the axis file's.")
     ] = None,
     eds: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--eds", metavar="FILE", help="EDS of the node, which is compared with it; else the axis file's."
         ),
     ] = None,
     axis: opt.GatewayAxis = None,
     motion: Annotated[
-        bool, typer.Option("--motion", help="Also switch power on and move the axis; else power stays off.")
+        bool, Option("--motion", help="Also switch power on and move the axis; else power stays off.")
     ] = False,
     store: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--store", help="Also save parameters (1010h) and restore defaults (1011h): stored ones are lost."
         ),
     ] = False,
     travel: Annotated[
         int | None,
-        typer.Option(
+        Option(
             "--travel",
             min=1,
             metavar="UNITS",
@@ -64,17 +60,12 @@ def conform(
         ),
     ] = None,
     only: Annotated[
-        list[str] | None, typer.Option("--only", metavar="ID", help="Only checks whose id begins so.")
+        list[str] | None, Option("--only", metavar="ID", help="Only checks whose id begins so.")
     ] = None,
     timeout_ms: Annotated[
-        float, typer.Option("--timeout-ms", min=1.0, max=60_000.0, help="Longest time to an SDO answer.")
+        float, Option("--timeout-ms", min=1.0, max=60_000.0, help="Longest time to an SDO answer.")
     ] = 500.0,
-    list_checks: Annotated[bool, typer.Option("--list", help="List the checks and end.")] = False,
-    simulate: opt.Simulate = False,
-    truth: opt.Truth = None,
-    seed: opt.Seed = 0,
-    force: opt.Force = False,
-    borrow: opt.Borrow = False,
+    list_checks: Annotated[bool, Option("--list", help="List the checks and end.")] = False,
     json_file: opt.Json = None,
 ) -> None:
     """Check a node against CiA 301 and CiA 402: NMT, SDO, PDO, SYNC, EMCY, its EDS, the drive profile.
@@ -88,7 +79,6 @@ def conform(
     """  # fmt: skip
     from hdbridge.axis import BusConfig
     from hdbridge.cli.machine import eds_of, gateway_axis
-    from hdbridge.cli.session import deferred_interrupt
     from hdbridge.conformance import NodeTester, checks, run
     from hdbridge.conformance.tester import StoppedError, Timing
     from hdbridge.daemon.machine import machine_file
@@ -106,23 +96,24 @@ def conform(
     od = None
     if profile is not None and machine_file(profile) is not None:
         config, settings, model = gateway_axis(profile, axis)
-        opened, node_id = bare_bus(settings.bus, force=force), settings.nodes[config.name]
+        opened, node_id = reach.bare(settings.bus), settings.nodes[config.name]
         od = eds_of(config, settings, model) if eds is None else None
     elif profile is not None:
-        session = Session(profile, simulate, truth, seed, interface, channel, force, borrow)
+        session = reach.of(profile)
         config, opened = session.axis, session.connected()
         node_id, eds = node_id or config.drive.node_id, eds or config.eds_path
-    elif simulate or channel is None or node_id is None:
+    elif reach.simulate or reach.channel is None or node_id is None:
         raise InputError("conform needs a node: give a PROFILE, or --channel (can0) and --node")
     else:
-        named = BusConfig(interface=interface or "socketcan", channel=channel, bitrate_bps=bitrate_bps)
-        opened = bare_bus(named, force=force)
+        interface = reach.interface or "socketcan"
+        named = BusConfig(interface=interface, channel=reach.channel, bitrate_bps=bitrate_bps)
+        opened = reach.bare(named)
     assert node_id is not None
     od = od if eds is None else read_eds(eds, node_id).dictionary
     with deferred_interrupt() as interrupted, opened as (bus, clock), progress_bar() as bar:
         link = Link(bus, clock)
         task = bar.add_task(f"{len(wanted)} checks", total=len(wanted))
-        if not simulate and not force:
+        if not reach.simulate and not reach.force:
             ear = Ear((node_id,), asked=(node_id,))
             ear.listen(link, listening_s())
             ear.refuse(link.name, listening_s())

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import typer
 from rich.console import Group
 from rich.live import Live
 from rich.text import Text
+from typer import Argument, Option
 
 from hdbridge.cli import options as opt
 from hdbridge.cli.options import taking
@@ -38,7 +38,7 @@ STOP_S: Final = 3.0
 """Time-out of a stop command; s."""
 AtOption = Annotated[
     str | None,
-    typer.Option(
+    Option(
         "--at",
         metavar="ADDRESS",
         help="Name of the machine, socket or URL of its daemon; else HDBRIDGE_SOCKET, HDBRIDGE_URL (its "
@@ -46,10 +46,10 @@ AtOption = Annotated[
     ),
 ]
 OneAxisArgument = Annotated[
-    str | None, typer.Argument(metavar="AXIS", help="Name of the axis; needed if there are several.")
+    str | None, Argument(metavar="AXIS", help="Name of the axis; needed if there are several.")
 ]
-AxisArgument = Annotated[str, typer.Argument(metavar="AXIS", help="Name of the axis.")]
-AxesArgument = Annotated[list[str] | None, typer.Argument(metavar="AXIS...", help="Names of axes; else all.")]
+AxisArgument = Annotated[str, Argument(metavar="AXIS", help="Name of the axis.")]
+AxesArgument = Annotated[list[str] | None, Argument(metavar="AXIS...", help="Names of axes; else all.")]
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Daemon:
 
     at: AtOption = None
     force: Annotated[
-        bool, typer.Option("--force", help="Take the lease from its holder, whose motion is stopped.")
+        bool, Option("--force", help="Take the lease from its holder, whose motion is stopped.")
     ] = False
     json_file: opt.Json = None
 
@@ -262,13 +262,13 @@ def status(at: AtOption = None, json_file: opt.Json = None) -> None:
 def watch(
     at: AtOption = None,
     every_s: Annotated[
-        float, typer.Option("--every", min=0.05, max=3600.0, help="Time between updates, s.")
+        float, Option("--every", min=0.05, max=3600.0, help="Time between updates, s.")
     ] = 0.25,
     count: Annotated[
-        int | None, typer.Option("--count", min=1, help="Number of updates; else until Ctrl-C.")
+        int | None, Option("--count", min=1, help="Number of updates; else until Ctrl-C.")
     ] = None,
     lines: Annotated[
-        bool, typer.Option("--lines", help="Print a JSON object per line in place of a table.")
+        bool, Option("--lines", help="Print a JSON object per line in place of a table.")
     ] = False,
 ) -> None:
     """Show the state of a machine until Ctrl-C; it moves nothing."""
@@ -286,8 +286,8 @@ def watch(
 
 def events(
     at: AtOption = None,
-    since: Annotated[int, typer.Option("--since", min=0, help="Only events after this number.")] = 0,
-    follow: Annotated[bool, typer.Option("--follow", "-f", help="Continue until Ctrl-C.")] = False,
+    since: Annotated[int, Option("--since", min=0, help="Only events after this number.")] = 0,
+    follow: Annotated[bool, Option("--follow", "-f", help="Continue until Ctrl-C.")] = False,
     json_file: opt.Json = None,
 ) -> None:
     """List faults, states, refused commands and remarks; oldest first."""
@@ -318,7 +318,7 @@ def lease(daemon: Daemon) -> None:
     say(_lease_line(state))
 
 
-def mark(text: Annotated[str, typer.Argument(metavar="TEXT", help="One line.")], at: AtOption = None) -> None:
+def mark(text: Annotated[str, Argument(metavar="TEXT", help="One line.")], at: AtOption = None) -> None:
     """Write a remark into the flight recorder, at the present cycle."""
     with connected(at) as client:
         for each in client.mark(text):
@@ -433,12 +433,12 @@ def move(
     axis: AxisArgument,
     angles_deg: opt.Angles,
     relative: Annotated[
-        bool, typer.Option("--relative", help="Each angle is relative to the previous target.")
+        bool, Option("--relative", help="Each angle is relative to the previous target.")
     ] = False,
     velocity_deg_s: opt.Velocity = None,
     acceleration_deg_s2: opt.Acceleration = None,
     wait: Annotated[
-        bool, typer.Option("--wait/--no-wait", help="Wait until the axis rests there; else return at once.")
+        bool, Option("--wait/--no-wait", help="Wait until the axis rests there; else return at once.")
     ] = True,
 ) -> None:
     """Move the load to one angle or to several, and hold the last.
@@ -463,11 +463,9 @@ def move(
 def jog(
     daemon: Daemon,
     axis: AxisArgument,
-    velocity_deg_s: Annotated[
-        float, typer.Argument(metavar="SPEED", help="Speed of the load, deg/s, with sign.")
-    ],
+    velocity_deg_s: Annotated[float, Argument(metavar="SPEED", help="Speed of the load, deg/s, with sign.")],
     duration_s: Annotated[
-        float, typer.Option("--for", min=0.05, max=86_400.0, help="Time, s; Ctrl-C ends it earlier.")
+        float, Option("--for", min=0.05, max=86_400.0, help="Time, s; Ctrl-C ends it earlier.")
     ] = 1.0,
 ) -> None:
     """Turn an axis at a speed for a time, then brake to rest; also if this command is killed."""
@@ -482,14 +480,12 @@ def queue(
     daemon: Daemon,
     axis: AxisArgument,
     angles_deg: Annotated[
-        list[float] | None, typer.Argument(metavar="ANGLE...", help="Load angles in degrees.")
+        list[float] | None, Argument(metavar="ANGLE...", help="Load angles in degrees.")
     ] = None,
     velocity_deg_s: opt.Velocity = None,
     acceleration_deg_s2: opt.Acceleration = None,
-    dwell_s: Annotated[float, typer.Option("--dwell", min=0.0, max=86_400.0, help="Rest at each, s.")] = 0.0,
-    clear: Annotated[
-        bool, typer.Option("--clear", help="Remove the way points not yet begun; add none.")
-    ] = False,
+    dwell_s: Annotated[float, Option("--dwell", min=0.0, max=86_400.0, help="Rest at each, s.")] = 0.0,
+    clear: Annotated[bool, Option("--clear", help="Remove the way points not yet begun; add none.")] = False,
 ) -> None:
     """Append way points, and wait until the last one is reached. Ctrl-C stops the axis."""
     from hdbridge.client.messages import QueueItem
@@ -510,7 +506,7 @@ def queue(
 def compensate(
     daemon: Daemon,
     axis: AxisArgument,
-    scheme: Annotated[Scheme, typer.Argument(metavar="SCHEME", help="`none` switches it off.")],
+    scheme: Annotated[Scheme, Argument(metavar="SCHEME", help="`none` switches it off.")],
 ) -> None:
     """Select the part of the model that compensates: none, synchronous, hysteresis, both or extended.
 
@@ -526,7 +522,7 @@ def model(
     axis: AxisArgument,
     version: Annotated[
         str,
-        typer.Argument(
+        Argument(
             metavar="VERSION",
             help="Number in `hdbridge model log`; `pending` commits that one, `active` reads it again.",
         ),
@@ -545,9 +541,9 @@ def adapt(
     axis: AxisArgument,
     mode: Annotated[
         AdaptationMode | None,
-        typer.Argument(metavar="MODE", help="`off`, `observe` (report what would change) or `on`."),
+        Argument(metavar="MODE", help="`off`, `observe` (report what would change) or `on`."),
     ] = None,
-    back: Annotated[bool, typer.Option("--back", help="Return to the committed model.")] = False,
+    back: Annotated[bool, Option("--back", help="Return to the committed model.")] = False,
 ) -> None:
     """Set the adaptation of model parameters to the load encoder."""
     if back == (mode is not None):
@@ -558,9 +554,7 @@ def adapt(
 
 @on_daemon
 def load_loop(
-    daemon: Daemon,
-    axis: AxisArgument,
-    on: Annotated[bool, typer.Option("--on/--off", help="Switch it on or off.")],
+    daemon: Daemon, axis: AxisArgument, on: Annotated[bool, Option("--on/--off", help="Switch it on or off.")]
 ) -> None:
     """Switch the slow integral of the load error on or off, if the machine file has one."""
     with daemon.moving(axis) as moved:

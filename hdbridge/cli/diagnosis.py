@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import typer
+from typer import Argument, Option
 
 from hdbridge.cli import options as opt
 from hdbridge.cli.calibration import Measured, print_next, print_stepping, print_steps, print_worse
@@ -38,7 +38,7 @@ def diagnose(
     csv: opt.CsvFormat,
     records: Annotated[
         list[Path] | None,
-        typer.Argument(
+        Argument(
             metavar="RECORD...",
             help="CSV files, recording folders, or flight recordings (MCAP files or their folder), in their "
             "order.",
@@ -46,7 +46,7 @@ def diagnose(
     ] = None,
     model: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--model",
             metavar="MODEL.yaml|PROFILE",
             help="Model to test, or its profile. Flight recordings: else the model used last.",
@@ -56,13 +56,13 @@ def diagnose(
     html_file: opt.Html = None,
     extend: Annotated[
         Path | None,
-        typer.Option("--extend", metavar="NEW_MODEL.yaml", help="Write the extended model."),
+        Option("--extend", metavar="NEW_MODEL.yaml", help="Write the extended model."),
         Kind.MODEL,
     ] = None,
     independent_zeros: opt.IndependentZeros = False,
     prior: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--prior",
             metavar="FLEET.parquet",
             help="fleet.parquet of hdbridge fleet run: how often each cause is there.",
@@ -70,7 +70,7 @@ def diagnose(
     ] = None,
     group: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--group",
             metavar="NAME=VALUE",
             help="Group of this joint in the prior: gear=..., batch=..., cell=..., lubricant=...",
@@ -78,7 +78,7 @@ def diagnose(
     ] = None,
     plan: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--plan",
             metavar="PLAN.yaml",
             help="Without records: causes that this plan could detect, from which size, and separate.",
@@ -284,7 +284,7 @@ def improve(
     csv: opt.CsvFormat,
     given: Annotated[
         list[Path] | None,
-        typer.Option(
+        Option(
             "--from",
             metavar="RECORDING",
             help="Diagnose this and measure nothing; may be repeated, in order of time.",
@@ -292,10 +292,10 @@ def improve(
     ] = None,
     independent_zeros: opt.IndependentZeros = False,
     auto: Annotated[
-        bool, typer.Option("--auto", help="Run further experiments if causes cannot be separated.")
+        bool, Option("--auto", help="Run further experiments if causes cannot be separated.")
     ] = False,
     rounds: Annotated[
-        int, typer.Option("--rounds", min=1, max=20, help="With --auto: maximum number of experiments.")
+        int, Option("--rounds", min=1, max=20, help="With --auto: maximum number of experiments.")
     ] = 3,
     json_file: opt.Json = None,
     html_file: opt.Html = None,

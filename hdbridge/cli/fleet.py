@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 from urllib.parse import unquote
 
-import typer
+from typer import Argument, Option
 
 from hdbridge.cli import options as opt
 from hdbridge.cli.options import need_extra, taking
@@ -29,10 +29,10 @@ PAGE_NAME = "fleet.html"
 PRIOR_NAME = "fleet.parquet"
 _EXTRA = ("distributed", "pyarrow", "fsspec")
 
-OutArgument = Annotated[Path, typer.Argument(metavar="OUT", help="The --out folder of a run.")]
+OutArgument = Annotated[Path, Argument(metavar="OUT", help="The --out folder of a run.")]
 LimitOption = Annotated[
     float,
-    typer.Option(
+    Option(
         "--limit",
         metavar="ARCSEC",
         min=0.1,
@@ -40,60 +40,53 @@ LimitOption = Annotated[
         help="Limit on the peak of a cause; the page predicts the hours until then.",
     ),
 ]
-JoinsOption = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="SOURCE...", help="Folders, globs or URLs (s3://, sftp://, ...) of recordings."),
-]
-OutOption = Annotated[
-    Path | None,
-    typer.Option("--out", metavar="FOLDER", help="Folder of the results; an earlier run in it is continued."),
-]
-ManifestOption = Annotated[
-    Path | None,
-    typer.Option("--manifest", metavar="M.csv|M.parquet", help="Table of the recordings: docs/fleet.md."),
-]
-ModelOption = Annotated[
-    Path | None,
-    typer.Option("--model", metavar="MODEL.yaml", help="Model of joints without one of their own."),
-]
-ModelsOption = Annotated[
-    Path | None, typer.Option("--models", metavar="FOLDER", help="Folder with a model per joint, JOINT.yaml.")
-]
-SchedulerOption = Annotated[
-    str | None,
-    typer.Option("--scheduler", metavar="ADDRESS", help="Running Dask scheduler: tcp://HOST:8786."),
-]
-WorkersOption = Annotated[
-    int | None,
-    typer.Option("--workers", min=1, max=1000, help="Processes on this computer; else one per core."),
-]
 PagesOption = Annotated[
-    bool, typer.Option("--pages", help="Also write the page of each listed joint, into OUT/pages.")
+    bool, Option("--pages", help="Also write the page of each listed joint, into OUT/pages.")
 ]
-TimeoutOption = Annotated[
-    float,
-    typer.Option(
-        "--timeout", metavar="SECONDS", min=0.1, max=3600.0, help="Longest wait for a server of SOURCE, s."
-    ),
-]
-MemoryOption = Annotated[str, typer.Option("--memory", metavar="SIZE", help="Memory limit of each process.")]
 
 
 @dataclass(frozen=True)
 class Fleet:
     """Recordings to diagnose, as the user of `run` or `watch` names them; InputError names a wrong option."""
 
-    sources: JoinsOption = None
-    out: OutOption = None
-    manifest: ManifestOption = None
-    model: ModelOption = None
-    models: ModelsOption = None
-    scheduler: SchedulerOption = None
-    workers: WorkersOption = None
-    memory: MemoryOption = "2GB"
+    sources: Annotated[
+        list[str] | None,
+        Argument(metavar="SOURCE...", help="Folders, globs or URLs (s3://, sftp://, ...) of recordings."),
+    ] = None
+    out: Annotated[
+        Path | None,
+        Option("--out", metavar="FOLDER", help="Folder of the results; an earlier run in it is continued."),
+    ] = None
+    manifest: Annotated[
+        Path | None,
+        Option("--manifest", metavar="M.csv|M.parquet", help="Table of the recordings: docs/fleet.md."),
+    ] = None
+    model: Annotated[
+        Path | None, Option("--model", metavar="MODEL.yaml", help="Model of joints without one of their own.")
+    ] = None
+    models: Annotated[
+        Path | None, Option("--models", metavar="FOLDER", help="Folder with a model per joint, JOINT.yaml.")
+    ] = None
+    scheduler: Annotated[
+        str | None, Option("--scheduler", metavar="ADDRESS", help="Running Dask scheduler: tcp://HOST:8786.")
+    ] = None
+    workers: Annotated[
+        int | None,
+        Option("--workers", min=1, max=1000, help="Processes on this computer; else one per core."),
+    ] = None
+    memory: Annotated[str, Option("--memory", metavar="SIZE", help="Memory limit of each process.")] = "2GB"
     limit_arcsec: LimitOption = 10.0
     pages: PagesOption = False
-    timeout_s: TimeoutOption = 20.0
+    timeout_s: Annotated[
+        float,
+        Option(
+            "--timeout",
+            metavar="SECONDS",
+            min=0.1,
+            max=3600.0,
+            help="Longest wait for a server of SOURCE, s.",
+        ),
+    ] = 20.0
 
     def __post_init__(self) -> None:
         from hdbridge.axis.model import TransmissionModel
@@ -111,10 +104,6 @@ class Fleet:
                 "--workers: a running cluster has its own workers; leave out --workers or --scheduler"
             )
         _check_memory(self.memory)
-        if self.scheduler == "":
-            raise InputError("--scheduler: found no address; expected one such as tcp://HOST:8786")
-        if "" in (self.sources or []):
-            raise InputError("SOURCE: found an empty name; expected a folder, a glob or a URL")
         if self.model is not None:
             TransmissionModel.load(self.model)
         if self.models is not None and not self.models.is_dir():
@@ -209,13 +198,9 @@ def watch(
     fleet: Fleet,
     interval_s: Annotated[
         float,
-        typer.Option(
-            "--interval", metavar="SECONDS", min=0.1, max=86_400.0, help="Time between two listings, s."
-        ),
+        Option("--interval", metavar="SECONDS", min=0.1, max=86_400.0, help="Time between two listings, s."),
     ] = 60.0,
-    once: Annotated[
-        bool, typer.Option("--once", help="End after one round, for a timer such as cron.")
-    ] = False,
+    once: Annotated[bool, Option("--once", help="End after one round, for a timer such as cron.")] = False,
 ) -> None:
     """Diagnose new recordings as they arrive, and update Parquet and page in FOLDER.
 
@@ -242,14 +227,14 @@ def report(
     out: OutArgument,
     html_file: Annotated[
         Path | None,
-        typer.Option("--html", metavar="PAGE", help="Write the page here; else OUT/fleet.html."),
+        Option("--html", metavar="PAGE", help="Write the page here; else OUT/fleet.html."),
         Kind.PAGE,
     ] = None,
     json_file: opt.Json = None,
     limit_arcsec: LimitOption = 10.0,
     pages: PagesOption = False,
     joints: Annotated[
-        list[str] | None, typer.Option("--joint", metavar="NAME", help="Also write the page of this joint.")
+        list[str] | None, Option("--joint", metavar="NAME", help="Also write the page of this joint.")
     ] = None,
 ) -> None:
     """Write the page of a run again, and print which joints to look at first."""
@@ -263,13 +248,11 @@ def report(
 
 def simulate(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="Write the fleet here: a new folder."), Kind.FOLDER
+        Path, Argument(metavar="FOLDER", help="Write the fleet here: a new folder."), Kind.FOLDER
     ],
-    joints: Annotated[int, typer.Option("--joints", min=4, max=100_000, help="Number of joints.")] = 12,
-    recordings: Annotated[
-        int, typer.Option("--recordings", min=3, max=1000, help="Recordings per joint.")
-    ] = 4,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the fleet.")] = 0,
+    joints: Annotated[int, Option("--joints", min=4, max=100_000, help="Number of joints.")] = 12,
+    recordings: Annotated[int, Option("--recordings", min=3, max=1000, help="Recordings per joint.")] = 4,
+    seed: Annotated[int, Option("--seed", help="Seed of the fleet.")] = 0,
 ) -> None:
     """Make recordings of a simulated fleet: growing known causes, damaged files, exchanged joints.
 

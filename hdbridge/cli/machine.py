@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+from typer import Option
 
 from hdbridge.cli import eventlog
 from hdbridge.cli import options as opt
@@ -43,17 +44,17 @@ _EXTRA = ("fastapi", "uvicorn", "websockets", "mcap", "prometheus_client")
 def run(
     machine: opt.Machine,
     simulate: Annotated[
-        bool, typer.Option("--simulate", help="Hold simulated drives in place of the bus.")
+        bool, Option("--simulate", help="Hold simulated drives in place of the bus.")
     ] = False,
     speed: Annotated[
         float,
-        typer.Option(
+        Option(
             "--speed", min=0.01, max=1000.0, help="With --simulate: speed relative to real time, at most."
         ),
     ] = 1.0,
     truth: Annotated[
         list[Path] | None,
-        typer.Option(
+        Option(
             "--truth",
             metavar="TRUTH.yaml",
             help="Truth file of a simulated axis; once for each axis, in order.",
@@ -63,9 +64,9 @@ def run(
     interface: opt.Interface = None,
     channel: opt.Channel = None,
     page: Annotated[
-        bool, typer.Option("--page", help="Serve the live page to this computer and print its address.")
+        bool, Option("--page", help="Serve the live page to this computer and print its address.")
     ] = False,
-    port: Annotated[int, typer.Option("--port", min=0, max=65_535, help="Port of --page; 0: any.")] = 8402,
+    port: Annotated[int, Option("--port", min=0, max=65_535, help="Port of --page; 0: any.")] = 8402,
     force: opt.Force = False,
 ) -> None:
     """Run the daemon: hold the drives of a machine and take load angles from clients.
@@ -127,14 +128,12 @@ def _check_real(machine: Machine, truths: list[Path], speed: float) -> None:
 
 def install_service(
     machine: opt.Machine,
-    yes: Annotated[bool, typer.Option("--yes", help="Write the files; else they are only shown.")] = False,
-    remove: Annotated[bool, typer.Option("--remove", help="Remove the files.")] = False,
-    user: Annotated[bool, typer.Option("--user", help="For your own service manager, without root.")] = False,
+    yes: Annotated[bool, Option("--yes", help="Write the files; else they are only shown.")] = False,
+    remove: Annotated[bool, Option("--remove", help="Remove the files.")] = False,
+    user: Annotated[bool, Option("--user", help="For your own service manager, without root.")] = False,
     account: Annotated[
         str | None,
-        typer.Option(
-            "--account", metavar="NAME", help="User of the service; else the owner of the machine file."
-        ),
+        Option("--account", metavar="NAME", help="User of the service; else the owner of the machine file."),
     ] = None,
 ) -> None:
     """Show, write or remove the systemd files that run a machine's daemon from the start of the computer.
@@ -222,12 +221,11 @@ def doctor(
     machine: opt.Machine,
     axis: opt.GatewayAxis = None,
     duration_s: Annotated[
-        float,
-        typer.Option("--duration", min=0.1, max=86_400.0, help="Time to listen, s; Ctrl-C ends it earlier."),
+        float, Option("--duration", min=0.1, max=86_400.0, help="Time to listen, s; Ctrl-C ends it earlier.")
     ] = 10.0,
     log: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--log", metavar="FILE", help="Read a bus log (.log, .asc, .blf, .trc, .mf4) in place of the bus."
         ),
     ] = None,
@@ -347,13 +345,13 @@ def simulate(
     channel: opt.Channel = None,
     gateway: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--gateway", help="PROFILE is a machine: an ideal drive with the bus and objects of its gateway."
         ),
     ] = False,
     axis: opt.GatewayAxis = None,
     duration_s: Annotated[
-        float | None, typer.Option("--duration", min=0.0, help="Stop after this time, s; else at Ctrl-C.")
+        float | None, Option("--duration", min=0.0, help="Stop after this time, s; else at Ctrl-C.")
     ] = None,
 ) -> None:
     """Run the simulated drive of a profile on its bus, in real time, until Ctrl-C.
@@ -415,7 +413,7 @@ def _simulated(
     from hdbridge.sim.machine import Machine
     from hdbridge.sim.truth import Truth
 
-    session = Session(profile, interface=interface, channel=channel)
+    session = Session(profile=profile, interface=interface, channel=channel)
     axis = session.axis
     if axis.bus.interface == "virtual":
         raise InputError(

@@ -5,8 +5,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-import typer
 from rich.text import Text
+from typer import Argument, Option
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.difference import Difference, diff
@@ -18,8 +18,8 @@ from hdbridge.files.profile import Profile
 from hdbridge.files.yamlfile import read_yaml
 from hdbridge.units import figure, with_interval
 
-ReasonOption = Annotated[str, typer.Option("--reason", help="Why, for the log.")]
-TwinOption = Annotated[bool, typer.Option("--twin", help="The twins of the axis instead of its models.")]
+ReasonOption = Annotated[str, Option("--reason", help="Why, for the log.")]
+TwinOption = Annotated[bool, Option("--twin", help="The twins of the axis instead of its models.")]
 
 
 def log(profile: opt.Profile, twin: TwinOption = False, json_file: opt.Json = None) -> None:
@@ -43,12 +43,9 @@ def log(profile: opt.Profile, twin: TwinOption = False, json_file: opt.Json = No
 def compare(
     profile: opt.Profile,
     before: Annotated[
-        str | None,
-        typer.Argument(metavar="BEFORE", help="Number, `active` or `pending`; else the active one."),
+        str | None, Argument(metavar="BEFORE", help="Number, `active` or `pending`; else the active one.")
     ] = None,
-    after: Annotated[
-        str | None, typer.Argument(metavar="AFTER", help="The same; else the pending one.")
-    ] = None,
+    after: Annotated[str | None, Argument(metavar="AFTER", help="The same; else the pending one.")] = None,
     twin: TwinOption = False,
     json_file: opt.Json = None,
 ) -> None:
@@ -87,7 +84,7 @@ def commit(profile: opt.Profile, twin: TwinOption = False) -> None:
 
 def activate(
     profile: opt.Profile,
-    version: Annotated[int, typer.Argument(min=1, help="Its number in the log.")],
+    version: Annotated[int, Argument(min=1, help="Its number in the log.")],
     reason: ReasonOption = "",
     twin: TwinOption = False,
 ) -> None:

@@ -9,18 +9,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import typer
+from typer import Option
 
 from hdbridge.cli import options as opt
 from hdbridge.cli.calibration import phases, print_steps
-from hdbridge.cli.printing import (
-    note,
-    print_table,
-    progress_bar,
-    say,
-    write_json,
-    write_result,
-)
+from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_result
 from hdbridge.cli.session import Session, compensating_model, note_clamped, on_axis
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.errors import HdbridgeError, InputError
@@ -50,12 +43,12 @@ def move(
     session: Session,
     angles_deg: opt.Angles,
     relative: Annotated[
-        bool, typer.Option("--relative", help="Each angle is relative to the previous position.")
+        bool, Option("--relative", help="Each angle is relative to the previous position.")
     ] = False,
     velocity_deg_s: opt.Velocity = None,
     hold_s: Annotated[
         float | None,
-        typer.Option(
+        Option(
             "--hold",
             min=0.0,
             help="Seconds to hold the last angle; else until Ctrl-C (a simulated axis: not at all).",
@@ -63,7 +56,7 @@ def move(
     ] = None,
     model: opt.Model = None,
     compensated: Annotated[
-        bool, typer.Option("--compensated/--uncompensated", help="Use the active model, if there is one.")
+        bool, Option("--compensated/--uncompensated", help="Use the active model, if there is one.")
     ] = True,
     json_file: opt.Json = None,
 ) -> None:
@@ -181,16 +174,16 @@ def step(
     model: opt.Model = None,
     scheme: Annotated[
         list[Scheme] | None,
-        typer.Option("--scheme", help="Only this scheme; may be repeated. Else all of the model."),
+        Option("--scheme", help="Only this scheme; may be repeated. Else all of the model."),
     ] = None,
-    count: Annotated[int, typer.Option("--count", min=2, max=100_000, help="Steps each way.")] = 240,
-    step_deg: Annotated[float, typer.Option("--step-deg", help="Step, motor degrees.")] = 43.56,
-    start_deg: Annotated[float, typer.Option("--start-deg", help="Load angle of the start, deg.")] = 0.0,
+    count: Annotated[int, Option("--count", min=2, max=100_000, help="Steps each way.")] = 240,
+    step_deg: Annotated[float, Option("--step-deg", help="Step, motor degrees.")] = 43.56,
+    start_deg: Annotated[float, Option("--start-deg", help="Load angle of the start, deg.")] = 0.0,
     json_file: opt.Json = None,
     html_file: opt.Html = None,
     record: Annotated[
         Path | None,
-        typer.Option("--record", metavar="FOLDER", help="Keep what was measured: one CSV file per scheme."),
+        Option("--record", metavar="FOLDER", help="Keep what was measured: one CSV file per scheme."),
         Kind.FOLDER,
     ] = None,
 ) -> None:
@@ -378,13 +371,13 @@ def motion(
     model: opt.Model = None,
     measure: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--measure/--no-measure",
             help="Measure the response of the axis, or test the one of the model file.",
         ),
     ] = True,
     propose: Annotated[
-        bool, typer.Option("--propose", help="Keep the model with the measured response as pending.")
+        bool, Option("--propose", help="Keep the model with the measured response as pending.")
     ] = False,
     json_file: opt.Json = None,
     html_file: opt.Html = None,
@@ -459,11 +452,11 @@ def print_motion(result: MotionTest) -> None:
 def demo(
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FOLDER", help="Where the results go; else demo-output, numbered."),
+        Option("--out", metavar="FOLDER", help="Where the results go; else demo-output, numbered."),
         Kind.FOLDER,
     ] = None,
-    count: Annotated[int, typer.Option("--count", min=2, max=2000, help="Steps each way.")] = 240,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the simulated axis.")] = 0,
+    count: Annotated[int, Option("--count", min=2, max=2000, help="Steps each way.")] = 240,
+    seed: Annotated[int, Option("--seed", help="Seed of the simulated axis.")] = 0,
 ) -> None:
     """Step a simulated axis 240 times each way under four compensation schemes.
 
@@ -472,7 +465,7 @@ def demo(
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.motion.procedures.stepping import Stepping
 
-    session = Session("article", simulate=True, seed=seed)
+    session = Session(profile="article", simulate=True, seed=seed)
     files, axis = session.files, session.axis
     stepping = Stepping(count=count)
     folder = new_folder(Path("demo-output")) if out is None else make_folder(out)

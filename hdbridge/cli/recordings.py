@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import typer
+from typer import Argument, Option
 
 from hdbridge.cli import options as opt
 from hdbridge.cli.options import need_extra, taking
@@ -27,7 +27,7 @@ _EXTRA = ("mcap", "google.protobuf")
 _NS = 10**9
 
 FlightsArgument = Annotated[
-    list[Path], typer.Argument(metavar="FILE.mcap|FOLDER...", help="Flight recordings, or folders of them.")
+    list[Path], Argument(metavar="FILE.mcap|FOLDER...", help="Flight recordings, or folders of them.")
 ]
 
 
@@ -37,17 +37,14 @@ class Part:
 
     axis: Annotated[
         str | None,
-        typer.Option(
-            "--axis", metavar="NAME", help="Axis of the flight recordings; needed if they have several."
-        ),
+        Option("--axis", metavar="NAME", help="Axis of the flight recordings; needed if they have several."),
     ] = None
     begin: Annotated[
         str | None,
-        typer.Option("--from", metavar="TIME", help="Start of the flight, ISO 8601; UTC without an offset."),
+        Option("--from", metavar="TIME", help="Start of the flight, ISO 8601; UTC without an offset."),
     ] = None
     end: Annotated[
-        str | None,
-        typer.Option("--to", metavar="TIME", help="End of the flight, ISO 8601; UTC without an offset."),
+        str | None, Option("--to", metavar="TIME", help="End of the flight, ISO 8601; UTC without an offset.")
     ] = None
 
     def read(self, paths: Sequence[Path], *, all_states: bool = False) -> tuple[Recording, ModelUsed | None]:
@@ -84,14 +81,14 @@ class Export:
 
     out: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--out",
             metavar="FOLDER|FILE.csv",
             help="New or empty folder of a recording, or a file .csv or .csv.gz.",
         ),
     ] = None
     all_states: Annotated[
-        bool, typer.Option("--all-states", help="Include samples in which the axis was not enabled.")
+        bool, Option("--all-states", help="Include samples in which the axis was not enabled.")
     ] = False
 
     def checked(self) -> Path:
@@ -167,7 +164,7 @@ def overviews(flights: FlightsArgument, json_file: opt.Json = None) -> None:
 
 
 def info(
-    flight: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="Flight recording.")],
+    flight: Annotated[Path, Argument(metavar="FILE.mcap", help="Flight recording.")],
     json_file: opt.Json = None,
 ) -> None:
     """Report the content of a recording: machine, axes, models, missing cycles, events."""
@@ -266,9 +263,7 @@ def export(
     flights: FlightsArgument,
     model: Annotated[
         Path | None,
-        typer.Option(
-            "--model-out", metavar="MODEL.yaml", help="Write the model that the axis used at the end."
-        ),
+        Option("--model-out", metavar="MODEL.yaml", help="Write the model that the axis used at the end."),
         Kind.MODEL,
     ] = None,
 ) -> None:
@@ -290,12 +285,11 @@ def export(
 def import_(
     to: Export,
     log: Annotated[
-        Path, typer.Argument(metavar="LOG", help="Bus log: candump (.log), .asc, .blf, .trc, .mf4; also .gz.")
+        Path, Argument(metavar="LOG", help="Bus log: candump (.log), .asc, .blf, .trc, .mf4; also .gz.")
     ],
-    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="Axis that was on the bus.")],
+    profile: Annotated[str, Argument(metavar="PROFILE", help="Axis that was on the bus.")],
     channel: Annotated[
-        str | None,
-        typer.Option("--channel", metavar="NAME", help="The bus, if the node is on several in the log."),
+        str | None, Option("--channel", metavar="NAME", help="The bus, if the node is on several in the log.")
     ] = None,
 ) -> None:
     """Make a record of a bus log, as `fit` and `diagnose` read it. Any master may have driven the axis.

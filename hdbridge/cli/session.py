@@ -26,13 +26,9 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Session:
-    """An axis as the user of one command names it. Nothing is connected before it is asked for.
+class BusOptions:
+    """Options of every command that reaches a node on a bus, or a simulated one."""
 
-    The fields are the options of every command that reaches an axis: see `on_axis`.
-    """
-
-    profile: opt.Profile
     simulate: opt.Simulate = False
     truth: opt.Truth = None
     seed: opt.Seed = 0
@@ -45,6 +41,32 @@ class Session:
         check_bus_options(self.interface, self.channel, simulate=self.simulate)
         if self.borrow and (self.simulate or self.force):
             raise InputError("--borrow takes the bus from a daemon: leave out --simulate and --force")
+
+    def of(self, profile: str) -> Session:
+        """Returns the session of an axis with these options."""
+        return Session(**vars(self), profile=profile)
+
+    @contextmanager
+    def bare(self, settings: BusConfig) -> Iterator[tuple[can.BusABC, Clock]]:
+        """Yields a bus that is not an axis's, and the monotonic clock.
+
+        With ``force``, the bus is opened even if another process on this computer masters it.
+        """
+        from hdbridge.drive.link import check_interface, open_bus
+
+        check_interface(settings.interface, "--interface")
+        with open_bus(settings, shared=self.force) as bus:
+            yield bus, MonotonicClock()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Session(BusOptions):
+    """An axis as the user of one command names it. Nothing is connected before it is asked for.
+
+    The fields are the options of every command that reaches an axis: see `on_axis`.
+    """
+
+    profile: opt.Profile
 
     @cached_property
     def files(self) -> Profile:
@@ -194,19 +216,6 @@ def simulated_by(files: Profile, truth: Path | None) -> Path:
     if plant == files.twin:
         note(f"simulated by the axis's twin, {plant}")
     return plant
-
-
-@contextmanager
-def bare_bus(settings: BusConfig, *, force: bool) -> Iterator[tuple[can.BusABC, Clock]]:
-    """Yields a bus that is not an axis's, and the monotonic clock.
-
-    With ``force``, the bus is opened even if another process on this computer masters it.
-    """
-    from hdbridge.drive.link import check_interface, open_bus
-
-    check_interface(settings.interface, "--interface")
-    with open_bus(settings, shared=force) as bus:
-        yield bus, MonotonicClock()
 
 
 def model_file(text: str) -> Path:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
+from typer import Argument, Option
 
 from hdbridge.cli import options as opt
 from hdbridge.cli.printing import note, say
@@ -41,7 +42,7 @@ _REMEDY: Final = re.compile(r"axis\.yaml:\d+:\d+: ([a-z_.]+): found (\S+), expec
 
 def setup(
     folder: Annotated[
-        Path, typer.Argument(metavar="NAME", help="Folder of the axis, new or from an earlier set-up.")
+        Path, Argument(metavar="NAME", help="Folder of the axis, new or from an earlier set-up.")
     ],
     interface: opt.Interface = None,
     channel: opt.Channel = None,
@@ -49,14 +50,14 @@ def setup(
     node_id: opt.Node = None,
     eds: opt.Eds = None,
     plan: Annotated[
-        str, typer.Option("--plan", metavar="quick|full|FILE", help="Plan of the calibration.")
+        str, Option("--plan", metavar="quick|full|FILE", help="Plan of the calibration.")
     ] = "quick",
     simulate: Annotated[
-        bool, typer.Option("--simulate", help="Set up a simulated axis, a copy of the profile demo.")
+        bool, Option("--simulate", help="Set up a simulated axis, a copy of the profile demo.")
     ] = False,
     seed: opt.Seed = 0,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Answer every yes-or-no question with yes; the axis moves.")
+        bool, Option("--yes", help="Answer every yes-or-no question with yes; the axis moves.")
     ] = False,
 ) -> None:
     """Set up an axis in one sitting: bus, axis file, checks, calibration, model, first move.

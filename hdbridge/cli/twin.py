@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import typer
+from typer import Argument, Option
 
 from hdbridge.cli import options as opt
 from hdbridge.cli.options import taking
@@ -27,17 +27,16 @@ def twin(
     csv: opt.CsvFormat,
     profile: opt.Profile,
     recordings: Annotated[
-        list[Path],
-        typer.Argument(metavar="RECORDING...", help="Recording folders or CSV files, in order of time."),
+        list[Path], Argument(metavar="RECORDING...", help="Recording folders or CSV files, in order of time.")
     ],
     check: Annotated[
-        bool, typer.Option("--check", help="Only report changes since the profile's twin was made.")
+        bool, Option("--check", help="Only report changes since the profile's twin was made.")
     ] = False,
     compare: Annotated[
-        bool, typer.Option("--compare", help="Only compare the present simulation with the recordings.")
+        bool, Option("--compare", help="Only compare the present simulation with the recordings.")
     ] = False,
     truth: opt.Truth = None,
-    afresh: Annotated[bool, typer.Option("--afresh", help="Start from typical values.")] = False,
+    afresh: Annotated[bool, Option("--afresh", help="Start from typical values.")] = False,
     json_file: opt.Json = None,
     html_file: opt.Html = None,
 ) -> None:

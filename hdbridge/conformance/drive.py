@@ -81,11 +81,7 @@ def _mode(number: int, name: str) -> None:
             t.wait(0.05)
             t.equal(t.read(0x6061, signed=True), number, "6061h")
         else:
-            wanted = t.read(0x6060, signed=True)
-            t.write(0x6060, 0, wanted, 1)
-            t.ask(expedited(0x6060, 0, pack(number, 1)))
-            t.wait(0.05)
-            t.true(t.read(0x6061, signed=True) != number, f"6061h = {number}", "another mode")
+            _refuses_mode(t, number)
 
 
 for _number, _name in MODES.items():
@@ -94,10 +90,14 @@ for _number, _name in MODES.items():
 
 @check("402.mode.reserved", "A reserved mode, 5, is refused or not displayed", _MODES)
 def _(t: NodeTester) -> None:
+    _refuses_mode(t, 5)
+
+
+def _refuses_mode(t: NodeTester, number: int) -> None:
     t.write(0x6060, 0, t.read(0x6060, signed=True), 1)
-    t.ask(expedited(0x6060, 0, b"\x05"))
+    t.ask(expedited(0x6060, 0, pack(number, 1)))
     t.wait(0.05)
-    t.true(t.read(0x6061, signed=True) != 5, "6061h = 5", "another mode")
+    t.true(t.read(0x6061, signed=True) != number, f"6061h = {number}", "another mode")
 
 
 # ---------------------------------------------------------------- states without power
@@ -254,7 +254,7 @@ def _(t: NodeTester) -> None:
 # ---------------------------------------------------------------- option codes
 
 
-def _option(index: int, name: str, reserved: int) -> None:
+def _option(index: int, name: str, reserved: int, defined: tuple[int, ...]) -> None:
     @check(
         f"402.option.{index:04X}.reserved",
         f"{index:04X}h, {name}: the reserved value {reserved} is refused",
@@ -269,23 +269,15 @@ def _option(index: int, name: str, reserved: int) -> None:
         data = t.upload(index)
         t.equal(len(data), 2, "bytes")
         value = int.from_bytes(data, "little", signed=True)
-        t.true(value in _DEFINED[index] or value < 0, f"{index:04X}h = {value}", f"one of {_DEFINED[index]}")
+        t.true(value in defined or value < 0, f"{index:04X}h = {value}", f"one of {defined}")
 
 
-_DEFINED: Final = {
-    0x6007: (0, 1, 2, 3),
-    0x605A: (0, 1, 2, 3, 4, 5, 6, 7, 8),
-    0x605B: (0, 1),
-    0x605C: (0, 1),
-    0x605D: (1, 2, 3, 4),
-    0x605E: (0, 1, 2, 3, 4),
-}
-_option(0x6007, "abort connection", 4)
-_option(0x605A, "quick stop", 9)
-_option(0x605B, "shutdown", 2)
-_option(0x605C, "disable operation", 2)
-_option(0x605D, "halt", 5)
-_option(0x605E, "fault reaction", 5)
+_option(0x6007, "abort connection", 4, (0, 1, 2, 3))
+_option(0x605A, "quick stop", 9, (0, 1, 2, 3, 4, 5, 6, 7, 8))
+_option(0x605B, "shutdown", 2, (0, 1))
+_option(0x605C, "disable operation", 2, (0, 1))
+_option(0x605D, "halt", 5, (1, 2, 3, 4))
+_option(0x605E, "fault reaction", 5, (0, 1, 2, 3, 4))
 
 
 # ---------------------------------------------------------------- units and limits

@@ -213,22 +213,23 @@ class NodeTester:
 
     def mark(self) -> int:
         """Returns the present place in the log; frames that have already arrived are before it."""
-        self._pump(self.now)
+        self.wait(0.0)
         return len(self.log)
 
     def wait(self, duration_s: float) -> None:
         """Receives frames for this time."""
-        self._pump(self.now + duration_s)
+        end_s = self.now + duration_s
+        while self._received(end_s):
+            pass
 
-    def _pump(self, end_s: float) -> None:
-        while True:
-            if self._stopped():
-                raise StoppedError("the run was ended before its last check")
-            frame = self.link.recv(min(end_s, self.now + 0.25))
-            if frame is not None:
-                self.log.append(frame)
-            elif self.now >= end_s:
-                return
+    def _received(self, end_s: float) -> bool:
+        """Receives a frame, or waits a little; returns False at the end of the time."""
+        if self._stopped():
+            raise StoppedError("the run was ended before its last check")
+        frame = self.link.recv(min(end_s, self.now + 0.25))
+        if frame is not None:
+            self.log.append(frame)
+        return frame is not None or self.now < end_s
 
     def heard(self, can_id: int, since: int = 0) -> list[Frame]:
         """Returns the frames with an identifier that have come since a place in the log."""
@@ -243,11 +244,7 @@ class NodeTester:
                 if frame.can_id == can_id:
                     return frame
             place = len(self.log)
-            if self._stopped():
-                raise StoppedError("the run was ended before its last check")
-            if (heard := self.link.recv(min(end_s, self.now + 0.25))) is not None:
-                self.log.append(heard)
-            elif self.now >= end_s:
+            if not self._received(end_s):
                 return None
 
     # ---------------------------------------------------------------- verdicts
@@ -360,7 +357,7 @@ class NodeTester:
     # ---------------------------------------------------------------- SDO
 
     def ask(self, request: bytes, timeout_s: float | None = None) -> bytes | None:
-        """Sends an SDO request; returns the answer, or None if there is none in time."""
+        """Sends an SDO request; returns the answer; None without one in time."""
         since = self.mark()
         self.send(0x600 + self.node_id, request)
         frame = self.hears(0x580 + self.node_id, timeout_s, since)

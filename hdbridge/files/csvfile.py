@@ -110,7 +110,7 @@ class CsvFile:
         return dict(zip(self.names, self._layout.units, strict=False))
 
     def find(self, column: str) -> str | None:
-        """Returns the name of a column given by name or by number; None if there is no such column.
+        """Returns the name of a column given by name or by number; None without this column.
 
         Raises `InputError` if two columns have the name.
         """

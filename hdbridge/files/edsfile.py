@@ -195,7 +195,7 @@ class _Reader:
         return value
 
     def _value(self, section: _Section, key: str, data_type: int) -> str | None:
-        """Returns a value as canopen reads it; None if there is none or it cannot be read."""
+        """Returns a value as canopen reads it; None without a readable one."""
         text = section.get(key)
         if text == "" or data_type not in _INTEGERS:
             return text or None

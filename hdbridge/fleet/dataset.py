@@ -16,8 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from hdbridge.errors import InputError, OutputError
-from hdbridge.files.atomic import make_folder
+from hdbridge.errors import InputError
+from hdbridge.files.atomic import make_folder, write_atomically
 from hdbridge.fleet.sources import Stored
 
 if TYPE_CHECKING:
@@ -191,8 +191,8 @@ class Dataset:
             for each in row["findings"]
         ]
         # Findings without their recording are ignored, so the recordings come last.
-        _write(folder / f"{FINDINGS}-{number:06d}.parquet", findings, FINDINGS)
-        _write(folder / f"{RECORDINGS}-{number:06d}.parquet", rows, RECORDINGS)
+        write_table(folder / f"{FINDINGS}-{number:06d}.parquet", findings, schema(FINDINGS))
+        write_table(folder / f"{RECORDINGS}-{number:06d}.parquet", rows, schema(RECORDINGS))
 
     def compact(self, present: Collection[tuple[str, str]] = ()) -> None:
         """Merges the increments into the parts, marks duplicates and sorts the rows.
@@ -221,7 +221,7 @@ class Dataset:
                 part = [row for row in each if row["key"].startswith(prefix)]
                 target = folder / f"part-{prefix}.parquet"
                 if part:
-                    _write(target, part, name)
+                    write_table(target, part, schema(name))
                 else:
                     target.unlink(missing_ok=True)
         for done in sorted((self.folder / INCREMENTS).glob("*.parquet"), reverse=True):  # recordings go first
@@ -257,18 +257,11 @@ def _mark_duplicates(rows: Sequence[dict[str, Any]]) -> None:
             row["duplicate_of"] = original if original != row["path"] else None
 
 
-def _write(path: Path, rows: Sequence[Mapping[str, Any]], name: str) -> None:
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]], columns: pa.Schema) -> None:
+    """Writes rows as a Parquet file, atomically."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    table = pa.Table.from_pylist([dict(row) for row in rows], schema=schema(name))
-    aside = path.with_name(f".{path.name}.tmp")
-    try:
-        pq.write_table(table, aside)
-        with aside.open("rb") as file:
-            os.fsync(file.fileno())
-        aside.replace(path)
-    except OSError as problem:
-        aside.unlink(missing_ok=True)
-        why = os.strerror(problem.errno) if problem.errno else str(problem)  # Arrow's own text is longer
-        raise OutputError(f"{path}: cannot be written: {why}") from None
+    sink = pa.BufferOutputStream()
+    pq.write_table(pa.Table.from_pylist([dict(row) for row in rows], schema=columns), sink)
+    write_atomically(path, sink.getvalue().to_pybytes())

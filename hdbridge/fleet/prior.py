@@ -17,8 +17,8 @@ from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.probability import Prior
 from hdbridge.axis.effects import CATALOGUE
 from hdbridge.errors import InputError
-from hdbridge.files.atomic import write_atomically
 from hdbridge.files.expectation import nearest
+from hdbridge.fleet.dataset import write_table
 from hdbridge.fleet.statistics import OUTLIERS_FROM, normal_range, prevalence, repeats
 from hdbridge.fleet.summary import REPEATED, Row, named_by, own_recordings
 
@@ -80,16 +80,12 @@ def _ranges(cause: str, joints: Mapping[str, Sequence[Row]]) -> list[dict[str, A
 def write_prior(path: Path, rows: Sequence[Row]) -> None:
     """Writes the prior of a data set as one Parquet file."""
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     text, number = pa.string(), pa.float64()
     ranges = pa.list_(pa.struct([("name", text), ("middle", number), ("deviation", number)]))
     fields = {"cause": text, "attribute": text, "group": text, "joints": pa.int64(), "cases": pa.int64()}
     fields |= {"share": number, "named": number, "wrongly": number, "parameters": ranges}
-    table = pa.Table.from_pylist(prior_rows(rows), schema=pa.schema([*fields.items()], {"schema": SCHEMA}))
-    sink = pa.BufferOutputStream()
-    pq.write_table(table, sink)
-    write_atomically(path, sink.getvalue().to_pybytes())
+    write_table(path, prior_rows(rows), pa.schema([*fields.items()], {"schema": SCHEMA}))
 
 
 def read_prior(path: Path, of: Mapping[str, str]) -> Prior:

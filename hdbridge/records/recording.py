@@ -5,6 +5,8 @@ latter is written last and contains the former's checksum: a folder without it i
 modified raw data are detected.
 """
 
+from __future__ import annotations
+
 import hashlib
 import importlib.metadata
 import platform
@@ -59,6 +61,11 @@ class RecordedFile(Strict):
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="checksum")
     samples: int = Field(ge=0, description="rows")
 
+    @classmethod
+    def of(cls, path: Path, samples: int) -> Self:
+        """Describes a file that has been written."""
+        return cls(name=path.name, sha256=sha256_of(path), samples=samples)
+
 
 class RecordingFile(Strict):
     """The content of ``recording.yaml``."""
@@ -74,6 +81,19 @@ class RecordingFile(Strict):
     notes: dict[str, Any] = Field(default_factory=dict, description="seed, scheme, model, ...")
     files: tuple[RecordedFile, ...] = Field(min_length=1, description="CSV files, in order of time")
     segments: tuple[Segment, ...] = Field((), description="legs of the motion, in order of time")
+
+    @classmethod
+    def made(cls, **values: Any) -> RecordingFile:
+        """Creates the content without validation, because a recording begins without files."""
+        return cls.model_construct(schema_="hdbridge.recording/1", **values)
+
+    def write(self, folder: Path) -> None:
+        """Writes ``recording.yaml`` atomically, without empty values."""
+        data = self.model_dump(mode="json", by_alias=True, exclude_none=True, exclude_defaults=True)
+        if self.drive is not None:
+            data["drive"] = {name: Hex(value) for name, value in data["drive"].items()}
+        data = {name: value for name, value in data.items() if value not in ({}, [])}
+        write_atomically(folder / ABOUT_NAME, HEADER + dump_yaml(data))
 
 
 @dataclass(frozen=True)
@@ -172,26 +192,11 @@ class Recording:
         for number, part in enumerate(parts, 1):
             path = folder / (RECORD_NAME if len(parts) == 1 else f"record-{number:03d}.csv.gz")
             part.write_csv(path)
-            files.append({"name": path.name, "sha256": sha256_of(path), "samples": len(part)})
-        write_atomically(folder / ABOUT_NAME, HEADER + dump_yaml(self._about(files)))
-
-    def _about(self, files: list[dict[str, Any]]) -> dict[str, Any]:
-        drive = self.drive.model_dump(exclude_none=True) if self.drive else {}
-        about: dict[str, Any] = {
-            "schema": "hdbridge.recording/1",
-            "axis": self.axis,
-            "ratio": self.ratio,
-            "drive": {name: Hex(value) for name, value in drive.items()},
-            "date": self.date,
-            "versions": self.versions,
-            "notes": self.notes,
-            "files": files,
-            "segments": [
-                each.model_dump(exclude={"notes"}) | ({"notes": each.notes} if each.notes else {})
-                for each in self.segments
-            ],
+            files.append(RecordedFile.of(path, len(part)))
+        common = {
+            name: getattr(self, name) for name in ("axis", "ratio", "drive", "date", "versions", "notes")
         }
-        return {name: value for name, value in about.items() if value not in (None, {}, [])}
+        RecordingFile.made(files=tuple(files), segments=self.segments, **common).write(folder)
 
     def pieces(self, *kinds: str) -> Iterator[tuple[Segment, Record]]:
         """Yields the segments of these kinds (all if none is given), each with its samples."""

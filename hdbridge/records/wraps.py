@@ -50,7 +50,7 @@ class Wraps(NamedTuple):
 def find_wraps(angle_deg: FloatArray, other_deg: FloatArray, starts: Sequence[int] = (0,)) -> Wraps | None:
     """Finds the constant jumps of an angle that the axis's other angle does not make; shapes (n,).
 
-    Returns None if there are none. A single jump counts if it is a whole number of turns or a power of two of
+    None without jumps. A single jump counts if it is a whole number of turns or a power of two of
     counts. A step to the first sample of a record (`starts`) is not a step of the axis.
     """
     if len(angle_deg) < 2 * WINDOW:

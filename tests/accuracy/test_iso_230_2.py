@@ -37,9 +37,7 @@ def test_matches_an_example_worked_by_hand():
 
 def test_bidirectional_repeatability_is_never_below_either_direction():
     found = axis_accuracy(
-        [0.0, 0.0, 0.0, 0.0, 9.0, 9.0, 9.0, 9.0],
-        [-10.0, 10.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        FORWARD,
+        [0.0, 0.0, 0.0, 0.0, 9.0, 9.0, 9.0, 9.0], [-10.0, 10.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], FORWARD
     )
     assert found.repeatability == pytest.approx(4.0 * 10.0 * S)
 
@@ -80,16 +78,12 @@ def test_order_and_a_common_zero_do_not_matter(random, zero):
     random.shuffle(places)
     plain = axis_accuracy(TARGET, DEVIATION, FORWARD)
     other = axis_accuracy(
-        [TARGET[at] for at in places],
-        [DEVIATION[at] + zero for at in places],
-        [FORWARD[at] for at in places],
+        [TARGET[at] for at in places], [DEVIATION[at] + zero for at in places], [FORWARD[at] for at in places]
     )
     assert other.as_dict() == pytest.approx(plain.as_dict(), abs=1e-9)
 
 
-@given(
-    st.lists(st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6), min_size=2, max_size=8),
-)
+@given(st.lists(st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6), min_size=2, max_size=8))
 def test_figures_keep_the_order_that_the_definitions_give_them(rows):
     targets = np.repeat(np.arange(len(rows), dtype=float), 6)
     found = axis_accuracy(

@@ -89,10 +89,7 @@ def test_any_correct_file_passes(
     assert verdict.figures["ratio_measured"] == pytest.approx(ratio)
 
 
-@given(
-    ratio=st.integers(30, 200),
-    signs=st.tuples(st.sampled_from([1, -1]), st.sampled_from([1, -1])),
-)
+@given(ratio=st.integers(30, 200), signs=st.tuples(st.sampled_from([1, -1]), st.sampled_from([1, -1])))
 def test_a_wrong_direction_is_always_reported_as_direction(ratio: int, signs: tuple[int, int]) -> None:
     said, true = file(ratio, 8000, 2880000, *signs), file(ratio, 8000, 2880000, signs[0], -signs[1])
     way = turned(true, said)

@@ -88,11 +88,7 @@ def test_a_second_node_of_the_same_id_is_refused(tmp_path):
             "{interface: virtual, channel: hdbridge}",
             "virtual:hdbridge is the bus of the drives; expected another one",
         ),
-        (
-            "{article: 5}",
-            "{}",
-            "machine.yaml:8:10: gateway.nodes: found an empty mapping; expected a map",
-        ),
+        ("{article: 5}", "{}", "machine.yaml:8:10: gateway.nodes: found an empty mapping; expected a map"),
         (
             "udp_multicast, channel: 239.74.163.11",
             "socketcann, channel: can1",

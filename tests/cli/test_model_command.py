@@ -98,10 +98,7 @@ def test_discard_leaves_the_active_model(hdbridge, propose):
 
 @pytest.mark.parametrize(
     ("old", "new", "word"),
-    [
-        ("product_code: 0x402", "product_code: 0x403", "drive"),
-        ("name: article", "name: another", "axis"),
-    ],
+    [("product_code: 0x402", "product_code: 0x403", "drive"), ("name: article", "name: another", "axis")],
 )
 def test_a_model_of_another_axis_is_not_committed(hdbridge, propose, profile, old, new, word):
     folder = propose(41.0)

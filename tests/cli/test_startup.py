@@ -31,11 +31,7 @@ print("scipy" in sys.modules, status)
 )
 def test_scipy_is_not_loaded_unless_something_is_fitted(arguments, status, tmp_path):
     done = subprocess.run(
-        [sys.executable, "-c", ASK, *arguments],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=tmp_path,
+        [sys.executable, "-c", ASK, *arguments], capture_output=True, text=True, check=True, cwd=tmp_path
     )
     assert done.stdout.splitlines()[-1] == f"False {status}"
 

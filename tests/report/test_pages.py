@@ -113,10 +113,7 @@ def test_charts_keep_the_page_order():
     assert [each["aria-label"][0] for each in holders] == ["a", "b", "c"]
 
 
-@given(
-    st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=300),
-    st.lists(st.floats(-1e6, 1e6), max_size=300),
-)
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=300), st.lists(st.floats(-1e6, 1e6), max_size=300))
 def test_a_histogram_counts_every_value_once(one, two):
     chart = histogram("c", "x", {"one": [*one, np.nan, np.inf], "two": two})
     assert [sum(each.y) for each in chart.series] == [len(one), len(two)]

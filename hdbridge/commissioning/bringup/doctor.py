@@ -415,7 +415,7 @@ def switched_off(context: BringUpContext) -> Verdict:
 
 
 def _timer(context: BringUpContext) -> int | None:
-    """Returns the communication parameter of a cyclic RPDO with an event timer; None if there is none."""
+    """Returns the communication parameter of a cyclic RPDO with an event timer; None without one."""
     used = (objects.RPDO_COMMUNICATION + layout.number - 1 for layout in context.drive.image.rpdos)
     return next((each for each in used if context.drive.sdo.has(each, 5)), None)
 

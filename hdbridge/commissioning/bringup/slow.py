@@ -51,7 +51,7 @@ class TravelPlan(NamedTuple):
 
 
 def plan_travel(axis: AxisConfig, here_deg: float) -> TravelPlan | None:
-    """Returns the travel from a motor angle, to the side with more space; None if there is too little.
+    """Returns the travel from a motor angle, to the side with more space; None without enough space.
 
     One motor turn, or more if the ratio is too high to be distinguished from its neighbour in one.
     """
@@ -101,7 +101,7 @@ class Silence:
     """Reaction of the drive to a silent master."""
 
     noticed_after_s: float | None
-    """Time from the last frame to the drive's reaction, s; None if there was none within its time-out."""
+    """Time from the last frame to the drive's reaction, s; None without one within its time-out."""
     event: Event | None
     """First event of the master's supervision, if it kept running."""
     statusword: int

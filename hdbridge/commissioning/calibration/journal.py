@@ -15,16 +15,15 @@ from pydantic import BaseModel, ConfigDict, Field
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.control.survived import Survived, lines
 from hdbridge.errors import InputError
-from hdbridge.files.yamlfile import Hex, dump_yaml, read_yaml, write_atomically
+from hdbridge.files.yamlfile import read_yaml
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.records.record import Record
 from hdbridge.records.recording import (
     ABOUT_NAME,
-    HEADER,
+    RecordedFile,
     Recording,
     RecordingFile,
     Segment,
-    sha256_of,
     versions_here,
 )
 
@@ -84,8 +83,7 @@ class Journal:
             raise InputError(
                 f"{folder}: there is a recording already; expected a new folder, or --resume to continue it"
             )
-        about = RecordingFile.model_construct(
-            schema_="hdbridge.recording/1",
+        about = RecordingFile.made(
             axis=axis.name,
             ratio=axis.gear.ratio,
             drive=identity,
@@ -185,34 +183,25 @@ class Journal:
             survived=survived,
         )
         self._tasks.append(entry)
-        segments = [
-            {"kind": each.kind, "start_s": each.start_s + shift_s, "end_s": each.end_s + shift_s}
+        segments = (
+            Segment(kind=each.kind, start_s=each.start_s + shift_s, end_s=each.end_s + shift_s)
             for each in legs
-        ]
-        file = {"name": name, "sha256": sha256_of(self.folder / name), "samples": len(record)}
-        self._write(file, segments)
+        )
+        before, tasks = (
+            self._about,
+            [each.model_dump(mode="json", exclude_defaults=True) for each in self._tasks],
+        )
+        changes = {
+            "notes": {**before.notes, "tasks": tasks},
+            "files": (*before.files, RecordedFile.of(self.folder / name, len(record))),
+            "segments": (*before.segments, *segments),
+        }
+        self._about = before.model_copy(update=changes)
+        self._about.write(self.folder)
 
     def recording(self) -> Recording:
         """Loads everything measured so far."""
         return Recording.load(self.folder)
-
-    def _write(self, file: dict[str, Any], segments: list[dict[str, Any]]) -> None:
-        before = self._about
-        drive = before.drive.model_dump(exclude_none=True) if before.drive else {}
-        tasks = [each.model_dump(mode="json", exclude_defaults=True) for each in self._tasks]
-        data = {
-            "schema": "hdbridge.recording/1",
-            "axis": before.axis,
-            "ratio": before.ratio,
-            "drive": {name: Hex(value) for name, value in drive.items()},
-            "date": before.date,
-            "versions": before.versions,
-            "notes": {**before.notes, "tasks": tasks},
-            "files": [*(each.model_dump() for each in before.files), file],
-            "segments": [*(each.model_dump(exclude={"notes"}) for each in before.segments), *segments],
-        }
-        write_atomically(self.folder / ABOUT_NAME, HEADER + dump_yaml(data))
-        self._about = RecordingFile.model_validate({**data, "drive": before.drive})
 
 
 def survived_in(folders: Iterable[Path]) -> tuple[str, ...]:
