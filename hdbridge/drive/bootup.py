@@ -12,6 +12,7 @@ from itertools import groupby
 from typing import Final
 
 from hdbridge.axis import AxisConfig
+from hdbridge.cia301 import NmtCommand, NmtState
 from hdbridge.drive import objects
 from hdbridge.drive.bootplan import plan
 from hdbridge.drive.dictionary import find, is_readable, is_writable
@@ -28,7 +29,7 @@ from hdbridge.drive.nameplate import (
     scaling_complaints,
     torque_notes,
 )
-from hdbridge.drive.objects import Address, Mode, NmtCommand, NmtState
+from hdbridge.drive.objects import Address, Mode
 from hdbridge.drive.sdo import SdoAbortError, SdoClient
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.writes import PlannedWrite

@@ -8,15 +8,15 @@ from collections.abc import Callable
 from itertools import pairwise
 from typing import Final
 
+from hdbridge.cia301 import NmtState, wrap_int32
 from hdbridge.drive import objects
 from hdbridge.drive.emergencies import error_name
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.monitor import NetworkMonitor
-from hdbridge.drive.objects import Mode, NmtState
+from hdbridge.drive.objects import Mode
 from hdbridge.drive.sdo import SdoClient
 from hdbridge.drive.states import State, controlword_for, decode, states_on_the_way
-from hdbridge.drive.unwrap import wrap_int32
 from hdbridge.errors import RESET, DriveError, TransitionError
 
 STEP_TIMEOUT_S: Final = 1.0

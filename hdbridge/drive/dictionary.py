@@ -10,16 +10,7 @@ from hdbridge.drive.objects import IntegerType
 from hdbridge.files.edsfile import read_eds, shared_eds
 
 INTEGER_TYPES: Final = {
-    datatypes.INTEGER8: IntegerType.INT8,
-    datatypes.INTEGER16: IntegerType.INT16,
-    datatypes.INTEGER24: IntegerType.INT24,
-    datatypes.INTEGER32: IntegerType.INT32,
-    datatypes.INTEGER64: IntegerType.INT64,
-    datatypes.UNSIGNED8: IntegerType.UINT8,
-    datatypes.UNSIGNED16: IntegerType.UINT16,
-    datatypes.UNSIGNED24: IntegerType.UINT24,
-    datatypes.UNSIGNED32: IntegerType.UINT32,
-    datatypes.UNSIGNED64: IntegerType.UINT64,
+    getattr(datatypes, f"{'INTEGER' if each.signed else 'UNSIGNED'}{each.bits}"): each for each in IntegerType
 }
 """Integer types by their number in the EDS (CiA 301, table 44)."""
 _TYPES: Final = {datatypes.BOOLEAN: IntegerType.UINT8, **INTEGER_TYPES}

@@ -18,6 +18,7 @@ import can
 from canopen.objectdictionary import ObjectDictionary
 
 from hdbridge.axis import AxisConfig, Identity
+from hdbridge.cia301 import NmtCommand
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.drive import modes, objects
 from hdbridge.drive.bootup import BootReport, BootUp
@@ -27,7 +28,7 @@ from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.manners import USUAL_MASTER, Ear, listening_s
 from hdbridge.drive.monitor import NetworkMonitor
-from hdbridge.drive.objects import Address, IntegerType, Mode, NmtCommand
+from hdbridge.drive.objects import Address, IntegerType, Mode
 from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoAbortError, SdoClient
 from hdbridge.drive.states import Command, State, decode, row_for
 from hdbridge.drive.writes import master_heartbeat

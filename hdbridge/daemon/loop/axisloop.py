@@ -20,11 +20,10 @@ from hdbridge.daemon.memory.cells import OuterCells, SettingSlot
 from hdbridge.daemon.memory.channels import Queue
 from hdbridge.daemon.memory.layout import NO_FAULT, Command, CommandKind, EventKind, Knot, OuterKnot
 from hdbridge.daemon.setting import CompensationSetting
-from hdbridge.drive.feedback import Feedback
+from hdbridge.drive.feedback import ENABLE_TIMEOUT_S, STOP_TIMEOUT_S, Feedback
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.supervision import EXPLAINED_HINT, Reaction, Supervision
-from hdbridge.drive.switching import ENABLE_TIMEOUT_S, STOP_TIMEOUT_S
 from hdbridge.errors import RESET, HdbridgeError, InputError, TransitionError
 from hdbridge.motion import MotionMode
 
