@@ -306,20 +306,14 @@ class Compensation:
         "step_arcsec", "weight",
     )  # fmt: skip
 
-    def __init__(
-        self,
-        model: TransmissionModel,
-        limits: CompensationLimits,
-        period_s: float,
-        start: Start = Start.VIRGIN,
-    ) -> None:
-        """``period_s`` is the control cycle; ``start`` the knowledge of the gear's past.
+    def __init__(self, model: TransmissionModel, limits: CompensationLimits, period_s: float) -> None:
+        """``period_s`` is the control cycle.
 
         InputError if the model's response was measured at another cycle.
         """
         self.model = model
         """Model that is inverted; `Bench` refuses one of another axis, gear or drive."""
-        self._inverse = Inverse(model, start)
+        self._inverse = Inverse(model)
         self._ratio = model.ratio
         self.maximum_arcsec = limits.maximum_arcsec
         """Cap on the correction."""

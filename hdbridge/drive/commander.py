@@ -158,9 +158,9 @@ class Commander:
             )
         return actual
 
-    def wait_for_standstill(self, timeout_s: float = BRAKE_TIMEOUT_S) -> bool:
+    def wait_for_standstill(self) -> bool:
         """Waits until the position stays within two counts; returns False on time-out."""
-        deadline_s = self.link.now() + timeout_s
+        deadline_s = self.link.now() + BRAKE_TIMEOUT_S
         last = self.sdo.fetch(objects.POSITION_ACTUAL)
         while self.link.now() < deadline_s:
             self.pause(_STILL_POLL_S)

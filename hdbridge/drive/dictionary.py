@@ -44,16 +44,6 @@ def integer_type(variable: ODVariable) -> IntegerType | None:
     return _TYPES.get(variable.data_type or 0)
 
 
-def is_writable(variable: ODVariable) -> bool:
-    """Returns True if the EDS permits writing the object."""
-    return "w" in variable.access_type
-
-
-def is_readable(variable: ODVariable) -> bool:
-    """Returns True if the EDS permits reading the object."""
-    return "r" in variable.access_type or variable.access_type == "const"
-
-
 def held(variable: ODVariable) -> int | None:
     """Returns the object's value according to the EDS: its value in a DCF, else its default, else None."""
     value = variable.value if variable.value is not None else variable.default

@@ -23,7 +23,7 @@ from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.drive import modes, objects
 from hdbridge.drive.bootup import BootReport, BootUp
 from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
-from hdbridge.drive.dictionary import find, is_writable
+from hdbridge.drive.dictionary import find
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.manners import USUAL_MASTER, Ear, listening_s
@@ -312,7 +312,7 @@ class Drive:
         """
         variable = find(self.sdo.od, address.index, address.sub)
         left = self.report.left if self.report is not None else ()
-        return variable is not None and is_writable(variable) and (address.index, address.sub) not in left
+        return variable is not None and variable.writable and (address.index, address.sub) not in left
 
     def close(self) -> list[str]:
         """Stops and disables the drive and takes it out of OPERATIONAL; returns the problems as text.
