@@ -24,11 +24,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
 
 
-class _Part(Strict):
-    """Mapping in the file: immutable, no unknown keys, finite numbers."""
-
-
-class BusConfig(_Part):
+class BusConfig(Strict):
     """The CAN bus, in the terms of python-can."""
 
     interface: str = Field(
@@ -55,7 +51,7 @@ class BusConfig(_Part):
         return channel
 
 
-class Identity(_Part):
+class Identity(Strict):
     """Identity object of the drive, 1018h; omitted values are not compared."""
 
     vendor_id: Unsigned32 = Field(description="1018h:01")
@@ -64,7 +60,7 @@ class Identity(_Part):
     serial: Unsigned32 | None = Field(None, description="1018h:04")
 
 
-class DriveConfig(_Part):
+class DriveConfig(Strict):
     """The servo drive: a CiA-402 node."""
 
     node_id: NodeId = Field(description="CANopen node id of the drive")
@@ -158,7 +154,7 @@ class DriveConfig(_Part):
         return period
 
 
-class Teeth(_Part):
+class Teeth(Strict):
     """Tooth counts of the gear, to check its ratio."""
 
     flexspline: int = Field(ge=10, le=10_000, description="teeth of the flexspline, zf")
@@ -184,7 +180,7 @@ class Teeth(_Part):
         return teeth / (self.circular_spline - self.flexspline)
 
 
-class Gear(_Part):
+class Gear(Strict):
     """The harmonic gear."""
 
     ratio: float = Field(
@@ -206,7 +202,7 @@ class Gear(_Part):
         )
 
 
-class Limits(_Part):
+class Limits(Strict):
     """Motion limits of the axis, all at the load."""
 
     position_min_deg: float = Field(description="lowest position")
@@ -231,7 +227,7 @@ class Limits(_Part):
         return self.position_min_deg <= position_deg <= self.position_max_deg
 
 
-class CompensationConfig(_Part):
+class CompensationConfig(Strict):
     """Limits of the compensation's changes to the target."""
 
     maximum_arcsec: float = Field(300.0, gt=0, le=36_000, description="largest correction, at the load")
@@ -241,7 +237,7 @@ class CompensationConfig(_Part):
     ramp_s: float = Field(0.5, gt=0, le=60, description="time of switching it on or off")
 
 
-class RealtimeConfig(_Part):
+class RealtimeConfig(Strict):
     """Scheduling of the master's process while it moves the axis over a real bus."""
 
     priority: int = Field(50, ge=0, le=99, description="SCHED_FIFO priority of the control loop; 0: none")

@@ -24,12 +24,12 @@ from hdbridge.control.realtime import resumed_realtime
 from hdbridge.control.sensed import Sensed
 from hdbridge.control.survived import Survived, Watch
 from hdbridge.drive.drive import Drive
+from hdbridge.drive.feedback import ENABLE_TIMEOUT_S, STANDING, STOP_TIMEOUT_S, until_enabled
 from hdbridge.drive.layout import layouts
 from hdbridge.drive.link import new_tuple
 from hdbridge.drive.objects import TORQUE_ACTUAL
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
-from hdbridge.drive.switching import ENABLE_TIMEOUT_S, STANDING, STOP_TIMEOUT_S, until_enabled
 from hdbridge.errors import DriveError, HdbridgeError, InputError, SafetyStop
 from hdbridge.motion.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
 from hdbridge.motion.procedures.rehearsal import Rehearsal, rehearse

@@ -27,6 +27,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
+from hdbridge.cia301 import NmtCommand, NmtState
 from hdbridge.clock import Clock
 from hdbridge.control.axiscycle import AxisCycle
 from hdbridge.control.busroutes import Slot, conflict, routes
@@ -34,7 +35,7 @@ from hdbridge.control.latency import Histogram
 from hdbridge.drive.busload import FRAME_BITS
 from hdbridge.drive.fastlink import fast_link
 from hdbridge.drive.link import Frame, Link, TransmitBufferFull
-from hdbridge.drive.objects import COB_NMT, COB_SYNC, NmtCommand, NmtState
+from hdbridge.drive.objects import COB_NMT, COB_SYNC
 from hdbridge.drive.pdo import PdoLengthError
 from hdbridge.drive.supervision import Fault
 from hdbridge.drive.traffic import bus_faults
@@ -65,46 +66,12 @@ class BusCycle:
     """
 
     __slots__ = (
-        "_awaited",
-        "_beginning",
-        "_bits",
-        "_bits_of_turn",
-        "_bus_faults",
-        "_changed",
-        "_deadline",
-        "_discarded",
-        "_dropped",
-        "_early",
-        "_heartbeat_id",
-        "_heartbeat_period_s",
-        "_heartbeat_s",
-        "_interrupted",
-        "_late_s",
-        "_listeners",
-        "_listening",
-        "_per_bit",
-        "_recv",
-        "_rested",
-        "_send",
-        "_slots",
-        "_speaking",
-        "_window_s",
-        "axes",
-        "busy_s",
-        "clock",
-        "count",
-        "down",
-        "due_s",
-        "faults",
-        "histogram",
-        "late_s",
-        "on_frame",
-        "outgoing",
-        "overruns",
-        "period_s",
-        "refused",
-        "skipped",
-        "woke_s",
+        "_awaited", "_beginning", "_bits", "_bits_of_turn", "_bus_faults", "_changed", "_deadline",
+        "_discarded", "_dropped", "_early", "_heartbeat_id", "_heartbeat_period_s", "_heartbeat_s",
+        "_interrupted", "_late_s", "_listeners", "_listening", "_per_bit", "_recv", "_rested",
+        "_send", "_slots", "_speaking", "_window_s", "axes", "busy_s", "clock", "count", "down",
+        "due_s", "faults", "histogram", "late_s", "on_frame", "outgoing", "overruns", "period_s",
+        "refused", "skipped", "woke_s",
     )  # fmt: skip
 
     def __init__(

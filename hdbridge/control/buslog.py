@@ -21,12 +21,13 @@ import can
 import numpy as np
 
 from hdbridge.axis import AxisConfig, Identity
+from hdbridge.cia301 import NmtCommand, NmtState
 from hdbridge.control.bench import record_of
 from hdbridge.drive import objects
 from hdbridge.drive.dictionary import dictionary_of
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.layout import OPTIONAL, PDOS_PER_KIND, Layout, Layouts, cyclic_mode, layouts, mapped
-from hdbridge.drive.objects import Mode, NmtCommand, NmtState
+from hdbridge.drive.objects import Mode
 from hdbridge.drive.pdo import PdoCodec, PdoLengthError
 from hdbridge.drive.states import State
 from hdbridge.errors import InputError

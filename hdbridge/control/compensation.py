@@ -301,31 +301,31 @@ class Compensation:
     """
 
     __slots__ = (
-        "_correction", "_fading", "_inverse", "_known", "_maximum", "_prefilter", "_ratio", "_slew_step",
-        "_static", "_target", "_weight", "_weight_step", "limited", "model", "needs",
+        "_fading", "_inverse", "_known", "_prefilter", "_ratio", "_static", "_target",
+        "correction_arcsec", "limited", "maximum_arcsec", "model", "needs", "ramp_step",
+        "step_arcsec", "weight",
     )  # fmt: skip
 
-    def __init__(
-        self,
-        model: TransmissionModel,
-        limits: CompensationLimits,
-        period_s: float,
-        start: Start = Start.VIRGIN,
-    ) -> None:
-        """``period_s`` is the control cycle; ``start`` the knowledge of the gear's past.
+    def __init__(self, model: TransmissionModel, limits: CompensationLimits, period_s: float) -> None:
+        """``period_s`` is the control cycle.
 
         InputError if the model's response was measured at another cycle.
         """
         self.model = model
         """Model that is inverted; `Bench` refuses one of another axis, gear or drive."""
-        self._inverse = Inverse(model, start)
+        self._inverse = Inverse(model)
         self._ratio = model.ratio
-        self._maximum = limits.maximum_arcsec
-        self._slew_step = limits.slew_arcsec_s * period_s
-        self._weight_step = period_s / limits.ramp_s if limits.ramp_s > 0.0 else 1.0
-        self._weight = 0.0
+        self.maximum_arcsec = limits.maximum_arcsec
+        """Cap on the correction."""
+        self.step_arcsec = limits.slew_arcsec_s * period_s
+        """Maximum change of the correction in one cycle."""
+        self.ramp_step = period_s / limits.ramp_s if limits.ramp_s > 0.0 else 1.0
+        """Change of a weight in one cycle."""
+        self.weight = 0.0
+        """Weight of the ramp: 0 off, 1 fully on."""
         self._target = 0.0
-        self._correction = self._static = 0.0
+        self.correction_arcsec = self._static = 0.0
+        """Correction in force, arcsec at the load: the error that the motor target compensates."""
         self._prefilter = (
             None
             if model.response is None
@@ -339,11 +339,6 @@ class Compensation:
         """Number of cycles in which a cap or the slew limit acted."""
 
     @property
-    def correction_arcsec(self) -> float:
-        """Correction in force, arcsec at the load: the error that the motor target compensates."""
-        return self._correction
-
-    @property
     def predicted_arcsec(self) -> float:
         """Model's error at the last motor target, arcsec at the load, regardless of the weight."""
         return self._inverse.error_arcsec
@@ -354,26 +349,6 @@ class Compensation:
         direction than the model remembers. Always True for a model without memory.
         """
         return self._inverse.memory_known
-
-    @property
-    def maximum_arcsec(self) -> float:
-        """Cap on the correction."""
-        return self._maximum
-
-    @property
-    def step_arcsec(self) -> float:
-        """Maximum change of the correction in one cycle."""
-        return self._slew_step
-
-    @property
-    def ramp_step(self) -> float:
-        """Change of a weight in one cycle."""
-        return self._weight_step
-
-    @property
-    def weight(self) -> float:
-        """Weight of the ramp: 0 off, 1 fully on."""
-        return self._weight
 
     def know(self, channels: frozenset[Channel]) -> None:
         """Sets the available channels of `LOSABLE`; effects that need others fade out."""
@@ -390,7 +365,7 @@ class Compensation:
 
     def reset(self, motor_deg: float, moment: Moment = _NOWHERE) -> None:
         """Restarts at ``motor_deg``, at standstill and without a correction."""
-        self._weight = self._correction = self._static = 0.0
+        self.weight = self.correction_arcsec = self._static = 0.0
         if self._prefilter is not None:
             self._prefilter.reset(0.0)
         for each in self._inverse.faded:
@@ -399,29 +374,22 @@ class Compensation:
 
     def command(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
         """Returns the motor target in degrees for this cycle's load target; advances the model's state."""
-        motor = self._solved(load_deg, moment)
-        wanted = ARCSEC_PER_DEG * (load_deg - motor / self._ratio)
-        prefilter, limited = self._prefilter, self.limited
-        if prefilter is None:
-            correction = self._limit(wanted, self._correction)
-            if self.limited != limited:
-                motor = self._ratio * (load_deg - correction / ARCSEC_PER_DEG)
-            self._correction = correction
-            self._inverse.advance(motor, moment)
-            return motor
-        static = self._limit(wanted, self._static)
+        motor, limited = self._solved(load_deg, moment), self.limited
+        static = self._limit(ARCSEC_PER_DEG * (load_deg - motor / self._ratio), self._static)
         if self.limited != limited:
             motor = self._ratio * (load_deg - static / ARCSEC_PER_DEG)
-        filtered = prefilter.follow(load_deg, static, moment, self._predicted)
-        correction = self._limit(filtered, self._correction)
-        self.limited = min(self.limited, limited + 1)
-        self._static, self._correction = static, correction
+        correction = static
+        if self._prefilter is not None:
+            filtered = self._prefilter.follow(load_deg, static, moment, self._predicted)
+            correction = self._limit(filtered, self.correction_arcsec)
+            self.limited = min(self.limited, limited + 1)
+        self._static, self.correction_arcsec = static, correction
         self._inverse.advance(motor, moment)
         return motor if correction == static else self._ratio * (load_deg - correction / ARCSEC_PER_DEG)
 
     def _limit(self, wanted: float, last: float) -> float:
         """Limits the correction to the slew limit and the cap; counts in `limited`."""
-        slew, most = self._slew_step, self._maximum
+        slew, most = self.step_arcsec, self.maximum_arcsec
         if last - slew <= wanted <= last + slew and -most <= wanted <= most:
             return wanted
         self.limited += 1
@@ -430,15 +398,15 @@ class Compensation:
     def _predicted(self, load_deg: float, moment: Moment) -> float:
         """Returns the correction at a load target ahead, arcsec; the state does not change."""
         motor = self._ratio * (load_deg - self._static / ARCSEC_PER_DEG)
-        return self._weight * self._inverse.error_at(motor, moment)
+        return self.weight * self._inverse.error_at(motor, moment)
 
     def _solved(self, load_deg: float, moment: Moment) -> float:
         """Advances the ramps by one cycle; returns the wanted motor angle."""
-        weight = self._weight
+        weight = self.weight
         if weight != self._target:
-            step = self._weight_step
+            step = self.ramp_step
             weight += min(max(self._target - weight, -step), step)
-            self._weight = weight
+            self.weight = weight
         if self._fading:
             self._fade()
         return self._inverse.solve(load_deg, moment, weight)
@@ -448,7 +416,7 @@ class Compensation:
 
         For two compensations that share one motor (`switchover.Correction`), followed by a call of `issued`.
         """
-        most = self._maximum
+        most = self.maximum_arcsec
         wanted = ARCSEC_PER_DEG * (load_deg - self._solved(load_deg, moment) / self._ratio)
         wanted = min(max(wanted, -most), most)
         if self._prefilter is None:
@@ -459,9 +427,10 @@ class Compensation:
 
     def issued(self, motor_deg: float, correction_arcsec: float, moment: Moment = _NOWHERE) -> None:
         """Advances the model's state to the motor target that was sent, which contains this correction."""
-        if self._prefilter is not None:
-            motor_deg += self._ratio * (correction_arcsec - self._static) / ARCSEC_PER_DEG
-        self._correction = correction_arcsec
+        if self._prefilter is None:
+            self._static = correction_arcsec
+        motor_deg += self._ratio * (correction_arcsec - self._static) / ARCSEC_PER_DEG
+        self.correction_arcsec = correction_arcsec
         self._inverse.advance(motor_deg, moment)
 
     def take_over(self, other: Compensation, moment: Moment = _NOWHERE) -> None:
@@ -474,8 +443,8 @@ class Compensation:
         self.reset(begin, moment)
         for motor_deg in rest:
             self._inverse.advance(motor_deg, moment)
-        self._weight, self._target, self._correction = other._weight, other._target, other._correction
-        self._static = self._correction if other._prefilter is None else other._static
+        self.weight, self._target = other.weight, other._target
+        self.correction_arcsec, self._static = other.correction_arcsec, other._static
         if self._prefilter is not None:
             self._prefilter.take_over(other._prefilter, self._static)
 
@@ -484,19 +453,16 @@ class Compensation:
         settled = True
         for each in self._inverse.faded:
             target = float(each.needs <= self._known)
-            each.weight += min(max(target - each.weight, -self._weight_step), self._weight_step)
+            each.weight += min(max(target - each.weight, -self.ramp_step), self.ramp_step)
             settled = settled and each.weight == target
         self._fading = not settled
 
     def hold(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
         """Returns the motor target in degrees, with the correction frozen, for a cycle without feedback."""
-        motor = self._ratio * (load_deg - self._correction / ARCSEC_PER_DEG)
-        if self._prefilter is None:
-            self._inverse.advance(motor, moment)
-        else:
+        if self._prefilter is not None:
             self._prefilter.follow(load_deg, self._static, moment, self._predicted)
-            self._inverse.advance(self._ratio * (load_deg - self._static / ARCSEC_PER_DEG), moment)
-        return motor
+        self._inverse.advance(self._ratio * (load_deg - self._static / ARCSEC_PER_DEG), moment)
+        return self._ratio * (load_deg - self.correction_arcsec / ARCSEC_PER_DEG)
 
 
 def _lead(response: Response, period_s: float) -> LeadFilter:

@@ -26,16 +26,9 @@ class Cycle:
     """
 
     __slots__ = (
-        "_axis",
-        "_bus",
-        "_exchange",
-        "clock",
-        "histogram",
-        "monitor",
-        "period_s",
-        "stopping",
+        "_axis", "_bus", "_exchange", "clock", "histogram", "monitor", "period_s", "stopping",
         "supervision",
-    )
+    )  # fmt: skip
 
     def __init__(
         self,

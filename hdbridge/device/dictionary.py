@@ -102,8 +102,8 @@ class Entry:
         self.codec: Final = struct.Struct("<" + code) if code else None
         self.is_known: Final = own is not None
         self.hidden = False
-        self.readable: Final = "r" in variable.access_type or variable.access_type == "const"
-        self.writable: Final = "w" in variable.access_type
+        self.readable: Final[bool] = variable.readable
+        self.writable: Final[bool] = variable.writable
         self.mappable: Final = bool(variable.pdo_mappable) and code is not None
         self.low: Final[int | None] = variable.min
         self.high: Final[int | None] = variable.max

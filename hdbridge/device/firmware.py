@@ -6,6 +6,7 @@ goes through the dictionary. The firmware reads no clock: it adds up the periods
 
 from typing import Final
 
+from hdbridge.cia301 import wrap_int32
 from hdbridge.device.behaviour import Behaviour, Controlword
 from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError, only
 from hdbridge.device.emergency import Emergency, ErrorCode
@@ -17,7 +18,7 @@ from hdbridge.device.modes import (
     Mode,
     ProfilePosition,
 )
-from hdbridge.device.motion import Machine, Motion, wrap_int32
+from hdbridge.device.motion import Machine, Motion
 from hdbridge.device.powerstate import POWERED, Control, PowerStage, State, Status, next_state
 from hdbridge.device.profile import Profile, stop
 

@@ -7,8 +7,9 @@ firmware's.
 import math
 from typing import ClassVar, Final
 
+from hdbridge.cia301 import wrap_int32
 from hdbridge.device.dictionary import only
-from hdbridge.device.motion import Motion, wrap_int32
+from hdbridge.device.motion import Motion
 from hdbridge.device.powerstate import Control, Status
 from hdbridge.device.profile import Profile, move
 
@@ -113,7 +114,27 @@ class InterpolatedPosition(CyclicSynchronousPosition):
         return _BIT_12 if self._active else 0
 
 
-class ProfilePosition(Mode):
+class _Planned(Mode):
+    """Base class of modes whose moves the drive plans itself."""
+
+    _profile: Profile | None
+    _elapsed_s: float
+
+    def step(self, period_s: float) -> tuple[float, float]:
+        if self._profile is None:
+            return self.motion.demand_counts, 0.0
+        self._elapsed_s += period_s
+        demand, velocity = self._profile.at(self._elapsed_s)
+        if self._elapsed_s >= self._profile.duration_s:
+            self._profile = None
+            self._arrive(demand)
+        return demand, velocity
+
+    def _arrive(self, demand_counts: float) -> None:
+        """Called at the end of a move."""
+
+
+class ProfilePosition(_Planned):
     """PP: trapezoidal moves to set-points; one more set-point may be queued during a move."""
 
     number = 1
@@ -123,7 +144,7 @@ class ProfilePosition(Mode):
         self.enter()
 
     def enter(self) -> None:
-        self._profile: Profile | None = None
+        self._profile = None
         self._elapsed_s = 0.0
         self._goal = self.motion.demand_counts
         self._waiting: float | None = None
@@ -177,15 +198,6 @@ class ProfilePosition(Mode):
             min(value(0x6084), value(0x60C6)),
         )
 
-    def step(self, period_s: float) -> tuple[float, float]:
-        if self._profile is None:
-            return self.motion.demand_counts, 0.0
-        self._elapsed_s += period_s
-        demand, velocity = self._profile.at(self._elapsed_s)
-        if self._elapsed_s >= self._profile.duration_s:
-            self._profile = None
-        return demand, velocity
-
     def observe(self, period_s: float) -> None:
         if self._profile is not None:
             return
@@ -206,7 +218,7 @@ class ProfilePosition(Mode):
         return (_REACHED if self._reached else 0) | (_BIT_12 if self._acknowledged else 0)
 
 
-class Homing(Mode):
+class Homing(_Planned):
     """HM: methods 33 and 34 move to the next index pulse, 35 and 37 take the present position.
 
     The position found is set to 607Ch. There is one index pulse per motor turn.
@@ -223,7 +235,7 @@ class Homing(Mode):
     def enter(self) -> None:
         self._attained = False
         self._failed = False
-        self._profile: Profile | None = None
+        self._profile = None
         self._elapsed_s = 0.0
 
     def control(self, word: int, rising: int) -> None:
@@ -250,15 +262,8 @@ class Homing(Mode):
             motion.demand_counts, 0.0, float(index * turn), value(0x6099, 2), acceleration, acceleration
         )
 
-    def step(self, period_s: float) -> tuple[float, float]:
-        if self._profile is None:
-            return self.motion.demand_counts, 0.0
-        self._elapsed_s += period_s
-        demand, velocity = self._profile.at(self._elapsed_s)
-        if self._elapsed_s >= self._profile.duration_s:
-            self._profile = None
-            self._attain(round(demand))
-        return demand, velocity
+    def _arrive(self, demand_counts: float) -> None:
+        self._attain(round(demand_counts))
 
     def _attain(self, counts: int) -> None:
         """Sets a position of the motor encoder to 607Ch."""

@@ -7,15 +7,11 @@ All motion is computed in the plant's counts; int32 appears only when objects ar
 from collections.abc import Callable
 from typing import Final, Protocol
 
+from hdbridge.cia301 import wrap_int32
 from hdbridge.device.dictionary import Dictionary
 
 _HALF: Final = 1 << 31
 _MASK: Final = (1 << 32) - 1
-
-
-def wrap_int32(value: int) -> int:
-    """Returns ``value`` modulo 2**32 in the range of an int32."""
-    return ((value + _HALF) & _MASK) - _HALF
 
 
 class Machine(Protocol):

@@ -15,6 +15,7 @@ from typing import Final
 import can
 
 from hdbridge.canframe import DataFrame
+from hdbridge.cia301 import NmtCommand, NmtState
 from hdbridge.clock import Clock
 from hdbridge.device.behaviour import Behaviour, HeartbeatConsumer
 from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError, only
@@ -24,7 +25,6 @@ from hdbridge.device.firmware import Firmware
 from hdbridge.device.lss import ANSWER, REQUEST, UNCONFIGURED, LssSlave
 from hdbridge.device.motion import Machine
 from hdbridge.device.nameplate import MOTOR_POSITION, Nameplate
-from hdbridge.device.nmt import Nmt, NmtCommand
 from hdbridge.device.parameters import StoredParameters
 from hdbridge.device.pdo import ReceivePdo, TransmitPdo
 from hdbridge.device.powerstate import POWERED, PowerStage
@@ -41,10 +41,10 @@ _NEVER: Final = float("inf")
 _HEARTBEAT: Final = 0x700
 
 
-_INITIALISING = Nmt.INITIALISING
+_INITIALISING = NmtState.INITIALISING
 # For the cyclic path: to look a member up in its class takes five times as long as a name of the module.
 
-_AFTER_ERROR: Final = {0: Nmt.PRE_OPERATIONAL, 2: Nmt.STOPPED}
+_AFTER_ERROR: Final = {0: NmtState.PRE_OPERATIONAL, 2: NmtState.STOPPED}
 """Object 1029h:01: the NMT state after a communication error; 1 changes nothing."""
 
 
@@ -125,7 +125,7 @@ class DriveNode:
 
     def _begin(self) -> None:
         """Initialises the communication from the dictionary, before the boot-up message."""
-        self.nmt = Nmt.INITIALISING
+        self.nmt = NmtState.INITIALISING
         self._sdo.reset()
         self._sdo_from_s = self._now_s + self.behaviour.sdo_delay_s
         self._take_period()
@@ -147,8 +147,8 @@ class DriveNode:
     def _boot(self) -> None:
         if self.node_id == UNCONFIGURED:
             return
-        self._send(_HEARTBEAT + self.node_id, bytes([Nmt.INITIALISING]))
-        self._enter(Nmt.PRE_OPERATIONAL)
+        self._send(_HEARTBEAT + self.node_id, bytes([NmtState.INITIALISING]))
+        self._enter(NmtState.PRE_OPERATIONAL)
 
     def _take_period(self) -> None:
         self._period_s = self._own_period_s()
@@ -225,7 +225,7 @@ class DriveNode:
 
     def _route(self) -> None:
         """Assigns frames and SYNC to the PDOs that are active now."""
-        running = self.nmt is Nmt.OPERATIONAL
+        running = self.nmt is NmtState.OPERATIONAL
         tpdos = [pdo for pdo in self._tpdos if running and pdo.valid]
         rpdos = [pdo for pdo in self._rpdos if running and pdo.valid]
         self._sync_tpdos = [pdo for pdo in tpdos if pdo.is_synchronous]
@@ -245,7 +245,7 @@ class DriveNode:
         takers |= {self._watched_id: self._on_watched_heartbeat, 0x000: self._on_nmt}
         for can_id, pdo in self._rpdo_by_id.items():
             takers[can_id] = partial(self._on_rpdo, pdo)
-        if self.nmt is not Nmt.STOPPED:
+        if self.nmt is not NmtState.STOPPED:
             takers[0x600 + self.node_id] = self._on_sdo_request
             takers[self.dictionary.value(0x1005) & 0x7FF] = self._on_sync
 
@@ -308,7 +308,7 @@ class DriveNode:
             self.lost_frames += 1  # as on a bus that is down: a drive drops the frame and carries on
 
     def _send_unless_stopped(self, can_id: int, data: bytes) -> None:
-        if self.nmt in (Nmt.OPERATIONAL, Nmt.PRE_OPERATIONAL):
+        if self.nmt in (NmtState.OPERATIONAL, NmtState.PRE_OPERATIONAL):
             self._send(can_id, data)
 
     def _on_sync(self, data: bytearray, now_s: float) -> None:
@@ -379,17 +379,17 @@ class DriveNode:
             return
         command = data[0]
         if command == NmtCommand.START:
-            self._enter(Nmt.OPERATIONAL)
+            self._enter(NmtState.OPERATIONAL)
         elif command == NmtCommand.STOP:
-            self._leave_operational(Nmt.STOPPED)
-        elif command == NmtCommand.ENTER_PRE_OPERATIONAL:
-            self._leave_operational(Nmt.PRE_OPERATIONAL)
+            self._leave_operational(NmtState.STOPPED)
+        elif command == NmtCommand.PRE_OPERATIONAL:
+            self._leave_operational(NmtState.PRE_OPERATIONAL)
         elif command == NmtCommand.RESET_NODE:
             self.reset()
         elif command == NmtCommand.RESET_COMMUNICATION:
             self._reset_communication()
 
-    def _enter(self, state: Nmt) -> None:
+    def _enter(self, state: NmtState) -> None:
         if self.nmt is state:
             return
         self.nmt = state
@@ -397,16 +397,18 @@ class DriveNode:
             pdo.restart()
         self._route()
 
-    def _leave_operational(self, state: Nmt) -> None:
+    def _leave_operational(self, state: NmtState) -> None:
         """Stops the PDOs; an axis that depends on them has lost its master (6007h)."""
-        lost = state is Nmt.STOPPED or (self.nmt is Nmt.OPERATIONAL and self.firmware.follows_the_bus)
+        lost = state is NmtState.STOPPED or (
+            self.nmt is NmtState.OPERATIONAL and self.firmware.follows_the_bus
+        )
         if lost:
             self.firmware.connection_lost(ErrorCode.COMMUNICATION)
         self._enter(state)
 
     def drop_out(self) -> None:
         """Enters PRE-OPERATIONAL without a command, and reports it."""
-        self._leave_operational(Nmt.PRE_OPERATIONAL)
+        self._leave_operational(NmtState.PRE_OPERATIONAL)
         self._send_heartbeat()
 
     def _on_lss(self, data: bytearray, _: float) -> None:
@@ -504,7 +506,7 @@ class DriveNode:
             return
         self.firmware.connection_lost(ErrorCode.HEARTBEAT)
         state = _AFTER_ERROR.get(self.dictionary.value(0x1029, 1))
-        if state is not None and self.nmt is Nmt.OPERATIONAL and not self.faults.stay_operational:
+        if state is not None and self.nmt is NmtState.OPERATIONAL and not self.faults.stay_operational:
             self._enter(state)
 
     def _lose_sync(self) -> None:

@@ -7,7 +7,7 @@ from canopen.objectdictionary import ObjectDictionary
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
-from hdbridge.drive.dictionary import dictionary_of, find, held, integer_type, is_writable
+from hdbridge.drive.dictionary import dictionary_of, find, held, integer_type
 from hdbridge.drive.layout import cyclic_mode, layouts
 from hdbridge.drive.nameplate import mode_advice
 from hdbridge.drive.objects import Mode
@@ -53,10 +53,10 @@ def left_to_drive(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[
     return [*_sorted(axis, od)[1], *_not_read(axis, od)]
 
 
-def sent_along(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[str]:
+def sent_along(axis: AxisConfig) -> list[str]:
     """Describes the objects that the master sends only because the drive's fixed mappings contain them."""
     own = {(each.index, each.sub) for each in (objects.CONTROLWORD, objects.MODE, cyclic_mode(axis).target)}
-    od = dictionary_of(axis) if od is None else od
+    od = dictionary_of(axis)
     found = []
     for layout in layouts(axis, od).rpdos:
         for entry in layout.codec.entries:
@@ -103,7 +103,7 @@ def _left_because(axis: AxisConfig, od: ObjectDictionary, row: PlannedWrite) -> 
     if kind is None:
         return f"which is not an integer in {eds}"
     found = held(variable)
-    if not is_writable(variable):
+    if not variable.writable:
         if found is None or row.holds(found):
             return None
         reason = f"which is read-only in {eds} ({found})"

@@ -12,9 +12,10 @@ from itertools import groupby
 from typing import Final
 
 from hdbridge.axis import AxisConfig
+from hdbridge.cia301 import NmtCommand, NmtState
 from hdbridge.drive import objects
 from hdbridge.drive.bootplan import plan
-from hdbridge.drive.dictionary import find, is_readable, is_writable
+from hdbridge.drive.dictionary import find
 from hdbridge.drive.image import drive_heartbeat_ms
 from hdbridge.drive.link import Link
 from hdbridge.drive.manners import heartbeat_of
@@ -28,7 +29,7 @@ from hdbridge.drive.nameplate import (
     scaling_complaints,
     torque_notes,
 )
-from hdbridge.drive.objects import Address, Mode, NmtCommand, NmtState
+from hdbridge.drive.objects import Address, Mode
 from hdbridge.drive.sdo import SdoAbortError, SdoClient
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.writes import PlannedWrite
@@ -270,7 +271,7 @@ class BootUp:
         off = rows[0]
         cob_id = find(self._sdo.od, off.index, off.sub) if off.node_id == self._sdo.node_id else None
         for row in rows:
-            fixed = row is off and cob_id is not None and not is_writable(cob_id)
+            fixed = row is off and cob_id is not None and not cob_id.writable
             if fixed or (row.passing and _maps(row) and not remap):
                 continue
             self._settle(row)
@@ -287,7 +288,7 @@ class BootUp:
         """Returns the present value; None for a write-only object."""
         sdo = self._clients[row.node_id]
         variable = find(sdo.od, row.index, row.sub)
-        if variable is not None and not is_readable(variable):
+        if variable is not None and not variable.readable:
             return None
         try:
             return sdo.read(row.index, row.sub, row.type)

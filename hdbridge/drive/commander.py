@@ -8,15 +8,15 @@ from collections.abc import Callable
 from itertools import pairwise
 from typing import Final
 
+from hdbridge.cia301 import NmtState, wrap_int32
 from hdbridge.drive import objects
 from hdbridge.drive.emergencies import error_name
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.monitor import NetworkMonitor
-from hdbridge.drive.objects import Mode, NmtState
+from hdbridge.drive.objects import Mode
 from hdbridge.drive.sdo import SdoClient
 from hdbridge.drive.states import State, controlword_for, decode, states_on_the_way
-from hdbridge.drive.unwrap import wrap_int32
 from hdbridge.errors import RESET, DriveError, TransitionError
 
 STEP_TIMEOUT_S: Final = 1.0
@@ -158,9 +158,9 @@ class Commander:
             )
         return actual
 
-    def wait_for_standstill(self, timeout_s: float = BRAKE_TIMEOUT_S) -> bool:
+    def wait_for_standstill(self) -> bool:
         """Waits until the position stays within two counts; returns False on time-out."""
-        deadline_s = self.link.now() + timeout_s
+        deadline_s = self.link.now() + BRAKE_TIMEOUT_S
         last = self.sdo.fetch(objects.POSITION_ACTUAL)
         while self.link.now() < deadline_s:
             self.pause(_STILL_POLL_S)

@@ -10,16 +10,7 @@ from hdbridge.drive.objects import IntegerType
 from hdbridge.files.edsfile import read_eds, shared_eds
 
 INTEGER_TYPES: Final = {
-    datatypes.INTEGER8: IntegerType.INT8,
-    datatypes.INTEGER16: IntegerType.INT16,
-    datatypes.INTEGER24: IntegerType.INT24,
-    datatypes.INTEGER32: IntegerType.INT32,
-    datatypes.INTEGER64: IntegerType.INT64,
-    datatypes.UNSIGNED8: IntegerType.UINT8,
-    datatypes.UNSIGNED16: IntegerType.UINT16,
-    datatypes.UNSIGNED24: IntegerType.UINT24,
-    datatypes.UNSIGNED32: IntegerType.UINT32,
-    datatypes.UNSIGNED64: IntegerType.UINT64,
+    getattr(datatypes, f"{'INTEGER' if each.signed else 'UNSIGNED'}{each.bits}"): each for each in IntegerType
 }
 """Integer types by their number in the EDS (CiA 301, table 44)."""
 _TYPES: Final = {datatypes.BOOLEAN: IntegerType.UINT8, **INTEGER_TYPES}
@@ -51,16 +42,6 @@ def find(od: ObjectDictionary, index: int, sub: int) -> ODVariable | None:
 def integer_type(variable: ODVariable) -> IntegerType | None:
     """Returns the integer type of an object; None if it is not an integer."""
     return _TYPES.get(variable.data_type or 0)
-
-
-def is_writable(variable: ODVariable) -> bool:
-    """Returns True if the EDS permits writing the object."""
-    return "w" in variable.access_type
-
-
-def is_readable(variable: ODVariable) -> bool:
-    """Returns True if the EDS permits reading the object."""
-    return "r" in variable.access_type or variable.access_type == "const"
 
 
 def held(variable: ODVariable) -> int | None:

@@ -18,16 +18,17 @@ import can
 from canopen.objectdictionary import ObjectDictionary
 
 from hdbridge.axis import AxisConfig, Identity
+from hdbridge.cia301 import NmtCommand
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.drive import modes, objects
 from hdbridge.drive.bootup import BootReport, BootUp
 from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
-from hdbridge.drive.dictionary import find, is_writable
+from hdbridge.drive.dictionary import find
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.manners import USUAL_MASTER, Ear, listening_s
 from hdbridge.drive.monitor import NetworkMonitor
-from hdbridge.drive.objects import Address, IntegerType, Mode, NmtCommand
+from hdbridge.drive.objects import Address, IntegerType, Mode
 from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoAbortError, SdoClient
 from hdbridge.drive.states import Command, State, decode, row_for
 from hdbridge.drive.writes import master_heartbeat
@@ -311,7 +312,7 @@ class Drive:
         """
         variable = find(self.sdo.od, address.index, address.sub)
         left = self.report.left if self.report is not None else ()
-        return variable is not None and is_writable(variable) and (address.index, address.sub) not in left
+        return variable is not None and variable.writable and (address.index, address.sub) not in left
 
     def close(self) -> list[str]:
         """Stops and disables the drive and takes it out of OPERATIONAL; returns the problems as text.

@@ -1,6 +1,11 @@
-"""Measurements of one control cycle. Data only."""
+"""Measurements of one control cycle, and waiting for power in it."""
 
-from typing import NamedTuple
+import math
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from hdbridge.drive.states import PowerWalk, State
+from hdbridge.errors import TransitionError
 
 
 class Feedback(NamedTuple):
@@ -20,3 +25,22 @@ class Feedback(NamedTuple):
     """False if a TPDO was missing or implausible; the values are then the last good ones."""
     readings: tuple[float | None, ...]
     """Last good reading of each channel of the axis file; None if there is none."""
+
+
+ENABLE_TIMEOUT_S: Final = 2.0
+STOP_TIMEOUT_S: Final = 2.0
+STANDING: Final = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON, State.FAULT)
+
+
+def until_enabled(tick: Callable[[], Feedback], power: PowerWalk, period_s: float) -> Feedback:
+    """Cycles until operation is enabled and returns that cycle's feedback; raises `TransitionError` on
+    time-out.
+    """
+    for _ in range(math.ceil(ENABLE_TIMEOUT_S / period_s)):
+        feedback = tick()
+        if power.state is State.OPERATION_ENABLED:
+            return feedback
+    raise TransitionError(
+        f"the drive did not reach 'operation enabled' within {ENABLE_TIMEOUT_S:g} s, it is in "
+        f"'{power.state.value}'; look at its enable input, its supply and its fault history"
+    )

@@ -5,7 +5,7 @@ from typing import Final
 
 from canopen.objectdictionary import ODVariable
 
-from hdbridge.drive.dictionary import integer_type, is_readable
+from hdbridge.drive.dictionary import integer_type
 from hdbridge.drive.sdo import SdoClient
 from hdbridge.errors import SdoError
 
@@ -22,7 +22,7 @@ def read_gains(sdo: SdoClient) -> dict[str, int]:
             continue
         members = [entry] if isinstance(entry, ODVariable) else list(entry.subindices.values())[1:]
         for each in members:
-            if integer_type(each) is None or not is_readable(each):
+            if integer_type(each) is None or not each.readable:
                 continue
             try:
                 found[f"{index:04X}h:{each.subindex:02X}"] = sdo.read(index, each.subindex)

@@ -11,6 +11,7 @@ from typing import Final
 from canopen.objectdictionary import ObjectDictionary
 
 from hdbridge.axis import AxisConfig
+from hdbridge.cia301 import INT32_RANGE, wrap_int32
 from hdbridge.drive import objects
 from hdbridge.drive.channels import ChannelFollower
 from hdbridge.drive.dictionary import dictionary_of, find, held
@@ -19,7 +20,7 @@ from hdbridge.drive.objects import Address
 from hdbridge.drive.pdo import PdoEntry
 from hdbridge.drive.states import Command, PowerWalk, State
 from hdbridge.drive.supervision import Fault
-from hdbridge.drive.unwrap import INT32_RANGE, Unwrap, wrap_int32
+from hdbridge.drive.unwrap import Unwrap
 from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG
 

@@ -21,7 +21,7 @@ from canopen.objectdictionary import ObjectDictionary, ODVariable
 from hdbridge.axis import AxisConfig, Source
 from hdbridge.axis.channels import ChannelSource
 from hdbridge.drive import objects
-from hdbridge.drive.dictionary import dictionary_of, find, held, integer_type, is_writable
+from hdbridge.drive.dictionary import dictionary_of, find, held, integer_type
 from hdbridge.drive.objects import PDO_INVALID, Address, CyclicMode, IntegerType
 from hdbridge.drive.pdo import MAX_BYTES, PdoCodec, PdoEntry
 from hdbridge.errors import InputError
@@ -182,16 +182,16 @@ def _offers(od: ObjectDictionary | None, communication: int, mapping: int) -> It
         while len(words) < _MOST_ENTRIES and (word := find(od, mapping + place, len(words) + 1)) is not None:
             words.append(word)
         fixed: tuple[PdoEntry, ...] | None = None
-        if not all(map(is_writable, [count, *words])):
+        if not all(each.writable for each in (count, *words)):
             fixed = mapped(od, [held(each) for each in words[: held(count) or 0]])
         can_id = None
-        if not is_writable(cob_id):
+        if not cob_id.writable:
             can_id = held(cob_id)
             if can_id is not None and can_id & (PDO_INVALID | _EXTENDED):
                 continue
             can_id = can_id & 0x7FF if can_id else None
         kind = find(od, communication + place, 2)
-        every = held(kind) if kind is not None and not is_writable(kind) else None
+        every = held(kind) if kind is not None and not kind.writable else None
         yield _Offer(place + 1, len(words), fixed, can_id, every)
 
 

@@ -9,15 +9,16 @@ import errno
 import logging
 import os
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import can
 
+from hdbridge.axis.config import BusConfig
 from hdbridge.canframe import DataFrame
 from hdbridge.clock import Clock
 from hdbridge.drive.interfacelock import InterfaceLock
@@ -74,19 +75,6 @@ class Dropped:
     def total(self) -> int:
         """Number of discarded frames of all kinds."""
         return self.remote + self.extended + self.error + self.fd
-
-
-class BusSettings(Protocol):
-    """The ``bus`` section of an axis file."""
-
-    @property
-    def interface(self) -> str: ...
-    @property
-    def channel(self) -> Any: ...
-    @property
-    def bitrate_bps(self) -> int | None: ...
-    @property
-    def options(self) -> Mapping[str, str | int | float | bool]: ...
 
 
 class Link:
@@ -248,7 +236,7 @@ def unknown_interface(interface: str) -> str | None:
     return f"python-can has no interface {interface!r}; expected one of {', '.join(known)}{hint}"
 
 
-def absent_interface(settings: BusSettings) -> str | None:
+def absent_interface(settings: BusConfig) -> str | None:
     """Returns an error text if this computer lacks the network interface of a SocketCAN
     channel, else None.
     """
@@ -269,7 +257,7 @@ def _lacking(interface: str) -> str | None:
 
 
 @contextmanager
-def open_bus(settings: BusSettings, *, shared: bool = False) -> Iterator[can.BusABC]:
+def open_bus(settings: BusConfig, *, shared: bool = False) -> Iterator[can.BusABC]:
     """Opens the bus of an axis file; raises a one-line `BusError` if that fails.
 
     Only one process of a computer may open an interface; the next is refused with `BusInUseError`, because
@@ -282,7 +270,7 @@ def open_bus(settings: BusSettings, *, shared: bool = False) -> Iterator[can.Bus
 
 
 @contextmanager
-def _opened(settings: BusSettings) -> Iterator[can.BusABC]:
+def _opened(settings: BusConfig) -> Iterator[can.BusABC]:
     name = f"{settings.interface}:{settings.channel}"
     check_interface(settings.interface, f"{name}: bus.interface")
     options: dict[str, Any] = dict(settings.options)

@@ -8,9 +8,10 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from hdbridge.cia301 import NmtState
 from hdbridge.drive.emergencies import error_name
 from hdbridge.drive.link import Frame
-from hdbridge.drive.objects import COB_EMCY, COB_HEARTBEAT, NmtState
+from hdbridge.drive.objects import COB_EMCY, COB_HEARTBEAT
 
 EMERGENCIES_KEPT: Final = 64
 
@@ -46,10 +47,6 @@ class NodeStatus:
     emergency_count: int = 0
     """Number of all emergencies, including those dropped from the ring buffer."""
     emergencies: deque[Emergency] = field(default_factory=lambda: deque(maxlen=EMERGENCIES_KEPT))
-
-    def heartbeat_age_s(self, now_s: float) -> float:
-        """Returns the seconds since the last heartbeat; infinite before the first."""
-        return float("inf") if self.heartbeat_s is None else now_s - self.heartbeat_s
 
     @property
     def counts(self) -> tuple[int, int, int]:

@@ -95,25 +95,6 @@ class Mode(IntEnum):
         return 1 << (self.value - 1)
 
 
-class NmtCommand(IntEnum):
-    """First byte of an NMT message."""
-
-    START = 0x01
-    STOP = 0x02
-    PRE_OPERATIONAL = 0x80
-    RESET_NODE = 0x81
-    RESET_COMMUNICATION = 0x82
-
-
-class NmtState(IntEnum):
-    """Byte of a heartbeat."""
-
-    BOOT_UP = 0x00
-    STOPPED = 0x04
-    OPERATIONAL = 0x05
-    PRE_OPERATIONAL = 0x7F
-
-
 # Function codes of the predefined connection set (CiA 301); the node id is added where there is one.
 COB_NMT: Final = 0x000
 COB_SYNC: Final = 0x080

@@ -13,18 +13,8 @@ from typing import Self
 from hdbridge.drive.objects import Address, IntegerType
 from hdbridge.errors import DriveError, InputError
 
-_FORMATS = {
-    IntegerType.INT8: "b",
-    IntegerType.INT16: "h",
-    IntegerType.INT24: "3s",
-    IntegerType.INT32: "i",
-    IntegerType.INT64: "q",
-    IntegerType.UINT8: "B",
-    IntegerType.UINT16: "H",
-    IntegerType.UINT24: "3s",
-    IntegerType.UINT32: "I",
-    IntegerType.UINT64: "Q",
-}
+_CODES = {8: "b", 16: "h", 24: "3s", 32: "i", 64: "q"}
+"""Format of `struct` by the width of a signed integer; it has no 24-bit one."""
 MAX_BYTES = 8
 _FIRST_OBJECT = 0x1000
 
@@ -70,7 +60,7 @@ class PdoCodec:
 
     def __init__(self, entries: Iterable[PdoEntry]) -> None:
         self.entries: tuple[PdoEntry, ...] = tuple(entries)
-        self._struct = struct.Struct("<" + "".join(_FORMATS[entry.type] for entry in self.entries))
+        self._struct = struct.Struct("<" + "".join(map(_format, self.entries)))
         self._unpack = self._struct.unpack
         self.length: int = self._struct.size
         """Exact length of the PDO; bytes."""
@@ -140,3 +130,8 @@ class PdoCodec:
             f"object {entry}: {value!r} is not an integer in "
             f"[{entry.type.minimum}, {entry.type.maximum}]; nothing was sent"
         )
+
+
+def _format(entry: PdoEntry) -> str:
+    code = _CODES[entry.type.bits]
+    return code if entry.type.signed or entry.type.bits == 24 else code.upper()

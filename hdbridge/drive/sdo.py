@@ -26,7 +26,7 @@ from hdbridge.errors import RESET, InputError, SdoError
 _log = logging.getLogger(__name__)
 DEFAULT_TIMEOUT_S: Final = 0.5
 DEFAULT_ATTEMPTS: Final = 3
-DEFAULT_SIZE_CAP: Final = 4096
+SIZE_CAP: Final = 4096
 """Maximum length of an object that is read, bytes; names and versions are the longest ones needed."""
 _TIMEOUTS_PER_TRANSFER: Final = 20
 _FRAME_BYTES: Final = 8
@@ -151,12 +151,10 @@ class SdoClient:
         od: ObjectDictionary | None = None,
         timeout_s: float = DEFAULT_TIMEOUT_S,
         attempts: int = DEFAULT_ATTEMPTS,
-        size_cap: int = DEFAULT_SIZE_CAP,
     ) -> None:
         self.node_id = node_id
         self.od = ObjectDictionary() if od is None else od  # type: ignore[no-untyped-call]
         self.attempts = attempts
-        self.size_cap = size_cap
         self._channel = _Channel(link, monitor, node_id, self.od)
         self._channel.timeout_s = timeout_s
 
@@ -232,17 +230,14 @@ class SdoClient:
         """Writes a known object, as `write` does."""
         self.write(address.index, address.sub, value)
 
-    def read_text(self, index: int, sub: int = 0) -> str:
+    def read_text(self, index: int) -> str:
         """Reads a string object; characters outside ASCII become question marks."""
         return (
-            self.read_bytes(index, sub)
-            .decode("ascii", errors="replace")
-            .rstrip("\x00 ")
-            .replace("\ufffd", "?")
+            self.read_bytes(index, 0).decode("ascii", errors="replace").rstrip("\x00 ").replace("\ufffd", "?")
         )
 
     def read_bytes(self, index: int, sub: int) -> bytes:
-        """Reads an object's raw bytes, at most ``size_cap``; an expedited answer without a size has four."""
+        """Reads an object's raw bytes, at most `SIZE_CAP`; an expedited answer without a size has four."""
         return self._transfer("read", index, sub, None)
 
     def write_bytes(self, index: int, sub: int, data: bytes) -> None:
@@ -257,7 +252,7 @@ class SdoClient:
             )
             try:
                 if data is None:
-                    answer = self._channel.fetch(index, sub, self.size_cap)
+                    answer = self._channel.fetch(index, sub, SIZE_CAP)
                     self._tell("sdo read", index, sub, data=answer.hex(" "))
                     return answer
                 self._channel.download(index, sub, data)

@@ -3,11 +3,12 @@
 from collections.abc import Iterator
 from typing import Final
 
+from hdbridge.cia301 import NmtState
 from hdbridge.drive.emergencies import HEARTBEAT_LOST, RPDO_TIMEOUT
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Frame
 from hdbridge.drive.monitor import NetworkMonitor
-from hdbridge.drive.objects import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SYNC, NmtState
+from hdbridge.drive.objects import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SYNC
 from hdbridge.drive.supervision import Fault
 
 _NODE_MASK: Final = 0x7F

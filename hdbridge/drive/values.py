@@ -8,7 +8,7 @@ from typing import Any
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
-from hdbridge.drive.dictionary import INTEGER_TYPES, is_readable, is_writable
+from hdbridge.drive.dictionary import INTEGER_TYPES
 from hdbridge.drive.objects import STANDARD, IntegerType
 from hdbridge.errors import InputError
 from hdbridge.files.expectation import nearest
@@ -148,8 +148,8 @@ def _of(variable: ODVariable) -> Object:
         _name(variable),
         data_type,
         INTEGER_TYPES.get(data_type),
-        readable=is_readable(variable),
-        writable=is_writable(variable),
+        readable=variable.readable,
+        writable=variable.writable,
         lowest=variable.min,
         highest=variable.max,
     )

@@ -15,7 +15,7 @@ from canopen.objectdictionary import ObjectDictionary, ODVariable
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
-from hdbridge.drive.dictionary import find, held, integer_type, is_writable
+from hdbridge.drive.dictionary import find, held, integer_type
 from hdbridge.drive.image import position_limits_counts
 from hdbridge.drive.layout import PDOS_PER_KIND, Layout, Layouts
 from hdbridge.drive.objects import PDO_INVALID, Address, IntegerType
@@ -274,7 +274,7 @@ def _period(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[int, int]:
         taken = e == _USUAL_EXPONENT if exponent is None else _takes(exponent, e)
         if taken and _takes(mantissa, m):
             return m, e
-    fixed = [each for each in (mantissa, exponent) if each is not None and not is_writable(each)]
+    fixed = [each for each in (mantissa, exponent) if each is not None and not each.writable]
     said = " and ".join(f"60C2h:{each.subindex:02X} is read-only ({held(each)})" for each in fixed)
     raise InputError(
         f"{axis.where('drive.cycle_ms')}: {axis.drive.eds} does not permit {axis.drive.cycle_ms:g} ms in "
@@ -290,7 +290,7 @@ def permitted(variable: ODVariable, kind: IntegerType) -> tuple[int, int]:
 
 
 def _takes(variable: ODVariable, value: int) -> bool:
-    if not is_writable(variable):
+    if not variable.writable:
         return held(variable) in (None, value)
     kind = integer_type(variable)
     if kind is None:

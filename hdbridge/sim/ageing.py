@@ -7,9 +7,8 @@ is evaluated once per substep, in order of time.
 import math
 from typing import ClassVar
 
-from hdbridge.sim.conditions import Conditions
 from hdbridge.sim.orders import Orders
-from hdbridge.sim.state import state
+from hdbridge.sim.state import Conditions, state
 from hdbridge.sim.truth.gear import TrueAgeing
 
 

@@ -9,7 +9,6 @@ import math
 from typing import ClassVar, Protocol
 
 from hdbridge.sim.ageing import AgeFactor, WornTeeth
-from hdbridge.sim.conditions import Conditions
 from hdbridge.sim.gear_pieces import (
     Creep,
     Damage,
@@ -24,7 +23,7 @@ from hdbridge.sim.gear_pieces import (
 )
 from hdbridge.sim.hysteresis_laws import Law, law_of
 from hdbridge.sim.orders import Orders
-from hdbridge.sim.state import state
+from hdbridge.sim.state import Conditions, state
 from hdbridge.sim.truth import TrueOrder, Truth
 from hdbridge.sim.truth.gear import TrueFlank
 from hdbridge.units import ARCSEC_PER_DEG

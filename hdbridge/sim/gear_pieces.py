@@ -7,8 +7,7 @@ import math
 import random
 from typing import ClassVar, Final
 
-from hdbridge.sim.conditions import Conditions
-from hdbridge.sim.state import state
+from hdbridge.sim.state import Conditions, state
 from hdbridge.sim.truth.gear import (
     TrueCreep,
     TrueDamage,

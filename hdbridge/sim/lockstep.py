@@ -263,11 +263,9 @@ def simulated_bench(
 
     ``load_object`` is the index and sub-index from which its load encoder is read.
     """
-    known = truth if isinstance(truth, Truth) else Truth.load(Path(truth))
-    machine = Machine(known, seed, may_compile=True)
-    nameplate, behaviour = nameplate_of(known, load_object=load_object), known.firmware
-    with lockstep_bench(machine, eds_path, node_id, channel, nameplate, behaviour=behaviour) as bench:
-        yield bench
+    axis = SimulatedAxis(truth, eds_path, node_id, seed, load_object)
+    with simulated_benches([axis], channel) as (bus, clock, (node,)):
+        yield bus, clock, node
 
 
 @dataclass(frozen=True)
@@ -300,6 +298,8 @@ def simulated_benches(
     may_compile = clock is None  # another clock may be tied to real time
     clock = clock if clock is not None else VirtualClock()
     with ExitStack() as stack:
+        if may_compile:
+            stack.enter_context(_unsearched())
         for serial, axis in enumerate(axes, start=1):
             known = axis.truth if isinstance(axis.truth, Truth) else Truth.load(Path(axis.truth))
             node_bus = stack.enter_context(_PolledBus(channel))

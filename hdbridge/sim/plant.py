@@ -12,10 +12,9 @@ momentary ratio by one or two per cent; the reaction neglects this, the angles d
 
 import math
 
-from hdbridge.sim.conditions import Conditions
 from hdbridge.sim.gear import Gear
 from hdbridge.sim.oscillator import Transition, exact_step, transition
-from hdbridge.sim.state import state
+from hdbridge.sim.state import Conditions, state
 from hdbridge.sim.truth import Truth
 
 RAD_PER_DEG = math.pi / 180.0

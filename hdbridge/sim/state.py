@@ -1,4 +1,4 @@
-"""Classes for the state of the simulation, each attribute declared with its type.
+"""Classes for the state of the simulation, each attribute declared with its type; conditions of the gear.
 
 Declared attributes can be laid out in memory, so that the methods can be compiled (`hdbridge.sim.compiled`).
 They are numbers, tuples and lists of numbers, and further objects of such classes.
@@ -18,3 +18,18 @@ def state(cls: type[T]) -> type[T]:
     made = dataclass(init=False, repr=False, eq=False, slots=True)(cls)
     STATES.append(made)
     return made
+
+
+@state
+class Conditions:
+    """Present conditions, updated by the plant."""
+
+    motor_deg: float
+    load_deg: float
+    torque_nm: float
+    """Torque of the flexspline's spring on the load."""
+    temperature_c: float
+
+    def __init__(self, temperature_c: float) -> None:
+        self.motor_deg = self.load_deg = self.torque_nm = 0.0
+        self.temperature_c = temperature_c

@@ -10,8 +10,8 @@ from typing import Any
 
 import can
 
+from hdbridge.cia301 import NmtState
 from hdbridge.device.behaviour import Behaviour
-from hdbridge.device.nmt import Nmt
 from hdbridge.device.node import DriveNode
 from hdbridge.device.powerstate import PowerStage
 from hdbridge.sim.lockstep import LockstepBus, VirtualClock, lockstep_bench
@@ -201,7 +201,7 @@ class Story:
             self.word(rng.choice((0x1F, 0x3F, 0x5F)))
         elif kind == 9:
             command = rng.choice((1, 1, 2, 128, 129, 130))
-            cyclic = self.node.nmt is Nmt.OPERATIONAL and self.laws.mode in (7, 8)
+            cyclic = self.node.nmt is NmtState.OPERATIONAL and self.laws.mode in (7, 8)
             self.send(0, bytes((command, 1)))
             self.lost(command in (2, 129, 130) or (command == 128 and cyclic))
             if command in (129, 130):
@@ -221,7 +221,7 @@ class Story:
             faults = self.node.faults
             lost = (faults.boot_up, faults.open_enable_input, lambda: faults.lose_master(0x8130))
             event = rng.choice((*lost, faults.leave_operational))
-            cyclic = self.node.nmt is Nmt.OPERATIONAL and self.laws.mode in (7, 8)
+            cyclic = self.node.nmt is NmtState.OPERATIONAL and self.laws.mode in (7, 8)
             event()
             self.node.poll(self.clock.now())
             self.lost(event != faults.leave_operational or cyclic)

@@ -139,7 +139,6 @@ class AmplitudeDrift(Modulating, Warmed):
         "friction_percent_per_k": -0.5,
         "tau_s": 1800.0,
     }
-    """Growth of 0.5 % per kelvin, with a falling loop."""
 
     orders: Orders
     loop: Loop = Field(description="the model's loop")

@@ -61,7 +61,6 @@ class CountLoss(Angleless):
     inexact = 0.03
     """Slow effects leave small steps next to a large one."""
     typical = {"steps": (Step(time_s=0.0, size_arcsec=10.0),)}
-    """One step of 10 arcsec at time zero."""
 
     steps: tuple[Step, ...] = Field(
         min_length=1, max_length=100, description="losses: time_s, size_arcsec each"

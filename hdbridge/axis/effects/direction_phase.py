@@ -49,7 +49,6 @@ class DirectionPhase(Modulating):
     curved = True
     linear = ("shift_deg",)
     typical = {"shift_deg": 1.0}
-    """A shift of 1 degree of the base's orders."""
 
     orders: Orders
     shift_deg: float = Field(

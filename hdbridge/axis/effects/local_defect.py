@@ -58,7 +58,6 @@ class LocalDefect(Momentary, Linear):
     """The bump of a real damaged tooth never has exactly this form."""
     linear = ("height_arcsec",)
     typical = {"height_arcsec": 5.0, "centre_deg": 0.0, "half_width_deg": 3.6}
-    """Height of 5 arcsec, tooth half width of 3.6 degrees."""
 
     ratio: Ratio
     height_arcsec: float = Field(ge=-3600, le=3600, description="height of the bump")

@@ -37,7 +37,6 @@ class RateDependence(Modulating):
     carries = {Part.LOOP: "loop"}
     linear = ("growth_percent",)
     typical = {"growth_percent": 10.0, "reference_deg_s": 30.0}
-    """10 % per decade."""
 
     loop: Loop = Field(description="the model's loop")
     growth_percent: float = Field(ge=0, le=200, description="growth per decade of speed")

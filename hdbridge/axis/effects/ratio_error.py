@@ -45,7 +45,6 @@ class RatioError(Momentary, Linear):
     )
     linear = ("ramp_arcsec_per_turn",)
     typical = {"ramp_arcsec_per_turn": 2.592}
-    """0.01 % of a ratio of 50."""
 
     ramp_arcsec_per_turn: float = Field(ge=-1e6, le=1e6, description="ramp per motor turn")
     limit_deg: float = Field(1e6, gt=0, le=1e9, description="motor angle beyond which it is held")

@@ -48,10 +48,7 @@ class SubdivisionalError(HarmonicSum):
         source="Lissajous errors of sine encoders (Heydemann)",
         size="0.1-2 arcsec",
     )
-    compensable = Compensable(
-        False,
-        "it is an error of the measurement",
-    )
+    compensable = Compensable(False, "it is an error of the measurement")
     few = frozenset(_HARMONICS)
     usual = 2
     sought = Sought.LINE

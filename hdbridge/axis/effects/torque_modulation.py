@@ -49,7 +49,6 @@ class TorqueModulation(TorqueGrowth, Modulating):
     carries = {Part.ORDERS: "orders"}
     linear = ("growth_percent_per_nm",)
     typical = {"growth_percent_per_nm": 1.0}
-    """1 % per Nm for all orders."""
 
     orders: Orders
 

@@ -45,7 +45,6 @@ class Wear(Linear):
     )
     linear = ("growth_arcsec_per_kiloturn",)
     typical = {"growth_arcsec_per_kiloturn": 1.0, "width_deg": 2.0}
-    """1 arcsec per thousand turns, crossed in 2 degrees."""
 
     growth_arcsec_per_kiloturn: float = Field(
         ge=-1000, le=1000, description="growth of the loop's height in the first 1000 turns"

@@ -52,7 +52,6 @@ class ZeroDrift(Linear, Warmed):
     )
     linear = ("drift_arcsec_per_k",)
     typical = {"drift_arcsec_per_k": 1.0, "tau_s": 1800.0}
-    """1 arcsec per kelvin, with a time constant of half an hour."""
 
     drift_arcsec_per_k: float = Field(ge=-1000, le=1000, description="shift per kelvin")
 

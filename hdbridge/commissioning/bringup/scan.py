@@ -10,13 +10,14 @@ from fractions import Fraction
 from typing import Final
 
 from hdbridge.axis import AxisConfig
+from hdbridge.cia301 import NmtState
 from hdbridge.commissioning.bringup import ASK_TIMEOUT_S, LISTEN_S
 from hdbridge.drive import objects
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.manners import Ear, listening_s
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.nameplate import IDENTITY
-from hdbridge.drive.objects import CYCLIC, Address, IntegerType, NmtState
+from hdbridge.drive.objects import CYCLIC, Address, IntegerType
 from hdbridge.drive.sdo import SdoAbortError, SdoClient
 from hdbridge.errors import SdoError
 

@@ -16,19 +16,19 @@ import can
 from canopen.objectdictionary import ObjectDictionary
 
 from hdbridge.axis import AxisConfig
+from hdbridge.cia301 import wrap_int32
 from hdbridge.clock import Clock
 from hdbridge.commissioning.bringup import TORQUE_PERCENT
 from hdbridge.commissioning.bringup.judge import Turned
 from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive import objects
 from hdbridge.drive.drive import Drive
+from hdbridge.drive.feedback import STANDING, STOP_TIMEOUT_S, until_enabled
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.monitor import Emergency
 from hdbridge.drive.objects import COB_EMCY
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.supervision import Event, Supervision
-from hdbridge.drive.switching import STANDING, STOP_TIMEOUT_S, until_enabled
-from hdbridge.drive.unwrap import wrap_int32
 from hdbridge.errors import HdbridgeError, SafetyStop
 from hdbridge.motion.procedures.moves import MotionLimits, MoveTo, Path
 

@@ -15,16 +15,15 @@ from typing import Final
 from canopen.objectdictionary import ObjectDictionary, ODVariable
 from canopen.sdo.exceptions import SdoAbortedError
 
-from hdbridge.device.nmt import Nmt, NmtCommand
+from hdbridge.cia301 import NmtCommand, NmtState, wrap_int32
 from hdbridge.drive.dictionary import find
 from hdbridge.drive.emergencies import gateway_error
 from hdbridge.drive.link import Frame
 from hdbridge.drive.states import State, decode
-from hdbridge.drive.unwrap import wrap_int32
 
 _MULTIPLEXER: Final = struct.Struct("<BHB")
 _NMT: Final = {int(each): each.name.lower().replace("_", " ").replace("pre ", "pre-") for each in NmtCommand}
-_NMT_STATES: Final = {int(each): each.name.replace("_", "-") for each in Nmt}
+_NMT_STATES: Final = {int(each): each.name.replace("_", "-") for each in NmtState}
 _CYCLIC: Final = (7, 8)
 _READY: Final = (State.READY_TO_SWITCH_ON, State.SWITCHED_ON)
 _INVALID: Final = 1 << 31

@@ -26,11 +26,10 @@ from hdbridge.daemon.memory.layout import (
     SampleFlag,
 )
 from hdbridge.daemon.setting import CompensationSetting
-from hdbridge.drive.feedback import Feedback
+from hdbridge.drive.feedback import ENABLE_TIMEOUT_S, STOP_TIMEOUT_S, Feedback
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.supervision import EXPLAINED_HINT, Reaction, Supervision
-from hdbridge.drive.switching import ENABLE_TIMEOUT_S, STOP_TIMEOUT_S
 from hdbridge.errors import RESET, HdbridgeError, InputError, TransitionError
 from hdbridge.motion import MotionMode
 

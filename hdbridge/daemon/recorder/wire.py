@@ -16,9 +16,9 @@ import numpy as np
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorSet
 from numpy.typing import NDArray
 
+from hdbridge.cia301 import NmtState
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SampleArray
-from hdbridge.device.nmt import Nmt
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import InputError
@@ -57,7 +57,7 @@ _ENUMS: Final[Mapping[str, Mapping[int, str]]] = {
     "mode": {int(each): each.name for each in MotionMode},
     "power": _names(State),
     "fault": _names(Fault) | {NO_FAULT: "NONE"},
-    "outer_nmt": {int(each): each.name for each in Nmt},
+    "outer_nmt": {int(each): each.name for each in NmtState},
     "outer_mode": {0: "NONE", 1: "PP", 6: "HM", 7: "IP", 8: "CSP"},
 }
 _WIDE: Final = {"u2": "u4"}

@@ -5,12 +5,12 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from hdbridge.files.yamlfile import wrong
-from hdbridge.sim.truth.part import Part
+from hdbridge.strictness import Strict
 
 Direction = Literal[1, -1]
 
 
-class TrueDisc(Part):
+class TrueDisc(Strict):
     """Mounting of the graduated disc on its shaft; one reading head."""
 
     radius_mm: float = Field(gt=0, le=1_000, description="radius of the graduation")
@@ -37,7 +37,7 @@ class TrueDisc(Part):
         return self
 
 
-class TrueSignals(Part):
+class TrueSignals(Strict):
     """Sine and cosine signals of the lines, and their imperfections."""
 
     lines_per_turn: int = Field(ge=1, le=1_000_000, description="signal periods per turn")
@@ -52,14 +52,14 @@ class TrueSignals(Part):
     third_harmonic: float = Field(0.0, ge=-0.3, le=0.3, description="third harmonic of both")
 
 
-class TrueLoss(Part):
+class TrueLoss(Strict):
     """One loss of counts, which remains in the reading."""
 
     time_s: float = Field(ge=0, le=1e8, description="time since the axis was switched on")
     counts: int = Field(ge=-(2**31), le=2**31 - 1, description="counts that the reading jumps by")
 
 
-class TrueEncoder(Part):
+class TrueEncoder(Strict):
     """Properties of every encoder."""
 
     counts_per_turn: int = Field(ge=4, le=2**31 - 1, description="counts per turn of its shaft")
@@ -82,7 +82,7 @@ class TrueMotorEncoder(TrueEncoder):
     )
 
 
-class TrueCoupling(Part):
+class TrueCoupling(Strict):
     """Flexible coupling between the load and the load encoder's shaft."""
 
     frequency_hz: float = Field(
@@ -92,7 +92,7 @@ class TrueCoupling(Part):
     play_arcsec: float = Field(0.0, ge=0, le=36_000, description="play between the load and the coupling")
 
 
-class TrueCable(Part):
+class TrueCable(Strict):
     """Cable of the encoder: taut beyond an angle, where it turns the encoder's body."""
 
     taut_from_deg: float = Field(ge=-36_000, le=36_000, description="load angle from which it is taut")
@@ -102,7 +102,7 @@ class TrueCable(Part):
     )
 
 
-class TrueSensorWarming(Part):
+class TrueSensorWarming(Strict):
     """Warming of the encoder itself, by the square of its speed; no temperature channel shows it."""
 
     arcsec_at_10_deg_s: float = Field(

@@ -7,11 +7,11 @@ from pydantic import Field, model_validator
 
 from hdbridge.files.yamlfile import wrong
 from hdbridge.sim.truth.hysteresis import Hysteresis, TrueOrder
-from hdbridge.sim.truth.part import Part
+from hdbridge.strictness import Strict
 from hdbridge.units import ARCSEC_PER_DEG
 
 
-class TrueStiffening(Part):
+class TrueStiffening(Strict):
     """Later stages of the spring: beyond each torque it is stiffer (or softer) than before."""
 
     first_torque_nm: float = Field(gt=0, le=1e6, description="torque T1 at which the first stage ends")
@@ -29,7 +29,7 @@ class TrueStiffening(Part):
         return self
 
 
-class TrueFlank(Part):
+class TrueFlank(Strict):
     """Other flank of the teeth, which carries after a reversal, with a shifted tooth error."""
 
     shift_deg: float = Field(
@@ -40,7 +40,7 @@ class TrueFlank(Part):
     travel_deg: float = Field(gt=0, le=360, description="motor travel from one flank to the other")
 
 
-class TrueRate(Part):
+class TrueRate(Strict):
     """Growth of the elastic hysteresis with speed: the grease's share in the rolling friction."""
 
     growth_per_decade: float = Field(ge=-1, le=5, description="growth of the loop per decade of motor speed")
@@ -48,7 +48,7 @@ class TrueRate(Part):
     time_constant_s: float = Field(0.05, gt=0, le=1e4, description="time that the friction takes to follow")
 
 
-class TrueWear(Part):
+class TrueWear(Strict):
     """Lost motion between the teeth, growing with the travel of the motor."""
 
     arcsec_per_1000_turns: float = Field(
@@ -57,7 +57,7 @@ class TrueWear(Part):
     exponent: float = Field(1.0, ge=0.1, le=3, description="growth with the travel; below 1 it runs in")
 
 
-class TrueAgeing(Part):
+class TrueAgeing(Strict):
     """Gradual change over hours of work, linear from switch-on, then constant."""
 
     duration_s: float = Field(gt=0, le=1e8, description="time that it takes")
@@ -69,7 +69,7 @@ class TrueAgeing(Part):
     )
 
 
-class TrueCreep(Part):
+class TrueCreep(Strict):
     """Spring with a dashpot in parallel (Kelvin-Voigt), in series with the gear."""
 
     time_constant_s: float = Field(gt=0, le=1e6, description="time constant of the element")
@@ -81,7 +81,7 @@ class TrueCreep(Part):
     )
 
 
-class TrueJump(Part):
+class TrueJump(Strict):
     """Jump of teeth, which remains in the output."""
 
     time_s: float = Field(ge=0, le=1e8, description="time since the axis was switched on")
@@ -89,7 +89,7 @@ class TrueJump(Part):
     duration_s: float = Field(0.1, gt=0, le=10, description="time that the jump takes")
 
 
-class TrueDamage(Part):
+class TrueDamage(Strict):
     """Damaged tooth: a bump of the output at one load angle."""
 
     at_deg: float = Field(ge=-360, le=360, description="load angle of its middle")
@@ -97,7 +97,7 @@ class TrueDamage(Part):
     height_arcsec: float = Field(ge=-36_000, le=36_000, description="height in its middle")
 
 
-class TrueRoller(Part):
+class TrueRoller(Strict):
     """Roller on the motor's hub, pressed on at some load angles more than at others."""
 
     order: float = Field(gt=0, le=512, description="its turns per motor turn, not a whole number")
@@ -107,7 +107,7 @@ class TrueRoller(Part):
     sharpness: float = Field(1.0, gt=0, le=50, description="how soon the pressure falls off from there")
 
 
-class TrueSeat(Part):
+class TrueSeat(Strict):
     """Bearing ring that sticks in its seat, is carried along, and slips at random angles."""
 
     slip_arcsec: float = Field(gt=0, le=36_000, description="how far it is carried at most; it slips before")
@@ -115,7 +115,7 @@ class TrueSeat(Part):
     seed: int = Field(0, ge=0, description="seed of where it slips")
 
 
-class TrueGear(Part):
+class TrueGear(Strict):
     """Harmonic gear: its output, beyond motor angle / ratio."""
 
     ratio: float = Field(ge=1, le=1_000, description="motor turns per load turn")

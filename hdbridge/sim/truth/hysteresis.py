@@ -5,10 +5,10 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from hdbridge.files.yamlfile import wrong
-from hdbridge.sim.truth.part import Part
+from hdbridge.strictness import Strict
 
 
-class TrueOrder(Part):
+class TrueOrder(Strict):
     """Term of the tooth error: amplitude * cos(order * angle + phase)."""
 
     order: int = Field(ge=1, le=512, description="periods per turn of the angle it belongs to")
@@ -16,7 +16,7 @@ class TrueOrder(Part):
     phase_deg: float = Field(ge=-360, le=360, description="phase at the angle zero")
 
 
-class RollingFriction(Part):
+class RollingFriction(Strict):
     """Law of the article: after a reversal the error crosses to the other side within a width."""
 
     law: Literal["rolling_friction"] = Field(description="the article's law; no return-point memory")
@@ -36,14 +36,14 @@ class RollingFriction(Part):
         return self
 
 
-class SlipElement(Part):
+class SlipElement(Strict):
     """Spring in series with a slider."""
 
     limit_arcsec: float = Field(ge=0, le=36_000, description="error at which it slips")
     yield_deg: float = Field(gt=0, le=36_000, description="motor travel from zero to slipping")
 
 
-class MaxwellSlip(Part):
+class MaxwellSlip(Strict):
     """Parallel elasto-plastic elements; a reversal is remembered until a larger one wipes it out."""
 
     law: Literal["maxwell_slip"] = Field(description="Maxwell slip, Prandtl-Ishlinskii; return-point memory")
@@ -52,7 +52,7 @@ class MaxwellSlip(Part):
     )
 
 
-class BoucWen(Part):
+class BoucWen(Strict):
     """Bouc-Wen law: a differential equation in the motor's travel, not in time."""
 
     law: Literal["bouc_wen"] = Field(description="Bouc-Wen, the smooth law")
@@ -64,7 +64,7 @@ class BoucWen(Part):
     )
 
 
-class Dahl(Part):
+class Dahl(Strict):
     """Dahl's law: the slope is a power of the remaining distance to the offset ahead."""
 
     law: Literal["dahl"] = Field(description="Dahl's law; no return-point memory")

@@ -5,10 +5,10 @@ from typing import Literal
 from pydantic import Field
 
 from hdbridge.sim.truth.encoder import TrueLoadEncoder
-from hdbridge.sim.truth.part import Part
+from hdbridge.strictness import Strict
 
 
-class TrueGravity(Part):
+class TrueGravity(Strict):
     """Mass on the axis."""
 
     mass_kg: float = Field(gt=0, le=1e5, description="mass")
@@ -17,7 +17,7 @@ class TrueGravity(Part):
     tilt_deg: float = Field(0.0, ge=0, le=90, description="tilt of the axis; 90 is upright, without torque")
 
 
-class TrueStribeck(Part):
+class TrueStribeck(Strict):
     """Friction at the load that is higher near rest."""
 
     breakaway_nm: float = Field(
@@ -26,14 +26,14 @@ class TrueStribeck(Part):
     speed_rad_s: float = Field(gt=0, le=100, description="load speed by which it has come down to 1/e")
 
 
-class TrueThinning(Part):
+class TrueThinning(Strict):
     """Grease that thins when sheared: viscous friction / (1 + speed / its speed)^exponent."""
 
     speed_rad_s: float = Field(gt=0, le=1_000, description="load speed at which it sets in")
     exponent: float = Field(0.5, gt=0, le=1, description="how much; 1 ends at a constant torque")
 
 
-class TrueVibration(Part):
+class TrueVibration(Strict):
     """Machine nearby that shakes the load."""
 
     frequency_hz: float = Field(gt=0, le=500, description="frequency")
@@ -41,14 +41,14 @@ class TrueVibration(Part):
     phase_deg: float = Field(0.0, ge=-360, le=360, description="phase when the axis is switched on")
 
 
-class TrueSlip(Part):
+class TrueSlip(Strict):
     """Spring between load and ground that slips at its limit."""
 
     limit_nm: float = Field(gt=0, le=1e6, description="friction at which it slips")
     travel_deg: float = Field(gt=0, le=360, description="load travel from no friction to slipping")
 
 
-class TrueLoad(Part):
+class TrueLoad(Strict):
     """Load with its encoder."""
 
     inertia_kg_m2: float = Field(gt=0, le=1e6, description="inertia of the load, at the load")

@@ -5,10 +5,10 @@ from typing import Literal
 from pydantic import Field
 
 from hdbridge.sim.truth.encoder import TrueMotorEncoder
-from hdbridge.sim.truth.part import Part
+from hdbridge.strictness import Strict
 
 
-class TrueMotorStribeck(Part):
+class TrueMotorStribeck(Strict):
     """Friction on the motor's shaft that is higher near rest, before a lubricant film forms."""
 
     rise: float = Field(
@@ -17,7 +17,7 @@ class TrueMotorStribeck(Part):
     speed_rad_s: float = Field(gt=0, le=1_000, description="motor speed by which that has come down to 1/e")
 
 
-class TrueMotor(Part):
+class TrueMotor(Strict):
     """Motor with the wave generator, and the friction on their shaft."""
 
     inertia_kg_m2: float = Field(gt=0, le=100, description="inertia of motor and wave generator")
@@ -33,7 +33,7 @@ class TrueMotor(Part):
     encoder: TrueMotorEncoder = Field(description="encoder on the motor shaft")
 
 
-class TrueLoadFeedforward(Part):
+class TrueLoadFeedforward(Strict):
     """Drive's model of the load behind the gear's spring, as commissioned."""
 
     inertia_kg_m2: float = Field(gt=0, le=100, description="inertia of the load, seen by the motor")
@@ -41,7 +41,7 @@ class TrueLoadFeedforward(Part):
     damping_ratio: float = Field(ge=0, le=2, description="damping ratio of the load, the motor held")
 
 
-class TrueNotch(Part):
+class TrueNotch(Strict):
     """Notch on the torque, exact at its frequency (bilinear transform)."""
 
     frequency_hz: float = Field(gt=0, le=900, description="centre, at most 0.45 of the rate of the substeps")
@@ -49,7 +49,7 @@ class TrueNotch(Part):
     width: float = Field(gt=0, le=10, description="bandwidth over the frequency")
 
 
-class TrueObserver(Part):
+class TrueObserver(Strict):
     """Disturbance observer: the lagged difference between the torque and what accelerates the inertia."""
 
     frequency_hz: float = Field(gt=0, le=500, description="corner frequency of the estimate")
@@ -57,7 +57,7 @@ class TrueObserver(Part):
     inertia_kg_m2: float = Field(gt=0, le=100, description="inertia that the observer assumes, at the motor")
 
 
-class TrueResponse(Part):
+class TrueResponse(Strict):
     """Measured response in addition to the loops, by cycle: the latest one first."""
 
     cycle_ms: float = Field(gt=0, le=1_000, description="control cycle of the responses")
@@ -72,7 +72,7 @@ class TrueResponse(Part):
     )
 
 
-class TrueServo(Part):
+class TrueServo(Strict):
     """Loops of the drive: position and velocity cascade with feed-forward, limited in torque."""
 
     position_gain_per_s: float = Field(gt=0, le=5_000, description="position loop: speed per position error")

@@ -18,11 +18,11 @@ from hdbridge.files.yamlfile import document_from_text, read_yaml, wrong
 from hdbridge.sim.truth.gear import TrueGear
 from hdbridge.sim.truth.load import TrueLoad
 from hdbridge.sim.truth.motor import TrueMotor, TrueServo
-from hdbridge.sim.truth.part import Part
 from hdbridge.sim.truth.resonance import Resonance
+from hdbridge.strictness import Strict
 
 
-class TrueTemperature(Part):
+class TrueTemperature(Strict):
     """Heat store that is warmed by losses and cooled by the surroundings."""
 
     ambient_c: float = Field(22.0, ge=-60, le=100, description="temperature of the surroundings")
@@ -57,7 +57,7 @@ class TrueTemperature(Part):
         return self.ambient_c if self.reference_c is None else self.reference_c
 
 
-class Truth(Part):
+class Truth(Strict):
     """Truth of the simulated axis."""
 
     schema_: Literal["hdbridge.truth/1"] = Field(alias="schema", description="kind and version of this file")
