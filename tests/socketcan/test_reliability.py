@@ -6,7 +6,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from hdbridge.errors import BusError
 from hdbridge.sim.lockstep import nameplate_of
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
+from tests.socketcan.conftest import master_on
 
 
 @contextmanager
@@ -96,7 +97,6 @@ class VcanBench:
 def bench(
     interface: str,
     profile: Path,
-    another_master: Callable[..., AbstractContextManager[Any]],
     intruder: can.BusABC,
     may_configure: Callable[..., None],
     tmp_path: Path,
@@ -107,7 +107,7 @@ def bench(
     text = (own / "axis.yaml").read_text()
     option = f"quick_stop_option: {character.quick_stop_option}"
     (own / "axis.yaml").write_text(re.sub("quick_stop_option: [0-9]", option, text))
-    with drive_in_a_thread(interface, own, character) as node, another_master(interface, own) as master:
+    with drive_in_a_thread(interface, own, character) as node, master_on(interface, own) as master:
         master.boot()
         master.run(20)
         yield VcanBench(master, node, intruder, may_configure, interface)
