@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(ROOT / "tests"))
 
-from tests.support.characters import CHARACTERS, FRIENDLY, Character  # noqa: E402
-from tests.support.daemon_bench import DaemonRow  # noqa: E402
-from tests.support.daemon_faults import DAEMON_ROWS  # noqa: E402
-from tests.support.reliability import (  # noqa: E402
+from support.characters import CHARACTERS, FRIENDLY, Character  # noqa: E402
+from support.daemon_bench import DaemonRow  # noqa: E402
+from support.daemon_faults import DAEMON_ROWS  # noqa: E402
+from support.reliability import (  # noqa: E402
     DAEMON,
     DAEMON_VCAN,
     FURTHER,

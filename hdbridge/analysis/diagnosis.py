@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 
@@ -12,7 +12,7 @@ import numpy as np
 from hdbridge.analysis import changes
 from hdbridge.analysis.acceptance import gate
 from hdbridge.analysis.calibrated import calibrated
-from hdbridge.analysis.capability import capability
+from hdbridge.analysis.capability import Capability, Identifiability, capability
 from hdbridge.analysis.checks import check_once, check_records, zeros_apart_arcsec
 from hdbridge.analysis.cuts import observed
 from hdbridge.analysis.extend import as_named, extended_model, supported
@@ -192,15 +192,18 @@ class _Judge:
         measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
         cleared = copy(estimator)  # the record without what was found in it
         cleared.observed = estimator.observed - before + after
-        visible = identifiability(cleared, cleared.fit(refitted.hypothesis), given, judged.context)
+
+        def visible() -> tuple[Mapping[str, Identifiability], Capability]:
+            causes = identifiability(cleared, cleared.fit(refitted.hypothesis), given, judged.context)
+            return causes, capability(estimator.data, given, causes, estimator.scales)
+
         return Diagnosis(
             baseline=_figures(before),
             refitted=_figures(refitted.residual / estimator.weight),
             extended=_figures(after),
             noise_floor_arcsec=estimator.data.noise_arcsec,
             findings=tuple(findings),
-            identifiability=visible,
-            capability=capability(estimator.data, given, visible, estimator.scales),
+            visible=visible,
             by_kind=self._by_kind(before, after),
             remarks=(
                 *estimator.data.remarks,

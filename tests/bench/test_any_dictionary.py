@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.eds import OWN, fixed, mapped, profile_with, section, stating, without
 
 from hdbridge import AxisConfig, Bench, Drive, Stepping, simulated
 from hdbridge.drive import plan
@@ -17,7 +18,6 @@ from hdbridge.errors import DriveError, InputError
 from hdbridge.files.profile import bundled_folder
 from hdbridge.records.record import Record
 from hdbridge.sim.lockstep import simulated_bench
-from tests.support.eds import OWN, fixed, mapped, profile_with, section, stating, without
 
 NEEDED = {0x1000, 0x1001, 0x1018, 0x6040, 0x6041, 0x6060, 0x6061, 0x6064, 0x60E4}
 TARGETS = {"csp": 0x607A, "ip": 0x60C1}

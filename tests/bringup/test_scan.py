@@ -6,6 +6,7 @@ from uuid import uuid4
 
 import can
 import pytest
+from support.chatter import Chatter
 
 from hdbridge.axis import AxisConfig
 from hdbridge.commissioning.bringup.scan import Node, Scan, axis_lines, compare, scan_bus
@@ -17,7 +18,6 @@ from hdbridge.files.profile import bundled_folder, bundled_profile
 from hdbridge.sim.lockstep import LockstepBus, lockstep_bench
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
-from tests.support.chatter import Chatter
 
 AXIS = AxisConfig.load(bundled_profile("article"))
 EDS = bundled_folder("eds") / "hdbridge-402.eds"

@@ -6,8 +6,7 @@ import json
 import re
 
 import pytest
-
-from tests.support.eds import OWN, fixed, mapped, profile_with, stating, without
+from support.eds import OWN, fixed, mapped, profile_with, stating, without
 
 SOURCE = "source: {index: 0x60E4, subindex: 1, type: int32, via: tpdo}"
 

@@ -11,6 +11,8 @@ from uuid import uuid4
 
 import can
 import pytest
+from support.characters import FRIENDLY, Character
+from support.spoilt import LoggingBus
 
 from hdbridge.axis import AxisConfig
 from hdbridge.control.cycle import Cycle, Feedback
@@ -21,43 +23,12 @@ from hdbridge.drive.link import Link
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Reaction, Supervision
 from hdbridge.errors import SafetyStop
-from hdbridge.sim.lockstep import LockstepBus, VirtualClock, simulated_bench
+from hdbridge.sim.lockstep import VirtualClock, simulated_bench
 from hdbridge.sim.truth import Truth
-from tests.support.characters import FRIENDLY, Character
 
 PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
 STEP_COUNTS = 40
 """Target step per cycle: 9 load degrees per second at 4 ms."""
-
-
-class SpoiltBus(LockstepBus):
-    """The master's end of the channel, with an interface that can fail."""
-
-    no_room_for: int | None = None
-    """Identifier of a frame for which the transmit queue is full, once."""
-    send_error: Exception | None = None
-    recv_error: Exception | None = None
-    sent: list[tuple[float, int, bytes]]
-
-    def __init__(self, bus: LockstepBus, channel: str, clock: VirtualClock) -> None:
-        bus.shutdown()
-        super().__init__(channel, clock)
-        self.clock = clock
-        self.sent = []
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        if self.send_error is not None:
-            raise self.send_error
-        if msg.arbitration_id == self.no_room_for:
-            self.no_room_for = None
-            raise can.CanOperationError("Transmit buffer full", errno.ENOBUFS)
-        self.sent.append((self.clock.now(), msg.arbitration_id, bytes(msg.data)))
-        super().send(msg, timeout)
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        if self.recv_error is not None:
-            raise self.recv_error
-        return super().recv(timeout)
 
 
 class SyncAnswer:
@@ -80,7 +51,7 @@ class SyncAnswer:
 class Rig:
     """An axis under way, and everything a test may turn."""
 
-    bus: SpoiltBus
+    bus: LoggingBus
     clock: VirtualClock
     node: DriveNode
     drive: Drive
@@ -132,10 +103,10 @@ class Rig:
         self.clock.sleep_until(self.clock.now() + duration_s)
 
     def interface_down(self) -> None:
-        self.bus.recv_error = can.CanOperationError("Network is down", errno.ENETDOWN)
+        self.bus.down = errno.ENETDOWN
 
     def interface_deleted(self) -> None:
-        self.bus.send_error = can.CanOperationError("No such device", errno.ENODEV)
+        self.bus.down = errno.ENODEV
 
     def transmit_queue_full(self) -> None:
         self.bus.no_room_for = 0x201
@@ -169,7 +140,7 @@ class Rig:
 
     def next_program(self, cycles: int = 10) -> None:
         """Another program begins on this bus, with a cycle of its own, and asks for no power."""
-        self.bus.recv_error = self.bus.send_error = self.bus.no_room_for = None
+        self.bus.down = self.bus.no_room_for = None
         link = Link(self.bus, self.clock)
         cycle = Cycle(link, self.clock, ProcessImage(self.drive.axis), Supervision(), self.period_s)
         for _ in range(cycles):
@@ -191,7 +162,8 @@ def rig(profile: Path = PROFILE, character: Character = FRIENDLY) -> Iterator[Ri
         node,
     ):
         intruder = can.Bus(interface="virtual", channel=channel, ignore_config=True)
-        with intruder, SpoiltBus(bus, channel, clock) as spoilt:
+        bus.shutdown()
+        with intruder, LoggingBus(channel, clock) as spoilt:
             drive = Drive(spoilt, axis, clock)
             drive.boot()
             supervision = Supervision()

@@ -17,13 +17,11 @@ from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
 from hdbridge.errors import InputError
 
-from .conftest import SpoiltBus
-
 
 @pytest.fixture
 def pair() -> Iterator[TwoAxes]:
     """Both enabled and moving at constant speed."""
-    with two_axes(SpoiltBus) as made:
+    with two_axes() as made:
         made.enable(0)
         made.enable(1)
         made.turn(60)
@@ -72,7 +70,7 @@ def test_the_shortest_heartbeat_of_the_axes_is_kept() -> None:
 
 
 def test_a_new_axis_is_silent_and_its_tpdos_are_taken() -> None:
-    with two_axes(SpoiltBus) as pair:
+    with two_axes() as pair:
         pair.enable(0)
         pair.turn(30)
         assert pair.axes[1].silent
@@ -82,7 +80,7 @@ def test_a_new_axis_is_silent_and_its_tpdos_are_taken() -> None:
 
 
 def test_a_silent_axis_neither_delays_the_other_nor_faults() -> None:
-    with two_axes(SpoiltBus) as pair:
+    with two_axes() as pair:
         pair.enable(0)
         pair.nodes[1].faults.silent = True
         pair.turn(100)

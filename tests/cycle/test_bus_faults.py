@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterator
 
-import can
 import pytest
 from support.twoaxes import TwoAxes, two_axes
 
@@ -13,15 +12,11 @@ from hdbridge.drive.link import Link
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Reaction
 
-from .conftest import SpoiltBus
-
-DOWN = can.CanOperationError("Network is down", errno.ENETDOWN)
-
 
 @pytest.fixture
 def pair() -> Iterator[TwoAxes]:
     """Both enabled and moving at constant speed."""
-    with two_axes(SpoiltBus) as made:
+    with two_axes() as made:
         made.enable(0)
         made.enable(1)
         made.turn(60)
@@ -114,14 +109,14 @@ def test_a_stopped_axis_gets_no_commands(pair: TwoAxes) -> None:
 
 
 def test_verified_axes_move_again_after_the_interface_is_reopened(pair: TwoAxes) -> None:
-    pair.bus.recv_error = DOWN
+    pair.bus.down = errno.ENETDOWN
     pair.turn()
     assert pair.cycle.down is not None
     count, began = pair.cycle.count, pair.clock.now()
     pair.turn(250)
     assert pair.cycle.count == count + 250, "it keeps time without a bus"
     assert pair.clock.now() == pytest.approx(began + 1.0, abs=0.01)
-    pair.bus.recv_error = None
+    pair.bus.down = None
     pair.turn()
     assert pair.cycle.down is not None, "a link that has failed stays down"
     pair.cycle.relink(Link(pair.bus, pair.clock))

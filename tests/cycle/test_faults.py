@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import errno
 import math
 import struct
 
-import can
 import pytest
 
 from hdbridge.drive.supervision import Fault, Reaction
@@ -164,11 +162,11 @@ def test_a_target_in_degrees_that_is_not_finite_stops_in_the_same_cycle(moving) 
 
 
 def test_a_full_transmit_queue_stops_without_a_retry(moving) -> None:
-    moving.bus.send_error = can.CanOperationError("Transmit buffer full", errno.ENOBUFS)
+    moving.bus.full = True
     sent = len(moving.bus.sent)
     moving.stopped_within(1, Fault.TRANSMIT_FULL)
     assert len(moving.bus.sent) == sent
-    moving.bus.send_error = None
+    moving.bus.full = False
     moving.stands_still()
 
 

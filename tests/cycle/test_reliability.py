@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
+from support.characters import CHARACTERS, Character, PowerCount, every_character
+from support.reliability import VIRTUAL, Row, rows_of, try_out
 
 from hdbridge.drive.supervision import Reaction
 from tests.cycle.conftest import rig
-from tests.support.characters import CHARACTERS, Character, PowerCount, every_character
-from tests.support.reliability import VIRTUAL, Row, rows_of, try_out
 
 
 @pytest.mark.parametrize("row", rows_of(VIRTUAL), ids=lambda row: row.name)

@@ -6,6 +6,7 @@ ENABLE command since it was last taken away; nothing to an axis that is not veri
 once.
 """
 
+import errno
 import math
 import struct
 from contextlib import ExitStack, suppress
@@ -329,7 +330,7 @@ class Disorder(RuleBasedStateMachine):
 
     @rule(down=st.booleans(), number=turns)
     def interface(self, down: bool, number: int) -> None:
-        self.daemon.bus.down = down
+        self.daemon.bus.down = errno.ENETDOWN if down else None
         self.go(number)
 
     @rule(duration=st.sampled_from([0.001, 0.003, 0.006, 0.02, 0.3]), number=turns)

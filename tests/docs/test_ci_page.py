@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-
-from tests.support import ci_page
+from support import ci_page
 
 LEAN = [f"-p no:{each}" for each in ("xdist", "hypothesispytest", "schemathesis", "anyio", "cacheprovider")]
 """Other packages' plugins only take time here."""

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.eds import OWN, mapped, stating, without
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import PdoLengthError, ProcessImage, State, load_eds
 from hdbridge.drive.image import Frames
 from hdbridge.errors import InputError, TransitionError
-from tests.support.eds import OWN, mapped, stating, without
 
 
 def tpdo1(statusword: int, position: int, torque: int = 0) -> bytes:

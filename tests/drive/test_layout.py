@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.eds import OWN, mapped, section, stating, without
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive.layout import Layouts, layouts
 from hdbridge.errors import InputError
 from hdbridge.files.edsfile import read_eds
-from tests.support.eds import OWN, mapped, section, stating, without
 
 STATUS, POSITION, TORQUE = 0x60410010, 0x60640020, 0x60770010
 LOAD, DEMAND, CONTROL, TARGET = 0x60E40120, 0x60620020, 0x60400010, 0x607A0020

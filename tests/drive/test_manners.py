@@ -11,6 +11,7 @@ from uuid import uuid4
 
 import can
 import pytest
+from support.chatter import Chatter
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive.drive import Drive
@@ -21,7 +22,6 @@ from hdbridge.files.profile import bundled_profile
 from hdbridge.sim.lockstep import VirtualClock, lockstep_bench, simulated_bench
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
-from tests.support.chatter import Chatter
 
 AXIS = AxisConfig.load(bundled_profile("article"))
 SDO_REQUEST = (0x601, b"\x40\x00\x10\0\0\0\0\0")

@@ -108,6 +108,10 @@ def unexplained(lives_in="load angle and direction"):
     )
 
 
+LIMITS = {
+    "load_order": Identifiability(True, 0.7, ("compliance",), 0.9),
+    "vibration": Identifiability(False, None, (), 0.0, "nothing <in> this record"),
+}
 CAPABILITY = Capability(("no slow motion", "no reversals"), ("orders",), (), ("hysteresis", "backlash"), 0.97)
 
 
@@ -128,11 +132,7 @@ def diagnosis(*findings, driven=MOTION, noise=0.5):
         extended=Figures(0.61, 1.83),
         noise_floor_arcsec=noise,
         findings=findings,
-        identifiability={
-            "load_order": Identifiability(True, 0.7, ("compliance",), 0.9),
-            "vibration": Identifiability(False, None, (), 0.0, "nothing <in> this record"),
-        },
-        capability=CAPABILITY,
+        visible=lambda: (LIMITS, CAPABILITY),
         by_kind={"standing": (Figures(2.0, 6.0), Figures(0.4, 1.2)), "forward": (Figures(3.0, 9.0),) * 2},
         remarks=("no command (motor_target_deg)",),
         model=TransmissionModel(RATIO, effects),

@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -232,12 +232,6 @@ def master(interface: str, simulated: subprocess.Popen[bytes]) -> Iterator[Maste
     with master_on(interface) as made:
         made.boot()
         yield made
-
-
-@pytest.fixture
-def another_master() -> Callable[..., AbstractContextManager[Master]]:
-    """Makes a second master, for after the first is gone."""
-    return master_on
 
 
 @pytest.fixture

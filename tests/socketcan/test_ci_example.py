@@ -1,6 +1,6 @@
 """The example of docs/ci.md on a real CAN stack: the motion program in a process of its own."""
 
-from tests.support import ci_page
+from support import ci_page
 
 
 def test_the_example_on_vcan(interface, pytester):

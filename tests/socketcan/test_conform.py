@@ -4,7 +4,7 @@ import json
 import subprocess
 import sys
 
-from tests.support.command import run_here
+from support.command import run_here
 
 MACHINE = """
 schema: hdbridge.machine/1

@@ -9,12 +9,12 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+from support.daemon_bench import OURS, THEIRS, Cable, DaemonBench, DaemonRow, Witness, try_out
+from support.daemon_faults import DAEMON_ROWS
+from support.running import running
 
 from hdbridge.axis import AxisConfig
 from tests.socketcan.conftest import unhurried_profile
-from tests.support.daemon_bench import OURS, THEIRS, Cable, DaemonBench, DaemonRow, Witness, try_out
-from tests.support.daemon_faults import DAEMON_ROWS
-from tests.support.running import running
 
 NAME = "unhurried"
 DISK_MB = 4

@@ -15,15 +15,15 @@ from pathlib import Path
 import can
 import canopen
 import pytest
+from support.daemon_bench import OURS, STATE_TPDO, THEIRS, Cable, Witness
+from support.daemon_faults import IN_ORDER
+from support.running import Daemon, gone, running
 
 from hdbridge.axis import AxisConfig
 from hdbridge.daemon.gateway.objects import write_eds
 from hdbridge.daemon.machine import Machine
 from hdbridge.drive.states import State, decode
 from tests.socketcan.conftest import CHANNEL, unhurried_profile
-from tests.support.daemon_bench import OURS, STATE_TPDO, THEIRS, Cable, Witness
-from tests.support.daemon_faults import IN_ORDER
-from tests.support.running import Daemon, gone, running
 
 MACHINE = """
 schema: hdbridge.machine/1
@@ -160,6 +160,7 @@ def killed(witness: Witness, pid: int) -> int:
     )
 
 
+@pytest.mark.slow  # 34 s of a processor; tests/gateway kills the processes in every run, without vcan
 @pytest.mark.usefixtures("interface")
 def test_a_killed_process_leads_to_no_motion_without_a_request(tmp_path: Path) -> None:
     with under_way(tmp_path) as (daemon, plc, witness):

@@ -18,20 +18,18 @@ from typing import Final
 
 import numpy as np
 import pytest
+from support import patience
+from support.daemon_bench import OURS, Cable
+from support.running import running
 
 from hdbridge import TransmissionModel
 from hdbridge.axis import AxisConfig
 from hdbridge.client import Client
 from hdbridge.client.sync import Axis
-from hdbridge.commissioning.calibration.path import path_errors
 from hdbridge.control.bench import axis_view
 from hdbridge.errors import HdbridgeError
 from hdbridge.motion.procedures.moves import MoveTo, Sample
 from hdbridge.motion.procedures.path_test import PathRun
-from tests.support import patience
-from tests.support.daemon_bench import OURS, Cable
-from tests.support.raised import measured_response, raised_profile, ripple_arcsec
-from tests.support.running import running
 
 KNOT_S: Final = 0.02
 EVEN_S: Final = 1.2
@@ -104,6 +102,11 @@ def moving_axis(folder: Path, profile: Path) -> Iterator[tuple[Axis, Recorder]]:
 
 def figures(folder: Path, speeds: tuple[float, ...]) -> dict[str, np.ndarray]:
     """Returns ripple and path error, arcsec rms, shape (speeds, 2, variants), of moves and of streams."""
+    # Not with the other tests of this folder: scipy takes seconds to load in user-mode-linux.
+    from support.raised import measured_response, raised_profile, ripple_arcsec
+
+    from hdbridge.commissioning.calibration.path import path_errors
+
     found = {"goto": np.empty((len(speeds), 2, 3)), "streamed": np.empty((len(speeds), 2, 3))}
     profile = raised_profile(folder / "fast")
     with (profile / "axis.yaml").open("a", encoding="utf-8") as file:

@@ -3,17 +3,19 @@
 import re
 import shutil
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import can
 import pytest
+from support.characters import FRIENDLY, RESTLESS, Character, PowerCount
+from support.command import run_here
+from support.reliability import ABOUT_POWER, VCAN, Row, cases_on, try_out
 
 from hdbridge.axis import AxisConfig
 from hdbridge.clock import MonotonicClock
@@ -24,9 +26,7 @@ from hdbridge.errors import BusError
 from hdbridge.sim.lockstep import nameplate_of
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
-from tests.support.characters import FRIENDLY, RESTLESS, Character, PowerCount
-from tests.support.command import run_here
-from tests.support.reliability import ABOUT_POWER, VCAN, Row, cases_on, try_out
+from tests.socketcan.conftest import master_on
 
 
 @contextmanager
@@ -97,7 +97,6 @@ class VcanBench:
 def bench(
     interface: str,
     profile: Path,
-    another_master: Callable[..., AbstractContextManager[Any]],
     intruder: can.BusABC,
     may_configure: Callable[..., None],
     tmp_path: Path,
@@ -108,7 +107,7 @@ def bench(
     text = (own / "axis.yaml").read_text()
     option = f"quick_stop_option: {character.quick_stop_option}"
     (own / "axis.yaml").write_text(re.sub("quick_stop_option: [0-9]", option, text))
-    with drive_in_a_thread(interface, own, character) as node, another_master(interface, own) as master:
+    with drive_in_a_thread(interface, own, character) as node, master_on(interface, own) as master:
         master.boot()
         master.run(20)
         yield VcanBench(master, node, intruder, may_configure, interface)
@@ -156,17 +155,7 @@ def check(bench: VcanBench, row: Row, character: Character) -> None:
 # ------------------------------------------------------------------ manners
 
 
-@pytest.mark.parametrize("command", ["step", "run"])
-def test_a_bus_of_another_master_is_left_alone(
-    command: str,
-    interface: str,
-    profile: Path,
-    intruder: can.BusABC,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    for each in ("XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
-        monkeypatch.setenv(each, str(tmp_path))
+def test_a_bus_of_another_master_is_left_alone(interface: str, profile: Path, intruder: can.BusABC) -> None:
     ended = threading.Event()
 
     def drive_on() -> None:
@@ -176,8 +165,7 @@ def test_a_bus_of_another_master_is_left_alone(
     other = threading.Thread(target=drive_on, daemon=True)
     other.start()
     with can.Bus(interface="socketcan", channel=interface, ignore_config=True) as witness:
-        # In user-mode-linux a process takes 3 s of processor time to begin; the daemon consists of several.
-        done = (hdbridge if command == "run" else hdbridge_here)(command, profile, interface)
+        done = step(profile, interface)
         ended.set()
         other.join()
         sent = {message.arbitration_id for message in iter(lambda: witness.recv(0), None)}
@@ -187,23 +175,12 @@ def test_a_bus_of_another_master_is_left_alone(
 
 
 def test_a_bus_without_the_drive(interface: str, profile: Path) -> None:
-    done = hdbridge_here("step", profile, interface)
+    done = step(profile, interface)
     assert done.returncode == 4
     assert "node 1" in done.stderr
     assert "drive.node_id" in done.stderr
 
 
-def hdbridge(command: str, profile: Path, interface: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "hdbridge", *arguments(command, profile, interface)],
-        capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL,
-    )  # fmt: skip
-
-
-def hdbridge_here(command: str, profile: Path, interface: str) -> subprocess.CompletedProcess[str]:
-    """The same in this process."""
-    return run_here(Path.cwd(), *arguments(command, profile, interface))
-
-
-def arguments(command: str, profile: Path, interface: str) -> list[str]:
-    return [command, str(profile), "--interface", "socketcan", "--channel", interface]
+def step(profile: Path, interface: str) -> subprocess.CompletedProcess[str]:
+    """Runs ``hdbridge step`` in this process: in user-mode-linux one takes 3 s of a processor to begin."""
+    return run_here(Path.cwd(), "step", profile, "--interface", "socketcan", "--channel", interface)

@@ -4,8 +4,9 @@ import json
 import subprocess
 import sys
 
+from support.command import run_here
+
 from hdbridge.errors import SafetyStop
-from tests.support.command import run_here
 
 ATTEMPTS = 3
 """A machine that stalls for two periods stops the axis, as it should; then the test begins anew."""

@@ -12,6 +12,7 @@ import pytest
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Reaction
 from hdbridge.errors import BusError
+from tests.socketcan.conftest import master_on
 
 
 def test_candump_shows_one_cycle_in_order(master, interface: str, tmp_path: Path) -> None:
@@ -36,9 +37,7 @@ def test_candump_shows_one_cycle_in_order(master, interface: str, tmp_path: Path
     assert periods[0] > 0.4 * expected  # late ones are skipped, never made up for by a burst
 
 
-def test_link_down_latches_and_recovery_needs_a_new_link(
-    master, another_master, may_configure, interface: str
-) -> None:
+def test_link_down_latches_and_recovery_needs_a_new_link(master, may_configure, interface: str) -> None:
     master.run(50)
     may_configure("link", "set", "down", interface)
     master.move_until_stopped(2)
@@ -48,14 +47,12 @@ def test_link_down_latches_and_recovery_needs_a_new_link(
         master.drive.link.send(0x080, b"")
     may_configure("link", "set", "up", interface)
     time.sleep(0.5)
-    with another_master(interface, shared=True) as again:
+    with master_on(interface, shared=True) as again:
         again.boot()
         assert again.run(50)[-1].fresh
 
 
-def test_a_killed_master_leaves_a_stopped_and_disabled_axis(
-    simulated, another_master, interface: str, profile: Path
-) -> None:
+def test_a_killed_master_leaves_a_stopped_and_disabled_axis(simulated, interface: str, profile: Path) -> None:
     script = Path(__file__).with_name("master_to_kill.py")
     victim = subprocess.Popen([sys.executable, str(script), interface, str(profile)], stdout=subprocess.PIPE)
     try:
@@ -66,7 +63,7 @@ def test_a_killed_master_leaves_a_stopped_and_disabled_axis(
         victim.wait()
         victim.stdout.close()
     time.sleep(1.0)
-    with another_master(interface) as again:
+    with master_on(interface) as again:
         first = again.drive.read_positions()
         time.sleep(0.3)
         second = again.drive.read_positions()

@@ -6,9 +6,7 @@ turns as fit. So the service runs here unchanged, as fast as the processor allow
 
 from __future__ import annotations
 
-import errno
 import math
-import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -31,40 +29,13 @@ from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.device.node import DriveNode
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import Link
-from hdbridge.sim.lockstep import LockstepBus, SimulatedAxis, VirtualClock, simulated_benches
+from hdbridge.sim.lockstep import SimulatedAxis, VirtualClock, simulated_benches
 from hdbridge.sim.truth import Truth
 from support.characters import FRIENDLY, Character
+from support.spoilt import SpoiltBus
 
 PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
 EVENTS_KEPT = 1000
-
-
-class SpoiltBus(LockstepBus):
-    """Loop's end of the channel: an interface that can fail, with a spy that sees the frames sent."""
-
-    def __init__(self, channel: str, clock: VirtualClock) -> None:
-        super().__init__(channel, clock)
-        self.clock = clock
-        self.no_room_for: int | None = None
-        """Identifier of a frame for which the transmit queue is full once."""
-        self.spy: Callable[[int, bytes], None] | None = None
-        self.down: int | None = None
-        """Error number of every call while the interface is down (ENETDOWN) or deleted (ENODEV)."""
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        if self.down is not None:
-            raise can.CanOperationError(os.strerror(self.down), self.down)
-        if msg.arbitration_id == self.no_room_for:
-            self.no_room_for = None
-            raise can.CanOperationError("Transmit buffer full", errno.ENOBUFS)
-        if self.spy is not None:
-            self.spy(msg.arbitration_id, bytes(msg.data))
-        super().send(msg, timeout)
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        if self.down is not None:
-            raise can.CanOperationError(os.strerror(self.down), self.down)
-        return super().recv(timeout)
 
 
 class SteppedClock:

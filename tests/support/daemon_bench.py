@@ -15,8 +15,8 @@ import can
 import pytest
 
 from hdbridge.drive.states import State, decode
-from tests.support.reliability import DAEMON_VCAN, Seen, record
-from tests.support.running import Daemon
+from support.reliability import DAEMON_VCAN, Seen, record
+from support.running import Daemon
 
 OURS, THEIRS = "hdvx0", "hdvx1"
 """Ends of the cable: the daemon's and the drive's."""
@@ -175,9 +175,12 @@ class DaemonBench:
         """Starts a long slow motion of the axis, from any state."""
         daemon = self.daemon
         state = daemon.until(
-            lambda: daemon.axis().get("state") not in {"", None, "unverified"} and daemon.axis(), "verified"
+            lambda: (
+                (found := daemon.axis()).get("state") in {"disabled", "enabled", "quick-stopped"} and found
+            ),
+            "verified",
         )
-        if state["state"] in {"latched", "quick-stopped"}:
+        if state["state"] == "quick-stopped":
             daemon.ask("reset")
         if daemon.axis()["state"] != "enabled":
             daemon.until_axis("disabled")

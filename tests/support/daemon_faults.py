@@ -13,8 +13,8 @@ from typing import Final
 import pytest
 
 from hdbridge.drive.supervision import Fault
-from tests.support.daemon_bench import EMERGENCY, OURS, SLOW_DEG_S, THEIRS, DaemonBench, DaemonRow
-from tests.support.running import gone
+from support.daemon_bench import EMERGENCY, OURS, SLOW_DEG_S, THEIRS, DaemonBench, DaemonRow
+from support.running import gone
 
 CAN_ERR_BUSOFF: Final = 0x40
 """Constant of linux/can/error.h."""
@@ -322,7 +322,7 @@ DAEMON_ROWS: Final = (
     DaemonRow("NMT reset of the drive by a second master", "quick stop, latch; verified again, disabled",
         f"{NOTICED}", _node_reset, slow=True),
     DaemonRow("a second daemon is started on the interface", "refused; the first continues", "0",
-        _second_daemon),
+        _second_daemon, slow=True),
     DaemonRow("the wall clock is set back and forth by a day", "no effect", "0", _clock_step),
     DaemonRow("the recorder's disk is full", "the recorder drops; the loop continues", "0", _disk_full,
         slow=True),

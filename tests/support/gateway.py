@@ -1,7 +1,6 @@
 """A gateway in simulated time: daemon, service, outer bus and a PLC-like master on it, in one thread."""
 
 import math
-import os
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -18,6 +17,7 @@ from hdbridge.daemon.gateway.slave import Gateway
 from hdbridge.daemon.machinefile import GatewaySettings
 from hdbridge.device.run import LONGEST_WAIT_S, Server
 from support.service import Service, stepped_service
+from support.spoilt import SpoiltVirtualBus
 
 NODE = 5
 COUNTS_PER_DEG = 12_960_000 / 360.0
@@ -107,27 +107,10 @@ class Plc:
         return self._answers.pop(0) if self._answers else None
 
 
-class OuterBus(VirtualBus):
-    """The gateway's end of the outer bus: an interface that can fail."""
-
-    down: int | None = None
-    """Error number of every call while the interface is down (ENETDOWN) or deleted (ENODEV)."""
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        if self.down is not None:
-            raise can.CanOperationError(os.strerror(self.down), self.down)
-        super().send(msg, timeout)
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        if self.down is not None:
-            raise can.CanOperationError(os.strerror(self.down), self.down)
-        return super().recv(timeout)
-
-
 class GatewayProcess:
     """The gateway process as a node of the virtual clock."""
 
-    def __init__(self, bus: OuterBus, gateway: Gateway, clock: Any) -> None:
+    def __init__(self, bus: SpoiltVirtualBus, gateway: Gateway, clock: Any) -> None:
         self.gateway, self._clock = gateway, clock
         self._server, self._again_s = Server(bus, gateway, clock), 0.0
 
@@ -143,7 +126,7 @@ class GatewayBench:
     """Everything between the outer master and the simulated drive."""
 
     def __init__(
-        self, service: Service, bus: OuterBus, gateway: Callable[[], Gateway], plcs: list[Plc]
+        self, service: Service, bus: SpoiltVirtualBus, gateway: Callable[[], Gateway], plcs: list[Plc]
     ) -> None:
         self.service, self.daemon, self.plcs = service, service.daemon, plcs
         self.plc = plcs[0]
@@ -269,7 +252,7 @@ def gateway_bench(
         service.machine = replace(service.machine, gateway=settings)
         axes = [(axis.config, axis.model()) for axis in service.machine.axes]
 
-        outer = stack.enter_context(OuterBus(channel))
+        outer = stack.enter_context(SpoiltVirtualBus(channel))
 
         def gateway() -> Gateway:
             return Gateway(outer, axes, settings, service.daemon.memory, clock, folder)

@@ -22,7 +22,7 @@ from hdbridge.device.behaviour import Controlword
 from hdbridge.device.node import DriveNode
 from hdbridge.drive.supervision import Event, Fault, Reaction, Supervision
 from hdbridge.errors import SafetyStop
-from tests.support.characters import CHARACTERS, FRIENDLY, Character
+from support.characters import CHARACTERS, FRIENDLY, Character
 
 RECORD: Final = "HDBRIDGE_RELIABILITY"
 """Environment variable: file to which a line of JSON is added for each row that was tried."""

@@ -17,7 +17,8 @@ from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import Link
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Reaction, Supervision
-from hdbridge.sim.lockstep import LockstepBus, SimulatedAxis, VirtualClock, simulated_benches
+from hdbridge.sim.lockstep import SimulatedAxis, VirtualClock, simulated_benches
+from support.spoilt import LoggingBus
 
 PROFILE: Final = Path(__file__).resolve().parents[2] / "profiles" / "article"
 STEP_COUNTS: Final = 40
@@ -35,7 +36,7 @@ def axis_of(node_id: int, name: str = "", profile: Path = PROFILE, **drive: obje
 class TwoAxes:
     """Two axes under way, and everything that a test may change."""
 
-    bus: LockstepBus
+    bus: LoggingBus
     clock: VirtualClock
     nodes: tuple[DriveNode, ...]
     cycle: BusCycle
@@ -103,13 +104,8 @@ class TwoAxes:
 
 
 @contextmanager
-def two_axes(
-    make_bus: object = None, boot: tuple[int, ...] = (0, 1), bitrate_bps: int | None = 1_000_000
-) -> Iterator[TwoAxes]:
-    """Provides two axes, those in ``boot`` booted and ready to be enabled; nothing moves yet.
-
-    ``make_bus(bus, channel, clock)`` may replace the master's bus.
-    """
+def two_axes(boot: tuple[int, ...] = (0, 1), bitrate_bps: int | None = 1_000_000) -> Iterator[TwoAxes]:
+    """Provides two axes, those in ``boot`` booted and ready to be enabled; nothing moves yet."""
     configs = [axis_of(node_id) for node_id in (1, 2)]
     channel = f"two-{uuid4()}"
     simulated = [
@@ -117,9 +113,9 @@ def two_axes(
         for seed, axis in enumerate(configs)
     ]
     with simulated_benches(simulated, channel) as (first, clock, nodes):
-        bus = make_bus(first, channel, clock) if callable(make_bus) else first
         intruder = can.Bus(interface="virtual", channel=channel, ignore_config=True)
-        with intruder, bus:
+        first.shutdown()
+        with intruder, LoggingBus(channel, clock) as bus:
             drives = tuple(Drive(bus, axis, clock) for axis in configs)
             cycle = BusCycle(Link(bus, clock), clock, configs[0].drive.cycle_s, bitrate_bps=bitrate_bps)
             axes = tuple(AxisCycle(drive.image, Supervision(), monitor=drive.monitor) for drive in drives)

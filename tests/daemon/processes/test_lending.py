@@ -15,12 +15,12 @@ from typing import Any
 import httpx
 import pytest
 import yaml
+from support.patience import until
 from support.running import Daemon, running
 
 from hdbridge.axis.model import TransmissionModel, store
 from hdbridge.drive.interfacelock import InterfaceLock
 from hdbridge.files.profile import bundled_profile
-from tests.support.patience import until
 
 LISTENING = ("scan", "--listen", 600, "--borrow")
 """A command that has the bus for ten minutes and needs no real time."""
