@@ -562,10 +562,15 @@ def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
 BANDWIDTHS: Final = ((25.0, 100.0), (80.0, 300.0), (200.0, 800.0))
 """Position gain, 1/s, and velocity gain over the whole inertia, rad/s: a geared axis with a soft load, an
 ordinary one, and a stiff one."""
-INTEGRALS: Final = ("speed", "position")
-"""Signal of the integral: speed error (PI velocity loop) or position error (PIV)."""
+REJECTIONS: Final = ("speed", "position", "observer")
+"""Block that supplies friction and load torque: the integral of the speed error (PI velocity loop) or of the
+position error (PIV), or a disturbance observer."""
 INTEGRAL: Final = 3.0
 """Integral time times that bandwidth (symmetric optimum: 2 to 4)."""
+SLOW_INTEGRAL: Final = 30.0
+"""The same next to an observer, which leaves an integral little to do."""
+OBSERVED: Final = 0.9
+"""Start value of an observer's share of the disturbance: most of it."""
 FILTER_MS: Final = 0.5
 """Speed and torque filter at the start: half to twice the period of common velocity loops."""
 SHORT_MS: Final = 0.1
@@ -589,8 +594,6 @@ SERVOS: Final = (
 )  # fmt: skip
 NOTCH: Final = ("notch frequency", "notch depth", "notch width")
 OBSERVER: Final = ("observer frequency", "observer share", "observer inertia")
-OBSERVERS_HZ: Final = (30.0, 100.0)
-"""Start values of the observer's frequency: one to three velocity loops, 20 to 150 Hz."""
 MOST_DEAD_CYCLES: Final = 2.0
 """Maximum dead time in SYNC cycles: one to take over the demand, one to execute it (CiA 402)."""
 PLACES: Final = (0.7, 1.0, 1.4)
@@ -670,13 +673,18 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
         (averaged, whole, ("inertia feed-forward", "moving average")),
     )
     for gain, rate in BANDWIDTHS:
-        for (command, forward, more), integral in product(commands, INTEGRALS):
+        for (command, forward, more), rejection in product(commands, REJECTIONS):
+            observed = rejection == "observer"
+            if observed:
+                more = (*more, *OBSERVER)  # noqa: PLW2901
+            observer = TrueObserver(frequency_hz=rate / math.tau, share=OBSERVED, inertia_kg_m2=whole)
             servo = truth.servo.model_copy(
                 update={
                     "position_gain_per_s": gain,
                     "velocity_gain_nm_s_per_rad": min(rate * whole, fastest),
-                    "integral_of": integral,
-                    "integral_time_ms": 1e3 * INTEGRAL / rate,
+                    "integral_of": "speed" if observed else rejection,
+                    "integral_time_ms": 1e3 * (SLOW_INTEGRAL if observed else INTEGRAL) / rate,
+                    "observer": observer if observed else None,
                     "velocity_feedforward": VELOCITY_FEEDFORWARD,
                     "speed_filter_ms": FILTER_MS,
                     "torque_filter_ms": FILTER_MS,
@@ -703,13 +711,6 @@ def more_blocks(best: Fitted) -> Iterator[Start]:
             notched = servo.model_copy(update={"notch": notch})
             parameters = (*best.parameters, *(BY_NAME[each] for each in NOTCH))
             yield truth.model_copy(update={"servo": notched}), parameters
-    if servo.observer is None:
-        whole = truth.motor.inertia_kg_m2 + truth.load_.whole_inertia_kg_m2 / truth.gear.ratio**2
-        for hz in OBSERVERS_HZ:
-            observer = TrueObserver(frequency_hz=hz, share=0.5, inertia_kg_m2=whole)
-            observed = servo.model_copy(update={"observer": observer})
-            parameters = (*best.parameters, *(BY_NAME[each] for each in OBSERVER))
-            yield truth.model_copy(update={"servo": observed}), parameters
     if BY_NAME["moving average"] not in best.parameters:
         lag_ms = min(max(2.0 * servo.command_filter_ms, 0.5), 3.0)
         averaged = servo.model_copy(update={"moving_average_ms": 2.0 * lag_ms, "command_filter_ms": SHORT_MS})
