@@ -130,11 +130,10 @@ def print_checks(foreign: Foreign, axis: AxisConfig, twin: Truth, seed: int, wor
         named = {each.cause for each in found.changes}
         silent = found.sentence.startswith("Nothing has changed")
         right = named == {cause} if cause else silent
+        unseen = "could not be seen" if silent and cause in found.unseen else ""
         grown = ", ".join(f"{times:.1f}" for times in found.growth_before.values())
-        print(
-            f"    {name} [{'ok' if right else 'WRONG' if named or silent else 'unnamed'}] misfit x {grown}: ",
-            end="",
-        )
+        verdict = "ok" if right else unseen or ("WRONG" if named or silent else "unnamed")
+        print(f"    {name} [{verdict}] misfit x {grown}: ", end="")
         print(found.sentence, flush=True)
 
 

@@ -605,11 +605,16 @@ Start = tuple[Truth, tuple[Parameter, ...]]
 
 
 def in_best_structure(
-    few: Replays, begun: Iterable[Start], keep: Callable[[Fitted], None] = lambda _: None
+    few: Replays, near: Fitted, others: Iterable[Start], keep: Callable[[Fitted], None] = lambda _: None
 ) -> Fitted:
-    """Fits the servo structure that explains a few legs best, and adds blocks that held-out legs confirm."""
+    """Fits the servo structure that explains a few legs best, and adds blocks that held-out legs confirm.
+
+    A servo that is already fitted joins the ``others`` at the end, because they need as many steps.
+    """
     scale = Scales(units(few.data))
-    best = by_halving(few, begun, scale, keep)
+    begun = [by_halving(few, each, scale) for each in ([(near.truth, near.parameters)], [*others]) if each]
+    best = min(begun, key=lambda each: each.cost)
+    keep(best)
     while more := list(more_blocks(best)):
         found = by_halving(few, more, scale)
         if misfit(few.data, found.residuals) > GAIN * misfit(few.data, best.residuals):
@@ -976,14 +981,14 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
 
     if not near(best):
         others = starts(begun, 1e3 * data.pieces[0].commands.cycle_s)
-        best = in_best_structure(few, [(best.truth, best.parameters), *others], keep)
+        best = in_best_structure(few, best, others, keep)
     progress(0.5)
     polished = None
     if near(best):
         polished = _polished(replays, best, begun, keep)
         if values_of(what_is_left(data, polished.residuals, noise_in_motion(data))) is Values.AXIS:
             return polished
-        best = in_best_structure(few, [(polished.truth, polished.parameters)])
+        best = in_best_structure(few, polished, ())
     progress(0.8)
     scale = Scales(units(data))
     whole = solve(replays, best.truth, best.parameters, WHOLE_STEPS, known=scale, tempered=True, linear=False)
