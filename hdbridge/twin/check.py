@@ -52,7 +52,9 @@ class Check:
         if self.changes:
             found.insert(0, f"Changed since the twin was made: {'. '.join(map(str, self.changes))}")
         elif self.unexplained:
-            found.insert(0, "Something has changed since the twin was made that no change of a cause explains")
+            found.insert(
+                0, "Something has changed since the twin was made that no change of a cause explains"
+            )
         elif self.blind:
             found = ["The twin explains too little of this axis to show a change"]
         else:
