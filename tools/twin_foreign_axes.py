@@ -75,11 +75,11 @@ def start(axis: AxisConfig, foreign: Foreign) -> Truth:
 
 
 def shares(other: Recording, axis: AxisConfig, truth: Truth, seed: int) -> str:
-    """Returns errors of following error and torque on the other motion, per cent of the signal."""
+    """Returns errors and noise of following error and torque on the other motion, per cent of the signal."""
     again = replay(other, axis, without_noise(truth), seed)
     told = compare(other.record, again, other.segments, axis.gear.ratio)
     return ", ".join(
-        f"{name.split('_')[0]} {100.0 * row.share:.1f} %"
+        f"{name.split('_')[0]} {100.0 * row.share:.1f} % (noise {100.0 * row.noise / row.measured:.1f} %)"
         for name in ("following_error", "motor_torque")
         if (row := told.row(name)) is not None
     )

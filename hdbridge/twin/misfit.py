@@ -108,11 +108,6 @@ class Data:
         """Kind of each leg."""
         return tuple(kind for each in self.pieces for kind in each.kind)
 
-    @property
-    def duration_s(self) -> float:
-        """Duration of the replayed motion."""
-        return sum(map(_replayed_s, self.pieces))
-
 
 def held_out_legs(recording: Recording) -> tuple[Segment, ...]:
     """Returns the legs that a fit does not see: every `HELD_OUT`-th of its kind."""
@@ -506,8 +501,8 @@ def _shaken_nm(truth: Truth, off_rad: float) -> float:
     return gain * off_rad / step_s * norm
 
 
-def scales(data: Data, found: Mapping[str, FloatArray], most: Scales | None = None) -> Scales:
-    """Estimates the scales of the residuals in motion; from the error of a smooth replay up to ``most``.
+def scales(data: Data, found: Mapping[str, FloatArray]) -> Scales:
+    """Estimates the scales of the residuals in motion; at least the error of a smooth replay.
 
     Residuals at rest are excluded, because they would dominate a recording that rests half of the time.
     """
@@ -521,8 +516,6 @@ def scales(data: Data, found: Mapping[str, FloatArray], most: Scales | None = No
             # At least half of the readings in motion are not outliers.
             typical = median_deviation(beyond(inside, 0.5 * steps[name]))
             given[name], stray[name] = deviation(inside, steps[name], max(least[name], typical))
-    if most is not None:
-        given = {name: min(each, most.deviation[name]) for name, each in given.items()}
     return Scales(given, steps, stray)
 
 
