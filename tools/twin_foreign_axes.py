@@ -75,11 +75,11 @@ def start(axis: AxisConfig, foreign: Foreign) -> Truth:
 
 
 def shares(other: Recording, axis: AxisConfig, truth: Truth, seed: int) -> str:
-    """Returns errors of following error and torque on the other motion, per cent of the signal."""
+    """Returns errors and noise of following error and torque on the other motion, per cent of the signal."""
     again = replay(other, axis, without_noise(truth), seed)
     told = compare(other.record, again, other.segments, axis.gear.ratio)
     return ", ".join(
-        f"{name.split('_')[0]} {100.0 * row.share:.1f} %"
+        f"{name.split('_')[0]} {100.0 * row.share:.1f} % (noise {100.0 * row.noise / row.measured:.1f} %)"
         for name in ("following_error", "motor_torque")
         if (row := told.row(name)) is not None
     )
@@ -130,11 +130,10 @@ def print_checks(foreign: Foreign, axis: AxisConfig, twin: Truth, seed: int, wor
         named = {each.cause for each in found.changes}
         silent = found.sentence.startswith("Nothing has changed")
         right = named == {cause} if cause else silent
+        unseen = "could not be seen" if silent and cause in found.unseen else ""
         grown = ", ".join(f"{times:.1f}" for times in found.growth_before.values())
-        print(
-            f"    {name} [{'ok' if right else 'WRONG' if named or silent else 'unnamed'}] misfit x {grown}: ",
-            end="",
-        )
+        verdict = "ok" if right else unseen or ("WRONG" if named or silent else "unnamed")
+        print(f"    {name} [{verdict}] misfit x {grown}: ", end="")
         print(found.sentence, flush=True)
 
 

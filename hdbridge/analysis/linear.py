@@ -114,7 +114,8 @@ def sandwich(influence: FloatArray, number: IntArray) -> FloatArray:
 
     Influences of one number may be correlated (Liang and Zeger 1986).
     """
-    summed, count = sums(influence, number), int(number[-1]) + 1
+    summed = sums(influence, number)
+    count = len(summed)
     return np.asarray(summed.T @ summed * (count / max(count - 1, 1)))
 
 

@@ -13,6 +13,7 @@ in Python.
 import hashlib
 import inspect
 import math
+import threading
 from collections.abc import Callable, Iterable
 from functools import cache, partial
 from pathlib import Path
@@ -84,6 +85,7 @@ KINDS: Final[dict[Any, Kinds]] = {
     ),
     encoder.ReadingError: Kinds((encoder.Cable, encoder.SensorWarming), 2, 0.0),
 }
+_registering: Final = threading.Lock()
 _NUMBERS: Final = {float: "f8", int: "i8", bool: "?", complex: "c16"}
 
 
@@ -152,7 +154,8 @@ def _entry_point(plant: Any, room: int, name: str) -> Callable[..., Any]:
 @cache
 def _methods() -> dict[str, Any]:
     """Returns numba's dispatchers of the methods, cached on disk for the present sources."""
-    _register()
+    with _registering:
+        _register()
     version = _version()
 
     def drive(
@@ -198,7 +201,7 @@ def _methods() -> dict[str, Any]:
         assert version
         axis[0].hold(torque_nm)
 
-    compiled = numba.njit(cache=True, fastmath=False)
+    compiled = numba.njit(cache=True, fastmath=False, nogil=True)
     return {each.__name__: compiled(each) for each in (drive, drive_all, roll, hold)}
 
 
@@ -320,6 +323,7 @@ _UNIONS: Final[dict[Any, Any]] = {}
 """Protocol of each record type of numba that may be one of several classes."""
 
 
+@cache
 def _register() -> None:
     """Registers the methods of all classes with numba, and unique names for the compiled code."""
     types.Record.mangling_args = property(_name_in_code)  # type: ignore[method-assign, assignment]

@@ -10,8 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from hdbridge.axis import AxisConfig
 from hdbridge.errors import InputError
 from hdbridge.records.recording import Recording
@@ -19,7 +17,7 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import free_parameters
 from hdbridge.twin.misfit import CHANNELS, Replays, Values, coarse, noise_floor, prepare
 from hdbridge.twin.naming import GROWN, OF_REPLAY, Finding, explain, findings, growth, scales_by_kind, shifted
-from hdbridge.twin.parameters import BY_NAME, Parameter, by_cause
+from hdbridge.twin.parameters import BY_NAME, Parameter, by_cause, coordinates
 from hdbridge.units import figure
 
 CHECK_S = 17.0
@@ -49,19 +47,23 @@ class Check:
     @property
     def sentence(self) -> str:
         """Summary in words: the changes, channels whose misfit has grown, and causes that cannot show."""
-        found = ["Nothing has changed since the twin was made"]
+        causes = ", ".join(self.unseen)
+        found = [f"This recording would not show a change in: {causes}"] if causes else []
         if self.changes:
-            found = [f"Changed since the twin was made: {'. '.join(map(str, self.changes))}"]
+            found.insert(0, f"Changed since the twin was made: {'. '.join(map(str, self.changes))}")
         elif self.unexplained:
-            found = ["Something has changed since the twin was made that no change of a cause explains"]
+            found.insert(
+                0, "Something has changed since the twin was made that no change of a cause explains"
+            )
         elif self.blind:
             found = ["The twin explains too little of this axis to show a change"]
-        found += [
+        else:
+            but = f", unless it is one of these, which this recording does not show: {causes}"
+            found = [f"Nothing has changed since the twin was made{but if causes else ''}"]
+        found[1:1] = [
             f"The twin leaves {figure(times, 3)} times as much of the {name} as when it was made"
             for name, times in self.unexplained.items()
         ]
-        if self.unseen and not self.blind:
-            found.append(f"This recording would not show a change in: {', '.join(self.unseen)}")
         return f"{'. '.join(found)}."
 
     @property
@@ -109,14 +111,16 @@ def check(
 
 
 def _shows(replays: Replays, twin: Truth, own: Sequence[Parameter], was: Mapping[str, Any]) -> bool:
-    """Returns True if a noticeable change of one of the parameters would make the misfit grow."""
-    moved = [
-        shifted(twin, each, sign * NOTICEABLE * each.least_change) for each in own for sign in (-1.0, 1.0)
-    ]
-    here, *there = replays([twin, *moved])
-    for found in there:
-        # The change is uncorrelated with the twin's residuals, so squares add.
-        change = {name: np.hypot(found[name] - here[name], was[name]) for name in CHANNELS}
-        if max(growth(replays.data, change, was).values(), default=0.0) > GROWN:
+    """Returns True if a noticeable change of one of the parameters cannot have happened unseen.
+
+    Then the twin with such a change, in either direction, explains the recording no more. What the twin
+    leaves may hide a change or add to it, so the changed twin is compared with the recording itself.
+    """
+    for each in own:
+        (now,) = coordinates(twin, [each])
+        moved = [shifted(twin, each, sign * NOTICEABLE * each.least_change) for sign in (-1.0, 1.0)]
+        moved = [there for there in moved if abs(coordinates(there, [each])[0] - now) > each.least_change]
+        grown = [growth(replays.data, found, was) for found in replays(moved)]
+        if grown and min(max(by_channel.values(), default=0.0) for by_channel in grown) > GROWN:
             return True
     return False

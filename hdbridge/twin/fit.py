@@ -21,7 +21,6 @@ from scipy.optimize import brentq, least_squares
 
 from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.linear import counted as numbered
-from hdbridge.analysis.linear import sums
 from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.hysteresis_laws import law_of
 from hdbridge.sim.truth import Truth
@@ -198,12 +197,6 @@ def _with_loop(truth: Truth, loop: Hysteresis) -> Truth:
 
 LEAST = 1e-9
 """Regularisation of the jackknife: share of the information that a single leg cannot have alone."""
-
-
-def over_legs(rows: FloatArray, legs: FloatArray) -> FloatArray:
-    """Sums rows (n, p) over each leg, shape (legs, p), with a correction of the squares for few legs."""
-    by_leg = sums(rows, numbered(legs.astype(np.intp)))
-    return np.asarray(by_leg * np.sqrt(len(by_leg) / max(len(by_leg) - 1, 1)), dtype=np.float64)
 
 
 def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
@@ -422,20 +415,17 @@ def solve(
     prior: FloatArray | None = None,
     known: Scales | None = None,
     everything: bool = False,
-    most: Scales | None = None,
     near: Fitted | None = None,
-    tempered: bool = False,
     wide: bool = False,
     linear: bool = True,
 ) -> Fitted:
     """Fits parameters by `scipy.optimize.least_squares` in at most ``steps`` steps; with none, linearises.
 
-    ``prior`` is the prior's mean, shape (p,), by default the start. ``known`` are the channels' scales; by
-    default they are estimated from the residuals before each round, at most ``most``, so that a worse channel
-    does not lose weight. ``tempered``: known scales grow with the residuals on the way to the minimum.
-    Held-out legs count only with ``everything``. ``near`` is a fit of the same parameters that gives the
-    directions of the first differences. ``wide``: the covariance uses wide differences. Without ``linear`` it
-    is the prior's, and the Jacobian that of the last place but one.
+    ``prior`` is the prior's mean, shape (p,), by default the start. ``known`` are the channels' scales, which
+    grow with the residuals on the way to the minimum; by default they are estimated from the residuals before
+    each round. Held-out legs count only with ``everything``. ``near`` is a fit of the same parameters that
+    gives the directions of the first differences. ``wide``: the covariance uses wide differences. Without
+    ``linear`` it is the prior's, and the Jacobian that of the last place but one.
     """
     data = replays.data
     rows = fitted_rows(data, everything=everything)
@@ -446,10 +436,10 @@ def solve(
     done = 0
     while True:
         found = problem.found(place)
-        problem.scale = known if known is not None else scales(data, found, most)
+        problem.scale = known if known is not None else scales(data, found)
         if done >= steps:
             break
-        if known is not None and tempered:
+        if known is not None:
             problem.scale = _tempered(known, found, rows)
         before = problem.residuals(place)
         taken = min(ROUND, steps - done)
@@ -469,12 +459,11 @@ def continued(
     replays: Replays,
     best: Fitted,
     steps: int,
-    most: Scales | None = None,
     truth: Truth | None = None,
     **options: Any,
 ) -> Fitted:
     """Continues a fit, at ``truth`` if given; ``options`` are those of `solve`."""
-    return solve(replays, truth or best.truth, best.parameters, steps, best.prior, most=most, **options)
+    return solve(replays, truth or best.truth, best.parameters, steps, best.prior, **options)
 
 
 def fitted_rows(data: Data, *, everything: bool = False) -> NDArray[np.bool_]:
@@ -562,18 +551,23 @@ def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
 BANDWIDTHS: Final = ((25.0, 100.0), (80.0, 300.0), (200.0, 800.0))
 """Position gain, 1/s, and velocity gain over the whole inertia, rad/s: a geared axis with a soft load, an
 ordinary one, and a stiff one."""
-INTEGRALS: Final = ("speed", "position")
-"""Signal of the integral: speed error (PI velocity loop) or position error (PIV)."""
+REJECTIONS: Final = ("speed", "position", "observer")
+"""Block that supplies friction and load torque: the integral of the speed error (PI velocity loop) or of the
+position error (PIV), or a disturbance observer."""
 INTEGRAL: Final = 3.0
 """Integral time times that bandwidth (symmetric optimum: 2 to 4)."""
+SLOW_INTEGRAL: Final = 30.0
+"""The same next to an observer, which leaves an integral little to do."""
+OBSERVED: Final = 0.9
+"""Start value of an observer's share of the disturbance: most of it."""
 FILTER_MS: Final = 0.5
 """Speed and torque filter at the start: half to twice the period of common velocity loops."""
 SHORT_MS: Final = 0.1
 """Negligible command filter: a fifth of a substep."""
 VELOCITY_FEEDFORWARD: Final = 0.9
 """Start value between none (rare) and the full speed."""
-FEW_STEPS, WHOLE_STEPS = 3, 25
-"""Maximum steps of a fit: from each start between two halvings, and over the whole recording."""
+FEW_STEPS = 3
+"""Maximum steps of a fit from each start between two halvings."""
 HOPELESS: Final = 2.0
 """Ratio to the least cost after as many steps above which a start is dropped as well: the starts that won on
 three foreign servos had at most 1.8."""
@@ -587,10 +581,11 @@ SERVOS: Final = (
     "position gain", "velocity gain", "integral time", "command filter", "velocity feed-forward",
     "servo dead time", "speed filter", "torque filter", "load encoder delay",
 )  # fmt: skip
+EQUAL_MOTORS: Final = 4.0
+"""Maximum ratio of the motor's inertia to the start's, or its inverse: servo motors of equal torque differ by
+a factor of three to five (catalogues). Observers and filters could otherwise replace it."""
 NOTCH: Final = ("notch frequency", "notch depth", "notch width")
 OBSERVER: Final = ("observer frequency", "observer share", "observer inertia")
-OBSERVERS_HZ: Final = (30.0, 100.0)
-"""Start values of the observer's frequency: one to three velocity loops, 20 to 150 Hz."""
 MOST_DEAD_CYCLES: Final = 2.0
 """Maximum dead time in SYNC cycles: one to take over the demand, one to execute it (CiA 402)."""
 PLACES: Final = (0.7, 1.0, 1.4)
@@ -602,11 +597,16 @@ Start = tuple[Truth, tuple[Parameter, ...]]
 
 
 def in_best_structure(
-    few: Replays, begun: Iterable[Start], keep: Callable[[Fitted], None] = lambda _: None
+    few: Replays, near: Fitted, others: Iterable[Start], keep: Callable[[Fitted], None] = lambda _: None
 ) -> Fitted:
-    """Fits the servo structure that explains a few legs best, and adds blocks that held-out legs confirm."""
+    """Fits the servo structure that explains a few legs best, and adds blocks that held-out legs confirm.
+
+    A servo that is already fitted joins the ``others`` at the end, because they need as many steps.
+    """
     scale = Scales(units(few.data))
-    best = by_halving(few, begun, scale, keep)
+    begun = [by_halving(few, each, scale) for each in ([(near.truth, near.parameters)], [*others]) if each]
+    best = min(begun, key=lambda each: each.cost)
+    keep(best)
     while more := list(more_blocks(best)):
         found = by_halving(few, more, scale)
         if misfit(few.data, found.residuals) > GAIN * misfit(few.data, best.residuals):
@@ -627,7 +627,7 @@ def by_halving(
     """
 
     def led(start: Start) -> Fitted:
-        return solve(few, *start, FEW_STEPS, known=known, tempered=True, linear=False)
+        return solve(few, *start, FEW_STEPS, known=known, linear=False)
 
     tried = [led(each) for each in begun]
     while True:
@@ -648,6 +648,8 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
     longest_ms = min(MOST_DEAD_CYCLES * cycle_ms, DEAD_TIME.most)
     known = {each: BY_NAME[each] for each in (*MECHANICS, *SERVOS)}
     known[DEAD_TIME.name] = replace(DEAD_TIME, most=longest_ms)
+    motor, usual = BY_NAME["motor inertia"], truth.motor.inertia_kg_m2
+    known[motor.name] = replace(motor, least=usual / EQUAL_MOTORS, most=usual * EQUAL_MOTORS)
     filtered_ms = truth.servo.command_filter_ms
     averaged_ms = min(cycle_ms, BY_NAME["moving average"].most)
     late_ms = max(_lag_ms(truth) - 0.5 * averaged_ms, 0.0)
@@ -670,13 +672,18 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
         (averaged, whole, ("inertia feed-forward", "moving average")),
     )
     for gain, rate in BANDWIDTHS:
-        for (command, forward, more), integral in product(commands, INTEGRALS):
+        for (command, forward, more), rejection in product(commands, REJECTIONS):
+            observed = rejection == "observer"
+            if observed:
+                more = (*more, *OBSERVER)  # noqa: PLW2901
+            observer = TrueObserver(frequency_hz=rate / math.tau, share=OBSERVED, inertia_kg_m2=whole)
             servo = truth.servo.model_copy(
                 update={
                     "position_gain_per_s": gain,
                     "velocity_gain_nm_s_per_rad": min(rate * whole, fastest),
-                    "integral_of": integral,
-                    "integral_time_ms": 1e3 * INTEGRAL / rate,
+                    "integral_of": "speed" if observed else rejection,
+                    "integral_time_ms": 1e3 * (SLOW_INTEGRAL if observed else INTEGRAL) / rate,
+                    "observer": observer if observed else None,
                     "velocity_feedforward": VELOCITY_FEEDFORWARD,
                     "speed_filter_ms": FILTER_MS,
                     "torque_filter_ms": FILTER_MS,
@@ -703,13 +710,6 @@ def more_blocks(best: Fitted) -> Iterator[Start]:
             notched = servo.model_copy(update={"notch": notch})
             parameters = (*best.parameters, *(BY_NAME[each] for each in NOTCH))
             yield truth.model_copy(update={"servo": notched}), parameters
-    if servo.observer is None:
-        whole = truth.motor.inertia_kg_m2 + truth.load_.whole_inertia_kg_m2 / truth.gear.ratio**2
-        for hz in OBSERVERS_HZ:
-            observer = TrueObserver(frequency_hz=hz, share=0.5, inertia_kg_m2=whole)
-            observed = servo.model_copy(update={"observer": observer})
-            parameters = (*best.parameters, *(BY_NAME[each] for each in OBSERVER))
-            yield truth.model_copy(update={"servo": observed}), parameters
     if BY_NAME["moving average"] not in best.parameters:
         lag_ms = min(max(2.0 * servo.command_filter_ms, 0.5), 3.0)
         averaged = servo.model_copy(update={"moving_average_ms": 2.0 * lag_ms, "command_filter_ms": SHORT_MS})
@@ -865,7 +865,7 @@ def _warms(data: Data) -> bool:
     return len(known_c) == len(begun) and max(known_c) - min(known_c) > BY_NAME["temperature"].least_change
 
 
-def with_loop(replays: Replays, best: Fitted, most: Scales | None = None) -> Fitted | None:
+def with_loop(replays: Replays, best: Fitted) -> Fitted | None:
     """Returns the fit with another loop law of the gear, or None if none is better.
 
     There is none if the load's residuals are as small as those of the true axis, or if no law reduces them.
@@ -884,10 +884,10 @@ def with_loop(replays: Replays, best: Fitted, most: Scales | None = None) -> Fit
     rest = [number for number, each in enumerate(best.parameters) if each.cause != ELASTIC]
     parameters = (*(best.parameters[number] for number in rest), *nearest.parameters)
     prior = np.append(best.prior[rest], nearest.prior)
-    return solve(replays, nearest.truth, parameters, STEPS, prior, most=most)
+    return solve(replays, nearest.truth, parameters, STEPS, prior)
 
 
-def with_limit(replays: Replays, best: Fitted, usual: Truth, most: Scales | None = None) -> Fitted:
+def with_limit(replays: Replays, best: Fitted, usual: Truth) -> Fitted:
     """Fits the drive's torque limit if the recording shows it, else sets the usual limit.
 
     So far the fit used the highest recorded torque as the limit (`start_of`). It is the drive's limit, and
@@ -900,7 +900,7 @@ def with_limit(replays: Replays, best: Fitted, usual: Truth, most: Scales | None
     if _cost(replays, without, best) - best.cost <= EARNED:
         return replace(best, truth=without)
     parameters, prior = (*best.parameters, LIMIT), np.append(best.prior, coordinates(usual, [LIMIT]))
-    return solve(replays, best.truth, parameters, STEPS, prior, most=most)
+    return solve(replays, best.truth, parameters, STEPS, prior)
 
 
 def _cost(replays: Replays, truth: Truth, best: Fitted) -> float:
@@ -917,10 +917,8 @@ FIT_S = 60.0
 thousand replays of a quarter of an hour would take hours."""
 MORE_STEPS = 10
 """Steps from another place over the whole recording."""
-NEAR_STEPS = 30
-"""Maximum steps over the whole recording with the expected noise."""
 STEPS = 30
-"""Maximum steps of the final fit."""
+"""Maximum steps over the whole recording."""
 MORE = 1.1
 """Ratio to the true axis's residuals above which a fit leaves more; a scale is not known better than that."""
 OPTIONAL = (
@@ -975,17 +973,17 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
 
     if not near(best):
         others = starts(begun, 1e3 * data.pieces[0].commands.cycle_s)
-        best = in_best_structure(few, [(best.truth, best.parameters), *others], keep)
+        best = in_best_structure(few, best, others, keep)
     progress(0.5)
     polished = None
     if near(best):
         polished = _polished(replays, best, begun, keep)
         if values_of(what_is_left(data, polished.residuals, noise_in_motion(data))) is Values.AXIS:
             return polished
-        best = in_best_structure(few, [(polished.truth, polished.parameters)])
+        best = in_best_structure(few, polished, ())
     progress(0.8)
     scale = Scales(units(data))
-    whole = solve(replays, best.truth, best.parameters, WHOLE_STEPS, known=scale, tempered=True, linear=False)
+    whole = solve(replays, best.truth, best.parameters, STEPS, known=scale, linear=False)
     if polished is not None and misfit(data, polished.residuals) <= misfit(data, whole.residuals):
         return polished
     return _linearised(replays, whole)
@@ -994,30 +992,28 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
 def _polished(replays: Replays, near: Fitted, begun: Truth, keep: Callable[[Fitted], None]) -> Fitted:
     """Continues a fit near the noise on all legs, and adds the parts that the recording shows."""
     data = replays.data
-    (before,) = replays([data.base])
-    most = scales(data, before)
     # The residuals of a wrong simulation are no estimate of the noise: they would reduce the weight of the
     # very channel that shows the error.
-    best = continued(replays, near, NEAR_STEPS, known=expected(data), near=near, tempered=True)
-    best = _ended(replays, best, most)
+    best = continued(replays, near, STEPS, known=expected(data), near=near)
+    best = _ended(replays, best)
     keep(best)
     laws = len(LAWS)  # maximum number of changes
     while True:
-        best = _in_best_minimum(replays, best, begun, most)
+        best = _in_best_minimum(replays, best, begun)
         wider = with_last(replays, best)
         if wider is not best:
-            best = _ended(replays, wider, most)
+            best = _ended(replays, wider)
             continue
         keep(best)
         # The loop comes last, because a wrong spring also leaves residuals of the load angle.
-        other = with_loop(replays, best, most) if laws else None
+        other = with_loop(replays, best) if laws else None
         if other is None:
             break
         laws, best = laws - 1, other
-    best = _ended(replays, with_limit(replays, best, data.base, most), most)
+    best = _ended(replays, with_limit(replays, best, data.base))
     keep(best)
     # Wide differences only for the covariance: near a minimum the loops may be unstable.
-    return continued(replays, best, 0, most, near=best, wide=True)
+    return continued(replays, best, 0, near=best, wide=True)
 
 
 def _linearised(replays: Replays, found: Fitted) -> Fitted:
@@ -1025,7 +1021,7 @@ def _linearised(replays: Replays, found: Fitted) -> Fitted:
     return solve(replays, found.truth, found.parameters, 0)
 
 
-def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, most: Scales) -> Fitted:
+def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
     """Moves the fit to significantly better minima until it finds no other.
 
     This comes after the other parameters are known, because at the start of the fit these places were equally
@@ -1042,13 +1038,13 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, most: Scales)
             places.append(by_halving(few, tried, noise).truth)
         last = best
         for place in places:
-            other = continued(replays, best, MORE_STEPS, most, place)
+            other = continued(replays, best, MORE_STEPS, place)
             if other.loss + EARNED < best.loss:
-                best = _ended(replays, other, most)
+                best = _ended(replays, other)
         if best is last:
             return best
 
 
-def _ended(replays: Replays, near: Fitted, most: Scales) -> Fitted:
+def _ended(replays: Replays, near: Fitted) -> Fitted:
     """Continues a fit to its minimum."""
-    return continued(replays, near, STEPS, most, near=near)
+    return continued(replays, near, STEPS, near=near)

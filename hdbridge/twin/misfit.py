@@ -7,16 +7,14 @@ residuals are smooth in the plant's parameters. The scale of each channel accoun
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
-import signal
-import threading
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from itertools import pairwise, repeat
+from functools import partial
+from itertools import pairwise
 from typing import Any, ClassVar, Final, Self
 
 import numpy as np
@@ -109,11 +107,6 @@ class Data:
     def kinds(self) -> tuple[str, ...]:
         """Kind of each leg."""
         return tuple(kind for each in self.pieces for kind in each.kind)
-
-    @property
-    def duration_s(self) -> float:
-        """Duration of the replayed motion."""
-        return sum(map(_replayed_s, self.pieces))
 
 
 def held_out_legs(recording: Recording) -> tuple[Segment, ...]:
@@ -341,67 +334,36 @@ def _legs(part: Record, legs: Sequence[Segment]) -> tuple[FloatArray, tuple[str,
 
 
 # ----------------------------------------------------------------
-# Parallel replays in worker processes.
+# Parallel replays.
 
-WORTH_S = 2.0
-"""Duration of the motion up to which replays run in this process, because starting workers costs more."""
-
-_data: tuple[Data, Data] | None = None
-"""A worker's recordings, and a few of their legs."""
+MOST_WORKERS: Final = 8
+"""Maximum number of threads by default: a fit asks for some thirty replays at a time."""
 
 
 class Replays:
-    """Replays of the same recordings; a context manager that owns the worker processes."""
+    """Replays of the same recordings; a context manager that owns the threads.
+
+    Compiled replays release Python's lock, so threads do not wait for each other.
+    """
 
     rough: Replays
-    """Replays of a few of their legs, in the same processes."""
+    """Replays of a few of their legs, in the same threads."""
 
     def __init__(self, data: Data, workers: int | None = None) -> None:
         self.data = data
-        self._place = 0
-        wanted = workers if workers is not None else min(os.cpu_count() or 1, 8)
-        self._pool: ProcessPoolExecutor | None = None
-        few = coarse(data)
-        if wanted > 1 and data.duration_s > WORTH_S:
-            # Not forked, because this process may have threads that hold locks.
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(wanted, context, _begin, ((data, few),))
-        rough = self.rough = copy(self)
-        rough.data, rough.rough, rough._place = few, rough, 1
+        self._pool = ThreadPoolExecutor(workers or min(os.cpu_count() or 1, MOST_WORKERS))
+        self.rough = copy(self)
+        self.rough.data, self.rough.rough = coarse(data), self.rough
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: Any) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+        self._pool.shutdown(cancel_futures=True)
 
     def __call__(self, truths: Iterable[Truth]) -> list[dict[str, FloatArray]]:
         """Returns the residuals of each truth, in order."""
-        if self._pool is None or self.data.duration_s <= WORTH_S:
-            return [residuals(self.data, each) for each in truths]
-        return list(self._pool.map(_residuals, truths, repeat(self._place)))
-
-
-def _begin(data: tuple[Data, Data]) -> None:
-    global _data  # noqa: PLW0603 - a process's own, set once where it begins
-    _data = data
-    # Ctrl-C in a terminal reaches every process; the one that waits for this one decides what to keep.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """Ends this process when its parent has been killed; it would otherwise wait for work forever."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None  # a worker has one
-    parent.join()
-    os._exit(1)
-
-
-def _residuals(truth: Truth, place: int) -> dict[str, FloatArray]:
-    assert _data is not None
-    return residuals(_data[place], truth)
+        return list(self._pool.map(partial(residuals, self.data), truths))
 
 
 # ----------------------------------------------------------------
@@ -539,8 +501,8 @@ def _shaken_nm(truth: Truth, off_rad: float) -> float:
     return gain * off_rad / step_s * norm
 
 
-def scales(data: Data, found: Mapping[str, FloatArray], most: Scales | None = None) -> Scales:
-    """Estimates the scales of the residuals in motion; from the error of a smooth replay up to ``most``.
+def scales(data: Data, found: Mapping[str, FloatArray]) -> Scales:
+    """Estimates the scales of the residuals in motion; at least the error of a smooth replay.
 
     Residuals at rest are excluded, because they would dominate a recording that rests half of the time.
     """
@@ -554,8 +516,6 @@ def scales(data: Data, found: Mapping[str, FloatArray], most: Scales | None = No
             # At least half of the readings in motion are not outliers.
             typical = median_deviation(beyond(inside, 0.5 * steps[name]))
             given[name], stray[name] = deviation(inside, steps[name], max(least[name], typical))
-    if most is not None:
-        given = {name: min(each, most.deviation[name]) for name, each in given.items()}
     return Scales(given, steps, stray)
 
 

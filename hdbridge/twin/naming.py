@@ -15,10 +15,12 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.special import ndtri
 
+from hdbridge.analysis.linear import counted as numbered
+from hdbridge.analysis.linear import sandwich
 from hdbridge.analysis.readings import median_deviation
 from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.fit import Fitted, fitted_rows, legs_of_rows, over_legs, solve
+from hdbridge.twin.fit import Fitted, fitted_rows, legs_of_rows, solve
 from hdbridge.twin.misfit import CHANNELS, Data, Misfit, Replays, Scales, counted
 from hdbridge.twin.parameters import Parameter, at_coordinates, by_cause, coordinates, free_value
 from hdbridge.units import figure
@@ -73,9 +75,9 @@ def worse_than_chance(left: FloatArray, change: FloatArray, legs: FloatArray) ->
     minus these; ``legs`` the leg number of each row.
     """
     loss = float(change @ (change + 2.0 * left))
-    within = over_legs((left * change)[:, None], legs)
+    within = sandwich((left * change)[:, None], numbered(legs.astype(np.intp)))
     white = max(1.0, float(left @ left) / max(len(left), 1)) * float(change @ change)
-    scatter = 2.0 * math.sqrt(max(float(np.sum(np.square(within))), white))
+    scatter = 2.0 * math.sqrt(max(float(within[0, 0]), white))
     return loss > -float(ndtri(FALSE_ALARM)) * scatter
 
 
@@ -134,7 +136,7 @@ def explain(
         own = tuple(each for name in causes for each in groups[name])
         return solve(
             replays, start, own, STEPS, np.array(coordinates(base, own)), known=Scales(was), everything=True,
-            tempered=True, linear=False,
+            linear=False,
         )  # fmt: skip
 
     while max(now.values(), default=0.0) > GROWN and len(named) < len(groups):

@@ -351,7 +351,7 @@ def fit_twin(
     """Fits the twin of an axis to recordings that have the commanded motor angle.
 
     ``start`` is the initial simulation: the translated axis file and model, or an older twin. Replays run in
-    ``workers`` processes. InputError if a recording has no command or is of another gear.
+    ``workers`` threads. InputError if a recording has no command or is of another gear.
 
     Causes are named only if the values before and after the fit are the axis's; intervals are given only if
     those after it are. Otherwise a measured response is added, if held-out legs confirm it.

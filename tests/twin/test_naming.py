@@ -39,7 +39,7 @@ class Known:
         out = np.where(leg % 4.0 == 3.0, 1.0, 0.0)
         self.rough = self
         self.data: Any = SimpleNamespace(
-            leg=leg, out=out, pieces=(SimpleNamespace(counts=ones, leg=leg, out=out),), duration_s=1.0
+            leg=leg, out=out, pieces=(SimpleNamespace(counts=ones, leg=leg, out=out),)
         )
 
     def __call__(self, truths: Iterable[Truth]) -> list[dict[str, FloatArray]]:

@@ -285,7 +285,7 @@ def test_an_axis_is_learned_and_a_later_change_of_it_is_named(profile: Path) -> 
     assert learned.motor.inertia_kg_m2 == pytest.approx(3.4e-5, rel=0.3)
     run_here(profile, "model", "commit", profile, "--twin")
     same = run_here(profile, "twin", profile, recording, "--check")
-    assert same.stdout.startswith("Nothing has changed since the twin was made.")
+    assert same.stdout.startswith("Nothing has changed since the twin was made")
     stiffer = Truth.load(DEMO).model_dump(by_alias=True)
     stiffer["motor"]["coulomb_nm"] = 0.068
     later = trips(Truth.model_validate(stiffer), profile / "later")
