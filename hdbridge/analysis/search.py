@@ -322,9 +322,9 @@ class Search:
         """
         if not effect.waves():
             return False
-        own = [at for at, each in enumerate(fitted.parameters) if not 0 <= each.effect < self.base]
+        others = [at for at, each in enumerate(fitted.parameters) if not 0 <= each.effect < self.base]
         columns = self.estimator.weighted(self.estimator.columns(effect, fitted.hypothesis.start))
-        left, _ = fitted.linearised.of(np.array(own, dtype=np.intp)).left(columns)
+        left, _ = fitted.linearised.of(np.array(others, dtype=np.intp)).left(columns)
         share = np.max(np.diag(left) / np.maximum(np.sum(columns**2, axis=0), 1e-300))
         return bool(share < self.scales.wave_share_left)
 

@@ -82,3 +82,15 @@ def test_parts_are_as_wide_as_the_model_file_says(model: TransmissionModel) -> N
     amplitude = model.effects[1 - loop].parameters()["orders"][0]["amplitude_arcsec"]
     assert orders[0].parameters["0"][1] == pytest.approx(np.hypot(0.04 * amplitude, 0.1))
     assert of_loop.strain(model.effects) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_changed_loop_is_named_if_another_law_fits_as_well(
+    columns: Callable[..., dict[str, Any]], model: TransmissionModel, seed: int
+) -> None:
+    """Sweeps alone do not show the memory of a loop."""
+    whole = columns(seed=seed, offset=25.0)
+    sweeps = Record({name: each[whole["time_s"] < 90.0] for name, each in whole.items()})
+    (found,) = diagnose(sweeps, model).findings
+    assert found.cause == "hysteresis_parameters"
+    assert found.parameters["offset_arcsec"].value == pytest.approx(25.0, rel=0.02)

@@ -1,0 +1,83 @@
+"""Fast moves of a load on its spring: wind-up and ringing of an ordinary axis are silent, of a soft one named."""
+
+from __future__ import annotations
+
+import math
+from types import ModuleType
+
+import numpy as np
+import pytest
+from support.filters import filtered
+
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.records.record import Record
+
+STEP_S, EVERY = 5e-4, 20
+"""Time step of the plant, and steps between samples (100 Hz)."""
+DAMPING = 0.1
+
+
+def moved(rng: np.random.Generator) -> np.ndarray:
+    """Returns the motor angle (n,) of moves whose speed rises and falls in a raised cosine, and of rests."""
+    speed = [np.zeros(2000)]
+    for _ in range(40):
+        rows = int(rng.integers(200, 700))
+        shape = 1.0 - np.cos(math.tau * np.arange(rows) / rows)
+        speed += [rng.choice([-1.0, 1.0]) * rng.uniform(300.0, 1500.0) * shape, np.zeros(1000)]
+    return np.cumsum(np.concatenate(speed)) * STEP_S
+
+
+def on_spring(base: np.ndarray, hertz: float) -> np.ndarray:
+    """Returns the motion of a mass behind a spring and a damper, by the bilinear transform."""
+    natural = math.tau * hertz
+    damper, double = 4.0 * DAMPING * natural / STEP_S, 4.0 / STEP_S**2
+    spring = natural**2 * np.array([1.0, 2.0, 1.0])
+    forward = damper * np.array([1.0, 0.0, -1.0]) + spring
+    back = forward + double * np.array([1.0, -2.0, 1.0])
+    return base[0] + filtered(forward / back[0], back / back[0], base - base[0])
+
+
+@pytest.fixture
+def seen(plant: ModuleType, model: TransmissionModel):
+    """Diagnoses fast moves of a load with this natural frequency, and with counts lost halfway."""
+
+    def run(hertz: float, lost_arcsec: float = 0.0) -> Diagnosis:
+        rng = np.random.default_rng(3)
+        motor = moved(rng)
+        error = plant.loop(motor, "plain", 40.0, 20.0, 1.6)
+        for order, amplitude, phase in plant.ORDERS:
+            error = error + amplitude * np.cos(np.radians(order * motor + phase))
+        load = on_spring(motor / plant.RATIO * 3600.0 + error, hertz)
+        load[len(load) // 2 :] += lost_arcsec
+        rows = slice(0, None, EVERY)
+        noisy = load[rows] + 0.3 * rng.normal(size=len(load[rows]))
+        columns = {
+            "time_s": np.arange(len(motor))[rows] * STEP_S,
+            "motor_position_deg": np.round(motor[rows] / 0.022) * 0.022,
+            "motor_target_deg": motor[rows],
+            "load_position_deg": np.round(noisy / 0.45) * 0.45 / 3600.0,
+        }
+        return diagnose(Record(columns), model)
+
+    return run
+
+
+def test_an_ordinary_load_is_silent(seen) -> None:
+    found = seen(45.0)
+    assert not found.findings
+    assert any("swings on its spring at 4" in each for each in found.remarks)
+
+
+def test_the_wind_up_of_a_soft_load_is_named_without_its_ringing(seen) -> None:
+    (found,) = seen(28.0).findings
+    assert found.cause == "inertial_windup"
+    stated = found.parameters["inertia_over_stiffness_s2"].value
+    assert stated == pytest.approx(1.0 / (math.tau * 28.0) ** 2, rel=0.1)
+
+
+def test_a_larger_cause_does_not_hide_the_swing(seen) -> None:
+    found = seen(45.0, lost_arcsec=60.0)
+    assert [each.cause for each in found.findings] == ["count_loss"]
+    assert any("swings on its spring at 4" in each for each in found.remarks)
