@@ -1,4 +1,4 @@
-"""Fast moves of a load on its spring: wind-up and ringing of an ordinary axis are silent, of a soft one named."""
+"""Fast moves of a load on its spring: an ordinary axis is silent, the wind-up of a soft one is named."""
 
 from __future__ import annotations
 
