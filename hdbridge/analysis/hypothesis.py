@@ -120,6 +120,11 @@ class Fitted:
         """Returns the columns of one effect."""
         return np.array([i for i, each in enumerate(self.parameters) if each.effect == effect], dtype=np.intp)
 
+    def without_parts(self, number: int) -> Linearised:
+        """Returns the linearised fit without its first ``number`` effects, which are the model's own."""
+        others = [at for at, each in enumerate(self.parameters) if not 0 <= each.effect < number]
+        return self.linearised.of(np.array(others, dtype=np.intp))
+
 
 class Estimator:
     """Fits hypotheses to one record; caches design-matrix columns."""

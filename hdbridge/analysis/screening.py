@@ -50,13 +50,19 @@ class Score:
     """Predicted fall in chi square, linearised."""
     freedom: int
     """Number of directions that the hypothesis does not span."""
+    share: float
+    """Largest share of a column's square that the causes of the hypothesis leave.
+
+    The model's own parts do not count, because their calibration says how large they are.
+    """
 
 
 class Screen:
     """Weighted columns of all candidates, computed once."""
 
-    def __init__(self, estimator: Estimator, candidates: Sequence[Effect], start: Start) -> None:
-        self._candidates = tuple(candidates)
+    def __init__(self, estimator: Estimator, candidates: Sequence[Effect], start: Start, parts: int) -> None:
+        """``parts`` is the number of the model's own effects."""
+        self._candidates, self._parts = tuple(candidates), parts
         blocks = [estimator.weighted(estimator.columns(each, start)) for each in candidates]
         self._slices: list[slice] = []
         at = 0
@@ -71,30 +77,36 @@ class Screen:
         fit, matrix = fitted.linearised, self._matrix
         shadow = fit.basis.T @ matrix
         moment = matrix.T @ fit.residual - shadow.T @ fit.slack
+        taken = np.sum((fitted.without_parts(self._parts).basis.T @ matrix) ** 2, axis=0)
         return [
-            _score(effect, np.diag(gram), gram - shadow[:, part].T @ shadow[:, part], moment[part])
-            for effect, gram, part in zip(self._candidates, self._grams, self._slices, strict=True)
+            _score(effect, np.diag(gram), gram - shadow[:, at].T @ shadow[:, at], moment[at], taken[at])
+            for effect, gram, at in zip(self._candidates, self._grams, self._slices, strict=True)
         ]
 
+    def score(self, effect: Effect, columns: FloatArray, fitted: Fitted) -> Score:
+        """Scores another candidate by its weighted columns."""
+        taken = np.sum((fitted.without_parts(self._parts).basis.T @ columns) ** 2, axis=0)
+        return _score(effect, np.sum(columns**2, axis=0), *fitted.linearised.left(columns), taken)
 
-def score_of(effect: Effect, columns: FloatArray, fitted: Fitted) -> Score:
-    """Scores one candidate by its weighted columns."""
-    return _score(effect, np.sum(columns**2, axis=0), *fitted.linearised.left(columns))
 
-
-def _score(effect: Effect, size: FloatArray, gram: FloatArray, moment: FloatArray) -> Score:
-    """Scores from the squares of the columns, and the remaining Gram matrix and moment."""
+def _score(
+    effect: Effect, size: FloatArray, gram: FloatArray, moment: FloatArray, taken: FloatArray
+) -> Score:
+    """Scores from the columns' squares, their remaining Gram matrix and moment, and the squares that other
+    causes explain.
+    """
     seen = size > 0.0
     if not np.any(seen):
-        return Score(effect, 0.0, 0)
+        return Score(effect, 0.0, 0, 0.0)
+    share = float(np.max(1.0 - taken[seen] / size[seen]))
     scale = np.sqrt(size[seen])
     left = gram[np.ix_(seen, seen)] / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(left)
     kept = values > SHARE_LEFT
     if not np.any(kept):
-        return Score(effect, 0.0, 0)
+        return Score(effect, 0.0, 0, share)
     inner = vectors[:, kept].T @ (moment[seen] / scale)
-    return Score(effect, float(np.sum(inner**2 / values[kept])), int(np.count_nonzero(kept)))
+    return Score(effect, float(np.sum(inner**2 / values[kept])), int(np.count_nonzero(kept)), share)
 
 
 # Matched filters for shapes whose place no grid covers, evaluated at all places at once (`Sought`).

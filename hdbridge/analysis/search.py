@@ -16,7 +16,7 @@ import numpy as np
 from hdbridge.analysis.acceptance import all_pieces_seen, evident, gate
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.linear import orthonormal, unknown
-from hdbridge.analysis.screening import Score, Screen, candidates, filtered, proposed, score_of
+from hdbridge.analysis.screening import Score, Screen, candidates, filtered, proposed
 from hdbridge.axis.effects import (
     CATALOGUE,
     Channel,
@@ -310,30 +310,18 @@ class Search:
         best: dict[tuple[str, int], Score] = {}
         for each in sorted(scores, key=lambda each: -net[id(each)]):
             enough = net[id(each)] > self.scales.enter and each.effect.name not in passed
-            if enough and not self._is_of_others(fitted, each.effect):
+            explained = each.effect.waves() and each.share < self.scales.wave_share_left
+            if enough and not explained:
                 best.setdefault((each.effect.name, each.freedom), each)
         causes = list(dict.fromkeys(cause for cause, _ in best))[:BEST]
         return [each for (cause, _), each in best.items() if cause in causes]
-
-    def _is_of_others(self, fitted: Fitted, effect: Effect) -> bool:
-        """Returns True for a wave that the causes of the hypothesis explain.
-
-        The model's own parts do not count, because their calibration says how large they are.
-        """
-        if not effect.waves():
-            return False
-        others = [at for at, each in enumerate(fitted.parameters) if not 0 <= each.effect < self.base]
-        columns = self.estimator.weighted(self.estimator.columns(effect, fitted.hypothesis.start))
-        left, _ = fitted.linearised.of(np.array(others, dtype=np.intp)).left(columns)
-        share = np.max(np.diag(left) / np.maximum(np.sum(columns**2, axis=0), 1e-300))
-        return bool(share < self.scales.wave_share_left)
 
     def _scores(self, fitted: Fitted) -> list[Score]:
         screen = self._screen(fitted)
         scores = screen.scores(fitted)
         for effect in filtered(self.estimator, fitted):
             columns = self.estimator.columns(effect, fitted.hypothesis.start)
-            scores.append(score_of(effect, self.estimator.weighted(columns), fitted))
+            scores.append(screen.score(effect, self.estimator.weighted(columns), fitted))
         return scores
 
     def _screen(self, fitted: Fitted) -> Screen:
@@ -342,7 +330,7 @@ class Search:
         if key not in self._screens:
             offered = candidates(self.estimator.data, base)
             self._screens.clear()
-            self._screens[key] = Screen(self.estimator, offered, fitted.hypothesis.start)
+            self._screens[key] = Screen(self.estimator, offered, fitted.hypothesis.start, self.base)
         return self._screens[key]
 
     def cost(self, fitted: Fitted) -> float:
