@@ -24,8 +24,14 @@ def plant() -> ModuleType:
 def columns(plant: ModuleType) -> Callable[..., dict[str, Any]]:
     """Columns of a short bench plan on an axis with these effects."""
 
-    def make(effects: dict[str, Any] | None = None, seed: int = 1, command: bool = True, **axis: Any) -> Any:
-        plan = plant.Plan(rate_hz=16.0, scale=0.2, load_turns=1.05, steps=16)
+    def make(
+        effects: dict[str, Any] | None = None,
+        seed: int = 1,
+        command: bool = True,
+        rate_hz: float = 12.0,
+        **axis: Any,
+    ) -> Any:
+        plan = plant.Plan(rate_hz=rate_hz, scale=0.2, load_turns=1.05, steps=16)
         return plant.record(plant.Truth(effects=effects or {}, **axis), plan, seed, command)
 
     return make

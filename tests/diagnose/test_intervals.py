@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.filters import binomial_quantile
+from support.filters import least
 
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Parameter
@@ -88,7 +88,7 @@ def test_intervals_have_their_nominal_coverage(
                     halves.append(0.5 * (parameter.high - parameter.low) / abs(true))
     assert len(inside) == 20 * len(SEEDS)
     # So few are inside by chance in one run of a thousand, were the share as low as LEAST.
-    assert sum(inside) >= binomial_quantile(1e-3, len(inside), LEAST), f"{sum(inside)} of {len(inside)}"
+    assert sum(inside) >= least(len(inside), LEAST, 1e-3), f"{sum(inside)} of {len(inside)}"
     assert np.median(halves) < 0.02
 
 
@@ -113,7 +113,7 @@ def test_a_changed_order_is_as_uncertain_as_its_reference(columns: Columns, plan
             truth = {f"order_{order}_amplitude_arcsec": size, f"order_{order}_phase_deg": phase}
             inside += [held(found.parameters[name], name, value) for name, value in truth.items()]
     # Without the calibration's own variance in them one in ten holds.
-    assert sum(inside) >= binomial_quantile(1e-3, len(inside), LEAST), f"{sum(inside)} of {len(inside)}"
+    assert sum(inside) >= least(len(inside), LEAST, 1e-3), f"{sum(inside)} of {len(inside)}"
 
 
 def swinging(columns: dict[str, Any], orders: Any, frequency_hz: float) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import pytest
-from support.rates import least
+from support.filters import least
 from support.trials import CAUSES, NONE, PAIRS, SHORT, SPECIAL, UNKNOWN, Verdict, planted, verdict
 
 from hdbridge.analysis.diagnosis import diagnose

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.filters import filtered
-from support.rates import least
+from support.filters import filtered, least
 
 from hdbridge.analysis.acceptance import gate
 from hdbridge.analysis.diagnosis import diagnose

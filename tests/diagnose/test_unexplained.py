@@ -39,7 +39,7 @@ def test_residuals_of_another_law_at_reversals_belong_to_the_loop(
     diagnosed: Callable[..., Diagnosis], law: str
 ) -> None:
     """An arcsecond rms, but none of it where the axis has gone on further than a loop remembers."""
-    (found,) = diagnosed(law=law).findings
+    (found,) = diagnosed(law=law, rate_hz=16.0).findings
     # At 16 Hz the errors of the turning points are as large as what it leaves.
     assert found.cause in LOOPS | ({"unexplained"} if law == "bouc_wen" else set())
 

@@ -14,7 +14,6 @@ from functools import cache
 import numpy as np
 from foreign.machine import Encoders, ForeignMachine
 from foreign.mechanics import ARCSEC, BoucWen, MaxwellSlip, Mechanics, Order
-from foreign.response import motor_response, tooth_response
 from foreign.servos import STRUCTURES, Law, Observed, PiNotch, Piv, Servo, StateFeedback
 
 PERIOD_MS = {"pi_notch": 0.25, "piv": 0.1, "observed": 0.5, "state_feedback": 0.2}
@@ -55,14 +54,6 @@ class Truth:
     def machine(self) -> ForeignMachine:
         """The axis at rest at zero, with the noise of its seed."""
         return ForeignMachine(self.mechanics, self.servo, self.encoders, self.seed)
-
-    def response(self, frequency_hz: np.ndarray) -> np.ndarray:
-        """Linear response from set-point to motor angle; see `motor_response`."""
-        return motor_response(self.mechanics, self.servo, frequency_hz, self.cycle_ms / 1000.0)
-
-    def ripple(self, frequency_hz: np.ndarray) -> np.ndarray:
-        """Load angle per tooth error without compensation; see `tooth_response`."""
-        return tooth_response(self.mechanics, self.servo, frequency_hz, self.cycle_ms / 1000.0)
 
     def by_place(self) -> dict[str, float]:
         """True values by their place in a truth file, if there is one with the same meaning."""

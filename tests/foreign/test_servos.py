@@ -1,4 +1,4 @@
-"""The foreign servos: response in closed form, settling, limits, orders in motion."""
+"""The foreign servos: steps as in the textbook, settling, limits."""
 
 import math
 from dataclasses import replace
@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from foreign.draw import REST_DEG, Truth, draw
 from foreign.machine import Encoders, ForeignMachine
-from foreign.mechanics import ARCSEC, DT_S, MaxwellSlip, static_error_arcsec
-from foreign.response import motor_response
-from foreign.servos import INTERPOLATIONS, STRUCTURES, Piv, StateFeedback
+from foreign.mechanics import DT_S, MaxwellSlip, static_error_arcsec
+from foreign.servos import STRUCTURES, Piv, StateFeedback
 
 FINE = Encoders(1 << 20, 64, 0.0, 1 << 23, 0.0)
 AXES = [(1, structure) for structure in STRUCTURES]
@@ -38,33 +37,6 @@ def run(machine: ForeignMachine, targets: np.ndarray, cycle_s: float) -> np.ndar
 
 def counts(truth: Truth, motor_deg):
     return np.round(np.asarray(motor_deg) / 360.0 * truth.encoders.motor_counts_per_turn)
-
-
-def cruise(truth: Truth, speed_deg_s: float, duration_s: float) -> tuple[ForeignMachine, np.ndarray]:
-    """The axis at even speed of the load: `run` after the first one and a half seconds."""
-    cycle_s, machine = truth.cycle_ms / 1000.0, truth.machine()
-    time_s = np.arange(1, round((duration_s + 1.5) / cycle_s)) * cycle_s
-    path_deg = np.where(time_s < 0.5, time_s**2, time_s - 0.25) * speed_deg_s * truth.mechanics.ratio
-    return machine, run(machine, counts(truth, path_deg), cycle_s)[round(1.5 / DT_S) :]
-
-
-@pytest.mark.parametrize("interpolation", INTERPOLATIONS)
-def test_a_chirp_finds_the_response_in_closed_form(axis, interpolation):
-    servo = replace(axis.servo, interpolation=interpolation, torque_limit_percent=1e6, speed_limit_rad_s=1e6)
-    mechanics, cycle_s = linear(axis), 0.004
-    time_s = np.arange(3000) * cycle_s
-    octaves = np.log(240.0) / 9.0  # from 0.5 to 120 Hz in 9 s, then rest
-    chirp = 2e4 * np.sin(math.pi / octaves * np.expm1(octaves * time_s))
-    chirp *= np.clip(np.minimum(time_s, 9.0 - time_s), 0.0, 0.5) / 0.5
-    motor = run(ForeignMachine(mechanics, servo, FINE, 0), chirp[1:], cycle_s)[:, 0] / math.tau * (1 << 20)
-    frequency_hz = np.array([1.0, 2.0, 5.0, 8.0, 12.0, 18.0, 27.0, 40.0, 60.0, 80.0, 100.0])
-    turning = -1j * math.tau * frequency_hz[:, None]
-    motor_time_s = (np.arange(motor.size) + 1) * DT_S
-    spectrum = np.array([np.exp(row * motor_time_s) @ motor for row in turning]) * DT_S
-    measured = spectrum / (np.exp(turning * time_s) @ chirp * cycle_s)
-    expected = motor_response(mechanics, servo, frequency_hz, cycle_s)
-    assert measured[0] == pytest.approx(expected[0], rel=1e-3)
-    assert np.abs(measured - expected) == pytest.approx(0.0, abs=5e-3 * np.abs(expected).max())
 
 
 def step_deg(mechanics, servo, duration_s: float) -> np.ndarray:
@@ -128,24 +100,6 @@ def test_the_load_at_rest_follows_the_static_law(axis):
             target_deg, abs=max(REST_DEG, count_deg) + 0.5 * count_deg
         )
         assert np.ptp(path[-round(0.2 / DT_S) :]) <= 0.05  # does not hunt
-
-
-@pytest.mark.parametrize("share", [0.01, 0.2, 1.0])
-def test_at_even_speed_each_order_shows_at_its_frequency_with_the_amplitude_in_closed_form(axis, share):
-    speed = share * axis.velocity_deg_s
-    _, rows = cruise(axis, speed, max(2.0, 360.0 * 2.0 / axis.mechanics.ratio / speed))
-    orders = axis.mechanics.motor_orders
-    time_s = np.arange(len(rows)) * DT_S
-    columns = [np.ones_like(time_s), time_s]
-    for each in orders:
-        columns += [np.cos(each.order * rows[:, 0]), -np.sin(each.order * rows[:, 0])]
-    fitted = np.linalg.lstsq(np.array(columns).T, rows[:, 1], rcond=None)[0][2:] / ARCSEC
-    measured = fitted[0::2] + 1j * fitted[1::2]
-    frequency_hz = np.array([each.order for each in orders]) * speed * axis.mechanics.ratio / 360.0
-    true = [each.amplitude_arcsec * np.exp(1j * math.radians(each.phase_deg)) for each in orders]
-    expected = np.array(true) * axis.ripple(frequency_hz)
-    # The tooth error shakes the motor through its slope as well: mixed orders, second order in the error.
-    assert np.abs(measured - expected) == pytest.approx(0.0, abs=0.06 * np.abs(expected).max())
 
 
 def test_limits_hold_and_integrators_recover(axis):

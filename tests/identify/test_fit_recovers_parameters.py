@@ -86,7 +86,14 @@ def test_an_unchanged_axis_gets_no_new_model(bench):
     assert not again.held_out.improves, again.held_out.text
 
 
-@pytest.mark.parametrize(("width", "exponent"), [(7.0, 2.0), (35.0, 2.6), (30.0, 1.25)])
+@pytest.mark.parametrize(
+    ("width", "exponent"),
+    [
+        (7.0, 2.0),
+        pytest.param(35.0, 2.6, marks=pytest.mark.slow),
+        pytest.param(30.0, 1.25, marks=pytest.mark.slow),
+    ],
+)
 def test_shapes_far_from_the_typical_one_are_found(bench, width, exponent):
     axis = bench.axis(width=width, exponent=exponent)
     result = fit(axis.record(bench.plan(turns=8.0)), axis.ratio, bench.options)

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 POWERLESS = frozenset({0x00, 0x02, 0x80})
 """Controlwords that leave a drive without power or remove it: disable voltage, quick stop, fault reset."""
 ENABLE_OPERATION = 0x0F
+PRE_OPERATIONAL = (0x000, 0x80)
+"""Sent by the loop itself to each node when the bus is open again."""
 SILENT = frozenset({AxisState.UNVERIFIED, AxisState.LENT, AxisState.LATCHED})
 LATCHES = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
 STANDING_COUNTS = 4
@@ -99,7 +101,7 @@ class Laws:
         if function == 0x200:
             self.axes[node].take(data)
         elif can_id == 0x000 or function == 0x600:
-            self.relayed += 1
+            self.relayed += (can_id, data[0]) != PRE_OPERATIONAL
             nodes = {data[1]} if can_id == 0x000 else {node}
             assert nodes <= set(self.axes)
         else:

@@ -1,10 +1,13 @@
-"""Linear filters and binomial quantiles; `scipy.signal` and `scipy.stats` take a second to load."""
+"""Linear filters, and tests of a claimed rate; `scipy.signal` and `scipy.stats` take a second to load."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg.blas import dtbsv
 from scipy.special import bdtr
+
+CHANCE = 0.01
+"""Probability of refusing a correct claim."""
 
 
 def filtered(forward: Sequence[float], back: Sequence[float], values: np.ndarray) -> np.ndarray:
@@ -14,6 +17,6 @@ def filtered(forward: Sequence[float], back: Sequence[float], values: np.ndarray
     return dtbsv(order, np.tile(np.reshape(back, (-1, 1)), len(values)), driven, lower=1, diag=1)
 
 
-def binomial_quantile(chance: float, trials: int, rate: float) -> int:
-    """Returns the quantile of a number of successes, as `scipy.stats.binom.ppf` does."""
+def least(trials: int, rate: float, chance: float = CHANCE) -> int:
+    """Returns the minimum count of successes; fewer have a probability below ``chance`` at this rate."""
     return next(count for count in range(trials + 1) if bdtr(count, trials, rate) >= chance)
