@@ -75,14 +75,14 @@ class Follower:
         """Time at which the model in use was last changed."""
         self.unwatched = NO_LOAD_ENCODER if axis.load_encoder.is_motor_encoder else ""
         """Reason why gear and load encoder are not watched; empty if they are."""
-        self._axis, self._index = axis.name, index
+        self._index = index
         self._settings = settings or AdaptationSettings()
         self._drift = DriftModel(model)
         motor_count = axis.motor_encoder.resolution_arcsec / axis.gear.ratio
         self._sigma_arcsec = math.hypot(motor_count, axis.load_encoder.resolution_arcsec) / UNIFORM
         """Standard deviation of an observation due to quantisation by the encoders' counts."""
         noise = max(held_out_arcsec(model), motor_count / UNIFORM)
-        self.watch = Watch(axis.name, self._drift, noise)
+        self.watch = Watch(self._drift, noise)
         channels = tuple(BY_KEY[key] for key in axis.channels)
         self._servo = ServoWatch(axis, model)
         self._measuring = Measuring(self._drift, self._settings.slow_deg_s, channels)
@@ -145,7 +145,7 @@ class Follower:
         raised: list[Raised] = []
         if servo is not None:
             verdict = Verdict.RETUNED if self._servo.retuned else self.watch.verdict
-            raised.append(Raised(self._now_s, self._axis, verdict, servo))
+            raised.append(Raised(verdict, servo))
         if self.unwatched:
             return Outcome(raised)
         axis, times_s = axis[first:], times_s[first:]

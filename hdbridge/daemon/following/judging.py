@@ -91,8 +91,6 @@ class Verdict(Enum):
 class Raised(NamedTuple):
     """A new verdict."""
 
-    time_s: float
-    axis: str
     verdict: Verdict
     evidence: str
     """Evidence in words with figures."""
@@ -288,11 +286,10 @@ def _places(observations: Sequence[Observation]) -> tuple[FloatArray, FloatArray
 class Watch:
     """Verdicts on one axis and its model."""
 
-    def __init__(self, axis: str, drift: DriftModel, noise_arcsec: float) -> None:
+    def __init__(self, drift: DriftModel, noise_arcsec: float) -> None:
         """``noise_arcsec`` is the standard deviation of an observation."""
         self.evidence: Evidence | None = None
         """Last evidence; None until enough observations exist."""
-        self._axis = axis
         self._calibrated = bool(drift.model.effects)
         self._judge = Judge(drift, noise_arcsec)
         self._adopted = self._other = Verdict.HOLDS
@@ -317,14 +314,14 @@ class Watch:
             self._observations.clear()
             self._zero = None
             reason = status.reason or "nothing speaks against the load encoder"
-            raised.append(Raised(now_s, self._axis, self.verdict, reason))
+            raised.append(Raised(self.verdict, reason))
         self._observations.extend(observations)
         self._new |= bool(observations)
         passed_s = now_s - self._judged_s
         if not 0.0 <= passed_s < EVERY_S:
             self._judged_s = now_s
             if self._test(now_s, min(passed_s, 2.0 * EVERY_S)) and self.evidence is not None:
-                raised.append(Raised(now_s, self._axis, self.verdict, self.evidence.text))
+                raised.append(Raised(self.verdict, self.evidence.text))
         return raised
 
     def _test(self, now_s: float, passed_s: float) -> bool:
