@@ -254,8 +254,12 @@ class Search:
         place = _last(trial, cause)
         effect = trial.hypothesis.effects[place]
         reason = self.refusal(effect, as_alias)
-        most = self.scales.extrapolated * self.peak(trial, place)
-        if not reason and not as_alias and effect.largest_piece_arcsec() > most:
+        alike = [
+            at for at, each in enumerate(trial.hypothesis.effects) if at >= self.base and each.name == cause
+        ]
+        most = self.scales.extrapolated * self.peak(trial, *alike)
+        size = max(effect.largest_piece_arcsec(), self.peak(trial, place))  # two of a kind may cancel
+        if not reason and not as_alias and size > most:
             reason = "the record shows too little of it to say how large it is"
         elif (
             not reason and Channel.TIME in effect.needs() and effect.shows(self.estimator.motion) is not None
@@ -295,10 +299,12 @@ class Search:
         told = asked - causes
         return [f"{cause}: {why}" for cause, why in self.refusals.items() if cause in told]
 
-    def peak(self, fitted: Fitted, place: int) -> float:
-        """Returns half the span of an effect's contribution in this record, arcsec, without rare extremes."""
-        hypothesis = fitted.hypothesis
-        return self.estimator.half_span(self.estimator.does(hypothesis.effects[place], hypothesis.start))
+    def peak(self, fitted: Fitted, *places: int) -> float:
+        """Returns half the span of the sum of effects in this record, arcsec, without rare extremes."""
+        effects, start = fitted.hypothesis.effects, fitted.hypothesis.start
+        return self.estimator.half_span(
+            np.sum([self.estimator.does(effects[at], start) for at in places], axis=0)
+        )
 
     def _shortlist(self, fitted: Fitted, scores: Sequence[Score], left_out: str = "") -> list[Score]:
         """Returns, for each of the best causes, the best candidate of each number of parameters.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -126,3 +127,14 @@ def test_equal_steps_over_many_lines_do_not_show_line_errors(
         period_s=1.0 / RATE_HZ,
     )
     assert (not lines.unidentifiable(seen)) is resolved
+
+
+def test_two_vibrations_do_not_cancel(
+    columns: Callable[..., dict[str, Any]], model: TransmissionModel
+) -> None:
+    """A tone whose amplitude passes through zero is the limit of two large ones with opposite signs."""
+    record = columns()
+    time_s = record["time_s"]
+    tone = 4.0 * np.sin(math.tau * 3.13 * time_s) * (2.0 * time_s / time_s[-1] - 1.0)
+    record["load_position_deg"] = record["load_position_deg"] + tone / 3600.0
+    assert all(each.peak_arcsec < 5.0 for each in diagnose(Record(record), model).findings)
