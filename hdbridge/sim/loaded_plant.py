@@ -156,10 +156,13 @@ class LoadedPlant(Plant):
         if not self._spring.touches(halfway):
             beyond -= self._damping * closing
         spring = self._stiffness * (lag - 0.5 * dt * load_speed) - self._damping * load_speed
-        self._turn_motor(torque_nm, brake_nm, spring + beyond)
+        moved = self._turn_motor(torque_nm, brake_nm, spring + beyond)
 
-        new_output = self.output_deg
-        rate = (new_output - output) / dt
+        if moved or not self._gear.by_motor_only:
+            self.output_deg = new_output = self._gear.turned_deg(now)
+            rate = (new_output - output) / dt
+        else:
+            new_output, rate = output, 0.0
         outer = beyond + self._outer_nm(load + 0.5 * dt * load_speed, load_speed)
         shift = outer / self._stiffness
         spline = self._flexspline

@@ -4,8 +4,8 @@ The stiff linear parts (load on the gear's spring, encoder on its coupling) are 
 that moves linearly within a step. The step of the motor is implicit in its friction: Coulomb friction is a
 set-valued force, so a motor whose torque does not exceed it stands perfectly still, without creep or chatter.
 
-The gear passes on power without loss: its reaction on the motor is the spring's torque over the momentary
-ratio, which tooth error and hysteresis change by one to ten per cent.
+The gear's reaction on the motor is the spring's torque divided by the ratio. The tooth error changes the
+momentary ratio by one or two per cent; the reaction neglects this, the angles do not.
 
 `Plant` has a linear spring and a load without external torques; `hdbridge.sim.loaded_plant` has the rest.
 """
@@ -18,10 +18,6 @@ from hdbridge.sim.state import Conditions, state
 from hdbridge.sim.truth import Truth
 
 RAD_PER_DEG = math.pi / 180.0
-LEAST_TRAVEL_DEG = 1e-6
-"""Motor travel in a substep below which the momentary ratio stays: a ten-thousandth of a usual count."""
-MOST_LEVER = 2.0
-"""Limit of the momentary ratio's inverse, times the ratio: some laws of hysteresis begin infinitely steep."""
 
 
 @state
@@ -52,7 +48,6 @@ class Plant:
     _flexspline: Transition
     _gear: Gear
     _inertia: float
-    _lever: float
     _load_drag: float
     _load_friction: float
     _ratio: float
@@ -67,10 +62,8 @@ class Plant:
         self._ratio = gear.ratio
         self._stiffness = gear.stiffness_nm_per_rad * RAD_PER_DEG
         self._damping = gear.damping_nm_s_per_rad * RAD_PER_DEG
-        # Spring torque, averaged over a step, by the sum of the output's speeds at its ends.
-        self._arm = self._stiffness * dt / 4.0 + self._damping / 2.0
-        # Output travel over motor travel in the latest substep.
-        self._lever = 1.0 / gear.ratio
+        # Spring torque, averaged over a step, by the sum of the motor's speeds at its ends.
+        self._arm = (self._stiffness * dt / 4.0 + self._damping / 2.0) / gear.ratio
         self._inertia = motor.inertia_kg_m2 * RAD_PER_DEG / dt
         self._drag = self._cold_drag = motor.viscous_nm_s_per_rad * RAD_PER_DEG
         self._coulomb = self._cold_coulomb = motor.coulomb_nm
@@ -106,11 +99,14 @@ class Plant:
         load_speed = self.load_deg_s
         lag = output - load
         spring = self._stiffness * (lag - 0.5 * dt * load_speed) - self._damping * load_speed
-        self._turn_motor(torque_nm, brake_nm, spring)
+        moved = self._turn_motor(torque_nm, brake_nm, spring)
 
         # Load, seen from the gear's output.
-        new_output = self.output_deg
-        rate = (new_output - output) / dt
+        if moved or not self._gear.by_motor_only:
+            self.output_deg = new_output = self._gear.turned_deg(now)
+            rate = (new_output - output) / dt
+        else:
+            new_output, rate = output, 0.0
         spline = self._flexspline
         slip = load_speed - rate
         new_load = new_output + spline.distance_by_rate * slip - spline.distance_by_distance * lag
@@ -137,38 +133,32 @@ class Plant:
         self._sticking = self._cold_sticking * factor
         self._drag = self._cold_drag * factor
 
-    def _turn_motor(self, torque_nm: float, brake_nm: float, spring: float) -> None:
-        """Runs the part of motor and gear in a substep.
+    def _turn_motor(self, torque_nm: float, brake_nm: float, spring: float) -> bool:
+        """Runs the motor's part of a substep; returns True if it moved.
 
         ``spring`` is the spring's torque without the share that the motor's own motion adds: arm * (old
-        speed + new speed) of the output.
+        speed + new speed).
         """
         now, dt, speed = self.now, self._dt, self.motor_deg_s
         held = self._coulomb + brake_nm
         if self._sticking:
             speeds = speed / self._stribeck
             held += self._sticking * math.exp(-speeds * speeds)
-        arm = self._arm * self._lever * self._lever
-        push = (self._inertia - arm) * speed + torque_nm - spring * self._lever
+        arm = self._arm / self._ratio
+        push = (self._inertia - arm) * speed + torque_nm - spring / self._ratio
         if push > held:
             new_speed = (push - held) / (self._inertia + arm + self._drag)
         elif push < -held:
             new_speed = (push + held) / (self._inertia + arm + self._drag)
         else:
             new_speed = 0.0
-        self.motor_deg_s = new_speed
         moved = new_speed != 0.0 or speed != 0.0
-        travel = 0.5 * dt * (speed + new_speed)
         if moved:
-            now.motor_deg += travel
+            now.motor_deg += 0.5 * dt * (speed + new_speed)
             turned = abs(new_speed)
             self.loss_j += (held + self._drag * turned) * turned * RAD_PER_DEG * dt
-        if moved or not self._gear.by_motor_only:
-            output = self._gear.turned_deg(now)
-            if abs(travel) > LEAST_TRAVEL_DEG:
-                lever = (output - self.output_deg) / travel
-                self._lever = min(max(lever, 0.0), MOST_LEVER / self._ratio)
-            self.output_deg = output
+        self.motor_deg_s = new_speed
+        return moved
 
     def _turn_encoder(self, load: float, new_load: float) -> None:
         """Runs the load encoder's part of a substep, relative to the load."""

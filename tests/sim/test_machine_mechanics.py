@@ -64,25 +64,6 @@ def test_without_losses_energy_and_momentum_stay(substep_ms: float) -> None:
     assert momentum == pytest.approx(truth.motor.inertia_kg_m2 * 500.0, rel=0.2 * substep_ms)
 
 
-@pytest.mark.parametrize(
-    "gear",
-    [
-        {"gear__motor_orders": [{"order": 4, "amplitude_arcsec": 300.0, "phase_deg": 10.0}]},
-        {"gear__hysteresis": {"law": "dahl", "offset_arcsec": 60.0, "yield_deg": 5.0}},
-    ],
-)
-def test_the_gear_passes_on_power_without_loss(gear: dict[str, Any]) -> None:
-    truth = plain(
-        motor__coulomb_nm=0.0, motor__viscous_nm_s_per_rad=0.0, gear__damping_nm_s_per_rad=0.0, **gear
-    )
-    plant = Plant(truth)
-    plant.motor_deg_s, plant.load_deg_s = 500.0, 10.0
-    energy = energy_j(plant, truth)
-    for _ in range(4000):
-        plant.step(0.0, 0.0)
-        assert energy_j(plant, truth) == pytest.approx(energy, rel=0.03)
-
-
 def test_friction_alone_brakes_as_newton_says() -> None:
     truth = plain(motor__viscous_nm_s_per_rad=0.0)
     plant = Plant(truth)
