@@ -317,6 +317,7 @@ class _Judge:
             if len(kept) == len(fitted.hypothesis.effects):
                 break  # the others are changes of the baseline, which stay in it
             fitted = self.estimator.fit(replace(fitted.hypothesis, effects=tuple(kept)))
+            fitted = self.search.with_best_law(fitted)
         usual = {each.cause for each in likely if _ordinary(each)}
         self.considered.extend(f"{cause}: no more than usual" for cause in sorted(usual))
         return replace(judged, findings=[each for each in likely if each.cause not in usual])

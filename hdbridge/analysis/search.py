@@ -59,13 +59,13 @@ class Search:
 
     def run(self) -> Fitted:
         """Adds causes, best first, then removes those that no longer improve the fit enough."""
-        fitted = self._with_best_law(self._with_best_sign(self.begun()))
+        fitted = self.with_best_law(self._with_best_sign(self.begun()))
         for number in range(MOST):
             found = self._best_addition(fitted)
             if number < ANEW and fitted.hypothesis.nuisances is None:
                 loose = self._with_free_loop(fitted, found)
                 if loose is not None:
-                    fitted = self._with_best_law(loose)
+                    fitted = self.with_best_law(loose)
                     continue
             if found is None:
                 break
@@ -75,10 +75,10 @@ class Search:
             if number >= self.scales.few - 1 and slow and left > self.scales.large * len(found.residual):
                 break  # many small pieces approximate something that is not in the catalogue
             if number < ANEW:
-                fitted = self._with_best_law(fitted)
+                fitted = self.with_best_law(fitted)
         if len(fitted.hypothesis.effects) - self.base <= self.scales.few:
             fitted = self._swapped(fitted)
-        return self._with_best_law(self.eliminated(fitted, self._least, []))
+        return self.with_best_law(self.eliminated(fitted, self._least, []))
 
     def instead(self, fitted: Fitted, stopped: Iterable[str]) -> Fitted:
         """Adds causes in place of those that were ``stopped`` by a test of the result."""
@@ -88,7 +88,7 @@ class Search:
             if found is None:
                 break
             fitted = found
-        return self.eliminated(fitted, self._least, [])
+        return self.with_best_law(self.eliminated(fitted, self._least, []))
 
     def begun(self) -> Fitted:
         """Fits the model alone, from the best elastic state at the start."""
@@ -112,7 +112,7 @@ class Search:
             self.estimator.loop_sign *= -1.0
         return self.begun()
 
-    def _with_best_law(self, fitted: Fitted) -> Fitted:
+    def with_best_law(self, fitted: Fitted) -> Fitted:
         """Exchanges the hysteresis law for an equivalent one that fits better.
 
         Another law than the model's must be better by as much as a cause.
@@ -152,7 +152,7 @@ class Search:
                 break  # the replacement was merged into an existing finding
             further = self._additions(fitted.hypothesis.effects[place]) - 1
             most = self.cost(fitted) + self.scales.enter * further
-            without = self._with_best_law(self.estimator.fit(fitted.hypothesis.without(place)))
+            without = self.with_best_law(self.estimator.fit(fitted.hypothesis.without(place)))
             other = self._best_addition(without)
             if other is not None and self.cost(other) < most:
                 fitted = other
