@@ -25,7 +25,7 @@ from hdbridge.analysis.findings import (
     for_unexplained,
     next_experiment,
 )
-from hdbridge.analysis.gain import Gain, held_out, of_written
+from hdbridge.analysis.gain import held_out, of_written
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.identifiability import identifiability
 from hdbridge.analysis.parameters import confounded, covariance, parameters_of, precisely
@@ -263,14 +263,14 @@ class _Judge:
             for each in findings
         ]
 
-        def gain(number: int) -> Gain | None:
-            others = {place for at, places in enumerate(own) for place in places if at != number}
-            return of_written(self.estimator, fitted, given, others, written)
-
-        return [
-            replace(each, gain=gain(number)) if each.gain and own[number] else each
-            for number, each in enumerate(findings)
+        tested = [number for number, each in enumerate(findings) if each.gain and own[number]]
+        if not tested:
+            return findings
+        others = [
+            {place for at, places in enumerate(own) for place in places if at != number} for number in tested
         ]
+        gains = dict(zip(tested, of_written(self.estimator, fitted, given, others, written), strict=True))
+        return [replace(each, gain=gains.get(at, each.gain)) for at, each in enumerate(findings)]
 
     def _uncalibrated(self, findings: Sequence[Finding]) -> str:
         """Returns a remark if the probabilities of the findings were fitted to other records; else empty."""

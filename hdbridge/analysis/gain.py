@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,22 +114,23 @@ def held_out(estimator: Estimator, before: Fitted, after: Fitted) -> Gain | None
 
     None if the record is too short.
     """
-    return _compared(estimator, before.linearised, after.linearised)
+    (gain,) = _compared(estimator, [before.linearised], after.linearised)
+    return gain
 
 
 def of_written(
     estimator: Estimator,
     fitted: Fitted,
     given: Sequence[Effect],
-    others: Collection[int],
+    others: Iterable[Collection[int]],
     written: Collection[int],
-) -> Gain | None:
-    """Compares the ``given`` model with the ``others`` of its findings to the written model.
+) -> list[Gain | None]:
+    """Compares, for each finding, the ``given`` model with the ``others`` of its findings to the written one.
 
     Both are places of effects in the fit. The others are not fitted again without the finding, so a fresh
     record can repeat the comparison.
     """
-    before = _as_written(estimator, fitted, given, others, ())
+    before = [_as_written(estimator, fitted, given, places, ()) for places in others]
     return _compared(estimator, before, _as_written(estimator, fitted, given, written, written))
 
 
@@ -155,17 +156,19 @@ def _as_written(
     return Linearised(full.columns[:, columns], left * estimator.weight, full.known[columns])
 
 
-def _compared(estimator: Estimator, before: Linearised, after: Linearised) -> Gain | None:
+def _compared(estimator: Estimator, before: Sequence[Linearised], after: Linearised) -> list[Gain | None]:
     stretch, over = repeats(estimator)
     fold = stretch % FOLDS
     samples = np.bincount(stretch).astype(np.float64)
     if len(samples) < REPEATS or len(stretch) - np.max(np.bincount(fold)) < after.columns.shape[1]:
-        return None
-    squares = []
-    for fit in (before, after):
+        return [None] * len(before)
+
+    def squares(fit: Linearised) -> FloatArray:
         left = fit.residual.copy()
         steps = steps_without(fit, fold, lambda rows: White(np.ones(np.count_nonzero(rows))))
         for number, step in enumerate(steps):
             left[fold == number] -= fit.columns[fold == number] @ step
-        squares.append(np.asarray(np.bincount(stretch, (left / estimator.weight) ** 2), dtype=np.float64))
-    return Gain(over, int(np.max(fold)) + 1, samples, squares[0], squares[1])
+        return np.asarray(np.bincount(stretch, (left / estimator.weight) ** 2), dtype=np.float64)
+
+    folds, later = int(np.max(fold)) + 1, squares(after)
+    return [Gain(over, folds, samples, squares(each), later) for each in before]

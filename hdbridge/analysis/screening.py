@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hdbridge.analysis.hypothesis import Estimator, Fitted
+from hdbridge.analysis.linear import Linearised
 from hdbridge.analysis.readings import median_deviation
 from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, Observations, Sought, Start, causes, unmet
 from hdbridge.axis.effects.orders import HIGHEST_MOTOR_ORDER
@@ -60,9 +61,8 @@ class Score:
 class Screen:
     """Weighted columns of all candidates, computed once."""
 
-    def __init__(self, estimator: Estimator, candidates: Sequence[Effect], start: Start, parts: int) -> None:
-        """``parts`` is the number of the model's own effects."""
-        self._candidates, self._parts = tuple(candidates), parts
+    def __init__(self, estimator: Estimator, candidates: Sequence[Effect], start: Start) -> None:
+        self._candidates = tuple(candidates)
         blocks = [estimator.weighted(estimator.columns(each, start)) for each in candidates]
         self._slices: list[slice] = []
         at = 0
@@ -72,21 +72,25 @@ class Screen:
         self._matrix = np.hstack(blocks) if blocks else np.empty((len(estimator.index), 0))
         self._grams = [block.T @ block for block in blocks]
 
-    def scores(self, fitted: Fitted) -> list[Score]:
-        """Returns the score of each candidate, in their order."""
-        fit, matrix = fitted.linearised, self._matrix
+    def scores(self, fit: Linearised, causes: Linearised) -> list[Score]:
+        """Returns the score of each candidate, in their order.
+
+        ``causes`` is the fit without the model's own parts.
+        """
+        matrix = self._matrix
         shadow = fit.basis.T @ matrix
         moment = matrix.T @ fit.residual - shadow.T @ fit.slack
-        taken = np.sum((fitted.without_parts(self._parts).basis.T @ matrix) ** 2, axis=0)
+        taken = np.sum((causes.basis.T @ matrix) ** 2, axis=0)
         return [
             _score(effect, np.diag(gram), gram - shadow[:, at].T @ shadow[:, at], moment[at], taken[at])
             for effect, gram, at in zip(self._candidates, self._grams, self._slices, strict=True)
         ]
 
-    def score(self, effect: Effect, columns: FloatArray, fitted: Fitted) -> Score:
-        """Scores another candidate by its weighted columns."""
-        taken = np.sum((fitted.without_parts(self._parts).basis.T @ columns) ** 2, axis=0)
-        return _score(effect, np.sum(columns**2, axis=0), *fitted.linearised.left(columns), taken)
+
+def score_of(effect: Effect, columns: FloatArray, fit: Linearised, causes: Linearised) -> Score:
+    """Scores one candidate by its weighted columns; ``causes`` is the fit without the model's own parts."""
+    taken = np.sum((causes.basis.T @ columns) ** 2, axis=0)
+    return _score(effect, np.sum(columns**2, axis=0), *fit.left(columns), taken)
 
 
 def _score(

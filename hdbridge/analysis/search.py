@@ -16,7 +16,7 @@ import numpy as np
 from hdbridge.analysis.acceptance import all_pieces_seen, evident, gate
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.linear import orthonormal, unknown
-from hdbridge.analysis.screening import Score, Screen, candidates, filtered, proposed
+from hdbridge.analysis.screening import Score, Screen, candidates, filtered, proposed, score_of
 from hdbridge.axis.effects import (
     CATALOGUE,
     Channel,
@@ -254,12 +254,7 @@ class Search:
         place = _last(trial, cause)
         effect = trial.hypothesis.effects[place]
         reason = self.refusal(effect, as_alias)
-        alike = [
-            at for at, each in enumerate(trial.hypothesis.effects) if at >= self.base and each.name == cause
-        ]
-        most = self.scales.extrapolated * self.peak(trial, *alike)
-        size = max(effect.largest_piece_arcsec(), self.peak(trial, place))  # two of a kind may cancel
-        if not reason and not as_alias and size > most:
+        if not reason and not as_alias and self._extrapolated(trial, place):
             reason = "the record shows too little of it to say how large it is"
         elif (
             not reason and Channel.TIME in effect.needs() and effect.shows(self.estimator.motion) is not None
@@ -270,6 +265,17 @@ class Search:
             if not reason and not all_pieces_seen(self.estimator, trial, place):
                 reason = "a part of it may be what a larger one gets wrong"
         return reason
+
+    def _extrapolated(self, trial: Fitted, place: int) -> bool:
+        """Returns True if a piece of an effect is much larger than what the record shows of all of its kind.
+
+        Pieces of one effect cancel where they are not seen, and so do two effects of a kind.
+        """
+        effects = trial.hypothesis.effects
+        own = self.peak(trial, place)
+        alike = [at for at in range(self.base, len(effects)) if effects[at].name == effects[place].name]
+        seen = self.peak(trial, *alike) if len(alike) > 1 else own
+        return max(effects[place].largest_piece_arcsec(), own) > self.scales.extrapolated * seen
 
     def refusal(self, effect: Effect, as_alias: bool = False) -> str:
         """Returns the reason to reject an effect with its fitted parameters, or an empty string.
@@ -323,11 +329,11 @@ class Search:
         return [each for (cause, _), each in best.items() if cause in causes]
 
     def _scores(self, fitted: Fitted) -> list[Score]:
-        screen = self._screen(fitted)
-        scores = screen.scores(fitted)
+        fit, causes = fitted.linearised, fitted.without_parts(self.base)
+        scores = self._screen(fitted).scores(fit, causes)
         for effect in filtered(self.estimator, fitted):
             columns = self.estimator.columns(effect, fitted.hypothesis.start)
-            scores.append(screen.score(effect, self.estimator.weighted(columns), fitted))
+            scores.append(score_of(effect, self.estimator.weighted(columns), fit, causes))
         return scores
 
     def _screen(self, fitted: Fitted) -> Screen:
@@ -336,7 +342,7 @@ class Search:
         if key not in self._screens:
             offered = candidates(self.estimator.data, base)
             self._screens.clear()
-            self._screens[key] = Screen(self.estimator, offered, fitted.hypothesis.start, self.base)
+            self._screens[key] = Screen(self.estimator, offered, fitted.hypothesis.start)
         return self._screens[key]
 
     def cost(self, fitted: Fitted) -> float:
