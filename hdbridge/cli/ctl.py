@@ -209,7 +209,7 @@ AXES: Final = (
 
 
 def figure(value: float | None, digits: int) -> str:
-    """Formats a number in a table; a dash if there is none."""
+    """Formats a number in a table; None is a dash."""
     return "-" if value is None else f"{value:z.{digits}f}"
 
 

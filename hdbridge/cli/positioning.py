@@ -114,7 +114,7 @@ def _tell_where_it_stands(drive: Drive) -> None:
 def _compensating(
     files: Profile, given: Path | None, ratio: float, *, compensated: bool
 ) -> TransmissionModel:
-    """Returns the compensating model; one without effects if there is none or none is wanted."""
+    """Returns the compensating model; one without effects without a model or if not ``compensated``."""
     from hdbridge.axis.model import TransmissionModel
 
     if not compensated:

@@ -247,7 +247,7 @@ def model_file(text: str) -> Path:
 def compensating_model(files: Profile, profile: str, model: Path | None, otherwise: str = "") -> Path:
     """Returns the model file to compensate with: the given one, else the profile's.
 
-    Raises `InputError` if there is none; ``otherwise`` is added as an alternative without a model.
+    Raises `InputError` without a model; ``otherwise`` adds an alternative to its text.
     """
     if model is None and not files.model.exists():
         raise InputError(

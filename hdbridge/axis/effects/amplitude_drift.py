@@ -177,19 +177,19 @@ class AmplitudeDrift(Modulating, Warmed):
             return None
         coldest, hottest = float(np.min(temperature)) - REACH_K, float(np.max(temperature)) + REACH_K
         growth = (self.ripple_percent_per_k, self.friction_percent_per_k)
-        told = nearest(self.orders, self.loop, growth, now[: len(given)], given)
-        if told is None or not coldest <= self.reference_c + told.warmer_k <= hottest:
+        moved = nearest(self.orders, self.loop, growth, now[: len(given)], given)
+        if moved is None or not coldest <= self.reference_c + moved.warmer_k <= hottest:
             return None
         return tuple(
-            each._counted(told) if isinstance(each, AmplitudeDrift) else told.counted(each) for each in now
+            each._counted(moved) if isinstance(each, AmplitudeDrift) else moved.counted(each) for each in now
         )
 
-    def _counted(self, told: Reparametrised) -> Self:
+    def _counted(self, moved: Reparametrised) -> Self:
         return self.model_copy(
             update={
-                "ripple_percent_per_k": self.ripple_percent_per_k * told.per_ripple,
-                "friction_percent_per_k": self.friction_percent_per_k * told.per_loop,
-                "reference_c": round(self.reference_c + told.warmer_k, 1),
+                "ripple_percent_per_k": self.ripple_percent_per_k * moved.per_ripple,
+                "friction_percent_per_k": self.friction_percent_per_k * moved.per_loop,
+                "reference_c": round(self.reference_c + moved.warmer_k, 1),
             }
         )
 

@@ -47,7 +47,7 @@ GRID: Final[Mapping[int, int]] = {1: 6, 2: 4, 3: 3}
 
 
 class Law(Strict, ABC):
-    """What every model needs of an effect: its equation, on a record and on line, and its bounds."""
+    """Law of an effect, as every model needs it: its equation, on a record and on line, and its bounds."""
 
     name: ClassVar[str]
     """Canonical name, used in model files, findings and tests."""
@@ -95,7 +95,7 @@ class Law(Strict, ABC):
         """
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """Returns a tracker for the inverse that falls no more steeply than this, or None if there is none.
+        """Returns a tracker for the inverse that falls no more steeply than this, or None without one.
 
         Backlash has one: the error on either side of the gap is known, and the path of the load across it,
         within a fraction of a motor degree, hardly matters.

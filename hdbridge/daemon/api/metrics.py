@@ -148,7 +148,7 @@ class _Scrape(Collector):
 
 
 def _field(state: Any, path: str) -> Any:
-    """Returns a field of a state, such as ``model.age_s``; None if there is none."""
+    """Returns a field of a state, such as ``model.age_s``; None without it."""
     for name in path.split("."):
         state = getattr(state, name, None)
     return state

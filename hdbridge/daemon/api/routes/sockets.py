@@ -75,9 +75,9 @@ async def live(bridge: Bridge, websocket: WebSocket) -> None:
             lost += batch.lost
             happened = bridge.events(known)
             known = max(known, happened.newest)
-            told = columns(batch.samples, list(bridge.axes), options, happened.events, lost)
-            if told.time_s or told.events:
-                await _send(websocket, told)
+            data = columns(batch.samples, list(bridge.axes), options, happened.events, lost)
+            if data.time_s or data.events:
+                await _send(websocket, data)
                 lost = 0
             await asyncio.sleep(BATCH_S)  # collects samples, so that messages are fewer and larger
 
