@@ -23,6 +23,8 @@ from hdbridge.axis.effects import BoolArray, FloatArray, IntArray
 PIECES = 16
 PIECE_BLOCKS = 250
 SMALLEST_ARCSEC, LARGEST_ARCSEC = 1e-3, 1e3
+ABSENT_ARCSEC = 2.0 * SMALLEST_ARCSEC
+"""A drift that a fit leaves below this, at its lower limit, is omitted: each makes all products slower."""
 COLUMNS_AT_ONCE = 8
 LOOP_LENGTH = 0.3
 """Correlation length of the misfit of a loop's shape, as a share of the travel over which it fades."""
@@ -320,9 +322,11 @@ def fit_noise(residual: FloatArray, blocks: Blocks, parameters: int, begin: Nois
         options={"ftol": 1e-7},
     )
     best = model(found.x)
+    drifts = {name: getattr(best, name) for name in ("slow_arcsec", "place_arcsec", "loop_arcsec")}
+    absent = {name: 0.0 for name, size in drifts.items() if size < ABSENT_ARCSEC}
     share = 1.0 / np.sqrt(max(1.0 - parameters / max(len(blocks), 1), 0.1))
     white = {name: share * getattr(best, name) for name in ("standing_arcsec", "moving_arcsec")}
-    return replace(best, **white)
+    return replace(best, **white, **absent)
 
 
 def _pieces(blocks: Blocks) -> IntArray:
