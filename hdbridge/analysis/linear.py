@@ -12,7 +12,6 @@ from itertools import compress
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.linalg.lapack import dposv
 
 from hdbridge.axis.effects import BoolArray, Effect, FloatArray, IntArray
 from hdbridge.axis.effects.described import Moves
@@ -27,6 +26,8 @@ SUSPECT = 1e-6
 
 def solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Solves a positive semi-definite system with scaled columns; undetermined directions stay at zero."""
+    from scipy.linalg.lapack import dposv  # noqa: PLC0415 - the daemon's service starts without scipy
+
     if not len(matrix):
         return np.zeros_like(right)
     seen = np.diag(matrix) > 0.0

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.linalg import solve_banded
+from scipy.linalg.blas import dtbsv
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import minimize
 
@@ -115,11 +116,10 @@ def swing(
     for each in (own, cross, other):
         each[begins[1:] - 1] = 0.0
     right.reshape(-1, 2)[begins[1:]] = 0.0
-    band = np.zeros((4, len(right)))
-    band[0] = 1.0
+    band = np.zeros((4, len(right)), order="F")
     band[2, 0:-2:2], band[1, 1:-1:2] = -own, -cross
     band[3, 0:-2:2], band[2, 1:-1:2] = cross, -other
-    state = solve_banded((3, 0), band, right, overwrite_ab=True, overwrite_b=True, check_finite=False)
+    state = dtbsv(3, band, right, lower=1, diag=1, overwrite_x=1)  # the diagonal is one
     return Swing(frequency_hz, damping, state[::2], np.zeros(len(bend)))
 
 
