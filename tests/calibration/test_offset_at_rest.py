@@ -1,6 +1,5 @@
 """Offset of the hysteresis, fitted to the rests of a stepping test."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -54,8 +53,3 @@ def test_the_offset_is_that_of_the_rests(truth: float, fitted: float) -> None:
     (orders, loop) = at_rest(model(fitted), stepped(model(truth), zero_arcsec=7.0)).effects
     assert orders == ORDERS
     assert loop.offset_arcsec == pytest.approx(truth, abs=1e-6)
-
-
-def test_a_model_without_hysteresis_stays_as_it_is() -> None:
-    plain = replace(model(40.0), effects=(ORDERS,))
-    assert at_rest(plain, stepped(model(40.0), 0.0)) is plain
