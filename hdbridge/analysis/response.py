@@ -669,7 +669,7 @@ def _filter(
     return LeadFilter(
         lead_cycles=LEAD_CYCLES,
         per_cycle=per_cycle,
-        full_speed_deg_s=limits.full_speed_deg_s(hertz, abs(wanted)),
+        full_speed_deg_s=limits.full_speed_deg_s(hertz, np.abs(wanted)),
         weights=tuple(float(f"{each:.9g}") for each in weights),
         feedback=tuple(float(f"{each:.9g}") for each in feedback),
     )
