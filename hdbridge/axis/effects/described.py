@@ -27,11 +27,6 @@ class Sought(Enum):
     TONE = "one line of the spectrum over time"
     LINE = "one line of the spectrum over a turn of the load"
 
-    @property
-    def is_line(self) -> bool:
-        """True for one sharp spectral line, which nothing smooth resembles."""
-        return self in {Sought.TONE, Sought.LINE}
-
 
 class Moves(Enum):
     """Range from which a local step improves a shape parameter."""
