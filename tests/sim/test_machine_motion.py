@@ -145,7 +145,8 @@ def test_a_demand_between_counts_is_followed_between_counts() -> None:
     machine.follow(500.0, 500.4, 8)
     for _ in range(100):
         machine.follow(500.4, 500.4, 8)
-    assert machine.true_motor_deg / DEG_PER_COUNT == pytest.approx(500.4, abs=0.1)
+    # Within the hunting band, 16 of 64 interpolated steps, the integral rests.
+    assert machine.true_motor_deg / DEG_PER_COUNT == pytest.approx(500.4, abs=0.26)
 
 
 def test_switching_on_does_not_move_an_axis_that_stands_between_counts() -> None:
