@@ -115,17 +115,31 @@ class ElasticHysteresis:
     by_motor_only: bool
     _factors: tuple[Factor, ...]
     _law: Law
+    _loop_arcsec: float
+    _loop_deg: float
+    _loop_slope: float
+    """Change of the loop over the last travel, arcsec per radian."""
+    _reaction: float
 
-    def __init__(self, law: Law, factors: tuple[Factor, ...]) -> None:
+    def __init__(self, law: Law, factors: tuple[Factor, ...], reaction: float) -> None:
         self._law = law
         self._factors = factors
+        self._reaction = reaction
+        self._loop_deg = self._loop_slope = 0.0
+        self._loop_arcsec = law.advance(0.0)
         self.by_motor_only = not factors
 
     def arcsec(self, now: Conditions) -> float:
-        error = self._law.advance(now.motor_deg)
+        loop, size = self._law.advance(now.motor_deg), 1.0
         for factor in self._factors:
-            error *= factor.factor(now)
-        return error
+            size *= factor.factor(now)
+        if self._reaction:
+            if now.motor_deg != self._loop_deg:
+                travel = math.radians(now.motor_deg - self._loop_deg)
+                self._loop_slope = (loop - self._loop_arcsec) / travel
+                self._loop_arcsec, self._loop_deg = loop, now.motor_deg
+            now.slope_arcsec += self._reaction * self._loop_slope * size
+        return loop * size
 
 
 @state
@@ -221,7 +235,7 @@ def _hysteresis(truth: Truth) -> list[Piece]:
         ageing = gear.ageing if gear.ageing is not None and gear.ageing.hysteresis_growth else None
         age = AgeFactor(ageing, truth.substep_s) if ageing is not None else None
         factors = tuple(factor for factor in (rate, warmth, age) if factor is not None)
-        pieces.append(ElasticHysteresis(law, factors))
+        pieces.append(ElasticHysteresis(law, factors, gear.hysteresis_reaction))
     return pieces
 
 

@@ -11,11 +11,12 @@ angle, e the tooth error and h the hysteresis,
                                                 torque on the motor -dV/dq = -T (1/N + de/dq)
 
 (Lagrange's equations; Goldstein, Classical Mechanics, chapter 1). So the tooth error changes the momentary
-ratio in the reaction as in the angles, by up to some per cent. The derivative leaves out what is not a
-function of the motor's angle: K h is a friction torque between the gear's input and output, which acts on
-both by the nominal ratio. If the error grows with the torque, e (1 + g |T|), the spring has the stiffness
-K / (1 - K g e) in the direction of the torque, and dV/dq = T (1/N + (1 + g |T| / 2) de/dq). An error by load
-angle would change the torque on the load, by less than a thousandth; this is neglected.
+ratio in the reaction as in the angles, by up to some per cent. The hysteresis is no function of the motor's
+angle. If K h is the friction torque by which the teeth drag the output along, it acts on both by the nominal
+ratio. If sticking contacts displace the output instead, they do no work, and the reaction has dh/dq too: the
+share ``gear.hysteresis_reaction`` does this. If the error grows with the torque, e (1 + g |T|), the spring
+has the stiffness K / (1 - K g e) in the direction of the torque, and dV/dq = T (1/N + (1 + g |T| / 2) de/dq).
+An error by load angle would change the torque on the load, by less than a thousandth; this is neglected.
 
 `Plant` has a linear spring and a load without external torques; `hdbridge.sim.loaded_plant` has the rest.
 """

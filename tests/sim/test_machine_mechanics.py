@@ -65,12 +65,15 @@ def test_without_losses_energy_and_momentum_stay(substep_ms: float) -> None:
     assert momentum == pytest.approx(truth.motor.inertia_kg_m2 * 500.0, rel=0.2 * substep_ms)
 
 
-def test_tooth_error_takes_no_energy_and_gives_none() -> None:
-    order = {"order": 4, "amplitude_arcsec": 60.0, "phase_deg": 10.0}
+TOOTH = {"gear__motor_orders": [{"order": 4, "amplitude_arcsec": 60.0, "phase_deg": 10.0}]}
+LOOP = {"law": "dahl", "offset_arcsec": 60.0, "yield_deg": 5.0}
+
+
+@pytest.mark.parametrize("gear", [TOOTH, {"gear__hysteresis": LOOP, "gear__hysteresis_reaction": 1.0}])
+def test_a_displacement_of_the_output_takes_no_energy_and_gives_none(gear: dict[str, Any]) -> None:
     truth = plain(
-        motor__coulomb_nm=0.0, motor__viscous_nm_s_per_rad=0.0, gear__damping_nm_s_per_rad=0.0,
-        gear__motor_orders=[order],
-    )  # fmt: skip
+        motor__coulomb_nm=0.0, motor__viscous_nm_s_per_rad=0.0, gear__damping_nm_s_per_rad=0.0, **gear
+    )
     plant = Plant(truth)
     plant.motor_deg_s, plant.load_deg_s = 1000.0, 20.0
     energy = energy_j(plant, truth)
