@@ -79,7 +79,7 @@ KINDS: Final[dict[Any, Kinds]] = {
         0.0,
     ),
     gear.Factor: Kinds(
-        (gear_pieces.SpeedFactor, gear_pieces.TorqueFactor, gear_pieces.WarmthFactor, ageing.AgeFactor),
+        (gear_pieces.SpeedFactor, gear_pieces.WarmthFactor, ageing.AgeFactor),
         4,
         1.0,
     ),
