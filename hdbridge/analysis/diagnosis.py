@@ -118,16 +118,19 @@ def _searched(
     data: Observed, model: TransmissionModel, scales: Scales, between: Nuisances, swing: Swing | None
 ) -> tuple[Search, Fitted]:
     """Returns the search and its result on the data less the swing."""
+    nothing = unknown(np.empty((len(data.full), 0)), ())
+    soft = swing is not None and swing.soft
     if swing is not None:
         data = without(data, swing)
-    search = _search(data, model, scales, between)
-    begun = search.begun()
-    if between.strain(begun.nuisances) > scales.enter:  # no load that is too stiff for the sampling does this
-        between = unknown(np.empty((len(data.full), 0)), ())
-        begun = _search(data, model, scales, between).begun()
-    if swing is None or not swing.soft:
-        data = settled(search.estimator, begun, swing)
-    search = _search(data, model, scales, between)
+    search = _search(data, model, scales, nothing if soft else between)
+    if not soft:
+        begun = search.begun()
+        if (
+            between.strain(begun.nuisances) > scales.enter
+        ):  # a load that is too stiff for the sampling does less
+            between = nothing
+            begun = _search(data, model, scales, between).begun()
+        search = _search(settled(search.estimator, begun, swing), model, scales, between)
     estimator = search.estimator
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)
