@@ -74,11 +74,10 @@ def diagnose(
     scales: Scales | None = None,
     prior: Prior | None = None,
 ) -> Diagnosis:
-    """Diagnoses how a model differs from one or several recordings, and why; ``.as_dict()`` is the document.
+    """Diagnoses the causes of the difference between a model and one or several recordings.
 
     ``independent_zeros`` states that the encoders' zeros were lost between recordings. ``progress`` receives
-    a description of each step. ``scales`` overrides the decision thresholds; ``prior`` holds
-    what a fleet says of the causes. InputError if a recording is too short, does not match the model's ratio,
+    a description of each step. ``scales`` overrides the decision thresholds; ``prior`` holds the fleet's prior for the causes. InputError if a recording is too short, does not match the model's ratio,
     or lacks a channel that the model needs.
     """
     recordings = by_name(recording)
@@ -229,8 +228,7 @@ class _Judge:
     ) -> tuple[Fitted, list[Finding], TransmissionModel]:
         """Returns the extended model, its fit, and the findings that it contains.
 
-        A finding that cannot be written is dropped: its parameters are out of bounds, the compensation could
-        not invert the model with it, or the record does not determine it.
+        Drops a finding if its parameters are out of bounds, if the compensation could not invert the model with it, or if the record does not determine it.
         """
         estimator, given = self.estimator, self.model.effects
         while True:
@@ -251,7 +249,7 @@ class _Judge:
             findings = [each for each in findings if each not in missing]
 
     def _with_gains(self, fitted: Fitted, findings: list[Finding], added: list[int]) -> list[Finding]:
-        """Returns the findings with the gain of the written model, in which ``added`` are the new effects."""
+        """Returns the findings with the gain of the written model; ``added`` are its new effects."""
         effects, given = fitted.hypothesis.effects, self.model.effects
         written = [place for place, old in enumerate(given) if effects[place] != old] + added
         own = [
@@ -273,11 +271,15 @@ class _Judge:
         return [replace(each, gain=gains.get(at, each.gain)) for at, each in enumerate(findings)]
 
     def _uncalibrated(self, findings: Sequence[Finding]) -> str:
-        """Returns a remark if the probabilities of the findings were fitted to other records; else empty."""
+        """Returns a remark if the probability formula was fitted to a different kind of record; else
+        empty.
+        """
         return UNCALIBRATED if findings and len(self.estimator.data.full.kinds) == 1 else ""
 
     def _stopped(self, fitted: Fitted) -> tuple[int, str] | None:
-        """Returns the weakest cause that fails its gate, else an implausible or unidentifiable one."""
+        """Returns the weakest cause that fails its gate; if all pass, an implausible or unidentifiable
+        cause.
+        """
         places = range(len(self.model.effects), len(fitted.hypothesis.effects))
         gates = {place: gate(self.estimator, fitted, place) for place in places}
         stopped = [place for place, each in gates.items() if each.reason]
@@ -294,7 +296,7 @@ class _Judge:
     def _likely_only(self, fitted: Fitted) -> _Judged:
         """Judges the findings and removes those that are improbable or normal for any axis.
 
-        Improbable ones are removed from the fit as well.
+        Improbable findings are also removed from the fit.
         """
         base = len(self.model.effects)
         while True:
@@ -368,7 +370,7 @@ class _Judge:
         )
 
     def _aliases(self, fitted: Fitted, without: Fitted, place: int) -> tuple[str, ...]:
-        """Returns other causes that explain the data nearly as well as this one."""
+        """Returns other causes that explain the data nearly as well as this cause."""
         effect, available = fitted.hypothesis.effects[place], self.estimator.motion.available()
         alike = lookalikes(effect, self.estimator.data.ratio)
         names = [
@@ -432,7 +434,9 @@ class _Judge:
 
 
 def _is_in(finding: Finding, changed: Sequence[Effect]) -> bool:
-    """Returns True if these effects, which differ from those of the given model, contain the finding."""
+    """Returns True if ``changed``, the effects that differ from those of the given model, contains the
+    finding.
+    """
     effect = finding.effect
     if effect is None:  # something unexplained
         return True

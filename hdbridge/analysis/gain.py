@@ -26,8 +26,8 @@ RECORDINGS = "recordings"
 class Gain:
     """Squared errors of stretches of a record, each predicted by a fit without it.
 
-    Only a held-out test gives them: two root mean squares of one fit are not a gain. Arrays of shape
-    (stretches,).
+    Only a held-out test provides these errors: the difference between two rms values of one fit is not a
+    gain. Arrays of shape (stretches,).
     """
 
     over: str
@@ -37,7 +37,7 @@ class Gain:
     samples: FloatArray
     """Weight of each stretch."""
     before_arcsec2: FloatArray
-    """Sum of squares without the tested part, or with the model that it is compared with."""
+    """Sum of squares without the tested part, or with the reference model."""
     after_arcsec2: FloatArray
     """Sum of squares with the tested part."""
 
@@ -53,7 +53,7 @@ class Gain:
 
     @property
     def recovered(self) -> float:
-        """Share of the mean square that it removes; negative if it increases the error."""
+        """Share of the mean square that the tested part removes; negative if the part increases the error."""
         return 1.0 - (self.after_arcsec / max(self.before_arcsec, 1e-12)) ** 2
 
     @property
@@ -72,7 +72,7 @@ class Gain:
 
     @property
     def predicts(self) -> bool:
-        """True if it lowers the error of what was left out; of whole recordings, of nearly all."""
+        """True if the part reduces the held-out error; for whole recordings, in nearly all of them."""
         return self.recovered > 0.0 and (self.repeated or self.over != RECORDINGS)
 
     def as_dict(self) -> dict[str, float | str]:
@@ -92,9 +92,10 @@ STRETCHES = 64
 
 
 def repeats(estimator: Estimator) -> tuple[IntArray, str]:
-    """Numbers the points (m,) by what repeats: recordings, else moves, else stretches of time; and its name.
+    """Numbers the points (m,) by repetition (recordings, else moves, else stretches of time); also returns
+    its name.
 
-    Errors that a repetition shares are no evidence.
+    Errors that a repetition shares with another are not evidence.
     """
     points = estimator.data.points
     if estimator.data.full.repeated:
@@ -110,7 +111,7 @@ def repeats(estimator: Estimator) -> tuple[IntArray, str]:
 
 
 def held_out(estimator: Estimator, before: Fitted, after: Fitted) -> Gain | None:
-    """Leaves out repetitions in turn, and compares two fits by what they leave there.
+    """Cross-validates two fits with whole repetitions left out, and compares them.
 
     None if the record is too short.
     """
@@ -125,10 +126,11 @@ def of_written(
     others: Iterable[Collection[int]],
     written: Collection[int],
 ) -> list[Gain | None]:
-    """Compares, for each finding, the ``given`` model with the ``others`` of its findings to the written one.
+    """Returns the gain of the written model for each finding.
 
-    Both are places of effects in the fit. The others are not fitted again without the finding, so a fresh
-    record can repeat the comparison.
+    The reference is the ``given`` model with the ``others``, the remaining findings; ``written`` and
+    ``others`` are places of effects in the fit. The other findings are not refitted without the finding, so a
+    fresh record can repeat the comparison.
     """
     before = [_as_written(estimator, fitted, given, places, ()) for places in others]
     return _compared(estimator, before, _as_written(estimator, fitted, given, written, written))
@@ -141,9 +143,9 @@ def _as_written(
     places: Collection[int],
     free: Collection[int],
 ) -> Linearised:
-    """Returns the fit of the zeros and the ``free`` effects, of those at ``places``.
+    """Returns the linearised fit of the zeros and the effects at the places ``free``.
 
-    Effects at other places are as given, or absent.
+    Effects outside ``places`` are as in the given model, or absent.
     """
     effects, full = fitted.hypothesis.effects, fitted.linearised
     used = [

@@ -35,7 +35,7 @@ MOST = 6
 BEST = 3
 """Maximum number of additions (`MOST`) and of causes fitted in full at each (`BEST`); both bound the run
 time."""
-ANEW = 3
+LAW_ROUNDS = 3
 """Number of additions after which the hysteresis law is chosen again."""
 
 
@@ -62,7 +62,7 @@ class Search:
         fitted = self.with_best_law(self._with_best_sign(self.begun()))
         for number in range(MOST):
             found = self._best_addition(fitted)
-            if number < ANEW and fitted.hypothesis.nuisances is None:
+            if number < LAW_ROUNDS and fitted.hypothesis.nuisances is None:
                 loose = self._with_free_loop(fitted, found)
                 if loose is not None:
                     fitted = self.with_best_law(loose)
@@ -74,7 +74,7 @@ class Search:
             fitted = found
             if number >= self.scales.few - 1 and slow and left > self.scales.large * len(found.residual):
                 break  # many small pieces approximate something that is not in the catalogue
-            if number < ANEW:
+            if number < LAW_ROUNDS:
                 fitted = self.with_best_law(fitted)
         if len(fitted.hypothesis.effects) - self.base <= self.scales.few:
             fitted = self._swapped(fitted)
