@@ -145,9 +145,7 @@ def law_discrepancies(estimator: Estimator, hypothesis: Hypothesis) -> FloatArra
 
 
 def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:
-    """Returns True if each piece of a finding is significant and exceeds the law error of any larger
-    piece.
-    """
+    """Returns True if each piece of a finding is significant and exceeds the law error of larger pieces."""
     effect = fitted.hypothesis.effects[place]
     pieces = range(len(effect.coefficients()))
     if not effect.inexact or len(pieces) != len(effect.pieces()):

@@ -262,9 +262,7 @@ class Design:
         return replace(self, blocks=replace(self.blocks, blur=change**2 / 12.0))
 
     def residual(self, effects: Sequence[Effect], rest: FloatArray) -> FloatArray:
-        """Returns the observation minus ``effects`` per sample and ``rest`` per block; NaN for unusable
-        samples.
-        """
+        """Returns the observation minus ``effects`` per sample and ``rest`` per block; NaN where unusable."""
         left = self.samples.error_arcsec - self.regressors.predicted(effects, self.starts)
         result = np.full(len(left), np.nan)
         index = self.blocks.index
@@ -291,8 +289,7 @@ def clusters(blocks: Blocks, number: int) -> IntArray:
 
 
 def missed_deg(motor_deg: FloatArray, turns: IntArray) -> FloatArray:
-    """Returns the possible motor travel beyond the sample of each turning point, degrees, shape of
-    ``turns``.
+    """Returns the possible motor travel beyond the sample of each turning point, shape of ``turns``.
 
     At constant speed before and after, the two lines intersect that far beyond the sample. It is 0 for a
     motor that rests at the turning point.

@@ -141,9 +141,7 @@ def capability(
 
 
 def _lacks(data: Observed, base: Sequence[Effect], causes: Mapping[str, Identifiability]) -> list[str]:
-    """Returns the kinds of motion that a record lacks, and the channels required by causes that are not
-    visible.
-    """
+    """Returns the kinds of motion that a record lacks, and the channels that invisible causes require."""
     full = data.full
     travel_deg = float(sum(np.ptp(full.motor_deg[each.rows]) for each in full.chains))
     width_deg = loop_of(base).width_deg

@@ -118,9 +118,7 @@ def _check_whole(path: Path, record: Record) -> None:
 
 
 def _check_wrapped(path: Path, record: Record) -> None:
-    """Raises InputError for an angle that jumps by a constant (a wrapping counter) while the other does
-    not.
-    """
+    """Raises InputError if one angle jumps by a constant (a wrapping counter) and the other does not."""
     motor, load, target = record.motor_position_deg, record.load_position_deg, record.motor_target_deg
     found: dict[str, Wraps] = {}
     for channel, angle, other in (("load", load, motor), ("motor", motor, load)):

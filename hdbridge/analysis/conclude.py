@@ -133,9 +133,7 @@ def _orders(name: str, left: Sequence[Line]) -> ResidualTest:
 def _contrast(
     name: str, column: FloatArray, residual: FloatArray, precision: Precision, scale: float
 ) -> ResidualTest:
-    """Fits the residual with one column and a mean by generalised least squares; the size is in ``scale``
-    columns.
-    """
+    """Fits one column and a mean by generalised least squares; returns the size in ``scale`` columns."""
     columns = np.stack([np.ones(len(column)), column], axis=1)
     weighted = precision.apply(columns)
     information = columns.T @ weighted
@@ -237,9 +235,7 @@ def held_out(
 
 
 def gain_of_law(before: tuple[State, Solution], after: tuple[State, Solution]) -> Gain:
-    """Compares two laws by the residual in each fold of a fit to the other folds, with the nuisances
-    refitted.
-    """
+    """Compares two laws by the residual of each fold from a fit to the others, with nuisances refitted."""
     design = before[0].design
     fold, stretch, over = folds(design)
     count = design.blocks.count

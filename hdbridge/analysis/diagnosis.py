@@ -271,15 +271,11 @@ class _Judge:
         return [replace(each, gain=gains.get(at, each.gain)) for at, each in enumerate(findings)]
 
     def _uncalibrated(self, findings: Sequence[Finding]) -> str:
-        """Returns a remark if the probability formula was fitted to a different kind of record; else
-        empty.
-        """
+        """Returns a remark if the probability formula was fitted to other kinds of records; else empty."""
         return UNCALIBRATED if findings and len(self.estimator.data.full.kinds) == 1 else ""
 
     def _stopped(self, fitted: Fitted) -> tuple[int, str] | None:
-        """Returns the weakest cause that fails its gate; if all pass, an implausible or unidentifiable
-        cause.
-        """
+        """Returns the weakest cause that fails its gate; else an implausible or unidentifiable cause."""
         places = range(len(self.model.effects), len(fitted.hypothesis.effects))
         gates = {place: gate(self.estimator, fitted, place) for place in places}
         stopped = [place for place, each in gates.items() if each.reason]
@@ -434,9 +430,7 @@ class _Judge:
 
 
 def _is_in(finding: Finding, changed: Sequence[Effect]) -> bool:
-    """Returns True if ``changed``, the effects that differ from those of the given model, contains the
-    finding.
-    """
+    """Returns True if ``changed``, the effects that differ from the given model, contains the finding."""
     effect = finding.effect
     if effect is None:  # something unexplained
         return True

@@ -101,9 +101,7 @@ class Parameter:
     """True for a size, which is zero if the effect is absent."""
 
     def combined(self, middle: float, deviation: float) -> Self:
-        """Combines the parameter with a normal prior; unchanged if they are three standard deviations
-        apart.
-        """
+        """Combines the parameter with a normal prior, unless they are three standard deviations apart."""
         own = (self.high - self.low) / (2.0 * NORMAL_95)
         if not 0.0 < own < math.inf or abs(self.value - middle) > 3.0 * math.hypot(own, deviation):
             return self

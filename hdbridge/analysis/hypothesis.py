@@ -170,9 +170,7 @@ class Estimator:
 
     @property
     def floor_arcsec(self) -> float:
-        """Smallest relevant peak, because at rest the rounding of both encoders is the same in all
-        readings.
-        """
+        """Smallest relevant peak. At rest, both encoders round alike in all readings."""
         rounded = math.hypot(self.count_arcsec, self.data.load_count_arcsec) / math.sqrt(12.0)
         return max(self.scales.floor_arcsec, rounded, 0.5 * self.data.noise_arcsec)
 
@@ -232,9 +230,7 @@ class Estimator:
         return self.weighted(np.column_stack(columns))
 
     def turned(self, effects: Sequence[Effect], start: Start) -> tuple[IntArray, FloatArray]:
-        """Returns the turning points, and the change of each sample due to their errors, arcsec, shape
-        (n,).
-        """
+        """Returns the turning points, and each sample's change due to their errors, arcsec, shape (n,)."""
         full, loops = self.data.full, with_memory(effects)
         change = np.zeros(len(full))
         if not loops:
@@ -253,9 +249,7 @@ class Estimator:
         return turns, change
 
     def begun(self, effects: Sequence[Effect]) -> FloatArray:
-        """Returns half the range that the elastic state at the start of a part spans in each sample, arcsec,
-        (n,).
-        """
+        """Returns half the range of each sample over all elastic states at the part's start, arcsec, (n,)."""
         change, loops = np.zeros(len(self.data.full)), with_memory(effects)
         for chain in self.data.full.chains if loops else ():
             motion = self.data.full.along(chain)
@@ -321,9 +315,7 @@ class Estimator:
     def _prior(
         self, hypothesis: Hypothesis, parts: Sequence[CalibratedPart]
     ) -> tuple[dict[tuple[int, str], Prior], float]:
-        """Returns the priors less the information due to channel noise, and the resulting offset of chi
-        square.
-        """
+        """Returns the priors less the information due to channel noise, and the offset of chi square."""
         known, offset = priors(parts), 0.0
         for place in {each.place for each in parts}:
             claimed = self.channel_noise(hypothesis.effects[place], hypothesis.start)
@@ -360,9 +352,7 @@ class Estimator:
         moves: frozenset[Moves],
         effort: Effort,
     ) -> Fitted:
-        """Fits with ``parts`` held at their calibration, and adds the ``costs`` of the changes of all
-        others.
-        """
+        """Fits with ``parts`` held at their calibration; adds the ``costs`` of the changes of the others."""
         start = hypothesis.start
         prior, offset = self._prior(hypothesis, parts)
         costs += offset

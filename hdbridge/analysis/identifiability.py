@@ -106,9 +106,7 @@ class _Example(NamedTuple):
 def _examples(
     estimator: Estimator, fitted: Fitted, base: Sequence[Effect]
 ) -> tuple[dict[str, _Example], dict[str, str]]:
-    """Returns the best example of each visible cause, and for each other cause the reason why it is not
-    visible.
-    """
+    """Returns the best example of each visible cause, and the reason why each other cause is invisible."""
     best: dict[str, _Example] = {}
     reasons: dict[str, str] = {}
     stride = -(-len(estimator.index) // ENOUGH)
