@@ -259,7 +259,9 @@ def folds(design: Design) -> tuple[IntArray, IntArray, str]:
     """Returns the fold and the stretch of each block (b,), and a description of the parts left out.
 
     Sweeps are divided by motor turns, every fourth one in both directions. Motion that turns back within a
-    motor turn (sines, reversals) is divided by stretches of time, because the loop is not determined without reversals, and no fold may contain them all. Several short recordings of unknown motion are left out whole, because a correlated residual would be predicted by neighbouring stretches.
+    motor turn (sines, reversals) is divided by stretches of time, because the loop is not determined without
+    reversals, and no fold may contain them all. Several short recordings of unknown motion are left out
+    whole, because a correlated residual would be predicted by neighbouring stretches.
     """
     blocks = design.blocks
     turns = (blocks.motor_deg - np.min(blocks.motor_deg)) / DEG_PER_TURN

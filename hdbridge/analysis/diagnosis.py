@@ -77,8 +77,9 @@ def diagnose(
     """Diagnoses the causes of the difference between a model and one or several recordings.
 
     ``independent_zeros`` states that the encoders' zeros were lost between recordings. ``progress`` receives
-    a description of each step. ``scales`` overrides the decision thresholds; ``prior`` holds the fleet's prior for the causes. InputError if a recording is too short, does not match the model's ratio,
-    or lacks a channel that the model needs.
+    a description of each step. ``scales`` overrides the decision thresholds; ``prior`` holds the fleet's
+    prior for the causes. InputError if a recording is too short, does not match the model's ratio, or lacks a
+    channel that the model needs.
     """
     recordings = by_name(recording)
     agreed_ratio(recordings, [(str(model.path or "the model"), model.ratio)])
@@ -228,7 +229,8 @@ class _Judge:
     ) -> tuple[Fitted, list[Finding], TransmissionModel]:
         """Returns the extended model, its fit, and the findings that it contains.
 
-        Drops a finding if its parameters are out of bounds, if the compensation could not invert the model with it, or if the record does not determine it.
+        Drops a finding if its parameters are out of bounds, if the compensation could not invert the model
+        with it, or if the record does not determine it.
         """
         estimator, given = self.estimator, self.model.effects
         while True:

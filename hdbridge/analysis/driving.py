@@ -174,7 +174,9 @@ def _driving(
 def _noise(lag: FloatArray, target: FloatArray, count: float) -> float:
     """Returns the noise of the motor reading in addition to quantisation, degrees.
 
-    In a fast move the lag itself bends within a few samples, which is not noise. The noise is therefore at most the noise of the reading while the command rests. It is zero if counts are visible and the command never rests.
+    In a fast move the lag itself bends within a few samples, which is not noise. The noise is therefore at
+    most the noise of the reading while the command rests. It is zero if counts are visible and the command
+    never rests.
     """
     third = np.diff(lag, 3)
     if not len(third):

@@ -217,8 +217,8 @@ class Estimator:
         """Returns the influence of turning-point errors within counts, weighted columns of one standard
         deviation, (m, k).
 
-        A motor with friction stops short of every turning point, by a common amount and an individual one. One
-        column is common to all; up to `MOST_TURNS` turning points also have their own.
+        A motor with friction stops short of every turning point, by a common amount and an individual one.
+        One column is common to all; up to `MOST_TURNS` turning points also have their own.
         """
         turns, change = self.turned(effects, start)
         if not len(turns):
@@ -330,7 +330,8 @@ class Estimator:
         """Returns the squared contribution of channel noise to an effect's columns, weighted, shape (p,).
 
         Errors in variables: a fit improves spuriously as the coefficient of a noisy column shrinks. The
-        correction (Fuller 1987, 2.2) applies to coefficients with a calibration; otherwise, a coefficient distinguished only by noise could take any size.
+        correction (Fuller 1987, 2.2) applies to coefficients with a calibration; otherwise, a coefficient
+        distinguished only by noise could take any size.
         """
         motion = self.data.full.motion
         channels = sorted(effect.needs() & NOISY & motion.measured.keys(), key=lambda each: each.value)

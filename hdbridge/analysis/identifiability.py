@@ -45,7 +45,8 @@ def identifiability(
 ) -> dict[str, Identifiability]:
     """Returns detection limit and look-alikes of each cause of the catalogue.
 
-    ``estimator`` holds the record without the causes found in it, ``fitted`` is the fit of the model to it, and ``context`` is the evidence against all findings.
+    ``estimator`` holds the record without the causes found in it, ``fitted`` is the fit of the model to it,
+    and ``context`` is the evidence against all findings.
     """
     best, reasons = _examples(estimator, fitted, base)
     scales, spans = estimator.scales, {name: orthonormal(each.rest) for name, each in best.items()}
