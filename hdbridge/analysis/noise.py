@@ -1,11 +1,11 @@
 """Coloured noise, and least squares weighted by it.
 
-The noise has five parts: white noise (which may differ between standing and moving); a drift in time;
-a drift over the motor's *travel*, because an axis rests anywhere within a count of its encoder, constant
-during a stop and different at the next one; the misfit of the loop's shape, which fades over each branch and
-differs between branches; and the rounding error that is constant over a leg, whose size follows from the
-count. The drifts are first-order Markov processes, so the inverse of their covariance is banded, and a fit
-costs no more than one with white noise (Rybicki and Press 1995).
+The noise has five parts: white noise, which may differ between standing and moving; a drift in time; a drift
+over the motor's *travel*, because an axis rests anywhere within a count of its encoder, constant during a
+stop and different at the next; the misfit of the loop's shape, which decays over each branch and differs
+between branches; and the rounding error that is constant over a leg, whose size follows from the count. The
+drifts are first-order Markov processes, so the inverse of their covariance is banded, and a fit costs no more
+than one with white noise (Rybicki and Press 1995).
 """
 
 from __future__ import annotations
@@ -28,13 +28,14 @@ DIFFERENCE = 1e-4
 """Step of the likelihood's derivatives, in logarithms. With a smaller one, rounding stops the fit early."""
 COLUMNS_AT_ONCE = 8
 CHAINS_KEPT = 12
-"""Size of the cache of chains: a derivative needs two at each length and one at a step from it."""
+"""Size of the cache of chains: a derivative needs two at each length and one at a step from each."""
 LOOP_LENGTH = 0.3
-"""Correlation length of the misfit of a loop's shape, as a share of the travel over which it fades."""
+"""Correlation length of the misfit of a loop's shape, as a share of the travel over which the misfit
+decays."""
 LOOP_DEG = 8.0, 40.0
-"""Range of that travel, as of the widths of loops. A longer one is a drift, a shorter one ringing."""
+"""Range of that travel, derived from the widths of loops. A longer one is a drift, a shorter one ringing."""
 SAME_LEG = 1e-8
-"""Step between blocks of a leg, over which that error is constant: practically zero."""
+"""Step between blocks of a leg in correlation lengths: practically zero, for an error constant over a leg."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +54,10 @@ class NoiseModel:
     """Drift over the motor's travel: standard deviation and correlation length."""
     loop_arcsec: float = 0.0
     loop_deg: float = 10.0
-    """Misfit of the loop's shape: standard deviation at a turning point, and travel over which it fades."""
+    """Misfit of the loop's shape: standard deviation at a turning point, and travel over which it decays."""
 
     def white_variance(self, blocks: Blocks) -> FloatArray:
-        """Returns the white variance of each block's mean; infinite for blocks without samples."""
+        """Returns the white-noise variance of each block's mean; infinite for blocks without samples."""
         sample = np.where(blocks.moving, self.moving_arcsec, self.standing_arcsec) ** 2
         mean = np.divide(sample, blocks.count, out=np.full(len(blocks), np.inf), where=blocks.count > 0)
         return np.asarray(mean + blocks.blur)
@@ -74,14 +75,16 @@ class White:
         self._precision = weight**2
 
     def apply(self, columns: FloatArray) -> FloatArray:
-        """K^-1 times columns of shape (m,) or (m, p)."""
+        """Returns K^-1 times columns of shape (m,) or (m, p)."""
         return np.asarray(
             (self._precision if columns.ndim == 1 else self._precision[:, np.newaxis]) * columns
         )
 
 
 class _Chain(NamedTuple):
-    """A drift of unit size along some blocks: its inverse covariance, and its share in each block's mean."""
+    """Drift of unit size along a set of blocks: its inverse covariance, and its share in each block's
+    mean.
+    """
 
     diagonal: FloatArray
     off_diagonal: FloatArray
@@ -90,7 +93,7 @@ class _Chain(NamedTuple):
 
 
 class _Wanders:
-    """Cache of the chains of some blocks; a fit of the noise model requests the same lengths repeatedly."""
+    """Cache of the chains of a set of blocks, because a noise fit requests the same lengths repeatedly."""
 
     def __init__(self, blocks: Blocks) -> None:
         self._blocks = blocks
@@ -110,7 +113,7 @@ class _Wanders:
         )
 
     def over_legs(self) -> _Chain:
-        """Returns the error that is constant over a leg, with the size given in the blocks."""
+        """Returns the error that is constant over a leg, of the size given in the blocks."""
         blocks = self._blocks
         return self._once(
             "leg",
@@ -118,7 +121,9 @@ class _Wanders:
         )
 
     def over_branches(self, length_deg: float) -> _Chain:
-        """Returns the misfit of the loop's shape, which fades over each branch and differs between them."""
+        """Returns the misfit of the loop's shape, which decays over each branch and differs between
+        branches.
+        """
 
         def make() -> _Chain:
             crossed = self._blocks.since_turn_deg / length_deg
@@ -141,7 +146,9 @@ class _Wanders:
 
 
 def _chain(step: FloatArray, load: FloatArray) -> _Chain:
-    """Builds a chain from steps between blocks, in correlation lengths (infinite: independent)."""
+    """Builds a chain from the steps between blocks, in correlation lengths (infinite for independent
+    blocks).
+    """
     spread = -np.expm1(-2.0 * step)
     decay = np.exp(-step)
     diagonal = np.ones(len(load))
@@ -151,7 +158,7 @@ def _chain(step: FloatArray, load: FloatArray) -> _Chain:
 
 
 class Precision:
-    """Inverse covariance of the noise of some blocks, applied without forming the matrix.
+    """Inverse covariance of the noise of a set of blocks, applied without forming the matrix.
 
     K = W + H S H', with W white and S of the drifts. By Woodbury, with P = S^-1 (tridiagonal for each drift),
     K^-1 = w - w H (P + H' w H)^-1 H' w, and the bracket is banded.
@@ -164,7 +171,7 @@ class Precision:
         left_out: BoolArray | None = None,
         wanders: _Wanders | None = None,
     ) -> None:
-        """Blocks in ``left_out`` count as not observed; ``wanders`` is the cache of the blocks, if any."""
+        """Treats blocks in ``left_out`` as unobserved; ``wanders`` is the cache of the blocks, if any."""
         weight = 1.0 / noise.white_variance(blocks)
         if left_out is not None:
             weight = np.where(left_out, 0.0, weight)
@@ -204,7 +211,7 @@ class Precision:
         return factor
 
     def apply(self, columns: FloatArray) -> FloatArray:
-        """K^-1 times columns of shape (b,) or (b, p)."""
+        """Returns K^-1 times columns of shape (b,) or (b, p)."""
         if columns.ndim == 1:
             return np.asarray(self._applied(columns[np.newaxis])[0])
         result = np.empty(columns.shape)
@@ -215,7 +222,7 @@ class Precision:
         return result
 
     def _applied(self, rows: FloatArray) -> FloatArray:
-        """Returns K^-1 times columns that are given as rows, (p, b)."""
+        """Returns K^-1 times columns given as rows, (p, b)."""
         weighted = self.weight * rows
         if self._factor is None:
             return weighted
@@ -229,12 +236,14 @@ class Precision:
         return np.asarray(weighted - self.weight * back)
 
     def log_likelihood(self, residual: FloatArray) -> float:
-        """Returns the Gaussian log likelihood up to a constant; only observed blocks count."""
+        """Returns the Gaussian log likelihood of the observed blocks up to a constant."""
         return 0.5 * (self._log_determinant - float(residual @ self.apply(residual)))
 
 
 def _averaged(extent: FloatArray) -> FloatArray:
-    """Returns the variance of a drift's block mean relative to its own; extent in correlation lengths."""
+    """Returns the variance of a block-averaged drift relative to the drift's; extent in correlation
+    lengths.
+    """
     x = np.maximum(extent, 1e-6)
     return np.where(x < 1e-3, 1.0 - x / 3.0, 2.0 * (x - 1.0 + np.exp(-x)) / x**2)
 
@@ -279,7 +288,7 @@ def fit_noise(residual: FloatArray, blocks: Blocks, parameters: int, begin: Nois
 
 
 def _pieces(blocks: Blocks) -> IntArray:
-    """Selects blocks of some pieces spread evenly over the record."""
+    """Selects the blocks of several pieces spread evenly over the record."""
     count = len(blocks)
     if count <= PIECES * PIECE_BLOCKS:
         return np.arange(count)
