@@ -202,8 +202,8 @@ def held_out(
     own = active.effects if active else ()
     new = [solution.effects[place] for place in sorted(written)]
     for row, (effects, of) in enumerate(((own, shift), (new, kept))):
-        told, columns = design.predict(effects), solution.jacobian[:, of]
-        fit = Linearised(columns, rest_arcsec - told, solution.known[of])
+        model_arcsec, columns = design.predict(effects), solution.jacobian[:, of]
+        fit = Linearised(columns, rest_arcsec - model_arcsec, solution.known[of])
         steps = steps_without(fit, fold, lambda rows: Precision(state.noise, blocks.picked(rows)))
         for number, step in enumerate(steps):
             out = fold == number
@@ -211,7 +211,7 @@ def held_out(
             lost = ~np.isin(blocks.zero, blocks.zero[~out])
             left = fit.residual - columns @ step
             added[row, out] = about_zeros(left, blocks.zero, blocks.count * lost)[out]
-            left = measured_arcsec - told - columns[:, len(shift) :] @ step[len(shift) :]
+            left = measured_arcsec - model_arcsec - columns[:, len(shift) :] @ step[len(shift) :]
             alone[row, out] = about_zeros(left, blocks.zero, blocks.count * (lost | ~out))[out]
     used = len(fold) - np.bincount(fold)[fold] >= 2 * len(solution.columns)
     weight = blocks.count * used

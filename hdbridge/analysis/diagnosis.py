@@ -182,7 +182,7 @@ class _Judge:
         judged = self._likely_only(fitted)
         fitted, findings = judged.fitted, judged.findings
         known = {each.cause for each in findings} | {each.split(":")[0] for each in self.considered}
-        refused = self.search.told_refusals(fitted)
+        refused = self.search.reported_refusals(fitted)
         self.considered.extend(each for each in refused if each.split(":")[0] not in known)
         findings = self._with_unexplained(findings, judged.left)
         refitted = estimator.fit(Hypothesis(given, fitted.hypothesis.start))
@@ -407,8 +407,8 @@ class _Judge:
         if many is None and loops and of_the_loop(self.estimator, left):
             # The best law is only an approximation: one finding, with its residual in the note.
             note = f"the loop has another shape than either law: {figure(left.arcsec, 3)} arcsec rms are left"
-            told = replace(loops[0], note=note, lives_in=lives)
-            return [told if each is loops[0] else each for each in findings]
+            noted = replace(loops[0], note=note, lives_in=lives)
+            return [noted if each is loops[0] else each for each in findings]
         if size < self.estimator.floor_arcsec:
             return findings
         largest = max((each.peak_arcsec for each in findings), default=0.0)

@@ -379,9 +379,7 @@ class FitOptions:
     """Model to compare with, which also provides the undetermined shapes."""
 
     def prototype(self, effect: Effect) -> Effect:
-        """Returns an effect of this kind with the parameters of the active model or, without it, of the
-        options.
-        """
+        """Returns an effect of this kind with the parameters of the active model, else of the options."""
         known = (*(self.active.effects if self.active else ()), *self.effects)
         laws = (law for each in known for law in (each, *in_place(each, CATALOGUE.values())))
         return next((law for law in laws if law.name == effect.name), effect)
@@ -493,8 +491,8 @@ class State(NamedTuple):
         return found.information, right
 
     def selected(self, system: System | None = None) -> State:
-        """Selects the orders that are significant at the current noise; ``system`` is `information`, if
-        already known.
+        """Selects the orders that are significant at the current noise; ``system``: `information` if
+        known.
         """
         options = self.options
         found = select(

@@ -41,9 +41,7 @@ class Interval:
 
 
 def intervals_of(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> list[Interval]:
-    """Returns the intervals of one effect's parameters; ``cov`` (c, c) is the covariance of its
-    ``columns``.
-    """
+    """Returns the intervals of one effect's parameters; ``cov`` (c, c) is that of its ``columns``."""
     shapes = {each.name: each for each in effect.shape}
     base = dict(leaves(effect.parameters()))
     result = []
@@ -109,9 +107,7 @@ def nested_half_widths(effect: Effect, intervals: list[Interval]) -> dict[str, A
 
 
 def leaves(parameters: Any, path: str = "") -> Iterator[tuple[str, float]]:
-    """Yields every floating-point parameter with its path; list items are labelled by their ``order``, if
-    any.
-    """
+    """Yields each floating-point parameter with its path; list items are labelled by ``order`` if any."""
     if isinstance(parameters, dict):
         for key, part in parameters.items():
             yield from leaves(part, joined(path, key))

@@ -121,9 +121,7 @@ def sandwich(influence: FloatArray, number: IntArray) -> FloatArray:
 
 
 def about_zeros(left_arcsec: FloatArray, zero: IntArray, weight: FloatArray) -> FloatArray:
-    """Subtracts the weighted mean of each absolute zero from a residual (n,); zeros without weight stay
-    unchanged.
-    """
+    """Subtracts the weighted mean of each absolute zero from a residual (n,); 0 without weight."""
     total, weights = np.bincount(zero, weight * left_arcsec), np.bincount(zero, weight)
     return np.asarray(left_arcsec - (total / np.maximum(weights, 1e-300))[zero])
 
@@ -261,16 +259,12 @@ class Linearised:
 
     @cached_property
     def basis(self) -> FloatArray:
-        """B, shape (m, r). The square of a column c after the fit is c'c - (B'c)'(B'c); B is orthonormal
-        without priors.
-        """
+        """B, shape (m, r): a column's square c'c falls to c'c - (B'c)'(B'c); orthonormal without priors."""
         return np.asarray(self.columns @ self.directions)
 
     @cached_property
     def slack(self) -> FloatArray:
-        """s, shape (r,). The moment of a column c with the residual r after the fit is c'r - (B'c)'s; zero
-        at the minimum.
-        """
+        """s, shape (r,): a column's moment c'r with the residual falls to c'r - (B'c)'s; 0 at the minimum."""
         return np.asarray(self.directions.T @ (self.columns.T @ self.residual + self.known[:, 1]))
 
     def of(self, places: IntArray) -> Linearised:

@@ -82,9 +82,7 @@ class White:
 
 
 class _Chain(NamedTuple):
-    """Drift of unit size along a set of blocks: its inverse covariance, and its share in each block's
-    mean.
-    """
+    """Drift of unit size along some blocks: its inverse covariance, and its share in each block's mean."""
 
     diagonal: FloatArray
     off_diagonal: FloatArray
@@ -121,9 +119,7 @@ class _Wanders:
         )
 
     def over_branches(self, length_deg: float) -> _Chain:
-        """Returns the misfit of the loop's shape, which decays over each branch and differs between
-        branches.
-        """
+        """Returns the misfit of the loop's shape, which decays over each branch, anew for each."""
 
         def make() -> _Chain:
             crossed = self._blocks.since_turn_deg / length_deg
@@ -146,9 +142,7 @@ class _Wanders:
 
 
 def _chain(step: FloatArray, load: FloatArray) -> _Chain:
-    """Builds a chain from the steps between blocks, in correlation lengths (infinite for independent
-    blocks).
-    """
+    """Builds a chain from the steps between blocks in correlation lengths (infinite: independent)."""
     spread = -np.expm1(-2.0 * step)
     decay = np.exp(-step)
     diagonal = np.ones(len(load))
@@ -241,9 +235,7 @@ class Precision:
 
 
 def _averaged(extent: FloatArray) -> FloatArray:
-    """Returns the variance of a block-averaged drift relative to the drift's; extent in correlation
-    lengths.
-    """
+    """Returns the variance of a drift's block mean relative to the drift's; extent: correlation lengths."""
     x = np.maximum(extent, 1e-6)
     return np.where(x < 1e-3, 1.0 - x / 3.0, 2.0 * (x - 1.0 + np.exp(-x)) / x**2)
 

@@ -57,9 +57,7 @@ class Order:
 
     @classmethod
     def flexspline(cls, number: int, ratio: float) -> Order:
-        """Returns the order with this number of periods per turn of the wave generator against the
-        flexspline.
-        """
+        """Returns the order with these periods per turn of the wave generator against the flexspline."""
         return cls(Family.FLEXSPLINE, number, number * (1.0 + 1.0 / ratio))
 
     def __str__(self) -> str:
@@ -77,9 +75,7 @@ class Selection:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Estimate of one order next to all others: its amplitude in the fit, or the amplitude if it were
-    added.
-    """
+    """Estimate of one order next to all others: its amplitude, or the amplitude that it would add."""
 
     order: Order
     amplitude_arcsec: float

@@ -163,9 +163,7 @@ class Samples:
 
     @property
     def repeated(self) -> bool:
-        """True for several recordings of similar duration and travel; the tasks of a plan are not
-        repetitions.
-        """
+        """True for several recordings of similar duration and travel; not for the tasks of a plan."""
         rows = [each.rows for each in self.chains]
         durations = np.array([np.ptp(self.time_s[each]) for each in rows])
         travels = np.array([np.sum(np.abs(np.diff(self.motor_deg[each]))) for each in rows])
