@@ -1,7 +1,7 @@
 """Optional measured channels of the axis file, in addition to the encoders.
 
 Each is an object of the drive that arrives by PDO, with its unit, its plausible range, and the time for which
-the last reading is held. `hdbridge.drive.channels` follows them on line.
+the last reading is held. `hdbridge.drive.channels` tracks them on line.
 """
 
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, Self
@@ -104,13 +104,13 @@ class Quantity(Strict):
 
 MeasuredChannel = LoadTorque | Temperature | Quantity
 BY_KEY: Final = {each.axis_key: each for each in MEASURED if each.axis_key}
-"""Channels that the axis file can have, by their key there."""
+"""Channels of the axis file by their key."""
 
 OWN_KEYS: Final = frozenset({"load_torque", "temperature"})
 if TYPE_CHECKING:
 
     class OtherChannels(Strict):
-        """Measured channels that `AxisConfig` does not declare explicitly."""
+        """Measured channels that `AxisConfig` does not declare."""
 
 else:
     OtherChannels = create_model(
