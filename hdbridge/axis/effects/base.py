@@ -190,9 +190,7 @@ class Effect(Law):
         return iter(())
 
     def implausible(self, observations: Observations) -> str:
-        """Returns the reason why this instance is physically impossible, regardless of the fit; else
-        empty.
-        """
+        """Returns the reason why this instance is physically impossible, whatever the fit; else empty."""
         return ""
 
     def unidentifiable(self, observations: Observations) -> str:

@@ -85,9 +85,7 @@ def has_orders(base: Iterable[Effect]) -> bool:
 
 
 def growth_of(base: Iterable[Effect]) -> TorqueGrowth | None:
-    """Returns the growth of a model's orders with torque, or None; a fit may have moved it out of its
-    range.
-    """
+    """Returns the growth of a model's orders with torque, possibly out of its range after a fit, or None."""
     for each in base:
         if isinstance(each, TorqueGrowth):
             values = {name: getattr(each, name) for name in TorqueGrowth.model_fields}

@@ -89,9 +89,7 @@ class Creep(Effect):
                 yield cls(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=tau_s),), build_up=build_up)
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Requires a time constant comparable to a rest, because a much slower relaxation need not end with
-        the rest.
-        """
+        """Requires a time constant comparable to a rest; a much slower relaxation need not end with it."""
         if min(each.tau_s for each in self.parts) <= RESTS * longest_rest_s(observations.motion):
             return ""
         return "no rest is long enough to see it bend"

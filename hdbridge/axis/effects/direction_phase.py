@@ -1,6 +1,4 @@
-"""Shift of the synchronous part with the direction of travel, because the other tooth flanks carry the
-load.
-"""
+"""Shift of the synchronous part with the direction of travel, because other tooth flanks carry the load."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -64,9 +62,7 @@ class DirectionPhase(Modulating):
             yield cls(orders=orders_of(base), shift_deg=0.0)
 
     def left_in_mean(self, order: int) -> float:
-        """Returns the cosine of the shift, because the mean of two shifted flanks is smaller than either
-        flank.
-        """
+        """Returns the cosine of the shift, because the mean of two shifted flanks is the smaller."""
         return math.cos(order * math.radians(self.shift_deg))
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:

@@ -19,7 +19,7 @@ from hdbridge.units import DEG_PER_TURN
 
 PASSES = 3
 OTHER_SPEED = 1.5
-"""Minimum number of passes, which must be in both directions or at speeds that differ by this factor."""
+"""Minimum ratio of speeds among the passes, if all are in one direction."""
 
 
 FORM = 0.07
@@ -79,9 +79,7 @@ class LocalDefect(Momentary, Linear):
         return "" if self._is_met(observations) else "not passed often enough, or always alike"
 
     def _is_met(self, observations: Observations) -> bool:
-        """Returns True if the axis passed the location several times, in both directions or at different
-        speeds.
-        """
+        """Returns True if the axis passed the location repeatedly, both ways or at different speeds."""
         motion = observations.motion
         if motion.motor_speed_deg_s is None or motion.time_s is None:
             return False

@@ -1,6 +1,4 @@
-"""Stop operator, which follows the motor and is limited to plus or minus one: the building block of dead
-zones.
-"""
+"""Stop operator: follows the motor, limited to plus or minus one. The building block of dead zones."""
 
 import numpy as np
 

@@ -175,8 +175,8 @@ class Store(Generic[K]):
         axis = AxisConfig.load(profile)
         content.check_ratio(axis)
         with _locked(profile):
-            content_bound = content.with_provenance(date=_iso(date), reason=reason)
-            content_bound.bound_to(axis, identity).save(profile / self.pending)
+            dated = content.with_provenance(date=_iso(date), reason=reason)
+            dated.bound_to(axis, identity).save(profile / self.pending)
         return profile / self.pending
 
     def commit(self, profile: Path, date: datetime, identity: Identity | None = None) -> int:

@@ -118,9 +118,7 @@ class TransmissionModel:
         return replace(self, provenance={**self.provenance, **provenance})
 
     def bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> Self:
-        """Returns the model bound to an axis and the identity of its drive (default: that of the axis
-        file).
-        """
+        """Returns the model bound to an axis and the identity of its drive, by default the axis file's."""
         return replace(self, provenance={**self.provenance, **binding(axis, identity)})
 
     def check_ratio(self, axis: AxisConfig) -> None:
