@@ -1,4 +1,4 @@
-"""Standstill: encoder readings without motion are noise."""
+"""Standstill: encoder readings without motion, which show the noise."""
 
 from dataclasses import dataclass
 
@@ -37,7 +37,7 @@ class Standstill:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Standstill at a recurring pose, approached from the same side each time, so that changes are drift."""
+    """Standstill at a recurring pose, always approached from the same side, so that changes are drift."""
 
     load_deg: float = 0.0
     duration_s: float = 1.5
