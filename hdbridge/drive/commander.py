@@ -1,6 +1,6 @@
 """Commands the drive by SDO, outside the control cycle: walks its states and waits for its statusword.
 
-While it waits it keeps up the master's duties: it processes heartbeats and emergencies and sends the master's
+While waiting, it fulfils the master's duties: it processes heartbeats and emergencies, and sends the master's
 own heartbeat, without which the drive stops.
 """
 
@@ -61,7 +61,7 @@ class Commander:
         self.sdo.store(objects.CONTROLWORD, controlword)
 
     def pause(self, duration_s: float) -> None:
-        """Waits; receives frames and sends the master's heartbeat when it is due."""
+        """Waits, receiving frames and sending the master's heartbeat when due."""
         end_s = self.link.now() + duration_s
         while True:
             self._beat()
@@ -80,7 +80,7 @@ class Commander:
     def wait_for(
         self, what: str, done: Callable[[int], bool], timeout_s: float, *, allow_fault: bool = False
     ) -> int:
-        """Polls the statusword until ``done(statusword)`` is true and returns it.
+        """Polls the statusword until ``done(statusword)`` is true, and returns it.
 
         Raises `DriveError` on a fault unless ``allow_fault``, and `TransitionError` on time-out.
         """
@@ -110,7 +110,7 @@ class Commander:
         return ", ".join(filter(None, details)) or "no error code is known"
 
     def fault(self, when: str) -> DriveError:
-        """Returns the error to raise for a drive in fault."""
+        """Returns the error for a drive in fault."""
         return DriveError(
             f"{self.name}: fault {when} ({self.fault_words()}); remove the cause (the drive's manual "
             f"explains the code), then reset the fault: {RESET}"
