@@ -1,6 +1,6 @@
 """Causes of transmission error in the gear other than orders and hysteresis; see `hdbridge.sim.gear`.
 
-Each piece is evaluated once per substep, in order of time, so those with a state advance by one substep.
+Each piece is evaluated once per substep, in order of time, so pieces with a state advance by one substep.
 """
 
 import math
@@ -26,7 +26,7 @@ SLIDING_DEG_S: Final = 0.5
 
 @state
 class Flank:
-    """Loaded flank of the teeth, -1 to 1, by the travel of the motor."""
+    """Loaded flank of the teeth, -1 to 1, over the motor's travel."""
 
     _last_deg: float
     _share: float
@@ -77,7 +77,7 @@ class SpeedFactor:
 
 @state
 class TorqueFactor:
-    """Growth of the tooth error with the torque that the teeth carry."""
+    """Growth of the tooth error with the torque carried by the teeth."""
 
     _per_nm: float
 
@@ -143,8 +143,8 @@ class Wear:
 class Creep:
     """Kelvin-Voigt elements in series, each yielding to the teeth's drag and to the load.
 
-    The drag acts against the motion while the motor turns, and ceases at standstill, so the output creeps on
-    after a stop. A torque at the load acts for as long as it lasts.
+    The drag acts against the motion while the motor turns, and ceases at standstill, so the output continues
+    to creep after a stop. A torque at the load acts for as long as it lasts.
     """
 
     by_motor_only: ClassVar[bool] = False
@@ -210,7 +210,7 @@ class Jumps:
 
 @state
 class Damage:
-    """Damaged teeth: smooth bumps by load angle."""
+    """Damaged teeth: smooth bumps over load angle."""
 
     by_motor_only: ClassVar[bool] = False
     _at_deg: tuple[float, ...]
@@ -235,7 +235,7 @@ class Damage:
 
 @state
 class Roller:
-    """Roller on the motor's hub: an error by its own angle, largest at the load angle that presses it on."""
+    """Roller on the motor's hub: an error over its own angle, largest at the load angle of the contact."""
 
     by_motor_only: ClassVar[bool] = False
     _amplitude: float
@@ -258,7 +258,7 @@ class Roller:
 
 
 class Seat:
-    """Bearing ring that is carried along by the motion and slips back at random angles."""
+    """Bearing ring that is dragged along by the motion and slips back at random angles."""
 
     by_motor_only: ClassVar[bool] = True
 

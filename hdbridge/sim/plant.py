@@ -136,8 +136,8 @@ class Plant:
     def _turn_motor(self, torque_nm: float, brake_nm: float, spring: float) -> bool:
         """Runs the motor's part of a substep; returns True if it moved.
 
-        ``spring`` is the spring's torque without the share that the motor's own motion adds: arm * (old
-        speed + new speed).
+        ``spring`` is the spring's torque without the contribution of the motor's own motion, arm * (old speed
+        + new speed).
         """
         now, dt, speed = self.now, self._dt, self.motor_deg_s
         held = self._coulomb + brake_nm

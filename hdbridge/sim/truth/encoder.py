@@ -103,7 +103,7 @@ class TrueCable(Strict):
 
 
 class TrueSensorWarming(Strict):
-    """Warming of the encoder itself, by the square of its speed; no temperature channel shows it."""
+    """Warming of the encoder by the square of its speed, which no temperature channel shows."""
 
     arcsec_at_10_deg_s: float = Field(
         ge=-3_600, le=3_600, description="shift that long motion at 10 degrees per second ends at"

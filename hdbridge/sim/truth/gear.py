@@ -12,7 +12,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 
 class TrueStiffening(Strict):
-    """Later stages of the spring: beyond each torque it is stiffer (or softer) than before."""
+    """Further stages of the spring, which is stiffer (or softer) beyond each torque than before."""
 
     first_torque_nm: float = Field(gt=0, le=1e6, description="torque T1 at which the first stage ends")
     second_stiffness_nm_per_rad: float = Field(gt=0, le=1e9, description="stiffness K2 beyond T1")
@@ -30,7 +30,7 @@ class TrueStiffening(Strict):
 
 
 class TrueFlank(Strict):
-    """Other flank of the teeth, which carries after a reversal, with a shifted tooth error."""
+    """Other flank of the teeth, which carries the load after a reversal, with a shifted tooth error."""
 
     shift_deg: float = Field(
         ge=-90,
@@ -82,7 +82,7 @@ class TrueCreep(Strict):
 
 
 class TrueJump(Strict):
-    """Jump of teeth, which remains in the output."""
+    """Jump of teeth that remains in the output."""
 
     time_s: float = Field(ge=0, le=1e8, description="time since the axis was switched on")
     teeth: int = Field(ge=-100, le=100, description="teeth that the output jumps forward by")
@@ -108,7 +108,7 @@ class TrueRoller(Strict):
 
 
 class TrueSeat(Strict):
-    """Bearing ring that sticks in its seat, is carried along, and slips at random angles."""
+    """Bearing ring that sticks in its seat, is dragged along, and slips at random angles."""
 
     slip_arcsec: float = Field(gt=0, le=36_000, description="how far it is carried at most; it slips before")
     travel_deg: float = Field(gt=0, le=1e6, description="motor travel that carries it as far as that")
