@@ -262,7 +262,7 @@ INTEGRAL_TIME_MS: Final = 15.0
 """About three times the period of the velocity loop's bandwidth."""
 COMMAND_FILTER_MS: Final = 1.0
 """Short filter by which drives interpolate the demand between SYNCs."""
-FRICTION_FEEDFORWARD: Final = 0.8
+FRICTION_FEEDFORWARD_SHARE: Final = 0.8
 """Friction feed-forward as a share of the friction, without overshoot at reversals."""
 TORQUE_LIMIT_PERCENT: Final = 300.0
 """Peak over rated torque of small servo motors."""
@@ -304,7 +304,7 @@ def default_truth(axis: AxisConfig) -> Truth:
                 "damping_ratio": DAMPING_RATIO,
             },
             "viscous_feedforward_nm_s_per_rad": viscous,
-            "friction_feedforward_nm": FRICTION_FEEDFORWARD * coulomb,
+            "friction_feedforward_nm": FRICTION_FEEDFORWARD_SHARE * coulomb,
             "torque_limit_percent": max(TORQUE_LIMIT_PERCENT, axis.limits.torque_percent),
         },
         "gear": {

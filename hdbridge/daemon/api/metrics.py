@@ -1,6 +1,7 @@
 """`/metrics` for Prometheus: loop timing, faults, axes and API requests.
 
-A sink of the observer: `take` costs a few microseconds per batch. Everything else is read when scraped.
+A sink of the observer, whose `take` costs a few microseconds per batch. Everything else is read on each
+scrape.
 """
 
 from collections import Counter
@@ -25,7 +26,7 @@ _PREFIX: Final = "hdbridge_"
 
 
 class Metrics:
-    """Counts that accumulate between two scrapes."""
+    """Counts accumulated for the scrapes."""
 
     def __init__(self) -> None:
         self.late = Histogram()
@@ -101,7 +102,7 @@ _AXIS: Final = (
     ),
     ("outer_latency_99_seconds", "The same, 99 % of them are not longer.", "outer.latency_99_s"),
 )
-"""Name, description and field of each metric of an axis."""
+"""Name, description and field of each axis metric."""
 
 
 class _Scrape(Collector):
@@ -148,7 +149,7 @@ class _Scrape(Collector):
 
 
 def _field(state: Any, path: str) -> Any:
-    """Returns a field of a state, such as ``model.age_s``; None without it."""
+    """Returns a field of a state, such as ``model.age_s``, or None."""
     for name in path.split("."):
         state = getattr(state, name, None)
     return state

@@ -1,1 +1,3 @@
-"""The gateway: a CiA-402 drive on another bus whose position is the load's, in a process of its own."""
+"""Gateway: shows each axis on another bus as a CiA-402 drive whose position is the load's, in its own
+process.
+"""
