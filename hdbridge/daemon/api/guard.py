@@ -114,9 +114,7 @@ class Policy:
 
 
 def too_deep(body: bytes) -> bool:
-    """Returns True if JSON is nested more deeply than any valid request, because a parser would recurse into
-    it.
-    """
+    """Returns True if JSON is nested too deeply for a valid request; a parser would recurse into it."""
     depth = 0
     for match in _BRACKETS.finditer(body):
         first = match[0][:1]

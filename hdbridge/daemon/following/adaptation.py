@@ -124,7 +124,7 @@ class Adaptation:
         self._now_s = 0.0
         self._nuisances = drift.has_memory.copy()
         self._nuisances[drift.zero :] = True
-        """Columns that may not be mistaken for a drift: the loop, the zero, the load encoder's disc."""
+        """Columns that must not be mistaken for a drift: the loop, the zero, the load encoder's disc."""
         self._zeros: deque[tuple[float, float]] = deque(maxlen=MAX_DRIFT_WINDOWS)
         """Time and zero of the last windows."""
         self._window: list[Observation] = []

@@ -55,10 +55,10 @@ PREDICTED_SHARE = 0.5
 """Share of the predicted change within a window that may appear too early or too late."""
 UNMODELLED_ARCSEC = 20.0
 UNMODELLED_DEG = 36.0
-"""Motor travel over which, or over a longer one, the largest unmodelled change of the gear's error occurs:
-an order of 10 per turn with an amplitude of 10 arcsec (`effects.motor_order` is at most 3)."""
+"""Motor travel of the largest unmodelled change of the gear's error: an order of 10 per turn with an
+amplitude of 10 arcsec (`effects.motor_order` is at most 3)."""
 SHAKE_S = 0.002
-"""Time by which a speed change may precede or follow in the error, through wind-up and skew between the
+"""Maximum time between a speed change and its effect on the error, through wind-up and skew between the
 encoders."""
 MEDIAN_DIFFERENCE = 1.0 / (0.6745 * np.sqrt(2.0))
 """Standard deviation of Gaussian values, relative to the median difference of neighbours."""

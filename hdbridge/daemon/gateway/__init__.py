@@ -1,3 +1,1 @@
-"""Gateway: shows each axis on another bus as a CiA-402 drive whose position is the load's, in its own
-process.
-"""
+"""Gateway, in its own process: a CiA-402 drive on another bus whose position is that of the load."""

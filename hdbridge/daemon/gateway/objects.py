@@ -67,7 +67,7 @@ _FOLLOWING_TIME_S: Final = 0.2
 
 
 def nameplate(axis: AxisConfig, settings: GatewaySettings) -> Nameplate:
-    """Returns the scales: the load is the motor of this drive, without a gear; the real motor is the second
+    """Returns the nameplate: the load is this drive's motor, without a gear; the motor is the second
     encoder.
     """
     return Nameplate(

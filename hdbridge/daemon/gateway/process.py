@@ -64,9 +64,7 @@ class SimulatedClock:
 
 
 def serve(start: Start) -> None:
-    """Simulates the drives of the outer bus until SIGTERM. Raises `BusError` if the bus cannot be opened or
-    read.
-    """
+    """Simulates the drives of the outer bus until SIGTERM. Raises `BusError` if the bus fails."""
     begin_log(start.log)
     machine, terminated = start.machine, when_terminated()
     settings = machine.gateway

@@ -122,9 +122,7 @@ class LoadAxis(PowerStage):
     # ---------------------------------------------------------------- the newest cycle
 
     def look(self, newest: SampleArray | None, now_s: float, alive: bool) -> None:
-        """Takes the newest cycle, shape (1,), and checks for errors; ``newest`` is None without a new
-        cycle.
-        """
+        """Takes the newest cycle, shape (1,), and checks for errors; ``newest``: None without a new cycle."""
         if newest is not None:
             self._take(newest)
         sample = self.sample

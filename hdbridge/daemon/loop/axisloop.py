@@ -1,8 +1,8 @@
 """One axis in the control loop: its state, the commands it accepts and the events it reports.
 
-`AxisLoop.command` takes the service's commands between two turns. `AxisCycle` asks for a target in each turn
-in which the drive is enabled. The state decides who answers (`_enabling`, `Follower.follow` or nobody), so
-the turn itself decides nothing. `AxisLoop.after` evaluates the result of the turn.
+`AxisLoop.command` takes the service's commands between two turns. `AxisCycle` requests a target in each turn
+in which the drive is enabled. The state determines which function provides it (`_enabling`, `Follower.follow`
+or `_pursue`), so the turn itself decides nothing. `AxisLoop.after` evaluates the result of the turn.
 """
 
 import math
@@ -43,7 +43,7 @@ _FRESH, _COMPENSATING, _LIMITED, _MEMORY_KNOWN, _CHANGING, _AT_REST, _UNDERRUN, 
 
 
 class AxisLoop:
-    """One axis. It sends nothing and is unverified until the service reports that its drive was verified."""
+    """One axis. It sends nothing and is unverified until the service reports that its drive is verified."""
 
     def __init__(
         self,
@@ -56,8 +56,8 @@ class AxisLoop:
         outer: OuterCells,
         due_s: Callable[[], float],
     ) -> None:
-        """``followed`` has the gateway's set-points, ``outer`` its states; ``due_s`` returns when the present
-        turn was due.
+        """``followed`` has the gateway's set-points, ``outer`` its states; ``due_s`` returns the due time of
+        the present turn.
         """
         config = setup.config
         self.index = index
@@ -69,7 +69,7 @@ class AxisLoop:
         self.follower = Follower(setup, self.image)
         self.set_point = self.follower.set_point
         self.group: frozenset[int] = frozenset()
-        """Indices of the axes that began the same stream; they stop when this one does."""
+        """Indices of the axes that began the same stream, which stop together with this axis."""
         self.broken: frozenset[int] = frozenset()
         """Group whose stream this axis left before its end; the controller stops the others."""
 
@@ -85,7 +85,7 @@ class AxisLoop:
         encoder = config.load_encoder
         self._load_deg = math.nan if encoder.is_motor_encoder else encoder.degrees(1)
         self._limited = 0
-        """Cycles in which the correction was limited, when the last sample was taken."""
+        """Number of cycles with a limited correction when the last sample was taken."""
         self._changing = self._underrun = self._unfed = False
         self._doubt = ""
         """Last reported states of the compensation change, the stream underrun and the load loop."""
@@ -93,11 +93,11 @@ class AxisLoop:
         self._mode = MotionMode.HOLD
         self._powering_off = False
         self._left = 0
-        """Turns left before the drive's time-out."""
+        """Number of turns left before the drive's time-out."""
         self._why = ""
         """Reason for stopping, if the supervision did not report one."""
         self.stands = True
-        """The axis stands and the stop was reported; False only in QUICK_STOPPED and LATCHED."""
+        """True if the axis stands and the stop was reported; False only in QUICK_STOPPED and LATCHED."""
         self._place = self._still = 0
         """Motor counts in the last turn of a stop, and the number of turns without a change."""
         self._handlers: dict[CommandKind, Callable[[Command], None]] = {
@@ -157,7 +157,7 @@ class AxisLoop:
         self.set_point.stop()
 
     def verification_lost(self) -> None:
-        """Handles a bus failure: the drive must be verified again, even if it is lent."""
+        """Handles a bus failure, after which the drive must be verified again, even if lent."""
         self._why = "the bus went down while the axis was lent"
         self._happened(Happening.VERIFICATION_LOST)
 
@@ -309,7 +309,7 @@ class AxisLoop:
         self.cycle.command = self._pursue
 
     def _pursue(self, feedback: Feedback) -> int | None:
-        """Follow the gateway's set-points of one period ago, because the newest may still be on their way."""
+        """Follows the gateway's set-points of one period ago; the newest may still be on their way."""
         if self.set_point.mode is MotionMode.FOLLOW:
             aim = self._outer.at(self._due_s() - self._period_s)
             if aim is None:
@@ -446,7 +446,7 @@ class AxisLoop:
         self._happened(Happening.OVERDUE)
 
     def _after_stop(self) -> None:
-        """Reports a stop once the axis stands or the time for stopping has passed."""
+        """Reports a stop once the axis stands or the time-out has passed."""
         if self.supervision.stop is None and self.state is AxisState.QUICK_STOPPED:
             if not self._obeyed():
                 return
@@ -530,7 +530,7 @@ class AxisLoop:
 
 
 def _readings(flags: int, readings: tuple[float | None, ...]) -> tuple[int, float, float]:
-    """Returns the flags with those of the known channels added, and both readings (NaN if unknown)."""
+    """Returns the flags including those of the known channels, and both readings (NaN if unknown)."""
     known = [each if each is not None else math.nan for each in (*readings, None)[:2]]
     for value, bit in zip(known, (_KNOWN0, _KNOWN1), strict=True):
         if not math.isnan(value):

@@ -27,9 +27,9 @@ COMMANDS_A_TURN: Final = 8
 REOPEN_EVERY_S: Final = 0.5
 """Interval between attempts to reopen a failed interface."""
 REFUSALS_A_SECOND: Final = 10
-"""Maximum rate at which refused relay frames are reported."""
+"""Maximum rate of reports of refused relay frames."""
 ENDING_TIMEOUT_S: Final = 10.0
-"""Time after which the process ends even if the drives have not confirmed that power is off."""
+"""Time after which the process ends even if the drives have not confirmed power-off."""
 _ALL: Final = -1
 _AT_REST: Final = frozenset({AxisState.UNVERIFIED, AxisState.DISABLED, AxisState.LATCHED})
 _OFF: Final = frozenset({State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON, State.UNKNOWN})
@@ -47,8 +47,8 @@ class Controller:
     ) -> None:
         """``reopen`` reopens the interface after a failure; it returns None while the interface is down.
 
-        Raises InputError if the axes cannot share one bus, or if the shared memory was made for another
-        number of axes.
+        Raises InputError if the axes cannot share one bus, or if the shared memory is for another number of
+        axes.
         """
         if memory.axes != len(setups):
             raise InputError(f"shared memory for {memory.axes} axes, but the machine has {len(setups)}")
@@ -70,7 +70,7 @@ class Controller:
         for axis in self.axes:
             cycle.join(axis.cycle)
         self.ended = False
-        """True once `end` has switched off power of all axes; no more turns are due."""
+        """True once `end` has switched off the power of all axes; no more turns are due."""
 
         self._reopen = reopen
         self._axis_of_node = {
@@ -99,7 +99,7 @@ class Controller:
     # ---------------------------------------------------------------- a turn
 
     def turn(self) -> None:
-        """Runs one cycle. Raises no error of the bus or the service."""
+        """Runs one cycle. Does not raise errors of the bus or the service."""
         cycle, axes = self.cycle, self.axes
         self._take_commands()
         for axis in axes:
@@ -185,7 +185,7 @@ class Controller:
         self._tell(command.axis, EventKind.DONE, command.id)
 
     def _stop_group(self, stopped: AxisLoop) -> None:
-        """Brakes the other axes of a group when one of them leaves it."""
+        """Brakes the other axes of a group when one axis leaves it."""
         for index in stopped.broken:
             axis = self.axes[index]
             if axis.group == stopped.broken:
@@ -241,7 +241,7 @@ class Controller:
     # ---------------------------------------------------------------- the end
 
     def end(self, *, at_once: bool = False) -> None:
-        """Stops all axes and switches power off; `ended` becomes True when that is done.
+        """Stops all axes and switches power off; `ended` then becomes True.
 
         Axes are braked to rest, or quick-stopped with ``at_once``. Repeated calls do nothing, except that
         ``at_once`` may follow an ordinary call.

@@ -1,4 +1,4 @@
-"""Faults of the supervision as events: one when a fault begins, one when its reaction becomes more severe."""
+"""Faults of the supervision as events: one when a fault begins, one when its reaction gets more severe."""
 
 import math
 from typing import Final, Protocol
@@ -7,7 +7,7 @@ from hdbridge.daemon.memory.layout import EventKind
 from hdbridge.drive.supervision import Fault, Reaction, Supervision
 
 OVER_S: Final = 1.0
-"""Time without a fault after which it is over, and is reported again when it returns."""
+"""Time without a fault after which it counts as over, and is reported again on its return."""
 CODES_KEPT: Final = 64
 FAULT_INDEX: Final = {fault: place for place, fault in enumerate(Fault)}
 """Number of each fault in events and samples."""
@@ -36,7 +36,7 @@ class FaultLog:
         """Last cycle and most severe reported reaction of each fault."""
 
     def tell(self) -> None:
-        """Reports the faults that are new since the last turn."""
+        """Reports the new faults since the last turn."""
         supervision = self._supervision
         if supervision.noted == self._noted:
             return

@@ -1,9 +1,9 @@
-"""A file of the flight recorder: MCAP, complete up to its last flush in any event.
+"""File of the flight recorder: MCAP, always complete up to its last flush.
 
 Messages collect in a chunk in memory; `flush` writes the chunk and syncs it to the disk. An unfinished file
-has all its chunks but no index: `mend` rewrites it as a finished one. Until it is finished its name ends in
-``.part``, and its writer holds a lock on it. Each file is complete by itself: it has the description of the
-machine (`About`) and the models in use.
+has all its chunks but no index; `mend` rewrites it as a finished file. Until it is finished, its name ends in
+``.part`` and its writer holds a lock on it. Each file is complete by itself: it contains the description of
+the machine (`About`) and the models in use.
 """
 
 import fcntl
@@ -28,12 +28,12 @@ from hdbridge.records.recording import versions_here
 
 FORMAT: Final = "hdbridge.flight/1"
 MACHINE_NAME: Final = "hdbridge"
-"""Name of the machine's metadata record; that of an axis is ``axis/NAME``."""
+"""Name of the machine's metadata record; the name of an axis record is ``axis/NAME``."""
 PART: Final = ".part"
 KEPT: Final = "kept"
 """Subfolder for recordings that contain a fault."""
 CHUNK_BYTES: Final = 64 << 20
-"""Maximum size of a chunk. It exceeds a second's data, so that chunks end at flushes."""
+"""Maximum size of a chunk. It exceeds a second's data, so chunks end at flushes."""
 EVENTS: Final = "/events"
 MODEL: Final = "/model"
 MACHINE_TOPIC: Final = "/machine"
@@ -183,7 +183,7 @@ class _Stream:
         return self._written + len(self._waiting)
 
     def flush(self) -> None:
-        """Does nothing: the MCAP writer flushes at will, but only `commit` writes."""
+        """Does nothing, because the MCAP writer flushes at will but only `commit` may write."""
 
     @property
     def waiting(self) -> int:
@@ -241,7 +241,7 @@ class FlightFile:
 
     @property
     def behind(self) -> int:
-        """Bytes that the last flush could not write."""
+        """Number of bytes that the last flush could not write."""
         return self._stream.waiting
 
     def add_samples(self, samples: SampleArray) -> None:
@@ -275,12 +275,12 @@ class FlightFile:
         self._put(self._models, time_ns, {"axis": axis, "version": version, "text": text})
 
     def flush(self) -> None:
-        """Writes new messages and syncs them to the disk. After an OSError they wait for a retry."""
+        """Writes new messages and syncs them to the disk. After an OSError, they wait for a retry."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._stream.commit()
 
     def finish(self) -> None:
-        """Writes the index and renames the file. After an OSError it stays a part, to be mended."""
+        """Writes the index and renames the file. After an OSError, it stays a part that can be mended."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         try:
             self._stream.commit()
@@ -289,7 +289,7 @@ class FlightFile:
             self.abandon()
 
     def abandon(self) -> None:
-        """Closes the file as it is."""
+        """Closes the file without finishing it."""
         if self._stream.descriptor >= 0:
             os.close(self._stream.descriptor)
             self._stream.descriptor = -1

@@ -1,6 +1,6 @@
 """Reading of flight recordings, finished or not, up to their last complete chunk.
 
-The recorder may be active in the same folder: it renames a file when it is finished or kept, and removes old
+The recorder may be active in the same folder. It renames a file when it is finished or kept, and removes old
 files. A recording is found under its present name as long as it exists.
 """
 
@@ -47,7 +47,7 @@ class Told(NamedTuple):
 
 
 class ModelUsed(NamedTuple):
-    """Model that an axis used from a time on."""
+    """Model used by an axis from a given time."""
 
     time_ns: int
     axis: str
@@ -60,10 +60,10 @@ class Flight:
     """Content of one file, or its summary."""
 
     path: Path
-    """Its present name."""
+    """Present name."""
     about: About
     finished: bool
-    """True if it has its index; else it was cut off or is being written."""
+    """True if the file has its index; else it was cut off or is being written."""
     first_ns: int
     """Times of day of the first and the last message, ns."""
     last_ns: int
@@ -78,9 +78,9 @@ class Flight:
 
 
 def flight_files(paths: Sequence[Path]) -> list[Path]:
-    """Returns the given files, and for each folder its recordings by date, kept ones included.
+    """Returns the given files, and the recordings of each folder by date, including kept ones.
 
-    Raises InputError if a folder has none.
+    Raises InputError for a folder without recordings.
     """
     found: list[Path] = []
     for path in paths:
@@ -130,9 +130,9 @@ def each_flight(paths: Sequence[Path], look: Callable[[Path], T]) -> Iterator[T]
 
 
 def records_of(file: BinaryIO, where: Path) -> Iterator[McapRecord]:
-    """Yields every record up to the last complete chunk; the last is a `Footer` only if the file is finished.
+    """Yields every record up to the last complete chunk; the last is a `Footer` only in a finished file.
 
-    Raises InputError if it is not an MCAP file.
+    Raises InputError if the file is not MCAP.
     """
     try:
         yield from StreamReader(file, validate_crcs=True).records
@@ -145,7 +145,7 @@ def records_of(file: BinaryIO, where: Path) -> Iterator[McapRecord]:
 
 
 def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
-    """Reads a file; ``axes`` selects the axes with samples (None: all). InputError names the file."""
+    """Reads a file; ``axes`` selects the axes with samples (None for all). InputError names the file."""
     topics: dict[int, str] = {}
     messages: dict[str, list[bytes]] = defaultdict(list)
     metadata: dict[str, Mapping[str, str]] = {}
@@ -187,7 +187,7 @@ def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
 
 
 def overview(path: Path) -> Flight:
-    """Returns the summary of a finished file without reading its samples; reads an unfinished one in full."""
+    """Returns the summary of a finished file without reading its samples; reads others in full."""
     path, opened = _opened(path)
     with opened as file:
         try:

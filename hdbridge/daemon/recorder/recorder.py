@@ -1,7 +1,7 @@
-"""The flight recorder: all samples and events of the loop, on disk within a second.
+"""Flight recorder: all samples and events of the loop, on disk within a second.
 
-`FlightRecorder` is a sink of the observer. It never blocks and uses bounded memory: data that its thread is
-too slow for is dropped, counted and reported. `flightlog` does the thread's work.
+`FlightRecorder` is a sink of the observer. It never blocks and uses bounded memory. Data that arrives faster
+than its thread can process is dropped, counted and reported. `flightlog` does the thread's work.
 """
 
 import logging
@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 class FlightRecorder:
     """Sink that passes everything to its thread; another thread mends files of earlier processes.
 
-    If the folder cannot be created, it records nothing and reports that.
+    If the folder cannot be created, it records nothing and reports the failure.
     """
 
     def __init__(
@@ -80,12 +80,12 @@ class FlightRecorder:
         self.flight.counts.dropped += len(samples)
 
     def put(self, item: ModelUse | Note) -> None:
-        """Records a change of model or a note. They are rare, and never dropped."""
+        """Records a change of model or a note. Both are rare and never dropped."""
         if self.flight is not None:
             self._queue.put(item)
 
     def mark(self, text: str = "") -> None:
-        """Records a mark and keeps the time around it, as around a fault."""
+        """Records a mark and keeps the time around it, like that around a fault."""
         self.put(Note(MARK, text))
 
     def state(self) -> messages.RecorderState:
@@ -99,7 +99,7 @@ class FlightRecorder:
         )
 
     def close(self) -> None:
-        """Finishes the file; returns when it is on the disk."""
+        """Finishes the file; returns once it is on the disk."""
         self._queue.put(None)
         for thread in self._threads:
             thread.join()

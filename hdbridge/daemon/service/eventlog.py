@@ -1,8 +1,8 @@
 """Event log: the control process's events and the service's notes, in two bounded lists. Thread-safe.
 
-One list has every entry, for the service itself. Clients see the other one, which omits routine entries
-(`_routine`): a calibration ends thousands of legs, which must not displace yesterday's stop. Each list has
-its own numbering. `Journal` writes the log lines of the control process, which writes none itself.
+One list has every entry, for the service itself. Clients see the other list, which omits routine entries
+(`_routine`), because a calibration ends thousands of legs, which must not displace yesterday's stop. Each
+list has its own numbering. `Journal` writes the log lines of the control process, which itself writes none.
 """
 
 import logging
@@ -40,7 +40,7 @@ class Entry(NamedTuple):
 
 
 class EventLog:
-    """The newest `KEPT` entries, and the answers to the newest commands."""
+    """Newest `KEPT` entries, and the answers to the newest commands."""
 
     def __init__(self, reader: RingReader[Event]) -> None:
         self._reader = reader
@@ -80,7 +80,7 @@ class EventLog:
             self._add(axis, None, text, hint)
 
     def answer(self, command_id: int) -> Event | None:
-        """Returns the DONE or REFUSED event of a command; None until it comes."""
+        """Returns the DONE or REFUSED event of a command; None until it arrives."""
         return self._answers.get(command_id)
 
     def since(self, number: int) -> list[Entry]:
@@ -89,7 +89,7 @@ class EventLog:
             return _newest(self._entries, self._number - number)
 
     def told(self, number: int) -> list[Entry]:
-        """Returns the entries for clients after their ``number``, oldest first."""
+        """Returns the entries for clients after ``number``, oldest first."""
         with self._lock:
             return _newest(self._told, self._told_number - number)
 
@@ -113,13 +113,13 @@ def _newest(entries: deque[Entry], count: int) -> list[Entry]:
 
 
 def _routine(event: Event) -> bool:
-    """Returns True for a completed command and the end of a stream, which only their client needs."""
+    """Returns True for a completed command and the end of a stream, which concern only their client."""
     stream = event.kind is EventKind.MOTION_ENDED and event.code == MotionMode.STREAM
     return stream or event.kind is EventKind.DONE
 
 
 class Journal:
-    """A sink of the observer that logs one line per event, with the name of its axis."""
+    """Sink of the observer that logs one line per event, with the name of its axis."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names

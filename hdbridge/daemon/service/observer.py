@@ -14,12 +14,12 @@ from hdbridge.daemon.service.eventlog import EventLog
 
 PERIOD_S = 0.02
 GONE_S = 3.0
-"""Time without a turn after which the control process is considered hung or gone."""
+"""Time without a turn after which the control process counts as hung or dead."""
 _log = logging.getLogger(__name__)
 
 
 class Sink(Protocol):
-    """Receiver of samples and events. It must not block; slow work needs a thread and a bounded queue."""
+    """Receiver of samples and events. It must not block; slow work requires a thread and a bounded queue."""
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
         """Takes the samples and events since the last call, oldest first, and the number of lost cycles."""
@@ -89,7 +89,7 @@ class Observer:
 
 
 class Batch(NamedTuple):
-    """Samples delivered to a subscriber at once."""
+    """Samples delivered to a subscriber together."""
 
     samples: SampleArray
     """One row per cycle, with the fields of `hdbridge.daemon.memory.sample_dtype`."""
@@ -98,9 +98,9 @@ class Batch(NamedTuple):
 
 
 class Subscription:
-    """Buffer of one live client: the newest samples until they are fetched. An asynchronous iterator.
+    """Buffer of one live client, an asynchronous iterator: the newest samples until they are fetched.
 
-    A client that is too slow loses samples; each batch contains the number lost.
+    A slow client loses samples; each batch contains the number lost.
     """
 
     def __init__(self, observer: Observer, most: int) -> None:
@@ -133,7 +133,7 @@ class Subscription:
         return self
 
     async def __anext__(self) -> Batch:
-        """Returns the next batch; waits until there is one."""
+        """Returns the next batch, waiting if necessary."""
         await self._came.wait()
         self._came.clear()
         samples = list(self._samples)
