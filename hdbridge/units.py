@@ -68,5 +68,5 @@ def with_interval(value: float, half_width: float) -> tuple[str, str]:
     last = math.floor(math.log10(half_width)) - 1
     if 0.0 < abs(value) < 1e-4:
         return f"{value:.{max(math.floor(math.log10(abs(value))) - last, 0)}e}", f"{half_width:.1e}"
-    told, half = (f"{round(each, -last):.{max(-last, 0)}f}" for each in (value, half_width))
-    return told, half
+    rounded, half = (f"{round(each, -last):.{max(-last, 0)}f}" for each in (value, half_width))
+    return rounded, half

@@ -163,7 +163,7 @@ for _panel, _commands in PANELS.items():
         app.command(_name, help=_summary, rich_help_panel=_panel)(_in_overview)
 
 
-def _tell_version(asked: bool) -> None:
+def _print_version(asked: bool) -> None:
     if asked:
         print(f"hdbridge {__version__}")
         raise typer.Exit
@@ -172,7 +172,7 @@ def _tell_version(asked: bool) -> None:
 @app.callback()
 def _hdbridge(
     version: Annotated[  # noqa: ARG001 - its callback has printed it by then
-        bool, typer.Option("--version", help="Print the version and exit.", callback=_tell_version)
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version)
     ] = False,
     verbose: Annotated[
         int,
@@ -193,7 +193,7 @@ def _hdbridge(
     """
     if verbose or log is not None:
         eventlog.begin(verbose, log)
-        eventlog.tell("command", arguments=sys.argv[1:], version=__version__)
+        eventlog.write("command", arguments=sys.argv[1:], version=__version__)
 
 
 _HANDLER: Final = "hdbridge.plain"

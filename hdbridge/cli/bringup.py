@@ -465,7 +465,7 @@ def doctor(
     ) as context:
         moving = next(place for place, each in enumerate(CHECKS) if each.moves)
         checks = (*CHECKS[:moving], RESPONSE, *CHECKS[moving:], SERVO) if servo else CHECKS
-        rows = run_checks(context, checks, permitted=permitted, tell=_print_row)
+        rows = run_checks(context, checks, permitted=permitted, notify=_print_row)
     failures = [row for row in rows if row.verdict.outcome is Outcome.FAIL]
     write_json(
         json_file,
@@ -574,11 +574,11 @@ def latency(
 
     periods = tuple(each / 1000.0 for each in cycle_ms) if cycle_ms else CANDIDATES_S
 
-    def tell(done: Measurement) -> None:
+    def notify(done: Measurement) -> None:
         note(f"measured {1e3 * done.period_s:g} ms")
 
     with prepare_realtime() if realtime else nullcontext("ordinary priority") as conditions:
-        report = measure(MonotonicClock(), duration_s, periods, conditions=str(conditions), progress=tell)
+        report = measure(MonotonicClock(), duration_s, periods, conditions=str(conditions), progress=notify)
     write_json(json_file, report.as_dict())
     say(report.table())
 

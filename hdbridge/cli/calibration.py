@@ -175,7 +175,7 @@ def calibrate(
             work.date,
             progress=progress,
             interrupted=interrupted,
-            tell=note,
+            notify=note,
         )
     _conclude(result, work.folder, json_file, html_file, session)
 

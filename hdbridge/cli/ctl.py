@@ -77,10 +77,10 @@ class Daemon:
             with client.lease(force=self.force), stopped_by_signals(client, name):
                 yield client.axis(name)
 
-    def tell(self, state: AxisState) -> None:
+    def print_state(self, state: AxisState) -> None:
         """Writes and prints the state of an axis after a command."""
         write_json(self.json_file, document("ctl-axis", state))
-        tell(state)
+        print_state(state)
 
 
 on_daemon = taking(Daemon)
@@ -165,7 +165,7 @@ def stopped_by_signals(client: Client, name: str) -> Iterator[None]:
             signal.signal(each, handler)
 
 
-def tell(state: AxisState) -> None:
+def print_state(state: AxisState) -> None:
     """Prints the state of an axis after a command."""
     load = "" if state.load_position_deg is None else f", load encoder {state.load_position_deg:.4f} deg"
     error = "" if state.error_arcsec is None else f", error {state.error_arcsec:+.2f} arcsec"
@@ -387,28 +387,28 @@ def _event_line(event: Event) -> str:
 def enable(daemon: Daemon, axis: OneAxisArgument = None) -> None:
     """Switch power on at standstill; boots and verifies the drive first if necessary."""
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.enable())
+        daemon.print_state(moved.enable())
 
 
 @on_daemon
 def disable(daemon: Daemon, axis: OneAxisArgument = None) -> None:
     """Brake to rest, then switch power off. A suspended load needs a brake."""
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.disable())
+        daemon.print_state(moved.disable())
 
 
 @on_daemon
 def reset(daemon: Daemon, axis: OneAxisArgument = None) -> None:
     """Release a latched stop when its cause is gone; the axis stays disabled."""
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.reset())
+        daemon.print_state(moved.reset())
 
 
 @taking(Daemon, opt.Homing)
 def home(daemon: Daemon, homing: opt.Homing, axis: OneAxisArgument = None) -> None:
     """Home by one of the drive's own methods; the axis is disabled before and after."""
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.home(**vars(homing)))
+        daemon.print_state(moved.home(**vars(homing)))
 
 
 def stop(axes: AxesArgument = None, at: AtOption = None) -> None:
@@ -416,7 +416,7 @@ def stop(axes: AxesArgument = None, at: AtOption = None) -> None:
     with stopping(at) as client:
         states = [client.axis(each).stop() for each in axes] if axes else client.stop().axes
     for each in states:
-        tell(each)
+        print_state(each)
 
 
 def quick_stop(axes: AxesArgument = None, at: AtOption = None) -> None:
@@ -424,7 +424,7 @@ def quick_stop(axes: AxesArgument = None, at: AtOption = None) -> None:
     with stopping(at) as client:
         states = [client.axis(each).quick_stop() for each in axes] if axes else client.quick_stop().axes
     for each in states:
-        tell(each)
+        print_state(each)
 
 
 @on_daemon
@@ -456,7 +456,7 @@ def move(
             state = moved.move(
                 before_deg, velocity_deg_s=velocity_deg_s, acceleration_deg_s2=acceleration_deg_s2, wait=wait
             )
-            (daemon.tell if given_deg is angles_deg[-1] else tell)(state)
+            (daemon.print_state if given_deg is angles_deg[-1] else print_state)(state)
 
 
 @on_daemon
@@ -472,7 +472,7 @@ def jog(
     with daemon.moving(axis) as moved:
         note_clamped(moved.state().limits, velocity_deg_s=velocity_deg_s)
         moved.jog(velocity_deg_s, duration_s)
-        daemon.tell(moved.rest())
+        daemon.print_state(moved.rest())
 
 
 @on_daemon
@@ -496,7 +496,7 @@ def queue(
     points = [QueueItem.given(target_deg=each, dwell_s=dwell_s, **limits) for each in angles_deg or ()]
     with daemon.moving(axis) as moved:
         note_clamped(moved.state().limits, **limits)
-        daemon.tell(moved.clear_queue() if clear else moved.queue(points))
+        daemon.print_state(moved.clear_queue() if clear else moved.queue(points))
 
 
 # ---------------------------------------------------------------- compensation and models
@@ -513,7 +513,7 @@ def compensate(
     The change is ramped, also in motion.
     """
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.compensate(scheme.value))
+        daemon.print_state(moved.compensate(scheme.value))
 
 
 @on_daemon
@@ -532,7 +532,7 @@ def model(
     if version not in {"pending", "active"} and not (version.isascii() and version.isdigit()):
         raise InputError(f"VERSION: found {version!r}; expected a number, pending or active")
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.activate_model(int(version) if version.isdigit() else version))
+        daemon.print_state(moved.activate_model(int(version) if version.isdigit() else version))
 
 
 @on_daemon
@@ -549,7 +549,7 @@ def adapt(
     if back == (mode is not None):
         raise InputError("expected either a mode or --back")
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.adaptation_back() if mode is None else moved.adapt(mode.value))
+        daemon.print_state(moved.adaptation_back() if mode is None else moved.adapt(mode.value))
 
 
 @on_daemon
@@ -558,7 +558,7 @@ def load_loop(
 ) -> None:
     """Switch the slow integral of the load error on or off, if the machine file has one."""
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.load_loop(on))
+        daemon.print_state(moved.load_loop(on))
 
 
 # ---------------------------------------------------------------- objects of the drive

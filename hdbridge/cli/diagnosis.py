@@ -329,7 +329,7 @@ def improve(
             rounds=rounds if auto else 0,
             progress=progress,
             interrupted=interrupted,
-            tell=note,
+            notify=note,
         )
     _conclude(result, work.folder, session, json_file, html_file)
 

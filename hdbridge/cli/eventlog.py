@@ -39,7 +39,7 @@ def begin(verbose: int, path: Path | None) -> None:
     _ROOT.setLevel(logging.DEBUG)
 
 
-def tell(event: str, **facts: object) -> None:
+def write(event: str, **facts: object) -> None:
     """Reports an event of the command line itself."""
     logging.getLogger(__name__).debug(event, facts)
 
@@ -55,7 +55,7 @@ def handed_over() -> tuple[int, Path | None]:
 
 def end(exit_status: int) -> int:
     """Reports the last event and stops; returns the exit status, changed only if just the log failed."""
-    tell("end", exit_status=exit_status)
+    write("end", exit_status=exit_status)
     for each in tuple(_ROOT.handlers):
         _ROOT.removeHandler(each)
         each.close()

@@ -143,7 +143,7 @@ class Fleet:
         with progress_bar() as bar:
             task = bar.add_task("diagnosing", total=len(found))
 
-            def tell(now: Progress) -> None:
+            def notify(now: Progress) -> None:
                 words = f"{now.done} of {now.total}" + f", {now.failed} failed" * bool(now.failed)
                 bar.update(task, completed=now.done, total=max(now.total, 1), description=words)
 
@@ -153,7 +153,7 @@ class Fleet:
                 Cluster(self.scheduler, self.workers, self.memory),
                 model=self.model,
                 models=self.models,
-                progress=tell,
+                progress=notify,
                 interrupted=interrupted,
                 retried=RETRIED if retried is None else retried,
             )

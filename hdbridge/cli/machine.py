@@ -158,7 +158,7 @@ def install_service(
         _remove(files)
     elif yes:
         _write(files)
-        _tell_what_next(held, files, user=user)
+        _print_next_steps(held, files, user=user)
     else:
         for file in files:
             say(f"# {file.path}")
@@ -195,7 +195,7 @@ def _refused(file: ServiceFile, problem: OSError) -> str:
     return f"{file.path}: {problem.strerror}; expected the rights of root (sudo), or --user"
 
 
-def _tell_what_next(machine: Machine, files: list[ServiceFile], *, user: bool) -> None:
+def _print_next_steps(machine: Machine, files: list[ServiceFile], *, user: bool) -> None:
     control = "systemctl --user" if user else "systemctl"
     unit = files[0].path.name
     say("next:")

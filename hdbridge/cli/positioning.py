@@ -98,13 +98,13 @@ def move(
             try:
                 run = bench.run(way, show, keep_s=KEPT_S)
             except KeyboardInterrupt:
-                _tell_where_it_stands(drive)
+                _print_position(drive)
                 raise
     write_json(json_file, _move_document(axis.name, chosen, run.outcome))
     _print_move(axis.name, chosen, run.outcome)
 
 
-def _tell_where_it_stands(drive: Drive) -> None:
+def _print_position(drive: Drive) -> None:
     """Prints the position after a stop on the way; nothing if the drive does not answer any more."""
     with suppress(HdbridgeError):
         stands_deg = drive.read_positions().motor_deg / drive.axis.gear.ratio
@@ -203,7 +203,7 @@ def step(
     if model is not None or not scheme or set(scheme) != {Scheme.NONE}:  # the scheme none needs no model
         chosen = compensating_model(files, session.profile, model, ", or step without one: --scheme none")
 
-    def tell(comparison: Comparison) -> None:
+    def notify(comparison: Comparison) -> None:
         write_json(json_file, comparison.as_dict())
         if html_file is not None:
             _write_stepping_page(html_file, axis, chosen, comparison, stepping, session.simulated_seed)
@@ -215,7 +215,7 @@ def step(
         stepping,
         scheme,
         record=record,
-        tell=tell,
+        notify=notify,
     )
 
 
@@ -226,11 +226,11 @@ def run_comparison(
     schemes: list[Scheme] | None,
     *,
     record: Path | None = None,
-    tell: Callable[[Comparison], None],
+    notify: Callable[[Comparison], None],
 ) -> None:
     """Connects, boots and compares; keeps each scheme's record as soon as it is complete.
 
-    ``tell`` receives the result, also of an interrupted test: then that of the completed schemes.
+    ``notify`` receives the result, also of an interrupted test: then that of the completed schemes.
     """
     from hdbridge.commissioning.evaluation.comparison import compare_schemes
     from hdbridge.control.bench import compensation_for
@@ -267,7 +267,7 @@ def run_comparison(
         note(f"stopped in '{scheme.value}' after {seconds:.1f} s, {kept}")
 
     with (
-        _told_when_stopped(axis, done, tell),
+        _reported_when_stopped(axis, done, notify),
         session.booted() as (drive, interrupted),
         progress_bar() as bar,
     ):
@@ -293,12 +293,12 @@ def run_comparison(
             finished=keep,
             stopped=stopped,
         )
-    tell(comparison)
+    notify(comparison)
 
 
 @contextmanager
-def _told_when_stopped(
-    axis: AxisConfig, done: dict[Scheme, Run[SteppingOutcome]], tell: Callable[[Comparison], None]
+def _reported_when_stopped(
+    axis: AxisConfig, done: dict[Scheme, Run[SteppingOutcome]], notify: Callable[[Comparison], None]
 ) -> Iterator[None]:
     """Reports the results of the completed schemes if a test is interrupted."""
     from hdbridge.commissioning.evaluation.comparison import Comparison
@@ -307,7 +307,7 @@ def _told_when_stopped(
         yield
     except BaseException:
         if done:
-            tell(Comparison.of(axis, done))
+            notify(Comparison.of(axis, done))
         raise
 
 
@@ -470,12 +470,12 @@ def demo(
     stepping = Stepping(count=count)
     folder = new_folder(Path("demo-output")) if out is None else make_folder(out)
 
-    def tell(comparison: Comparison) -> None:
+    def notify(comparison: Comparison) -> None:
         write_json(folder / "stepping.json", comparison.as_dict())
         _write_stepping_page(folder / "stepping.html", axis, files.model, comparison, stepping, seed)
         _print_stepping(axis, comparison)
 
-    run_comparison(session, TransmissionModel.load(files.model), stepping, None, record=folder, tell=tell)
+    run_comparison(session, TransmissionModel.load(files.model), stepping, None, record=folder, notify=notify)
     say(f"\nopen {folder / 'stepping.html'} in a browser for the picture; next: docs/tutorial.md")
 
 

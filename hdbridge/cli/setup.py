@@ -77,7 +77,7 @@ def setup(
     except (HdbridgeError, KeyboardInterrupt, typer.Abort, typer.Exit):
         note(f"resume: hdbridge setup {shlex.quote(str(folder))}")
         raise
-    work.tell_next()
+    work.print_next()
 
 
 @dataclass
@@ -215,7 +215,7 @@ class _Setup:
         self._run("move", self._folder, *self._how, "--hold", "1", *places)
         self._finish("move")
 
-    def tell_next(self) -> None:
+    def print_next(self) -> None:
         """Prints the page of the calibration and the commands for daily use."""
         how = " --simulate" if self._state.simulated else ""
         say(

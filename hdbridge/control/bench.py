@@ -224,7 +224,7 @@ class Bench:
             with resumed_realtime():
                 outcome = self._powered(procedure, rehearsal, progress)
         finally:
-            self._tell_end()
+            self._log_end()
         axis = self._drive.axis
         return Run(
             self.record(),
@@ -256,7 +256,7 @@ class Bench:
         self._rest()
         return outcome
 
-    def _tell_end(self) -> None:
+    def _log_end(self) -> None:
         """Logs the events of the run once the axis is at rest, because the cycle itself does not log."""
         nodes = self._drive.monitor.nodes.values()
         facts = {

@@ -53,8 +53,8 @@ def run(start: Start) -> None:
 async def serve(start: Start, memory: Memory) -> None:
     """Runs the service until SIGTERM and the end of the control process."""
     machine = start.machine
-    told = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
+    terminated = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, terminated.set)
     async with AsyncExitStack() as stack:
         simulated = start.simulation is not None
         clock = SimulatedClock(lambda: memory.status.loop_count, machine.cycle_s) if simulated else None
@@ -68,7 +68,7 @@ async def serve(start: Start, memory: Memory) -> None:
                 machine.name, tuple(AxisAbout.of(each.config) for each in machine.axes), machine.cycle_s
             ),
             machine.recorder,
-            tell=bridge.core.log.note,
+            notify=bridge.core.log.note,
             in_use=lambda: {name: axis.models.in_use for name, axis in bridge.axes.items()},
         )
         bridge.recorder = recorder.state
@@ -87,7 +87,7 @@ async def serve(start: Start, memory: Memory) -> None:
                 group.create_task(_apply(following)),
                 group.create_task(_keep_socket(start, server, bridge.core.log.note)),
             ]
-            await told.wait()
+            await terminated.wait()
             await _last_words(bridge, memory)
             for task in beside:
                 task.cancel()

@@ -67,10 +67,10 @@ class Start:
 
     def hand_over(self, **changes: object) -> int:
         """Returns a descriptor with the data for a child, to be closed once the child runs."""
-        told = replace(self, **changes)  # type: ignore[arg-type]
+        start = replace(self, **changes)  # type: ignore[arg-type]
         fd = os.memfd_create("hdbridge-start", os.MFD_CLOEXEC)
         with os.fdopen(os.dup(fd), "wb") as file:
-            pickle.dump(told, file)
+            pickle.dump(start, file)
         os.lseek(fd, 0, os.SEEK_SET)
         return fd
 
@@ -80,12 +80,12 @@ class Start:
         try:
             (number,) = arguments
             with os.fdopen(int(number), "rb") as file:
-                told = pickle.load(file)
+                start = pickle.load(file)
         except (ValueError, OSError, pickle.UnpicklingError, EOFError):
-            told = None
-        if not isinstance(told, cls):
+            start = None
+        if not isinstance(start, cls):
             raise InputError("this is a process of the daemon and not started by hand: use 'hdbridge run'")
-        return told
+        return start
 
 
 def run_child(arguments: list[str], name: str, run: Callable[[Start], None]) -> int:

@@ -253,12 +253,12 @@ class SdoClient:
             try:
                 if data is None:
                     answer = self._channel.fetch(index, sub, SIZE_CAP)
-                    self._tell("sdo read", index, sub, data=answer.hex(" "))
+                    self._log("sdo read", index, sub, data=answer.hex(" "))
                     return answer
                 self._channel.download(index, sub, data)
-                self._tell("sdo write", index, sub, data=data.hex(" "))
+                self._log("sdo write", index, sub, data=data.hex(" "))
             except SdoAbortedError as error:
-                self._tell(f"sdo {doing} refused", index, sub, abort=f"{error.code:08X}h")
+                self._log(f"sdo {doing} refused", index, sub, abort=f"{error.code:08X}h")
                 advice = _ADVICE.get(error.code, "see the drive's manual for this code")
                 text = SdoAbortedError.CODES.get(error.code, "vendor-specific")
                 raise SdoAbortError(
@@ -268,16 +268,16 @@ class SdoClient:
                 ) from error
             except _NoAnswerError as error:
                 problem = f"{error}; check that the node is powered and its node id and bit rate are right"
-                self._tell(f"sdo {doing} failed", index, sub, problem=str(error))
+                self._log(f"sdo {doing} failed", index, sub, problem=str(error))
             except SdoCommunicationError as error:
                 problem = f"{error}; check that no second SDO client is active"
-                self._tell(f"sdo {doing} failed", index, sub, problem=str(error))
+                self._log(f"sdo {doing} failed", index, sub, problem=str(error))
             else:
                 return b""
         times = f"{self.attempts} attempts" if self.attempts != 1 else "one attempt"
         raise SdoError(f"{self.describe(index, sub)}: {doing} failed after {times}: {problem}")
 
-    def _tell(self, event: str, index: int, sub: int, **facts: object) -> None:
+    def _log(self, event: str, index: int, sub: int, **facts: object) -> None:
         _log.debug(event, {"node": self.node_id, "object": f"{index:04X}h:{sub:02X}", **facts})
 
     @staticmethod

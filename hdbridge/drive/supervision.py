@@ -210,10 +210,10 @@ class Supervision:
         done = "quick stop" if self.reaction is Reaction.QUICK_STOP else "set-points stopped"
         then = "" if gravest.fault is stop.fault else f"; then {gravest.fault.value}"
         said = self._emergencies(stop.cycle - 1)
-        told = f"; the drive sent {', '.join(said)}" if said else ""
+        sent = f"; the drive sent {', '.join(said)}" if said else ""
         hint = EXPLAINED_HINT if said and stop.fault in _BY_THE_DRIVE else row.hint
         return SafetyStop(
-            f"cycle {stop.cycle}: {stop.fault.value}{again}{detail}{then}{told}: {done}, latched", hint
+            f"cycle {stop.cycle}: {stop.fault.value}{again}{detail}{then}{sent}: {done}, latched", hint
         )
 
     def _emergencies(self, since_cycle: int) -> list[str]:

@@ -193,7 +193,7 @@ class _Run:
         """Returns the client of the cluster; the first call starts it."""
         self._dataset = dataset
         self._stored = dataset.stored()
-        self._tell = progress
+        self._notify = progress
         self._interrupted = interrupted
         self._retried = retried
         self._renewed: dict[tuple[str, str], Row] = {}
@@ -388,4 +388,4 @@ class _Run:
         return Progress(len(self._present), self._total, self._failed, self._known, self._memory)
 
     def _report(self) -> None:
-        self._tell(self._state())
+        self._notify(self._state())

@@ -242,12 +242,12 @@ def _stall(reach: Reach, duration_s: float) -> End:
     return _nothing
 
 
-def _told(reach: Reach, index: int, subindex: int, value: int) -> End:
-    return reach.drive.tell_instead(index, subindex, value)
+def _reported(reach: Reach, index: int, subindex: int, value: int) -> End:
+    return reach.drive.report_instead(index, subindex, value)
 
 
 def _identity(reach: Reach, product_code: int) -> End:
-    return reach.drive.tell_instead(0x1018, 2, product_code)
+    return reach.drive.report_instead(0x1018, 2, product_code)
 
 
 def _no_object(reach: Reach, index: int, subindex: int) -> End:
@@ -350,7 +350,7 @@ _ROWS: Final = (
     Row("sdo_silent", "SDO requests are not answered.",
         lambda reach: reach.mute(0x580 + reach.drive.node_id)),
     Row("wrong_value", "The drive reports `value` for an object, by SDO and in its TPDOs.",
-        _told, {"index": 0x2100, "subindex": 0, "value": 32767}, _CHANNEL, touches=_named_object),
+        _reported, {"index": 0x2100, "subindex": 0, "value": 32767}, _CHANNEL, touches=_named_object),
     Row("wrong_identity", "Object 1018h:02 holds another `product_code`.", _identity, {"product_code": 1}),
     Row("missing_object", "The drive has no object `index`:`subindex` (for good).",
         _no_object, {"index": 0x60E4, "subindex": 1}, touches=_named_object),

@@ -252,7 +252,7 @@ class WatchedDrive(DriveNode):
                 fault._undo()
             self.note("fault", f"{fault.name} {'ends' if fault._undo is not None else 'is called off'}")
 
-    def tell_instead(self, index: int, subindex: int, value: int) -> End:
+    def report_instead(self, index: int, subindex: int, value: int) -> End:
         """Reports another value of an object than it has, by SDO and in TPDOs."""
         entry = self.dictionary[index, subindex]
         before = entry.bound

@@ -88,9 +88,9 @@ def run_checks(
     checks: Iterable[Check[P]],
     *,
     permitted: Callable[[], str | None] = lambda: None,
-    tell: Callable[[Row[P]], None] = lambda _: None,
+    notify: Callable[[Row[P]], None] = lambda _: None,
 ) -> list[Row[P]]:
-    """Runs the checks in order; ``tell`` receives each row as soon as it is complete.
+    """Runs the checks in order; ``notify`` receives each row as soon as it is complete.
 
     A check whose dependencies have not passed is not possible. ``permitted`` is called once, before the first
     check that moves the axis; a returned text is the reason why nothing may move. A `HdbridgeError` is a
@@ -113,7 +113,7 @@ def run_checks(
         outcomes[check.name], titles[check.name] = verdict.outcome, check.title
         row = Row(check, verdict)
         rows.append(row)
-        tell(row)
+        notify(row)
     return rows
 
 

@@ -28,15 +28,15 @@ class Pace:
         self,
         total_s: float,
         period_s: float,
-        tell: Callable[[str, float, float], None],
+        notify: Callable[[str, float, float], None],
         interrupted: Callable[[], bool],
     ) -> None:
-        """``tell`` receives the task's name, the seconds done and the seconds in all."""
+        """``notify`` receives the task's name, the seconds done and the seconds in all."""
         self.name = ""
         self.total_s = total_s
         self._done_s = 0.0
         self._period_s = period_s
-        self._tell = tell
+        self._notify = notify
         self._interrupted = interrupted
         self._cycles = 0
 
@@ -55,7 +55,7 @@ class Pace:
     def _say(self) -> None:
         self._done_s += self._cycles * self._period_s
         self._cycles = 0
-        self._tell(self.name, min(self._done_s, self.total_s), self.total_s)
+        self._notify(self.name, min(self._done_s, self.total_s), self.total_s)
 
 
 @dataclass(frozen=True, slots=True)

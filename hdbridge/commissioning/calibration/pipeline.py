@@ -152,18 +152,18 @@ def calibrate(
     *,
     progress: Progress = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
-    tell: Callable[[str], None] = lambda _: None,
+    notify: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
     """Measures the remaining tasks, fits, validates, and proposes the model to the profile.
 
-    ``profile`` is the folder of axis.yaml; ``tell`` receives a line for each step. A model that does not
+    ``profile`` is the folder of axis.yaml; ``notify`` receives a line for each step. A model that does not
     improve on unseen data, or that makes the axis point worse, is saved in the recording's folder but not
     proposed.
     """
     axis = drive.axis
     measure(drive, journal, progress=progress, interrupted=interrupted)
-    active = active_model(profile, axis, drive, tell)
-    tell("fitting")
+    active = active_model(profile, axis, drive, notify)
+    notify("fitting")
     recording = journal.recording()
     result = conclude({journal.folder: recording}, axis.gear.ratio, active, axis=axis)
     if active and active.response:
@@ -176,16 +176,16 @@ def calibrate(
         result = replace(result, offer=Offer(False, f"not offered for commit: {result.fit.held_out.text}"))
         return _kept(journal.folder, result)
     if remark := cap_remark(axis, result.model):
-        tell(remark)
+        notify(remark)
     if journal.plan.validation.motion:
-        tell("measuring the response in motion")
+        notify("measuring the response in motion")
         try:
             tested = motion_test(drive, result.model, progress=progress, interrupted=interrupted)
         except InputError as problem:
-            tell(f"not tested in motion: {problem}")
+            notify(f"not tested in motion: {problem}")
         else:
             result = replace(result, model=tested.applied(result.model), motion=tested)
-    tell("testing it on the axis, before and after")
+    notify("testing it on the axis, before and after")
     floor = floor_of(axis, recording)
     checked = validate(
         drive,
@@ -291,7 +291,7 @@ def concluded(folder: Path) -> Calibration:
 
 
 def active_model(
-    profile: Path, axis: AxisConfig, drive: Drive | Rig, tell: Callable[[str], None] = lambda _: None
+    profile: Path, axis: AxisConfig, drive: Drive | Rig, notify: Callable[[str], None] = lambda _: None
 ) -> TransmissionModel | None:
     """Returns the profile's active model if it belongs to this axis and drive, else None."""
     path = profile / "model.yaml"
@@ -301,10 +301,10 @@ def active_model(
     try:
         model.check_bound_to(axis, drive.identity)
     except InputError as problem:
-        tell(f"not compared with the active model: {problem}")
+        notify(f"not compared with the active model: {problem}")
         return None
     if model.response and not model.response.fits_cycle(axis.drive.cycle_s):
-        tell("the response in motion of the active model is not used: it was measured at another cycle")
+        notify("the response in motion of the active model is not used: it was measured at another cycle")
         return replace(model, response=None)
     return model
 

@@ -154,12 +154,12 @@ def choose(
     best: Choice | None = None
     for duration_s, plan in menu if pairs else ():
         report = plan_report(plan, model, view.limits)["identifiability"]
-        told = dict.fromkeys(
+        separated = dict.fromkeys(
             f"{one} or {other}" for one, other, peak in pairs if _separates(report, one, other, peak)
         )
-        if len(told) > (len(best.separates) if best else 0):
-            best = Choice(plan, duration_s, tuple(told))
-        if len(told) == len(pairs):
+        if len(separated) > (len(best.separates) if best else 0):
+            best = Choice(plan, duration_s, tuple(separated))
+        if len(separated) == len(pairs):
             break
     if best:
         return best

@@ -123,21 +123,21 @@ def improve(
     rounds: int = 0,
     progress: Progress = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
-    tell: Callable[[str], None] = lambda _: None,
+    notify: Callable[[str], None] = lambda _: None,
 ) -> Improvement:
     """Diagnoses, extends, steps with both models, and proposes the better one to the profile.
 
-    ``profile`` is the folder of axis.yaml, ``active`` its model; ``tell`` receives a line for each step. The
-    axis runs up to ``rounds`` further experiments while causes remain to be separated. Nothing is proposed if
-    nothing is found, if nothing found can be compensated, or if the model does not gain on held-out data and
-    in stepping. Raises `InputError` if model or recordings belong to another axis or drive.
+    ``profile`` is the folder of axis.yaml, ``active`` its model; ``notify`` receives a line for each step.
+    The axis runs up to ``rounds`` further experiments while causes remain to be separated. Nothing is
+    proposed if nothing is found, if nothing found can be compensated, or if the model does not gain on held-
+    out data and in stepping. Raises `InputError` if model or recordings belong to another axis or drive.
     """
     active.check_bound_to(drive.axis, drive.identity)
     drive.axis.require_load_encoder()
     bench = _Bench(drive, date, progress, interrupted)
     earlier = source.journal is None or bool(source.journal.done)  # measured before the drive was booted
     recordings, apart = _begin(source, bench)
-    tell("diagnosing")
+    notify("diagnosing")
     diagnosis = diagnose(recordings, active, independent_zeros=apart)
     view = axis_view(drive.axis)
     plans = _plans_of(source, recordings.values())
@@ -148,8 +148,8 @@ def improve(
         journal, pairs = _journal(folder, bench, diagnosis, rivals, active, plans)
         if journal is None:
             break
-        tell(diagnosis.verdict())
-        tell(f"round {len(found) + 1}: {journal.plan.about}, to separate {', '.join(pairs) or 'the rest'}")
+        notify(diagnosis.verdict())
+        notify(f"round {len(found) + 1}: {journal.plan.about}, to separate {', '.join(pairs) or 'the rest'}")
         apart = bench.run(journal) or apart or earlier
         recordings[folder] = journal.recording()
         diagnosis = diagnose(recordings, active, independent_zeros=apart)
@@ -175,7 +175,7 @@ def improve(
     )
     if diagnosis.findings:
         whole = Recording.joined(list(recordings.values()))
-        result = _concluded(result, bench, source, profile, whole, tell)
+        result = _concluded(result, bench, source, profile, whole, notify)
     return _kept(source.folder, result)
 
 
@@ -249,7 +249,7 @@ def _concluded(
     source: Source,
     profile: Path,
     recording: Recording,
-    tell: Callable[[str], None],
+    notify: Callable[[str], None],
 ) -> Improvement:
     """Adds the trial, if it is worth its time, and the offer."""
     extension, drive = result.extension, bench.drive
@@ -259,8 +259,8 @@ def _concluded(
         return replace(result, offer=Offer(False, f"not offered: {'; '.join(extension.refused)}"))
     model = with_provenance(extension.model, _provenance(result, recording))
     if remark := cap_remark(drive.axis, model):
-        tell(remark)
-    tell("stepping with the active and with the extended model, in turns")
+        notify(remark)
+    notify("stepping with the active and with the extended model, in turns")
     floor = floor_of(drive.axis, recording)
     try:
         trial = try_out(
@@ -276,14 +276,14 @@ def _concluded(
     except InputError as problem:
         return replace(result, offer=Offer(False, f"not offered: {problem}"))
     result = replace(result, trial=trial)
-    told = _told(trial)
+    summary = _summary(trial)
     if not trial.improves:
-        return replace(result, offer=Offer(False, f"not offered: the axis does not point better, {told}"))
-    reason = f"improvement {source.folder.name}: {named(extension.carried)}; {told}"
+        return replace(result, offer=Offer(False, f"not offered: the axis does not point better, {summary}"))
+    reason = f"improvement {source.folder.name}: {named(extension.carried)}; {summary}"
     return replace(result, offer=proposed(profile, model, reason, bench.date, drive))
 
 
-def _told(trial: Trial) -> str:
+def _summary(trial: Trial) -> str:
     big = [each.pooled.three_sigma_arcsec for each in (trial.stepping.before, trial.stepping.after)]
     small = [each.pooled.three_sigma_arcsec for each in trial.small]
     figures = (

@@ -70,7 +70,7 @@ class ApiServer:
         # At DEBUG the server's libraries log headers, including the token.
         for name in ("uvicorn", "uvicorn.error", "websockets"):
             logging.getLogger(name).setLevel(logging.WARNING)
-        logging.getLogger("uvicorn.error").addFilter(_worth_telling)
+        logging.getLogger("uvicorn.error").addFilter(_worth_logging)
         async with self._group as group:
             for server, listener in self._servers:
                 group.create_task(server.serve(sockets=[listener.socket]))
@@ -185,7 +185,7 @@ class _WebSocket(_Watched, WebSocketsSansIOProtocol):
             super()._check()
 
 
-def _worth_telling(record: logging.LogRecord) -> bool:
+def _worth_logging(record: logging.LogRecord) -> bool:
     """Returns False for records of client errors: a refused WebSocket, a message that is not UTF-8."""
     words = record.getMessage()
     return "without completing handshake" not in words and "Invalid UTF-8" not in words

@@ -96,13 +96,13 @@ def serve(start: Start) -> None:
         )
         status = memory.status
         status[Cell.GATEWAY_PID] = os.getpid()
-        told_s = 0.0
+        reported_s = 0.0
 
         def should_stop() -> bool:
-            nonlocal told_s
+            nonlocal reported_s
             now_s = time.monotonic()
-            if now_s - told_s > ALIVE_S:
-                told_s = now_s
+            if now_s - reported_s > ALIVE_S:
+                reported_s = now_s
                 status[Cell.GATEWAY_TIME_NS] = time.monotonic_ns()
             return terminated()
 

@@ -95,7 +95,7 @@ class Trace:
         self._sync_s: float | None = None
         self._rpdos_since_sync = 0
         self._heartbeat_s: dict[int, float] = {}
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self.mistakes: Counter[str] = Counter()
         """Number of occurrences of each piece of advice."""
         self._begun_s: float | None = None
@@ -140,12 +140,12 @@ class Trace:
 
     def _say_once(self, time_s: float, key: str, text: str, advice: str) -> None:
         """Reports a lasting mistake once, until `_over`."""
-        if key not in self._told:
-            self._told.add(key)
+        if key not in self._reported:
+            self._reported.add(key)
             self._say(time_s, text, advice)
 
     def _over(self, key: str) -> None:
-        self._told.discard(key)
+        self._reported.discard(key)
 
     # ---------------------------------------------------------------- SDO
 

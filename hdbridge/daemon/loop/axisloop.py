@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Final
 
 from hdbridge.control.axiscycle import STILL_CYCLES, AxisCycle
-from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Tell
+from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Report
 from hdbridge.daemon.loop.feeds import KnotFeed, OuterFeed
 from hdbridge.daemon.loop.follower import AxisSetup, Follower
 from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, AxisState, Cause, Happening, refusal, target_of
@@ -51,7 +51,7 @@ class AxisLoop:
         setup: AxisSetup,
         knots: Queue[Knot],
         slot: SettingSlot,
-        tell: Tell,
+        report: Report,
         followed: Queue[OuterKnot],
         outer: OuterCells,
         due_s: Callable[[], float],
@@ -73,11 +73,11 @@ class AxisLoop:
         self.broken: frozenset[int] = frozenset()
         """Group whose stream this axis left before its end; the controller stops the others."""
 
-        self._slot, self._tell = slot, tell
+        self._slot, self._report = slot, report
         slot.use(0)
         self._feed = KnotFeed(knots, self.set_point)
         self._outer, self._due_s = OuterFeed(followed), due_s
-        self._faults = FaultLog(self.supervision, tell, config.drive.cycle_s)
+        self._faults = FaultLog(self.supervision, report, config.drive.cycle_s)
         self._period_s = config.drive.cycle_s
         self._follow = self.follower.follow
         self._outer_cells = outer
@@ -127,7 +127,7 @@ class AxisLoop:
             self.check(kind)
             self._handlers[kind](command)
         except HdbridgeError as error:
-            self._tell(EventKind.REFUSED, command.id, command.kind, str(error))
+            self._report(EventKind.REFUSED, command.id, command.kind, str(error))
             return
         target = target_of(self.state, kind)
         assert target is not None
@@ -163,7 +163,7 @@ class AxisLoop:
 
     def _done(self, id_: int) -> None:
         if id_:
-            self._tell(EventKind.DONE, id_, 0)
+            self._report(EventKind.DONE, id_, 0)
 
     def _happened(self, cause: Cause) -> bool:
         """Makes the transition for ``cause``; returns True if the state changed."""
@@ -188,7 +188,7 @@ class AxisLoop:
             self.stands = False
             self._still = 0
             self._left = self._turns(STOP_TIMEOUT_S)
-        self._tell(EventKind.STATE, 0, state)
+        self._report(EventKind.STATE, 0, state)
         self._answer_waiting(state)
 
     def _answer_waiting(self, state: AxisState) -> None:
@@ -211,7 +211,7 @@ class AxisLoop:
         else:
             id_, self._disable_id = self._disable_id, 0
         if id_:
-            self._tell(EventKind.REFUSED, id_, kind, why)
+            self._report(EventKind.REFUSED, id_, kind, why)
 
     def _stand(self) -> None:
         """Ends all following of set-points."""
@@ -329,7 +329,7 @@ class AxisLoop:
         self._slot.use(command.i)
         self._changing = self.follower.correction.changing
         if not self._changing:
-            self._tell(EventKind.CHANGED, command.id, 0)
+            self._report(EventKind.CHANGED, command.id, 0)
 
     # ---------------------------------------------------------------- power
 
@@ -367,12 +367,12 @@ class AxisLoop:
         """Prepares the turn: feeds the next knots of a stream to the set-point."""
         refusal_ = self._feed.feed()
         if refusal_ is not None:
-            self._tell(EventKind.STREAM_REFUSED, self._motion_id, 0, refusal_)
+            self._report(EventKind.STREAM_REFUSED, self._motion_id, 0, refusal_)
             self._break_group()
 
     def after(self) -> None:
         """Evaluates the turn: reports faults and ended motions, and makes the resulting transitions."""
-        self._faults.tell()
+        self._faults.report()
         supervision = self.supervision
         if supervision.stop is not None:
             latched = supervision.reaction is Reaction.LATCH
@@ -395,7 +395,7 @@ class AxisLoop:
         mode = set_point.mode
         if mode is not self._mode:
             if mode is MotionMode.HOLD:
-                self._tell(EventKind.MOTION_ENDED, self._motion_id, self._mode)
+                self._report(EventKind.MOTION_ENDED, self._motion_id, self._mode)
             if self._mode is MotionMode.FOLLOW:
                 self.cycle.command = self._follow
             if mode is not MotionMode.STREAM:
@@ -408,20 +408,20 @@ class AxisLoop:
             self._unfed = False
             if not set_point.at_rest:
                 words = "the set-points of the gateway ended in motion; it loses its power"
-                self._tell(EventKind.UNDERRUN, self._motion_id, 0, words)
+                self._report(EventKind.UNDERRUN, self._motion_id, 0, words)
             self._happened(Happening.UNFED)
         if set_point.underrun is not self._underrun:
             self._underrun = set_point.underrun
             if self._underrun:
-                self._tell(EventKind.UNDERRUN, self._motion_id, 0)
+                self._report(EventKind.UNDERRUN, self._motion_id, 0)
         doubt = self.follower.loop_doubt
         if doubt != self._doubt:
             self._doubt = doubt
-            self._tell(EventKind.LOAD_LOOP, 0, int(bool(doubt)), doubt or "it acts again")
+            self._report(EventKind.LOAD_LOOP, 0, int(bool(doubt)), doubt or "it acts again")
         if self._changing and not self.follower.correction.changing:
             self._changing = False
             self.follower.changed()
-            self._tell(EventKind.CHANGED, 0, 0)
+            self._report(EventKind.CHANGED, 0, 0)
 
     def _after_stopping(self) -> None:
         if not self._powering_off:
@@ -458,7 +458,7 @@ class AxisLoop:
         error = self.cycle.stopped
         explained = error is not None and error.hint == EXPLAINED_HINT
         text = error.text if error is not None else self._why
-        self._tell(EventKind.STOPPED, int(explained), code, text)
+        self._report(EventKind.STOPPED, int(explained), code, text)
 
     def _obeyed(self) -> bool:
         """Returns True if a commanded quick stop is over: the motor stands, or the time-out has passed."""

@@ -60,7 +60,7 @@ class Controller:
                 setup,
                 memory.knots[index],
                 memory.settings[index],
-                partial(self._tell, index),
+                partial(self._report, index),
                 memory.followed[index],
                 memory.outer[index],
                 lambda: cycle.due_s,
@@ -133,7 +133,7 @@ class Controller:
         self._turns += 1
         self.memory.status.turned(self._turns, time.monotonic_ns())
 
-    def _tell(self, axis: int, kind: EventKind, id_: int = 0, code: int = 0, text: str = "") -> None:
+    def _report(self, axis: int, kind: EventKind, id_: int = 0, code: int = 0, text: str = "") -> None:
         cycle = self.cycle
         time_ns = round(1e9 * cycle.woke_s)
         self.memory.events.append(Event(0, cycle.count, time_ns, axis, kind, id_, code, text))
@@ -156,13 +156,13 @@ class Controller:
             elif command.axis == _ALL and kind in (CommandKind.QUICK_STOP, CommandKind.STOP):
                 for axis in self.axes:
                     axis.command(command._replace(id=0))
-                self._tell(_ALL, EventKind.DONE, command.id)
+                self._report(_ALL, EventKind.DONE, command.id)
             elif self._ending and kind not in (CommandKind.QUICK_STOP, CommandKind.STOP):
                 raise InputError(f"{label(kind)}: the daemon is ending")
             else:
                 self._axis(command.axis).command(command)
         except (HdbridgeError, ValueError) as error:
-            self._tell(command.axis, EventKind.REFUSED, command.id, command.kind, str(error))
+            self._report(command.axis, EventKind.REFUSED, command.id, command.kind, str(error))
 
     def _axis(self, index: int) -> AxisLoop:
         if not 0 <= index < len(self.axes):
@@ -182,7 +182,7 @@ class Controller:
         group = frozenset(axis.index for axis in members) if len(members) > 1 else frozenset()
         for axis in members:
             axis.begin_stream(command, group)
-        self._tell(command.axis, EventKind.DONE, command.id)
+        self._report(command.axis, EventKind.DONE, command.id)
 
     def _stop_group(self, stopped: AxisLoop) -> None:
         """Brakes the other axes of a group when one axis leaves it."""
@@ -211,7 +211,7 @@ class Controller:
         second = round(1.0 / self.cycle.period_s)
         if self.cycle.count - self._refusals > second // REFUSALS_A_SECOND:
             self._refusals = self.cycle.count
-            self._tell(_ALL, EventKind.REFUSED, 0, 0, refusal)
+            self._report(_ALL, EventKind.REFUSED, 0, 0, refusal)
         return None
 
     # ---------------------------------------------------------------- the bus
@@ -221,12 +221,12 @@ class Controller:
         cycle = self.cycle
         if cycle.down is None:
             self._down = False
-            self._tell(_ALL, EventKind.BUS_UP)
+            self._report(_ALL, EventKind.BUS_UP)
             return
         if not self._down:
             self._down = True
             self._reopen_in = 0
-            self._tell(_ALL, EventKind.BUS_DOWN, text=cycle.down)
+            self._report(_ALL, EventKind.BUS_DOWN, text=cycle.down)
             self.memory.outgoing.clear()
             for axis in self.axes:
                 axis.verification_lost()
@@ -254,7 +254,7 @@ class Controller:
             return
         self._ending = True
         self._ending_left = round(ENDING_TIMEOUT_S / self.cycle.period_s)
-        self._tell(_ALL, EventKind.ENDING)
+        self._report(_ALL, EventKind.ENDING)
         for axis in self.axes:
             # The service can no longer stop a lent axis; the loop's quick stop overrides it.
             lent = axis.state is AxisState.LENT

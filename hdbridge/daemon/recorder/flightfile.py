@@ -257,7 +257,7 @@ class FlightFile:
         axes = self._about.axes
         name = axes[event.axis].name if 0 <= event.axis < len(axes) else self._about.machine
         kind = EventKind(event.kind)
-        self._tell(
+        self._add_note(
             event.time_ns,
             name,
             kind.name,
@@ -268,7 +268,7 @@ class FlightFile:
 
     def note(self, time_ns: int, kind: str, text: str, level: int = logging.INFO) -> None:
         """Adds a note of the recorder or a client; ``level`` is that of a log record."""
-        self._tell(time_ns, self._about.machine, kind, text, level)
+        self._add_note(time_ns, self._about.machine, kind, text, level)
 
     def add_model(self, time_ns: int, axis: str, version: str, text: str) -> None:
         """Adds the model that an axis uses from now on."""
@@ -294,7 +294,7 @@ class FlightFile:
             os.close(self._stream.descriptor)
             self._stream.descriptor = -1
 
-    def _tell(
+    def _add_note(
         self, time_ns: int, name: str, kind: str, text: str, level: int, event: Event | None = None
     ) -> None:
         seconds, rest = divmod(time_ns + self._about.offset_ns, 1_000_000_000)

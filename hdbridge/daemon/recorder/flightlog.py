@@ -96,16 +96,16 @@ class FlightLog:
         settings: RecorderSettings,
         about: About,
         *,
-        tell: Callable[[str], None] = lambda _: None,
+        notify: Callable[[str], None] = lambda _: None,
         wall_ns: Callable[[], int] = time.time_ns,
         free: Callable[[Path], int] = free_bytes,
     ) -> None:
-        """``tell`` reports events of the recording to the user; ``wall_ns`` returns the time of day.
+        """``notify`` reports events of the recording to the user; ``wall_ns`` returns the time of day.
 
         Raises OSError if the folder cannot be created.
         """
         self.folder, self._settings, self._about, self._free = folder, settings, about, free
-        self._tell = tell
+        self._notify = notify
         self._wall_ns = wall_ns
         self._file: FlightFile | None = None
         self._begun_ns = 0
@@ -125,8 +125,8 @@ class FlightLog:
 
     def mend(self) -> None:
         """Mends the files of a dead process, and keeps those that contain a fault."""
-        for path in mend_folder(self.folder, self._tell):
-            self._tell(f"{path.name}: was not finished; it is whole up to its last second")
+        for path in mend_folder(self.folder, self._notify):
+            self._notify(f"{path.name}: was not finished; it is whole up to its last second")
             with suppress(InputError, OSError):
                 if any(each.kind in _KEPT_NAMES for each in overview(path).events):
                     self._move_aside(path)
@@ -214,13 +214,13 @@ class FlightLog:
         self._refused_now += cycles
         words = problem.strerror or str(problem)
         if not self._trouble:
-            self._tell(f"{self.folder}: nothing is recorded: {words}; free some space")
+            self._notify(f"{self.folder}: nothing is recorded: {words}; free some space")
         self._trouble = words
 
     def _recovered(self) -> None:
         if not self._trouble:
             return
-        self._tell(f"{self.folder}: recorded again; {self._refused_now} cycles were not ({self._trouble})")
+        self._notify(f"{self.folder}: recorded again; {self._refused_now} cycles were not ({self._trouble})")
         if self._file is not None:
             self._file.note(
                 self._newest_ns,
@@ -307,7 +307,7 @@ class FlightLog:
         _trim(self.folder, limits.size_mb * _MB - writing, now_s - limits.age_days * _DAY_S)
         gone = _trim(self.folder / KEPT, limits.kept_mb * _MB, -1.0)
         if gone:
-            self._tell(
+            self._notify(
                 f"{self.folder}: what is kept of faults is over {limits.kept_mb:g} MB; removed: "
                 f"{', '.join(each.name for each in gone)}"
             )

@@ -35,7 +35,7 @@ class GoneError(InputError):
     """The recording no longer exists: the recorder or a user removed it."""
 
 
-class Told(NamedTuple):
+class LoggedEvent(NamedTuple):
     """Event of a recording."""
 
     time_ns: int
@@ -70,7 +70,7 @@ class Flight:
     size: int
     """Bytes."""
     cycles: int
-    events: tuple[Told, ...]
+    events: tuple[LoggedEvent, ...]
     axes: Mapping[str, Mapping[str, NDArray[Any]]] = field(default_factory=dict)
     """Requested sample fields as columns, by axis."""
     machine: Mapping[str, NDArray[Any]] = field(default_factory=dict)
@@ -149,7 +149,7 @@ def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
     topics: dict[int, str] = {}
     messages: dict[str, list[bytes]] = defaultdict(list)
     metadata: dict[str, Mapping[str, str]] = {}
-    events: list[Told] = []
+    events: list[LoggedEvent] = []
     models: list[ModelUsed] = []
     times: list[int] = []
     finished = False
@@ -161,7 +161,7 @@ def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
             if isinstance(record, Message):
                 topic = topics.get(record.channel_id, "")
                 if topic == EVENTS:
-                    events.append(_told(record))
+                    events.append(_logged_event(record))
                 elif topic == MODEL:
                     models.append(ModelUsed(record.log_time, **json.loads(record.data)))
                 elif wanted is None or topic in wanted:
@@ -196,7 +196,7 @@ def overview(path: Path) -> Flight:
             if summary is None or summary.statistics is None:
                 raise EndOfFile
             metadata = {each.name: each.metadata for each in reader.iter_metadata()}
-            events = tuple(_told(message) for _, _, message in reader.iter_messages(EVENTS))
+            events = tuple(_logged_event(message) for _, _, message in reader.iter_messages(EVENTS))
         except (*TORN, OSError):
             return replace(read(path, ()), finished=False)
         size = os.fstat(file.fileno()).st_size
@@ -224,6 +224,6 @@ def _opened(path: Path) -> tuple[Path, BinaryIO]:
     raise GoneError(f"{path}: there is no such file or folder; expected a flight recording")
 
 
-def _told(message: Message) -> Told:
+def _logged_event(message: Message) -> LoggedEvent:
     content = json.loads(message.data)
-    return Told(message.log_time, content["name"], content["kind"], content["text"])
+    return LoggedEvent(message.log_time, content["name"], content["kind"], content["text"])

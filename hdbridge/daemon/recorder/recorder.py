@@ -38,23 +38,23 @@ class FlightRecorder:
         about: About,
         settings: RecorderSettings | None = None,
         *,
-        tell: Callable[[str], None] = lambda _: None,
+        notify: Callable[[str], None] = lambda _: None,
         in_use: Callable[[], Mapping[str, CompensationSetting]] = dict,
         free: Callable[[Path], int] = free_bytes,
     ) -> None:
-        """``in_use`` returns the setting that compensates each axis. The recorder's threads call ``tell``."""
+        """``in_use`` returns the setting that compensates each axis. Its threads call ``notify``."""
         self.folder = folder
         self.flight: FlightLog | None = None
         """None if the folder could not be created."""
-        self._tell_user, self._in_use = tell, in_use
+        self._notify_user, self._in_use = notify, in_use
         self._note: str | None = None
-        self._told: dict[str, CompensationSetting] = {}
+        self._recorded: dict[str, CompensationSetting] = {}
         self._queue: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self._threads: list[threading.Thread] = []
         try:
-            flight = FlightLog(folder, settings or RecorderSettings(), about, tell=self._tell, free=free)
+            flight = FlightLog(folder, settings or RecorderSettings(), about, notify=self._notify, free=free)
         except OSError as problem:
-            self._tell(f"{folder}: cannot be made: {problem.strerror}; nothing is recorded")
+            self._notify(f"{folder}: cannot be made: {problem.strerror}; nothing is recorded")
             return
         self.flight = flight
         # The duration of the mending does not matter: each file is mended completely or not at all.
@@ -66,8 +66,8 @@ class FlightRecorder:
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
         """Takes samples and events from the observer; never waits."""
         for axis, setting in self._in_use().items():
-            if self._told.get(axis) is not setting:
-                self._told[axis] = setting
+            if self._recorded.get(axis) is not setting:
+                self._recorded[axis] = setting
                 version = str(setting.version) if setting.version is not None else ""
                 self.put(ModelUse(axis, version, setting.compensating.dump()))
         if self.flight is None:
@@ -76,7 +76,7 @@ class FlightRecorder:
             self._queue.put(Batch(samples if len(samples) else None, tuple(events), lost))
             return
         if not self.flight.counts.dropped:
-            self._tell("the recorder is too slow: cycles are dropped")
+            self._notify("the recorder is too slow: cycles are dropped")
         self.flight.counts.dropped += len(samples)
 
     def put(self, item: ModelUse | Note) -> None:
@@ -104,10 +104,10 @@ class FlightRecorder:
         for thread in self._threads:
             thread.join()
 
-    def _tell(self, text: str) -> None:
+    def _notify(self, text: str) -> None:
         self._note = text
         _log.warning("recorder", {"text": text})
-        self._tell_user(text)
+        self._notify_user(text)
 
     def _mend(self, flight: FlightLog) -> None:
         try:
@@ -117,7 +117,7 @@ class FlightRecorder:
 
     def _run(self, flight: FlightLog) -> None:
         due_s = time.monotonic() + FLUSH_S
-        told = 0
+        reported = 0
         going = True
         while going:
             with suppress(queue.Empty):
@@ -126,10 +126,10 @@ class FlightRecorder:
                     going = False
                 else:
                     flight.put(item)
-            dropped = flight.counts.dropped - told
+            dropped = flight.counts.dropped - reported
             if dropped:
                 flight.put(Note("DROPPED", f"{dropped} cycles were dropped: the recorder was too slow"))
-                told += dropped
+                reported += dropped
             if time.monotonic() < due_s and going:
                 continue
             due_s = time.monotonic() + FLUSH_S

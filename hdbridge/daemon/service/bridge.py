@@ -51,7 +51,7 @@ VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
 """Pauses before successive attempts to verify a drive that did not answer; the last pause repeats."""
 SETTLE_AGAIN_S: Final = (0.0, 0.5)
 """Pauses before successive attempts to send an unacknowledged compensation."""
-EVENTS_TOLD: Final = 1000
+EVENTS_RETURNED: Final = 1000
 _log = logging.getLogger(__name__)
 
 
@@ -306,12 +306,12 @@ class ServiceBridge:
         return warnings
 
     def events(self, since: int = 0) -> messages.Events:
-        """Returns at most the newest `EVENTS_TOLD` events after number ``since``, oldest first."""
-        told = self.core.log.told(since)[-EVENTS_TOLD:]
-        newest = told[-1].number if told else self.core.log.newest_told
+        """Returns at most the newest `EVENTS_RETURNED` events after number ``since``, oldest first."""
+        events = self.core.log.public(since)[-EVENTS_RETURNED:]
+        newest = events[-1].number if events else self.core.log.newest_public
         return messages.Events(
-            events=[reports.event_message(each, self._names) for each in told],
-            lost=max(newest - since - len(told), 0),
+            events=[reports.event_message(each, self._names) for each in events],
+            lost=max(newest - since - len(events), 0),
             newest=newest,
         )
 

@@ -46,9 +46,9 @@ class EventLog:
         self._reader = reader
         self._lock = threading.Lock()
         self._entries: deque[Entry] = deque(maxlen=KEPT)
-        self._told: deque[Entry] = deque(maxlen=KEPT)
+        self._public: deque[Entry] = deque(maxlen=KEPT)
         self._answers: dict[int, Event] = {}
-        self._number = self._told_number = 0
+        self._number = self._public_number = 0
         self.lost = 0
         """Events lost because they were not read in time."""
 
@@ -58,9 +58,9 @@ class EventLog:
         return self._number
 
     @property
-    def newest_told(self) -> int:
+    def newest_public(self) -> int:
         """Number of the newest entry for clients; 0 before the first."""
-        return self._told_number
+        return self._public_number
 
     def poll(self) -> None:
         """Reads new events of the control process."""
@@ -88,10 +88,10 @@ class EventLog:
         with self._lock:
             return _newest(self._entries, self._number - number)
 
-    def told(self, number: int) -> list[Entry]:
+    def public(self, number: int) -> list[Entry]:
         """Returns the entries for clients after ``number``, oldest first."""
         with self._lock:
-            return _newest(self._told, self._told_number - number)
+            return _newest(self._public, self._public_number - number)
 
     def of_axis(self, axis: int, since: int) -> list[Event]:
         """Returns the control process's events of one axis and of the machine after number ``since``."""
@@ -103,8 +103,8 @@ class EventLog:
         self._number += 1
         self._entries.append(Entry(self._number, date, axis, event, text, hint))
         if event is None or not _routine(event):
-            self._told_number += 1
-            self._told.append(Entry(self._told_number, date, axis, event, text, hint))
+            self._public_number += 1
+            self._public.append(Entry(self._public_number, date, axis, event, text, hint))
 
 
 def _newest(entries: deque[Entry], count: int) -> list[Entry]:

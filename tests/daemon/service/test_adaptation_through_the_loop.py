@@ -89,7 +89,7 @@ async def test_the_model_in_the_loop_is_adapted_and_reverted(service: Service) -
         changed = np.abs(np.diff(samples["correction_arcsec"]))[stands[1:] & stands[:-1]]
         assert 0.0 < float(np.max(changed)) < 0.5  # a cycle: four arcsec are faded in, never at once
         assert offset_arcsec(bridge) == pytest.approx(44.0, abs=1.0)
-        assert service.daemon.told(EventKind.CHANGED)
+        assert service.daemon.reported(EventKind.CHANGED)
         state = bridge.axis_state("axis1").adaptation
         assert state.mode == messages.AdaptationMode.ON
         assert state.frozen is None
