@@ -76,7 +76,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """Plan to be measured into a folder, or the rest of one that was begun there."""
+    """Plan to be measured into a folder, or the remaining part of an interrupted measurement."""
 
     session: Session
     plan: Plan
@@ -86,7 +86,7 @@ class Measurement:
     """Journal of the recording to continue; None for a new one."""
 
     def announce(self, after: str = "") -> None:
-        """Prints what is left of the plan and its duration; ``after`` describes what follows."""
+        """Prints the remaining part of the plan and its duration; ``after`` describes the next step."""
         from hdbridge.commissioning.calibration.measure import outlook
 
         done = self.journal.done if self.journal else ()
@@ -100,7 +100,7 @@ class Measurement:
         )
 
     def begun(self, drive: Drive) -> Journal:
-        """Returns the journal to continue, else a new one for this booted drive."""
+        """Returns the journal to continue, else a new journal for this booted drive."""
         from hdbridge.commissioning.calibration import start_journal
 
         if self.journal is not None:
@@ -113,8 +113,8 @@ class Measurement:
     def booted(self) -> Iterator[tuple[Drive, Callable[[str, float, float], None], Callable[[], bool]]]:
         """Yields the booted drive, and functions that show progress and report a request to end.
 
-        Locks the axis against other measurements. If the measurement fails, the place of its record is
-        printed; an empty folder is removed.
+        Locks the axis against other measurements. If the measurement fails, prints the location of its
+        record; removes an empty folder.
         """
         from hdbridge.axis.model.store import measuring
 
@@ -136,7 +136,7 @@ class Measurement:
 
 @contextmanager
 def phases() -> Iterator[Callable[[str, float, float], None]]:
-    """Yields a progress function with one bar per phase; a phase is identified by its total duration, s."""
+    """Yields a progress function with one bar per phase, identified by its total duration, s."""
     with progress_bar() as bar:
         bars: dict[float, int] = {}
 
@@ -187,7 +187,7 @@ def _conclude(
     html_file: Path | None,
     session: Session | None = None,
 ) -> None:
-    """Writes and prints the result; for a measurement of a session, also the next steps."""
+    """Writes and prints the result; for a measurement in a session, also the next steps."""
     page = html_file or folder / "report.html"
     write_json(json_file, result.as_dict())
     write_calibration_page(page, result)
@@ -250,7 +250,7 @@ def fit(
 
     A CSV file needs `time_s`, `motor_position_deg` and `load_position_deg` (multi-turn), or other names by
     --columns; `motor_target_deg` helps. Nothing is activated. A model that is worse on held-out data than
-    that of --model, or than none, is not written.
+    that of --model, or than no model, is not written.
     """
     from hdbridge.axis import AxisConfig
     from hdbridge.axis.model import TransmissionModel
@@ -293,7 +293,8 @@ def report(
 
 
 TAKEN_OFF = 0.95
-"""Terms fitted in addition to the model are reported if they reduce the residual to this share or less."""
+"""Maximum remaining share of the residual with the terms fitted in addition to the model, for reporting
+them."""
 
 
 def print_calibration(result: Calibration) -> None:
@@ -352,7 +353,7 @@ def write_calibration_page(path: Path, result: Calibration) -> None:
 
 
 def print_next(offer: Offer | None, session: Session) -> None:
-    """Prints the commands for a pending model. The daemon that lent its bus commits it, and uses it."""
+    """Prints the commands for a pending model. A daemon that lent its bus commits and uses the model."""
     if offer is not None and offer.made:
         folder = session.files.axis.parent
         daemon = f"hdbridge ctl model {session.axis.name} pending"
@@ -361,7 +362,7 @@ def print_next(offer: Offer | None, session: Session) -> None:
 
 
 def print_stepping(checked: Validation) -> None:
-    """Prints the stepping test with the previous and the new model, next to the floor of the axis."""
+    """Prints the stepping test with the previous and the new model, and the floor of the axis."""
     print_steps("Stepping test: load error at rest, arcsec", (checked.before, checked.after))
     print_worse("stepping", checked.worse)
     _print_accuracy(checked)
@@ -386,7 +387,7 @@ def print_steps(title: str, tests: Iterable[Stepped], first: str = "with") -> No
 
 
 def print_worse(test: str, ways: Iterable[str]) -> None:
-    """Prints what got worse in one direction."""
+    """Prints the deterioration in one direction."""
     for each in ways:
         say(f"{test}: {each}", style="bold")
 

@@ -1,4 +1,4 @@
-"""``hdbridge ctl``: control of a running daemon: look, move, stop, compensate."""
+"""``hdbridge ctl``: control of a running daemon: state, motion, stop, compensation."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ class Daemon:
 
     @contextmanager
     def moving(self, name: str | None) -> Iterator[Axis]:
-        """Yields an axis with the lease to move it; Ctrl-C or another end of the command stops it.
+        """Yields an axis with the lease for moving it; Ctrl-C or any other end of the command stops it.
 
-        Without a name it is the only axis; raises `InputError` if there are several.
+        The name may be omitted for a single axis; raises `InputError` if there are several.
         """
         with connected(self.at) as client:
             if name is None:
@@ -98,7 +98,7 @@ def connected(at: str | None, *, named: bool = True) -> Client:
 
 
 def _name(at: str | None, client: Client) -> None:
-    """Reports the machine that a command acts on if the command did not name it."""
+    """Reports the machine on which a command acts, if the command did not name it."""
     if at is not None:
         return
     place = client.address.socket
@@ -110,7 +110,7 @@ def _name(at: str | None, client: Client) -> None:
 
 @contextmanager
 def stopping(at: str | None) -> Iterator[Client]:
-    """Yields the daemon's client for a stop. If it fails, the error names the process that holds the bus."""
+    """Yields the daemon's client for a stop. If it fails, the error names the holder of the bus."""
     from hdbridge.client import Client
 
     try:
@@ -124,7 +124,9 @@ def stopping(at: str | None) -> Iterator[Client]:
 
 
 def _who_holds(at: str | None) -> str:
-    """Describes who holds an interface or listens at the daemon's socket, and how to end them."""
+    """Describes the processes that hold an interface or listen at the daemon's socket, and how to end
+    them.
+    """
     from hdbridge.client.address import find
     from hdbridge.daemon.api.sockets import daemon_of
     from hdbridge.drive.interfacelock import holders, process_words
@@ -209,7 +211,7 @@ AXES: Final = (
 
 
 def figure(value: float | None, digits: int) -> str:
-    """Formats a number in a table; None is a dash."""
+    """Formats a number in a table; None becomes a dash."""
     return "-" if value is None else f"{value:z.{digits}f}"
 
 
@@ -271,7 +273,7 @@ def watch(
         bool, Option("--lines", help="Print a JSON object per line in place of a table.")
     ] = False,
 ) -> None:
-    """Show the state of a machine until Ctrl-C; it moves nothing."""
+    """Show the state of a machine until Ctrl-C; nothing moves."""
     with connected(at, named=False) as client:
         if lines:
             for _ in _looks(count, every_s):
@@ -290,7 +292,7 @@ def events(
     follow: Annotated[bool, Option("--follow", "-f", help="Continue until Ctrl-C.")] = False,
     json_file: opt.Json = None,
 ) -> None:
-    """List faults, states, refused commands and remarks; oldest first."""
+    """List faults, states, refused commands and remarks, oldest first."""
     with connected(at) as client:
         found = client.events(since)
         write_json(json_file, document("ctl-events", found))
@@ -308,7 +310,7 @@ def events(
 
 @on_daemon
 def lease(daemon: Daemon) -> None:
-    """Report who has the right to move; with --force take it from its holder, and release it."""
+    """Report who has the right to move; with --force, take it from its holder and release it."""
     with connected(daemon.at) as client:
         if daemon.force:
             with client.lease(force=True):
@@ -399,7 +401,7 @@ def disable(daemon: Daemon, axis: OneAxisArgument = None) -> None:
 
 @on_daemon
 def reset(daemon: Daemon, axis: OneAxisArgument = None) -> None:
-    """Release a latched stop when its cause is gone; the axis stays disabled."""
+    """Release a latched stop once its cause is gone; the axis stays disabled."""
     with daemon.moving(axis) as moved:
         daemon.print_state(moved.reset())
 
@@ -443,7 +445,7 @@ def move(
 ) -> None:
     """Move the load to one angle or to several, and hold the last.
 
-    The axis has to be enabled. Ctrl-C stops it; it stays enabled.
+    The axis must be enabled. Ctrl-C stops it; it stays enabled.
     """
     if not wait and len(angles_deg) > 1:
         raise InputError("--no-wait goes to one angle: give one, or use 'hdbridge ctl queue'")
@@ -468,7 +470,7 @@ def jog(
         float, Option("--for", min=0.05, max=86_400.0, help="Time, s; Ctrl-C ends it earlier.")
     ] = 1.0,
 ) -> None:
-    """Turn an axis at a speed for a time, then brake to rest; also if this command is killed."""
+    """Turn an axis at a speed for a time, then brake to rest, even if this command is killed."""
     with daemon.moving(axis) as moved:
         note_clamped(moved.state().limits, velocity_deg_s=velocity_deg_s)
         moved.jog(velocity_deg_s, duration_s)

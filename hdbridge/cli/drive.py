@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 @on_axis
 def reset(session: Session, json_file: opt.Json = None) -> None:
-    """Reset a fault of the drive when its cause is gone; power stays off.
+    """Reset a fault of the drive once its cause is gone; power stays off.
 
     Boots the drive, prints the error code and the last emergency, and resets the fault. Nothing moves. Exit
-    status 4 if the fault returns at once. With a daemon use `hdbridge ctl reset`.
+    status 4 if the fault returns at once. With a daemon, use `hdbridge ctl reset`.
     """
     from hdbridge.drive.states import State
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 # ---------------------------------------------------------------- move
 
 KEPT_S = 60.0
-"""Duration of the samples kept while the axis holds; s."""
+"""Duration of the kept samples while the axis holds; s."""
 
 
 @on_axis
@@ -105,7 +105,7 @@ def move(
 
 
 def _print_position(drive: Drive) -> None:
-    """Prints the position after a stop on the way; nothing if the drive does not answer any more."""
+    """Prints the position after a stop on the way; nothing if the drive no longer answers."""
     with suppress(HdbridgeError):
         stands_deg = drive.read_positions().motor_deg / drive.axis.gear.ratio
         note(f"stopped on the way, at {stands_deg:.4f} deg by the motor encoder; power is off")
@@ -114,7 +114,7 @@ def _print_position(drive: Drive) -> None:
 def _compensating(
     files: Profile, given: Path | None, ratio: float, *, compensated: bool
 ) -> TransmissionModel:
-    """Returns the compensating model; one without effects without a model or if not ``compensated``."""
+    """Returns the compensating model; without a model or ``compensated``, one without effects."""
     from hdbridge.axis.model import TransmissionModel
 
     if not compensated:
@@ -187,7 +187,7 @@ def step(
         Kind.FOLDER,
     ] = None,
 ) -> None:
-    """Step the axis both ways under each compensation scheme; print what the load encoder measured.
+    """Step the axis both ways under each compensation scheme; print the results at the load encoder.
 
     Uses the article's four schemes, and the whole model if it has more than their two parts.
     """
@@ -230,7 +230,7 @@ def run_comparison(
 ) -> None:
     """Connects, boots and compares; keeps each scheme's record as soon as it is complete.
 
-    ``notify`` receives the result, also of an interrupted test: then that of the completed schemes.
+    ``notify`` receives the result. For an interrupted test, this is the result of the completed schemes.
     """
     from hdbridge.commissioning.evaluation.comparison import compare_schemes
     from hdbridge.control.bench import compensation_for
@@ -333,7 +333,7 @@ def _write_stepping_page(
     stepping: Stepping,
     simulated_seed: int | None,
 ) -> None:
-    """Writes the result as a self-contained page, with what was stepped, when, and by which model."""
+    """Writes the result as a self-contained page with axis, date and model of the test."""
     from hdbridge.report.page import render
     from hdbridge.report.stepping import stepping_page
 
@@ -460,7 +460,7 @@ def demo(
 ) -> None:
     """Step a simulated axis 240 times each way under four compensation schemes.
 
-    Table, JSON, records and a page go to FOLDER.
+    FOLDER receives table, JSON, records and a page.
     """
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.motion.procedures.stepping import Stepping

@@ -1,4 +1,4 @@
-"""Typed messages between the daemon and its clients. Both ends import this and nothing of each other.
+"""Typed messages between the daemon and its clients, imported by both.
 
 Angles are degrees at the load unless the name says ``motor``; errors and corrections are arcseconds at the
 load. A request refuses unknown keys, NaN and infinity; a report ignores keys that a newer daemon adds.
@@ -20,7 +20,7 @@ _PRINTABLE: Final = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"
 """Text without characters that move a terminal's cursor, start a log line or reverse the writing
 direction."""
 Real = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-"""A number, not its text; NaN and infinity are refused."""
+"""Number, not its text; NaN and infinity are refused."""
 Angle = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e7, le=1e7)]
 """Degrees at the load, multi-turn; the axis's own limits are narrower."""
 Speed = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=1e5)]
@@ -85,7 +85,7 @@ class MotionMode(StrEnum):
     STREAM = "stream"
     STOP = "stop"
     FOLLOW = "follow"
-    """After the set-points of another master, through the gateway."""
+    """Following the set-points of another master, through the gateway."""
 
 
 class PowerState(StrEnum):
@@ -110,7 +110,7 @@ class Scheme(StrEnum):
     HYSTERESIS = "hysteresis"
     BOTH = "both"
     EXTENDED = "extended"
-    """The whole model, with effects that a diagnosis added."""
+    """Whole model, including effects added by a diagnosis."""
 
 
 class AdaptationMode(StrEnum):
@@ -147,7 +147,7 @@ STATUS: Final[dict[type[HdbridgeError], tuple[int, str]]] = {
 
 
 class Problem(Report):
-    """Problem document: the reason why a request failed."""
+    """Problem document: the reason for the failure of a request."""
 
     type: str = Field(description="kind of error, as a URN", examples=[f"{TYPE_PREFIX}LeaseError"])
     title: str = Field(description="the kind in words", examples=["The right to move is not yours"])
@@ -180,7 +180,7 @@ class Problem(Report):
         )
 
     def error(self) -> HdbridgeError:
-        """Returns the error to raise in the client; DaemonError for an unknown kind."""
+        """Returns the error for the client; DaemonError for an unknown kind."""
         name = self.type.removeprefix(TYPE_PREFIX)
         kind = next((each for each in STATUS if each.__name__ == name), errors.DaemonError)
         return kind("; ".join((self.detail, *self.errors)))
@@ -199,7 +199,7 @@ class LeaseRequest(Request):
 
 
 class LeaseGrant(Report):
-    """The granted lease; its token goes into the header ``X-Lease`` of each request that moves an axis."""
+    """Granted lease, whose token goes into the header ``X-Lease`` of each request that moves an axis."""
 
     token: str = Field(description="secret that permits motion", examples=["mZ3sWJx0b0lq"])
     client: str = Field(description="who holds it")
@@ -264,7 +264,7 @@ class Jog(Request):
 
 
 class QueueItem(Request):
-    """A way point: move there, rest, continue."""
+    """Way point: a move, a rest, and the continuation."""
 
     target_deg: Angle = Field(description="load angle, degrees", examples=[45.0])
     velocity_deg_s: Speed | None = Field(None, description="highest speed, deg/s; else the axis's limit")
@@ -285,7 +285,7 @@ class Queue(Request):
 
 
 class StreamPoint(Request):
-    """One knot of a streamed path; between knots the daemon interpolates (cubic Hermite)."""
+    """Knot of a streamed path; the daemon interpolates between knots (cubic Hermite)."""
 
     time_s: Annotated[Real, Field(ge=0, le=1e7)] = Field(
         description="since the stream began, seconds; later than the knot before", examples=[0.02]
@@ -338,7 +338,7 @@ class Home(Request):
 
 
 class SdoWrite(Request):
-    """A value for an object of the drive, by the type that its EDS gives it."""
+    """Value for an object of the drive, of the type given by its EDS."""
 
     value: Annotated[str, StringConstraints(strict=True, min_length=1, max_length=2000)] = Field(
         description="decimal or 0x...; text, or bytes in hexadecimal", examples=["0x10"]
@@ -346,7 +346,7 @@ class SdoWrite(Request):
 
 
 class SdoValue(Report):
-    """An object of the drive as it was read."""
+    """Value read from an object of the drive."""
 
     index: int = Field(ge=0, le=0xFFFF, description="number of the object", examples=[0x6064])
     subindex: int = Field(ge=0, le=0xFF, examples=[0])
@@ -358,7 +358,7 @@ class SdoValue(Report):
 
 
 class Mark(Request):
-    """A remark for the flight recorder, at the present cycle."""
+    """Remark for the flight recorder, at the present cycle."""
 
     text: Words = Field(min_length=1, examples=["coupling tightened"])
 
@@ -398,7 +398,7 @@ class EventKind(StrEnum):
 
 
 class Event(Report):
-    """An event."""
+    """Event of the loop or the service."""
 
     sequence: int = Field(ge=0, description="counts from the start of the service", examples=[17])
     kind: EventKind
@@ -436,7 +436,7 @@ class AxisColumns(Report):
 
 
 class Samples(Report):
-    """A batch of cycles in columns, oldest first."""
+    """Batch of cycles in columns, oldest first."""
 
     type: Literal["samples"] = "samples"
     time_s: list[float] = Field(description="time of SYNC, by the machine's monotonic clock")
@@ -464,7 +464,7 @@ class LiveOptions(Request):
 
 
 class StreamBegin(Request):
-    """The first message of a stream."""
+    """First message of a stream."""
 
     lease: str = Field(max_length=200, description="the token of the lease")
     timeout_s: Annotated[Real, Field(gt=0, le=5)] = Field(
@@ -473,14 +473,14 @@ class StreamBegin(Request):
 
 
 class StreamPoints(Request):
-    """Knots to append; the stream ends where the last one has speed 0 and ``end`` is set."""
+    """Knots to append; the stream ends if the last one has speed 0 and ``end`` is set."""
 
     points: list[StreamPoint] = Field(max_length=POINTS_MAXIMUM)
     end: bool = Field(False, strict=True, description="no more points follow")
 
 
 class StreamAnswer(Report):
-    """The answer to each message of a stream."""
+    """Answer to each message of a stream."""
 
     accepted: int = Field(ge=0, description="number of points accepted")
     problem: Problem | None = Field(
@@ -518,7 +518,7 @@ class Limits(Report):
 
 
 class ModelInUse(Report):
-    """The model that compensates an axis."""
+    """Model that compensates an axis."""
 
     version: int | None = Field(None, description="number in the history; None without one", examples=[4])
     file: str = Field(description="its file on the daemon's machine")
@@ -542,7 +542,7 @@ class LoadLoopState(Report):
 
 
 class RefinedResponse(Report):
-    """Response in motion that is used in place of the model's."""
+    """Response in motion that replaces that of the model."""
 
     date: datetime | None = Field(None, description="when it was refined last; None: before the daemon began")
     low_hz: float = Field(description="lowest frequency at which it differs by 1 % or more")
@@ -575,7 +575,7 @@ class AdaptationState(Report):
 
 
 class OuterState(Report):
-    """The axis as a drive of another master, through the gateway."""
+    """Axis as a drive of another master, through the gateway."""
 
     node_id: int = Field(ge=1, le=255, description="on the bus of that master; 255: LSS took it away")
     alive: bool = Field(description="whether the gateway process runs")
@@ -648,7 +648,7 @@ class AxisState(Report):
 
 
 class BusState(Report):
-    """The CAN bus of the machine."""
+    """CAN bus of the machine."""
 
     interface: str = Field(examples=["socketcan"])
     channel: str = Field(examples=["can0"])
@@ -659,7 +659,7 @@ class BusState(Report):
 
 
 class CycleState(Report):
-    """The control loop."""
+    """Control loop of the machine."""
 
     period_s: float = Field(gt=0, examples=[0.004])
     cycle: int = Field(description="number of the newest cycle")
@@ -671,7 +671,7 @@ class CycleState(Report):
 
 
 class RecorderState(Report):
-    """The flight recorder."""
+    """Flight recorder of the machine."""
 
     on: bool
     folder: str | None = None

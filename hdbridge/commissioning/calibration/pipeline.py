@@ -1,4 +1,4 @@
-"""Whole calibration, from a booted drive to a pending model; its result, also read again from its folder."""
+"""Complete calibration, from a booted drive to a pending model, and its result, restored from its folder."""
 
 import json
 import math
@@ -32,7 +32,7 @@ from hdbridge.units import unit_of
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """Decision to offer a model for commit, with its reason."""
+    """Decision on offering a model for commit, with its reason."""
 
     made: bool
     reason: str
@@ -42,14 +42,14 @@ class Offer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """Result of a calibration, or of a fit to recordings alone (then without validation and offer)."""
+    """Result of a calibration, or of a fit to recordings alone (without validation and offer)."""
 
     recordings: tuple[str, ...]
     fit: FitResult
     model: TransmissionModel
     """Model, with its provenance."""
     active: TransmissionModel | None
-    """Model that it is compared with."""
+    """Model for comparison."""
     axis: str | None = None
     date: str | None = None
     """Date and time of the recording, ISO 8601."""
@@ -58,7 +58,7 @@ class Calibration:
     """Parts of the plan that were shortened for this axis, in words."""
     validation: Validation | None = None
     motion: MotionTest | None = None
-    """Motion test, which measures the response; None if the plan has none."""
+    """Motion test, which measures the response; None without one in the plan."""
     drift: tuple[tuple[float, float], ...] = ()
     """Time (s) and error (arcsec, relative to the first) of each visit to the reference pose."""
     offer: Offer | None = None
@@ -133,7 +133,7 @@ class Calibration:
 
 
 def _number(value: float) -> float | None:
-    """Returns the number; None if it is not finite, because JSON has no infinity."""
+    """Returns the number, or None if it is not finite, because JSON has no infinity."""
     return float(value) if math.isfinite(value) else None
 
 
@@ -157,7 +157,7 @@ def calibrate(
     """Measures the remaining tasks, fits, validates, and proposes the model to the profile.
 
     ``profile`` is the folder of axis.yaml; ``notify`` receives a line for each step. A model that does not
-    improve on unseen data, or that makes the axis point worse, is saved in the recording's folder but not
+    improve on held-out data, or that worsens positioning, is saved in the recording's folder but not
     proposed.
     """
     axis = drive.axis
@@ -231,9 +231,9 @@ def conclude(
     axis: AxisConfig | None = None,
     independent_zeros: bool = False,
 ) -> Calibration:
-    """Fits recordings in the order given, keyed by their paths; needs no drive.
+    """Fits recordings in the given order, keyed by their paths; requires no drive.
 
-    With ``axis`` the model is bound to it.
+    With ``axis``, the model is bound to it.
     """
     measured = list(recordings.values())
     fit = identify(measured, ratio, active, independent_zeros=independent_zeros)
@@ -310,7 +310,7 @@ def active_model(
 
 
 def _kept(folder: Path, result: Calibration) -> Calibration:
-    """Saves the result, the new model and the active one next to the recording."""
+    """Saves the result, the new model and the active model next to the recording."""
     with writing():
         result.model.save(folder / MODEL_NAME)
         if result.active:
@@ -331,8 +331,8 @@ def fit(
     """Fits a model to one or several recordings; ``.model`` is the model, ``.as_dict()`` the document.
 
     ``ratio`` (motor turns per load turn) is needed if neither the recordings nor ``axis`` state it; with
-    ``axis`` the model is bound to it. ``active`` is the model to compare with and to fall back on.
-    ``independent_zeros`` means that the encoders lost their zeros between the recordings.
+    ``axis`` the model is bound to it. ``active`` is the model for comparison and the fall-back.
+    ``independent_zeros`` states that the encoders lost their zeros between the recordings.
 
     InputError if a recording cannot be used, belongs to another gear, or does not come from an axis.
     Quantities that the data do not determine are listed in ``.fit.warnings``.
