@@ -25,14 +25,14 @@ ROWS: Final = 200
 NOT_KNOWN: Final = "not known yet"
 NO_PAGES: Final[Mapping[str, str]] = MappingProxyType({})
 Joint = Callable[[str], Cell]
-"""Returns the name of a joint, with a link to its page if there is one."""
+"""Returns the name of a joint, with a link to its page if it exists."""
 _FAILURES: Final = 40
-"""Length of the prefix by which failure reasons are grouped; characters."""
+"""Length of the prefix by which failure reasons are grouped, characters."""
 _KINDS: Final = {"swapped": "another joint", "turned": "another encoder or zero", "changed": "changed orders"}
 
 
 def hours_words(remaining: Interval | None) -> str:
-    """Formats the hours to a limit with their interval, or reports that they are not known yet."""
+    """Formats the hours to a limit with their interval, or reports that they are unknown."""
     if remaining is None:
         return NOT_KNOWN
     if remaining.high == 0.0:
@@ -43,7 +43,7 @@ def hours_words(remaining: Interval | None) -> str:
 def fleet_page(summary: Summary, folder: Path, pages: Mapping[str, str] = NO_PAGES) -> Page:
     """Returns the page of a summary.
 
-    ``folder`` holds the data set, ``pages`` the addresses of the joints' pages that exist.
+    ``folder`` contains the data set, ``pages`` the addresses of the existing joint pages.
     """
 
     def joint(name: str) -> Cell:
@@ -85,7 +85,7 @@ def _verdict(summary: Summary) -> str:
 
 
 def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
-    """Yields the sections that have rows; the list of joints always."""
+    """Yields the sections that have rows, and always the list of joints."""
     text = (
         "Joints with a cause that appeared after the first recording and repeats, or that grows: more often "
         "than the fleet's rate of wrong names explains. No more than 1 in 100 of these lines is expected to "
@@ -163,7 +163,7 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
 def _table(
     title: str, text: str, header: Sequence[str | Heading], rows: Sequence[Sequence[Cell]]
 ) -> Iterator[Section]:
-    """Yields a section with the first rows; nothing without rows."""
+    """Yields a section with the first rows, if any."""
     more = f"the first {ROWS} of {len(rows):,}; fleet report --json has all" if len(rows) > ROWS else ""
     if rows:
         yield Section(title, text, [Table(header, rows[:ROWS], more)])
@@ -212,7 +212,7 @@ KEY_DIGITS = 12
 
 
 def shown(rows: Sequence[Row]) -> dict[str, Row]:
-    """Returns the recording that the page of each joint shows: the last that is its own.
+    """Returns the recording for the page of each joint: the last that is the joint's own.
 
     Its ``mistaken`` are the joint's recordings of another joint or encoder, or with other orders.
     """
@@ -224,7 +224,7 @@ def shown(rows: Sequence[Row]) -> dict[str, Row]:
 
 
 def links(folder: Path, latest: Mapping[str, Row]) -> dict[str, str]:
-    """Returns the relative address of each joint's page that is there and up to date.
+    """Returns the relative address of each existing, up-to-date joint page.
 
     ``latest`` is from `shown`.
     """
@@ -234,9 +234,9 @@ def links(folder: Path, latest: Mapping[str, Row]) -> dict[str, str]:
 
 
 def write_page(folder: Path, row: Row) -> None:
-    """Diagnoses the recording to show again and writes the page; removes the joint's older pages.
+    """Diagnoses the displayed recording again and writes the page; removes the joint's older pages.
 
-    InputError if recording or model are not there any more.
+    InputError if recording or model no longer exist.
     """
     from hdbridge.analysis.diagnosis import diagnose
     from hdbridge.axis.model import TransmissionModel

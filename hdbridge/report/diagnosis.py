@@ -44,8 +44,8 @@ def diagnosis_page(
 ) -> Page:
     """Returns the page of a diagnosis.
 
-    ``provenance`` holds names and values about the origin of records and model. ``stepping`` is the stepping
-    test with the old and the extended model, if there was one; it precedes everything else. ``offer`` is the
+    ``provenance`` contains names and values about the origin of records and model. ``stepping`` is the
+    stepping test with the old and the extended model, if any; it precedes everything else. ``offer`` is the
     outcome for the extended model, if it was proposed for commit. ``command`` is the command line of the
     diagnosis.
     """
@@ -128,7 +128,7 @@ def _verdict(diagnosis: Diagnosis, stepping: Validation | None) -> str:
 
 
 def _claim(finding: Finding) -> str:
-    """Phrases a finding with its certainty: "backlash behind the gear, up to 3.1 arcsec"."""
+    """Describes a finding with its certainty: "backlash behind the gear, up to 3.1 arcsec"."""
     if finding.cause == UNEXPLAINED:
         size = f"up to {_two(finding.peak_arcsec)} arcsec"
         return f"something unexplained that depends on the {finding.lives_in or 'time'}, {size}"
@@ -351,5 +351,5 @@ def _listed(words: Sequence[str], last: str = "and") -> str:
 
 
 def _two(value: float) -> str:
-    """Formats two or three digits, without an exponent."""
+    """Formats a value with two or three digits, without an exponent."""
     return f"{value:.1f}" if value >= 9.95 else f"{value:.2f}"

@@ -29,7 +29,7 @@ def motion_page(axis_name: str, result: MotionTest) -> Page:
 
 
 def motion_sections(result: MotionTest) -> list[Section]:
-    """Returns the ripple over speed, the path errors, and the response if there is one."""
+    """Returns the ripple over speed, the path errors, and the response if measured."""
     sections = [
         Section(
             "Ripple over speed", blocks=[Grid([_ripple(result)]), Table(RIPPLE_COLUMNS, ripple_rows(result))]
@@ -94,7 +94,7 @@ def ripple_rows(result: MotionTest) -> list[list[str]]:
 
 
 def figure(value: float | None) -> str:
-    """Formats two decimals; empty for None."""
+    """Formats two decimals; None is empty."""
     return "" if value is None else f"{value:.2f}"
 
 

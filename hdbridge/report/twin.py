@@ -37,7 +37,7 @@ MEASURED, SIMULATED, BEFORE, DIFFERENCE = "measured", "simulated", "before", "di
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """A fitted value of the plant."""
+    """Fitted value of the plant."""
 
     name: str
     unit: str
@@ -45,7 +45,7 @@ class Learned:
     """Value before; None if it was only assumed."""
     after: float
     interval: tuple[float, float] | None
-    """95 %; None if the value is not the axis's."""
+    """95 % interval; None if the value is not the axis's."""
 
     @property
     def text(self) -> str:
@@ -62,7 +62,7 @@ class TwinReport:
     before: Comparison
     """Comparison of the measured record with the initial simulation."""
     after: Comparison | None = None
-    """Comparison with the fitted simulation; None if it was only compared."""
+    """Comparison with the fitted simulation; None without a fit."""
     learned: Sequence[Learned] = ()
     named: Sequence[Finding | Alike | Left] = ()
     translated: Sequence[Translated] = ()
@@ -70,7 +70,7 @@ class TwinReport:
     verdict: str = ""
     """Quality of the values, and the outcome for the twin, in one sentence."""
     values: str = ""
-    """Origin of the values (`hdbridge.twin.twin.Values`); empty if nothing was fitted."""
+    """Origin of the values (`hdbridge.twin.twin.Values`); empty without a fit."""
     left: Sequence[Left] = ()
     """Residuals of each channel."""
     commands: Sequence[Command] = ()
@@ -78,7 +78,7 @@ class TwinReport:
 
     @property
     def now(self) -> Comparison:
-        """The later of the two comparisons."""
+        """Comparison after the fit, else before."""
         return self.after or self.before
 
 
@@ -168,7 +168,7 @@ def _title(row: Row) -> str:
 
 
 def figures(report: TwinReport, *, by_kind: bool = False) -> tuple[list[str], list[list[str]]]:
-    """Returns header and rows of the figures of each channel: of the whole record, or by kind of motion."""
+    """Returns header and rows of each channel's figures, of the whole record or by kind of motion."""
     before = ["difference before"] if report.after is not None else []
     header = ["", "measured", "simulated", *before, "difference", "of the noise", "unit"]
     if not by_kind:

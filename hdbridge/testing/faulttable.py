@@ -1,8 +1,8 @@
 """Faults of a simulated drive by name: one row each.
 
-They are those of the fault table in docs/reliability.md, seen from the other end of the bus: actions of
-the drive, its encoders, other nodes and the interface. Faults of the program itself (a target that is not a
-number, a full disk) must be made by the program.
+They are those of the fault table in docs/reliability.md, seen from the other end of the bus: actions of the
+drive, its encoders, other nodes and the interface. Faults of the program itself (a target that is not a
+number, a full disk) must be caused by the program.
 """
 
 import struct
@@ -27,13 +27,13 @@ _BUS_OFF: Final = 0x40
 
 @dataclass(frozen=True)
 class Reach:
-    """Objects that a fault can act on."""
+    """Objects on which a fault can act."""
 
     drive: WatchedDrive
     another: Callable[[], AbstractContextManager[can.BusABC]]
     """Opens another node's end of the bus."""
     port: Port | None
-    """The program's interface, if it is in this process."""
+    """Program's interface, if it is in this process."""
     bus: str
     """Name of the bus, for messages."""
 
@@ -64,7 +64,7 @@ class Reach:
 
     @property
     def interface(self) -> Port:
-        """The program's interface, for rows that require it."""
+        """Program's interface, for rows that require it."""
         assert self.port is not None
         return self.port
 
@@ -90,12 +90,12 @@ class Row:
 
     name: str
     what: str
-    """One sentence; arguments by their names."""
+    """One sentence, with the arguments by name."""
     make: Make
     arguments: Mapping[str, Value] = field(default_factory=dict)
     """Arguments with their defaults."""
     answers: str = ""
-    """First words of the row of the fault table that this fault produces."""
+    """First words of the corresponding row of the fault table."""
     needs: Needs = Needs.NOTHING
     touches: Callable[[Mapping[str, Any]], tuple[int, int]] | None = None
     """Returns the object that the drive must have, given the arguments."""
@@ -125,7 +125,7 @@ class Row:
             raise BusError(f"fault '{self.name}' cannot be made on {reach.bus}: {error}") from error
 
     def checked(self, given: Mapping[str, Any]) -> dict[str, Value]:
-        """Returns the complete arguments; raises `InputError` with the existing ones."""
+        """Returns the complete arguments; raises `InputError` with the existing arguments."""
         __tracebackhide__ = True  # pytest shows the test's line
         signature = ", ".join(f"{name}={value!r}" for name, value in self.arguments.items()) or "none"
         for name, value in given.items():
@@ -159,7 +159,7 @@ def _once(act: Callable[[WatchedDrive], object]) -> Make:
 
 
 def _frame(can_id: int, data: bytes = b"", *, own: bool = False, **kind: bool) -> Make:
-    """Returns a maker of a frame; with ``own`` the drive's node id is added to its identifier."""
+    """Returns a function that sends a frame; with ``own``, the drive's node id is added to its identifier."""
     return lambda reach: reach.send(can_id + own * reach.drive.node_id, data, **kind)
 
 
@@ -367,11 +367,11 @@ OF_THE_PROGRAM: Final = (
     "the target is not a number within the limits",
     "a load torque or temperature stays away",
 )
-"""Rows of the fault table without a fault here: those of the program, and consequences of another row."""
+"""Rows of the fault table without a fault here: those of the program, and consequences of other rows."""
 
 
 def find(name: str) -> Row:
-    """Returns the fault with a name; raises `InputError` with the nearest one."""
+    """Returns the fault with a name; raises `InputError` with the nearest name."""
     __tracebackhide__ = True  # pytest shows the test's line
     row = FAULTS.get(name)
     if row is None:
