@@ -77,7 +77,6 @@ class Blocks:
     """Variance of each block due to uncertain turning points of the driving angle, arcsec squared."""
 
     def __len__(self) -> int:
-        """Number of blocks."""
         return len(self.first)
 
     @property

@@ -216,7 +216,7 @@ class Traces:
     start: Start
     """Elastic state at the first point of ``motion``, as fitted."""
     samples: Motion
-    """Motion at every sample."""
+    """Motion at each sample."""
     runs: IntArray
     """First sample of each point of ``motion``."""
 

@@ -191,7 +191,6 @@ class Nuisances:
     """Shape (b, q)."""
     names: tuple[str, ...]
     prior: tuple[Prior, ...]
-    """Prior of each coefficient."""
 
     def and_also(self, other: Nuisances) -> Nuisances:
         """Returns these columns followed by others."""

@@ -153,7 +153,6 @@ class Samples:
     """True if the record contains the command."""
 
     def __len__(self) -> int:
-        """Number of samples."""
         return len(self.error_arcsec)
 
     @property

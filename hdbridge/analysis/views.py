@@ -37,7 +37,6 @@ class ResidualViews:
     direction: FloatArray
     time_s: FloatArray
     coordinates: Mapping[str, Coordinate]
-    """Coordinates by name."""
 
     def shares(self) -> dict[str, tuple[float, float]]:
         """Returns, per coordinate, the shares of the mean square that bin means predict, 0 to 1.

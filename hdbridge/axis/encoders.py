@@ -42,15 +42,12 @@ class Encoder(Strict):
 
     @property
     def scale(self) -> Scale:
-        """Conversion between counts and degrees."""
         return Scale(self.direction, self.counts_per_turn)
 
     def counts(self, deg: float) -> float:
-        """Converts degrees to counts; see `Scale.counts`."""
         return self.scale.counts(deg)
 
     def degrees(self, counts: float) -> float:
-        """Converts counts to degrees; see `Scale.degrees`."""
         return self.scale.degrees(counts)
 
     @property

@@ -244,7 +244,6 @@ class _Report:
         return {**self.facts, **self.rows}
 
     def print(self) -> None:
-        """Prints the report."""
         _print_facts(self.facts)
         for name, rows in self.rows.items():
             for row in rows:

@@ -312,7 +312,6 @@ def _reported_when_stopped(
 
 
 def _print_stepping(axis: AxisConfig, comparison: Comparison) -> None:
-    """Prints the result."""
     title = f"Load error at rest, arcsec: axis '{axis.name}'"
     print_steps(title, comparison.results.values(), "compensation")
     for line in comparison.survived:

@@ -465,7 +465,6 @@ class AsyncLink:
         self._address = address
 
     async def send(self, message: BaseModel) -> None:
-        """Sends a message."""
         try:
             await self._connection.send(message.model_dump_json())
         except FAILURES as problem:

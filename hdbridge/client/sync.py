@@ -151,7 +151,6 @@ class Client:
 
     @property
     def address(self) -> Address:
-        """Address of the daemon."""
         return self._own.address
 
     @property

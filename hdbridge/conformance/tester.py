@@ -200,7 +200,6 @@ class NodeTester:
         return self.link.now()
 
     def send(self, can_id: int, data: bytes = b"") -> None:
-        """Sends a data frame."""
         self.link.send(can_id, data)
 
     def send_special(self, can_id: int, data: bytes = b"", *, remote: bool = False) -> None:
@@ -346,7 +345,6 @@ class NodeTester:
         self.equal(self.state(), state, "NMT state")
 
     def sync(self, counter: int | None = None) -> None:
-        """Sends SYNC."""
         self.send(0x080, b"" if counter is None else bytes((counter,)))
 
     def emergencies(self, since: int) -> list[int]:

@@ -197,7 +197,6 @@ class _Bus:
             self._take_pdo(can_id, data, time_s)
 
     def end(self) -> None:
-        """Ends the log."""
         self._end_window()
 
     # -- SDO ----------------------------------------------------------------------------------------------

@@ -56,19 +56,16 @@ class Cycle:
         self._bus.join(self._axis)
         self._exchange = self._bus.exchange
         self.histogram = self._bus.histogram
-        """Lateness of the start of each period."""
         self.stopping: list[Feedback] = []
         """Feedback of the cycles that `tick` ran to complete the last quick stop."""
         self.restart()
 
     @property
     def overruns(self) -> int:
-        """Number of cycles skipped because they began too late."""
         return self._bus.overruns
 
     @property
     def skipped(self) -> int:
-        """Number of whole periods without a SYNC."""
         return self._bus.skipped
 
     def restart(self) -> None:

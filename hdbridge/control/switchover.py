@@ -51,7 +51,6 @@ class Correction:
 
     @property
     def changing(self) -> bool:
-        """True during a change."""
         return self._new is not None
 
     @property
@@ -75,17 +74,14 @@ class Correction:
 
     @property
     def memory_known(self) -> bool:
-        """True if the state depends on the issued path alone (`Compensation.memory_known`)."""
         return self._now.memory_known and (self._new is None or self._new.memory_known)
 
     @property
     def weight(self) -> float:
-        """Weight of the ramp: 0 off, 1 fully on."""
         return self._now.weight
 
     @property
     def limited(self) -> int:
-        """Number of cycles in which a cap or the slew limit acted."""
         return self._limited + self._now.limited
 
     def change(self, new: Compensation) -> None:
@@ -105,17 +101,14 @@ class Correction:
         self.command = self._first_blended
 
     def know(self, channels: frozenset[Channel]) -> None:
-        """Sets the available channels (`Compensation.know`)."""
         for each in self._all():
             each.know(channels)
 
     def engage(self) -> None:
-        """Fades the correction in from the next command on."""
         for each in self._all():
             each.engage()
 
     def disengage(self) -> None:
-        """Fades the correction out from the next command on."""
         for each in self._all():
             each.disengage()
 

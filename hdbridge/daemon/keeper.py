@@ -67,11 +67,11 @@ class Times:
     begin_s: float = 60.0
     """Start-up of a child."""
     hung_s: float = 5.0
-    """A turn of the control process; the drives' own watchdogs act long before."""
+    """Duration of a turn of the control process; the drives' own watchdogs act long before."""
     service_hung_s: float = 30.0
-    """Heartbeat of the service."""
+    """Interval without a sign of life of the service."""
     gateway_hung_s: float = 5.0
-    """Heartbeat of the gateway."""
+    """Interval without a sign of life of the gateway."""
     stop_s: float = 30.0
     """Braking of all axes by the control process."""
     service_stop_s: float = 10.0

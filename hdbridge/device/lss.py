@@ -33,7 +33,6 @@ class LssSlave:
         ``bit_rate_bps`` is the only bit rate of the interface; None if unknown.
         """
         self.node_id = node_id
-        """Node id in use."""
         self.pending = self.stored = node_id
         """Node id after the next reset of the communication, and after the next reset of the node."""
         self.configuring = False

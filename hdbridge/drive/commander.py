@@ -45,7 +45,6 @@ class Commander:
         return f"node {self.sdo.node_id} on {self.link.name}"
 
     def statusword(self) -> int:
-        """Reads the statusword."""
         self._beat()
         return self.sdo.fetch(objects.STATUSWORD)
 
@@ -56,7 +55,6 @@ class Commander:
         return self.image.power.observe(statusword)
 
     def control(self, controlword: int) -> None:
-        """Writes the controlword."""
         self._beat()
         self.sdo.store(objects.CONTROLWORD, controlword)
 

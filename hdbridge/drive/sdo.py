@@ -223,11 +223,9 @@ class SdoClient:
         self.write_bytes(index, sub, kind.encode(value))
 
     def fetch(self, address: Address) -> int:
-        """Reads a known object, like `read`."""
         return self.read(address.index, address.sub)
 
     def store(self, address: Address, value: int) -> None:
-        """Writes a known object, like `write`."""
         self.write(address.index, address.sub, value)
 
     def read_text(self, index: int) -> str:

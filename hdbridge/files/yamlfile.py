@@ -69,11 +69,6 @@ class Node:
     """Children; for a mapping, key -> (key's node, value's node)."""
 
 
-def compose(text: str, path: Path) -> Node:
-    """Returns the root node of a YAML text; ``path`` only names it in messages (`FileError`)."""
-    return _Composer(text, path).document()
-
-
 class _Composer:
     """Builds nodes from parser events, and refuses features that a configuration does not need."""
 
@@ -240,7 +235,7 @@ def read_yaml(path: Path | str) -> Document:
 def document_from_text(text: str, path: Path | str) -> Document:
     """Parses YAML text as a document; ``path`` only names it in messages."""
     path = Path(path)
-    return Document(path, compose(text, path))
+    return Document(path, _Composer(text, path).document())
 
 
 @dataclass(frozen=True, slots=True)

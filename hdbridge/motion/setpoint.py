@@ -67,17 +67,14 @@ class SetPoint:
 
     @property
     def velocity_deg_s(self) -> float:
-        """Velocity of the load target."""
         return self._velocity_deg_s
 
     @property
     def acceleration_deg_s2(self) -> float:
-        """Acceleration of the load target."""
         return self._acceleration_deg_s2
 
     @property
     def mode(self) -> MotionMode:
-        """Mode of the present motion."""
         return self._mode
 
     @property

@@ -133,7 +133,6 @@ class Stream:
 
     @property
     def state(self) -> Kinematics:
-        """Present state."""
         return self._state
 
     def add(self, time_s: float, position_deg: float, velocity_deg_s: float) -> None:

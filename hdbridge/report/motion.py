@@ -19,7 +19,7 @@ PATH_WORDS = (
 
 
 def motion_page(axis_name: str, result: MotionTest) -> Page:
-    """Returns the page of one test."""
+    """Returns the page of a motion test."""
     return Page(
         title=f"Motion test of axis '{axis_name}'",
         verdict=_verdict(result),

@@ -41,7 +41,6 @@ class AgeFactor:
         self._growth = truth.hysteresis_growth
 
     def factor(self, now: Conditions) -> float:
-        """Returns the factor after one more substep."""
         return 1.0 + self._growth * self._age.grown()
 
 

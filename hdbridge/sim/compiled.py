@@ -104,7 +104,6 @@ class CompiledAxis:
         self._drive = self._entry_point("drive")
 
     def drive(self, *inputs: float) -> Measured:
-        """Runs a closed-loop cycle; see `Axis`."""
         measured: Measured = self._drive(self._record, *inputs)
         return measured
 
@@ -128,12 +127,10 @@ class CompiledAxis:
         return last
 
     def roll(self, *inputs: float) -> Measured:
-        """Runs a cycle with the power stage off; see `Axis`."""
         measured: Measured = self._entry_point("roll")(self._record, *inputs)
         return measured
 
     def hold(self, torque_nm: float) -> None:
-        """Sets the holding torque; see `Axis`."""
         self._entry_point("hold")(self._record, torque_nm)
 
 

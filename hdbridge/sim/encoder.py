@@ -152,7 +152,6 @@ class Losses:
     """Lost counts of an encoder."""
 
     _counts: tuple[float, ...]
-    """Counts of each loss."""
     _count: int
     _lost: float
     _past: int

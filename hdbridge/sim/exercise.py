@@ -60,7 +60,6 @@ class Exercise:
         return len(self._rows)
 
     def hold(self, duration_s: float) -> None:
-        """Holds the position."""
         self.lead(lambda seconds: 0.0 * seconds, duration_s)
 
     def move(self, distance_deg: float, speed_deg_s: float, acceleration_deg_s2: float) -> None:

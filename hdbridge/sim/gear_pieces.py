@@ -67,7 +67,6 @@ class SpeedFactor:
         self._now = 0.0
 
     def factor(self, now: Conditions) -> float:
-        """Returns the factor after one more substep."""
         speed_deg_s = abs(now.motor_deg - self._last_deg) / self._dt
         self._last_deg = now.motor_deg
         goal = self._gain * math.log10(1.0 + speed_deg_s / self._from_deg_s)
@@ -85,7 +84,6 @@ class TorqueFactor:
         self._per_nm = per_nm
 
     def factor(self, now: Conditions) -> float:
-        """Returns the factor under these conditions."""
         return 1.0 + self._per_nm * abs(now.torque_nm)
 
 
@@ -101,11 +99,9 @@ class WarmthFactor:
         self._reference_c = reference_c
 
     def factor(self, now: Conditions) -> float:
-        """Returns the factor under these conditions."""
         return self.at(now.temperature_c)
 
     def at(self, temperature_c: float) -> float:
-        """Returns the factor at a temperature."""
         return max(0.05, 1.0 + self._per_k * (temperature_c - self._reference_c))
 
 

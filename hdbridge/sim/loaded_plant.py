@@ -139,11 +139,9 @@ class LoadedPlant(Plant):
         )
 
     def weight_nm(self, load_deg: float) -> float:
-        """Returns the torque of gravity; see `Plant`."""
         return -self._arm_nm * math.sin((load_deg - self._down_deg) * RAD_PER_DEG)
 
     def step(self, torque_nm: float, brake_nm: float) -> None:
-        """Runs one substep; see `Plant`."""
         now, dt = self.now, self._dt
         output, load = self.output_deg, now.load_deg
         load_speed = self.load_deg_s

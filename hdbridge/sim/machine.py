@@ -37,20 +37,6 @@ class Machine:
     It has the attributes of `Measured`.
     """
 
-    motor_reading: float
-    load_reading: float
-    torque_nm: float
-    torque_permille: int
-    temperature_c: float
-    load_torque_nm: float
-    motor_counts: int
-    load_counts: int
-    velocity_counts_s: float
-    elapsed_s: float
-    true_motor_deg: float
-    true_load_deg: float
-    true_output_deg: float
-
     def __init__(self, truth: Truth, seed: int, *, may_compile: bool = False, loaded: bool = False) -> None:
         """``may_compile`` permits a pause of some seconds, after which the machine runs faster; see
         `sim.fast`.
@@ -59,7 +45,6 @@ class Machine:
         """
         self.truth = truth
         self.dt_s = truth.substep_s
-        """Length of a substep."""
         axis = Axis(truth, loaded=loaded)
         self._axis: fast.AnyAxis = axis
         self._to_compile = axis if may_compile else None

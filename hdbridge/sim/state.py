@@ -11,7 +11,6 @@ from typing import Final, TypeVar
 T = TypeVar("T")
 
 STATES: Final[list[type]] = []
-"""All state classes."""
 
 
 def state(cls: type[T]) -> type[T]:

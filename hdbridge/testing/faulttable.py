@@ -93,7 +93,6 @@ class Row:
     """One sentence, with the arguments by name."""
     make: Make
     arguments: Mapping[str, Value] = field(default_factory=dict)
-    """Arguments with their defaults."""
     answers: str = ""
     """First words of the corresponding row of the fault table."""
     needs: Needs = Needs.NOTHING
@@ -361,7 +360,6 @@ _ROWS: Final = (
 )  # fmt: skip
 
 FAULTS: Final[Mapping[str, Row]] = MappingProxyType({row.name: row for row in _ROWS})
-"""All faults by name."""
 
 OF_THE_PROGRAM: Final = (
     "the target is not a number within the limits",

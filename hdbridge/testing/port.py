@@ -121,7 +121,6 @@ class ProgramBus(can.BusABC):
         port.note("bus", "the program opens its bus")
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """See `can.BusABC`."""
         port = self._port
         if port.deletions != self._deletions:
             raise can.CanOperationError(*_ERRORS[Condition.DELETED])
@@ -133,7 +132,6 @@ class ProgramBus(can.BusABC):
         self._inner.send(msg, timeout)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """See `can.BusABC`."""
         return self._inner.recv(timeout)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
@@ -143,7 +141,6 @@ class ProgramBus(can.BusABC):
         self._inner.set_filters(filters)
 
     def shutdown(self) -> None:
-        """See `can.BusABC`."""
         if self in self._port.open_buses:
             self._port.open_buses.remove(self)
             self._port.note("bus", "the program closes its bus")

@@ -273,14 +273,12 @@ class WatchedDrive(DriveNode):
         return min((event_s, *(plan.at_s for plan in self._plans))) if self._plans else event_s
 
     def handle(self, message: can.Message, now_s: float) -> None:
-        """See `hdbridge.device.node.DriveNode`."""
         with self.lock:
             self.history.frames.append(Frame(self.time_s, False, message))
             super().handle(message, now_s)
             self._look()
 
     def run_until(self, now_s: float) -> None:
-        """See `hdbridge.device.node.DriveNode`."""
         with self.lock:
             while due := next((each for each in self._plans if self._is_due(each, now_s)), None):
                 self._plans.remove(due)

@@ -218,7 +218,6 @@ class _Signals:
     time_s: FloatArray
     command_deg: FloatArray
     load_arcsec: FloatArray
-    """Load reading, arcsec."""
     by_name: Mapping[str, FloatArray]
 
 

@@ -285,7 +285,6 @@ class Fitted:
     covariance: FloatArray
     """Covariance of the coordinates, shape (p, p)."""
     scales: Scales
-    """Scales of the residuals."""
     residuals: dict[str, FloatArray]
     rows: NDArray[np.bool_]
     """Mask of the fitted rows, one channel after the other."""

@@ -78,7 +78,6 @@ class Piece:
     leg: FloatArray
     """Leg number of each row, from zero."""
     kind: tuple[str, ...]
-    """Kind of each leg."""
     out: FloatArray
     """1 for each row of a held-out leg, else 0."""
     rest: FloatArray
@@ -106,7 +105,6 @@ class Data:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kind of each leg."""
         return tuple(kind for each in self.pieces for kind in each.kind)
 
 

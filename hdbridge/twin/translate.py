@@ -63,12 +63,10 @@ class Draft:
 
     @property
     def gear(self) -> dict[str, Any]:
-        """Section ``gear``."""
         return self.part("gear")
 
     @property
     def load(self) -> dict[str, Any]:
-        """Section ``load``."""
         return self.part("load")
 
     def part(self, *names: str) -> dict[str, Any]:

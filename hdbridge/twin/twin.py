@@ -335,7 +335,6 @@ TWINS: Final = Store(
     "hdbridge model log PROFILE --twin",
     KeptTwin.load,
 )
-"""The twins of a profile."""
 
 
 # ----------------------------------------------------------------

@@ -86,7 +86,6 @@ class Cause:
     signature: str
     """Visible symptom in a record."""
     consequence: str
-    """Consequence for the axis."""
     remedy: str
     """Advice to the user."""
     experiment: str
@@ -137,9 +136,7 @@ class Observations(Protocol):
     """Record as seen by an effect."""
 
     @property
-    def motion(self) -> Motion:
-        """Motion of the axis."""
-        ...
+    def motion(self) -> Motion: ...
 
     @property
     def ratio(self) -> float:

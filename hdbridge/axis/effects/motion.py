@@ -1,6 +1,6 @@
 """Motion of an axis as input of effects: channels, motions of whole records, moments of a control loop."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final, NamedTuple, Self
@@ -152,12 +152,6 @@ class Motion:
             return self.measured.get(channel)
         values: FloatArray | None = getattr(self, channel.value, None)
         return values
-
-
-def measured_by_all(parts: Sequence[Mapping[Channel, FloatArray]]) -> dict[Channel, FloatArray]:
-    """Returns the measured channels of every part, concatenated."""
-    common = [each for each in MEASURED if all(each in part for part in parts)]
-    return {each: np.concatenate([part[each] for part in parts]) for each in common}
 
 
 def missing_error(effect: str, channels: frozenset[Channel]) -> InputError:

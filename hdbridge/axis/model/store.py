@@ -392,6 +392,5 @@ MODELS: Final = Store(
     "hdbridge model log",
     TransmissionModel.load,
 )
-"""The models of a profile."""
 log, find, propose, commit = MODELS.log, MODELS.find, MODELS.propose, MODELS.commit
 discard, activate, rollback = MODELS.discard, MODELS.activate, MODELS.rollback

@@ -397,7 +397,6 @@ class BringUpContext(ExitStack):
 
     @property
     def axis(self) -> AxisConfig:
-        """Axis file."""
         assert self._axis is not None, "checks that need the files come after them"
         return self._axis
 

@@ -47,7 +47,7 @@ def measured_of(recordings: Sequence[Recording], *, independent_zeros: bool = Fa
     pieces: list[_Piece] = []
     for recording in recordings:
         zeros = int(pieces[-1].zero[-1]) + 1 if pieces else 0
-        apart = independent_zeros or _sessions(recording)
+        apart = independent_zeros or len({each.session for each in tasks_of(recording)}) > 1
         pieces += _pieces(recording, zeros if apart else 0, independent_zeros)
     if not pieces:
         raise InputError("the recordings hold no leg to be used; expected samples: record more")
@@ -116,11 +116,6 @@ def provenance(
 def with_provenance(model: TransmissionModel, data: dict[str, Any]) -> TransmissionModel:
     """Returns the model with ``data`` added to its provenance."""
     return replace(model, provenance={**model.provenance, **data})
-
-
-def _sessions(recording: Recording) -> bool:
-    """Returns True if the recording has several sessions, each with its own encoder zeros."""
-    return len({each.session for each in tasks_of(recording)}) > 1
 
 
 class _Piece(NamedTuple):

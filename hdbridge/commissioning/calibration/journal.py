@@ -143,7 +143,6 @@ class Journal:
 
     @property
     def notes(self) -> dict[str, Any]:
-        """Notes of the recording."""
         return dict(self._about.notes)
 
     def begin_session(self) -> None:

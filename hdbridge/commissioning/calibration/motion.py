@@ -207,7 +207,6 @@ class MotionTest:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> MotionTest:
-        """Restores a test from `as_dict`."""
         restored: MotionTest = TypeAdapter(cls).validate_python({**data, "ripples": data["speeds"]})
         return restored
 
@@ -422,7 +421,6 @@ class _Runner:
         )
 
     def run_paths(self, model: TransmissionModel) -> tuple[PathRun, ...]:
-        """Runs the paths with this model."""
         self._pace.begin("path error")
         compensation = compensation_for(self.axis, model)
         return bench_on(self._drive, compensation, interrupted=self._pace.interrupted).run(PathTest()).outcome

@@ -113,7 +113,6 @@ class Validation:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Validation:
-        """Restores a validation from `as_dict`."""
         stepped = TypeAdapter(Stepped).validate_python
         return cls(
             stepped(data["before"]),

@@ -68,7 +68,6 @@ class Follower:
     ) -> None:
         """``index`` is that of the axis in a sample; there is no adaptation before `adapt`."""
         self.model = model
-        """Committed model."""
         self.health = EncoderHealth(axis, model, index)
         self.adaptation: Adaptation | None = None
         self.updated: datetime | None = None

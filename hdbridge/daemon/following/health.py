@@ -242,7 +242,6 @@ def _median(values: FloatArray) -> FloatArray:
 
 
 def _ranges(width: int, values: FloatArray) -> FloatArray:
-    """Returns the range of the values in each window."""
     windows = _windows(values, width)
     return np.asarray(windows.max(axis=0) - windows.min(axis=0))
 

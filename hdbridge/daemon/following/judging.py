@@ -304,7 +304,6 @@ class Watch:
 
     @property
     def verdict(self) -> Verdict:
-        """Present verdict."""
         return Verdict.ENCODER if self._faulty else self._adopted
 
     def take(self, observations: Sequence[Observation], status: EncoderStatus, now_s: float) -> list[Raised]:

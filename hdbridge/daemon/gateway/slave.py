@@ -316,7 +316,6 @@ class Gateway:
         self._served = tuple(self.nodes.values())
 
     def handle(self, message: can.Message, now_s: float) -> None:
-        """Handles one frame."""
         self._look(now_s)
         for node in self._served:
             node.handle(message, now_s)

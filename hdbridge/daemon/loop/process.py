@@ -62,7 +62,6 @@ class Interface(ExitStack):
         return link
 
     def close(self) -> None:
-        """Closes the bus."""
         with suppress(HdbridgeError):
             super().close()
 

@@ -138,7 +138,6 @@ class OuterCells(Cells):
 
     @property
     def view(self) -> OuterView:
-        """View of the outer master."""
         return OuterView._make(self.values())
 
 

@@ -129,7 +129,6 @@ class Ring(_Slots[T]):
         self._sequence: int = self._head[0]
 
     def append(self, item: T) -> None:
-        """Adds an item."""
         sequence = self._sequence + 1
         self._fill(sequence, item)
         self._head[0] = self._sequence = sequence

@@ -123,7 +123,6 @@ class Memory:
 
     @property
     def period_s(self) -> float:
-        """Period of the cycle."""
         return self.period_ns / 1e9
 
     def reader(self) -> SampleReader:

@@ -253,7 +253,6 @@ class FlightFile:
             self._add(channel, times, numbers, axis_messages(samples, place))
 
     def add_event(self, event: Event) -> None:
-        """Adds an event of the loop."""
         axes = self._about.axes
         name = axes[event.axis].name if 0 <= event.axis < len(axes) else self._about.machine
         kind = EventKind(event.kind)

@@ -125,7 +125,6 @@ class Journal:
         self._names = names
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """Takes samples and events from the observer."""
         if lost:
             _log.warning("cycles lost", {"cycles": lost})
         for event in events:

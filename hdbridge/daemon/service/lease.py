@@ -23,7 +23,6 @@ class Holder:
     """Holder of the lease."""
 
     client: str
-    """Name of the client."""
     taken_s: float
     """Time at which it was taken; lease's clock."""
     expires_s: float

@@ -40,18 +40,15 @@ class Observer:
         self._sinks: list[Sink] = []
         self._broken: set[int] = set()
         self.none: SampleArray = np.empty(0, sample_dtype(memory.axes))
-        """Empty array of samples."""
         self.newest: SampleArray | None = None
         """Newest sample, shape (1,); None before the first."""
         self.lost = 0
         """Cycles lost because this process was too slow."""
 
     def add(self, sink: Sink) -> None:
-        """Adds a sink."""
         self._sinks.append(sink)
 
     def remove(self, sink: Sink) -> None:
-        """Removes a sink."""
         self._sinks.remove(sink)
 
     @property
@@ -143,5 +140,4 @@ class Subscription:
         return batch
 
     def close(self) -> None:
-        """Ends the subscription."""
         self._observer.remove(self)

@@ -47,7 +47,6 @@ class Latency:
         self._newest_s = [math.nan] * axes
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """Takes samples from the observer."""
         if not len(samples):
             return
         sent_s = 1e-9 * samples["time_ns"] + 1e-6 * samples["busy_us"]

@@ -18,7 +18,6 @@ class Chain:
     acceleration_deg_s2: float | None = None
 
     def moves(self, axis: AxisView) -> Steps[object]:
-        """Yields the moves of each procedure."""
         outcome: object = None
         for part in self.parts:
             steps = part.moves(axis)

@@ -101,7 +101,6 @@ class _Timed:
     """Leg that ends with its path."""
 
     def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
-        """Returns True."""
         return True
 
 
@@ -162,7 +161,6 @@ class Dwell(_Timed):
     kind: str = "standstill"
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """Returns a path without motion."""
         return Path(self.duration_s, lambda _: start_deg, start_deg, start_deg)
 
 
@@ -183,7 +181,6 @@ class Settle:
     kind: str = "settle"
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """Returns a path without motion."""
         return Path(max(self.minimum_s, self.window_s), lambda _: start_deg, start_deg, start_deg)
 
     def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:

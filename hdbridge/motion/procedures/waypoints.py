@@ -21,7 +21,6 @@ class Hold:
         self._since_s = 0.0
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """Returns a path without motion."""
         return Path(0.0, lambda _: start_deg, start_deg, start_deg)
 
     def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:

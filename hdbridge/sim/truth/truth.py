@@ -110,7 +110,6 @@ class Truth(Strict):
 
     @property
     def resonance(self) -> Resonance:
-        """Fastest resonance."""
         return Resonance(
             self.gear.stiffest_nm_per_rad,
             math.degrees(self.load_.presliding_nm_per_deg),
