@@ -96,7 +96,7 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
     if robust < needed:
         if robust_chi_square(estimator, fitted, place) < needed:
             return Gate(robust, needed, "not seen in enough independent stretches")
-        return Gate(robust, needed, "may be what the law of another cause is wrong by")
+        return Gate(robust, needed, "may be an error in the law of another cause")
     if effect.tracker().memory_deg > 0.0:
         others = fitted.hypothesis.without(place)
         laws = np.hstack([laws, estimator.turn_discrepancy(others.effects, others.start)])
@@ -106,7 +106,7 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
         free = estimator.weighted(estimator.free_loop(fitted.hypothesis.start).columns)
         robust = min(robust, robust_chi_square(estimator, fitted, place, free, laws=laws))
         if robust < needed:
-            return Gate(robust, needed, "an elastic loop of another shape does as well")
+            return Gate(robust, needed, "an elastic loop of another shape explains it as well")
     stretch = effect.shows(estimator.motion)
     if stretch is not None:
         rows = stretch.rows[estimator.index]

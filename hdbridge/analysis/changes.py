@@ -217,7 +217,7 @@ def _freed(
         parameters_of(estimator, precise, place, spread),
         "a change of what the model has: "
         + (
-            "it is left as it was, for the record does not distinguish it from another cause"
+            "it is unchanged, because the record does not separate it from another cause"
             if aliases
             else "its own parameters take it over"
         ),

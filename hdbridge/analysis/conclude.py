@@ -168,7 +168,7 @@ def _whiteness(noise: NoiseModel) -> ResidualTest:
 def _level(figures: NoiseFigures) -> ResidualTest:
     rest = figures.standing_arcsec
     if rest is None:
-        return ResidualTest("noise_level", True, 0.0, "the axis never stood long enough to tell its noise")
+        return ResidualTest("noise_level", True, 0.0, "the axis never stood long enough to measure its noise")
     size = math.sqrt(max(figures.fitted_arcsec**2 - rest**2, 0.0))
     text = f"{figures.fitted_arcsec:.2f} arcsec is left, at rest the noise is {rest:.2f}"
     return ResidualTest("noise_level", size < max(rest, 1.0), size, text)
@@ -373,7 +373,7 @@ def _nuisances(state: State, further: Mapping[str, tuple[float, float]]) -> tupl
             found.append(Nuisance(name, TEXTS[name], value, half, UNITS[name]))
     for order in _not_the_motors(state):
         cosine, sine = further[f"{order} cosine"], further[f"{order} sine"]
-        text = f"an error that repeats with {order}, which the model has no part for"
+        text = f"an error that repeats with {order}, for which the model has no part"
         size = math.hypot(cosine[0], sine[0])
         found.append(Nuisance(str(order), text, size, max(cosine[1], sine[1]), "arcsec"))
     return tuple(found)
@@ -387,10 +387,10 @@ def _describe_limits(state: State, lines: Sequence[Line], warnings: list[str]) -
     """Appends warnings about orders that are not separable, short travel and outliers."""
     samples, outliers = state.design.samples, state.outliers
     for alike in _families(lines):
-        warnings.append(f"{_named(alike)} cannot be distinguished at the angles of this record")
+        warnings.append(f"{_named(alike)} are not separable at the angles of this record")
     if state.selection.unresolved:
         unresolved = _named(state.selection.unresolved)
-        warnings.append(f"{unresolved} cannot be distinguished from what else was fitted")
+        warnings.append(f"{unresolved} are not separable from the other fitted terms")
     load_turns = float(np.ptp(state.design.blocks.motor_deg)) / DEG_PER_TURN / samples.ratio
     if load_turns < 0.95:
         warnings.append(
@@ -400,16 +400,16 @@ def _describe_limits(state: State, lines: Sequence[Line], warnings: list[str]) -
     if outliers.swinging:
         warnings.append(
             f"{outliers.swinging} samples ({outliers.swinging / len(samples):.2%}) in or just after fast "
-            "accelerations stand out and were given no weight: the load swings on its spring there"
+            "accelerations stand out and have no weight: the load swings on its spring there"
         )
     if others := outliers.samples - outliers.swinging:
         warnings.append(
-            f"{others} samples ({others / len(samples):.2%}, at most {outliers.longest_run} in a row) stand "
-            "out from their neighbours and were given no weight: look for lost counts, plugs, shields"
+            f"{others} samples ({others / len(samples):.2%}, at most {outliers.longest_run} in a row) "
+            f"stand out from their neighbours and have no weight: look for lost counts, plugs, shields"
         )
     for order in _not_the_motors(state):
         warnings.append(
-            f"{order} shows in this record; the model has no part for it, a diagnosis may name it"
+            f"{order} shows in this record; the model has no part for it; a diagnosis may find its cause"
         )
 
 

@@ -186,7 +186,7 @@ class Finding:
         if self.cause == "unexplained":
             return "there is no law that could be held out or compensated"
         if self.left_alone:
-            return "the record does not distinguish a change of it from " + ", ".join(self.aliases)
+            return "the record does not separate a change of it from " + ", ".join(self.aliases)
         if self.gain is None:
             return "nothing was held out: the record is too short to leave any of it out"
         if not self.gain.predicts:
@@ -196,7 +196,7 @@ class Finding:
             )
         sizes = [each for each in self.parameters.values() if each.is_size]
         if sizes and not self.aliases and all(each.low <= 0.0 <= each.high for each in sizes):
-            return "zero is in the 95 % interval of everything that says how large it is"
+            return "the 95 % intervals of all its sizes include zero"
         return ""
 
 

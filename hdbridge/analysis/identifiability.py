@@ -228,7 +228,7 @@ def _missing(estimator: Estimator, cause: str) -> str:
     lacking = CATALOGUE[cause].channels - estimator.data.points.motion.available()
     if lacking:
         return "not recorded: " + ", ".join(sorted(each.value for each in lacking))
-    return "nothing in this record or model to see it by"
+    return "nothing in this record or model shows it"
 
 
 def _correlation(one: FloatArray, other: FloatArray) -> float:

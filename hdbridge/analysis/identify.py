@@ -113,7 +113,7 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
         prototype = options.prototype(effect)
         if share_left(design.columns(prototype), always, weight) < EFFECT_SHARE:
             warnings.append(
-                f"{effect.name}: left out: not distinguished from the zero in this record (no reversal?); "
+                f"{effect.name}: left out: not separable from the zero in this record (no reversal?); "
                 "record both directions"
             )
             continue
@@ -126,7 +126,7 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
         nuisances.append(DELAY)
     elif effects and size > 0.05:
         warnings.append(
-            "a delay between the two encoders is not distinguished from the hysteresis' offset at one speed: "
+            "a delay between the two encoders is not separable from the hysteresis offset at one speed: "
             f"one millisecond would be {size:.2f} arcsec; record a second speed"
         )
     if samples.count_deg and effects:

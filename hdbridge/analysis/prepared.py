@@ -248,8 +248,8 @@ def observe(
             )
     for row in np.setdiff1d(np.flatnonzero(np.diff(time) < 0.0) + 1, record.starts)[:1].tolist():
         raise InputError(
-            f"{name}time_s of sample {row} lies before that of sample {row - 1}; expected time to run "
-            "forwards: sort the samples, or make two records of them"
+            f"{name}time_s of sample {row} is earlier than that of sample {row - 1}; expected increasing "
+            f"times: sort the samples, or split the record"
         )
     if not ratio > 0:
         raise InputError(f"{name}the ratio is {ratio:g}; expected more than 0")
@@ -389,7 +389,7 @@ def gather(
     if not standstill:
         remarks.append("no standstill: the noise is taken from differences of neighbouring samples")
     if turns < 2:
-        remarks.append("hardly a reversal: hysteresis and all that depends on direction cannot be seen")
+        remarks.append("too few reversals: hysteresis and other effects of direction are not visible")
     span = float(np.ptp(record.motor_position_deg))
     if origin is not None and "motor" not in origin.stated and span < 2.0 * DEG_PER_TURN:
         remarks.append(f"the motor's angle spans {span:.3g}: too little to check that it is not in radians")

@@ -254,7 +254,7 @@ class Search:
         effect = trial.hypothesis.effects[place]
         reason = self.refusal(effect, as_alias)
         if not reason and not as_alias and self._extrapolated(trial, place):
-            reason = "the record shows too little of it to say how large it is"
+            reason = "the record shows too little of it to determine its size"
         elif (
             not reason and Channel.TIME in effect.needs() and effect.shows(self.estimator.motion) is not None
         ):
@@ -262,7 +262,7 @@ class Search:
             # another cause, which would not be found with this one in the fit.
             reason = gate(self.estimator, trial, place).reason
             if not reason and not all_pieces_seen(self.estimator, trial, place):
-                reason = "a part of it may be what a larger one gets wrong"
+                reason = "part of it may be an error of a larger one"
         return reason
 
     def _extrapolated(self, trial: Fitted, place: int) -> bool:

@@ -147,7 +147,7 @@ app = typer.Typer(
     epilog=(
         "Exit status: 0 done, 2 bad input (nothing moved, nothing written), 3 bus, 4 drive, "
         "5 stopped by supervision, 6 a result could not be written (a full disk; the figures are printed), "
-        "7 the daemon is not reached or does not do it now, 130 Ctrl-C (axis stopped, record kept)."
+        "7 the daemon cannot be reached or refuses the request, 130 Ctrl-C (axis stopped, record kept)."
     ),
 )
 

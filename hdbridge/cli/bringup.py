@@ -397,7 +397,8 @@ _MARKS = {
 }
 _WARNING = (
     "The next checks switch the drive on and move the axis: up to a motor turn and an eighth each way (more "
-    "with a ratio above 75), slowly, with at most {torque:g} % of the rated torque. Keep the way clear and a "
+    "with a ratio above 75), slowly, with at most {torque:g} % of the rated torque. Keep the path clear "
+    "and a "
     "hardware emergency stop at hand. Move now?"
 )
 _FAST = (

@@ -127,7 +127,7 @@ class Measurement:
                 yield drive, progress, interrupted
         except BaseException:
             if (self.folder / "recording.yaml").exists():
-                note(f"what was measured is kept; go on with --resume {self.folder}")
+                note(f"the measured data are kept; continue with --resume {self.folder}")
             raise
         finally:
             with suppress(OSError):

@@ -268,7 +268,7 @@ def _print_plan(report: dict[str, Any]) -> None:
             f"{limit:.2g} arcsec" if each["detectable"] else f"no: {each.get('reason') or 'limit too high'}"
         )
         rows.append((name, words, ", ".join(each["aliases"])))
-    print_table(("cause", "detected from", "not distinguished from"), rows)
+    print_table(("cause", "detected from", "not separable from"), rows)
     for each in report["notes"]:
         note(each)
 

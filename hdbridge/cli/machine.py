@@ -154,7 +154,9 @@ def install_service(
     files = service_files(held, user=user, account=account)
     foreign = [each.path for each in files if not each.ours]
     if foreign and (yes or remove):
-        raise InputError(f"{foreign[0]}: is not of this program, or cannot be read; move it away first")
+        raise InputError(
+            f"{foreign[0]}: was not written by this program, or cannot be read; move it away first"
+        )
     if remove:
         _remove(files)
     elif yes:

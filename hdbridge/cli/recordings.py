@@ -305,7 +305,7 @@ def import_(
     _write(recording, out)
     note(f"PDO mapping {recording.notes['mapping']}")
     if cut_off := recording.notes.get("cut_off"):
-        note(f"{log}: {cut_off}; what comes before is imported")
+        note(f"{log}: {cut_off}; the part before that is imported")
     if recording.record.motor_target_deg is None:
         note("no command in each cycle: the record has no motor_target_deg")
     _print_export(recording, out)

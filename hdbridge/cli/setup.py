@@ -151,7 +151,7 @@ class _Setup:
                 return
             self._confirm(
                 "The doctor switches the drive on and moves the axis slowly, up to a motor turn and an "
-                "eighth each way. Keep the way clear and a hardware emergency stop at hand. Move now?"
+                "eighth each way. Keep the path clear and a hardware emergency stop at hand. Move now?"
             )
             try:
                 self._run("doctor", self._folder, *self._how, "--yes", "--json", self._folder / DOCTOR)
@@ -170,7 +170,7 @@ class _Setup:
 
         cycle_ms = AxisConfig.load(self._folder).drive.cycle_ms
         self._run("latency", "--cycle-ms", f"{cycle_ms:g}")
-        self._confirm(f"Does this computer carry {cycle_ms:g} ms, by the table above?")
+        self._confirm(f"Does this computer sustain {cycle_ms:g} ms, by the table above?")
         self._finish("latency")
 
     def calibrate(self, plan: str) -> None:

@@ -515,8 +515,8 @@ def _unreachable(address: Address, problem: Exception) -> DaemonError:
         return DaemonError(f"{address}: no daemon answers ({problem}); start it with 'hdbridge run'")
     what = "did not answer in time" if isinstance(problem, httpx.TimeoutException) else "went away"
     return DaemonError(
-        f"{address}: the daemon {what} ({problem or type(problem).__name__}); whether it was done is not "
-        "known: look at the state first"
+        f"{address}: the daemon {what} ({problem or type(problem).__name__}); the outcome is unknown: "
+        f"check the state first"
     )
 
 

@@ -571,7 +571,7 @@ def _(t: NodeTester) -> None:
     rpdo.holds(rpdo.value, "after the RPDO", rpdo.after(rpdo.data() + b"\xff"))
 
 
-@check("rpdo.extended", "A frame with a 29-bit identifier is no RPDO", _PDO)
+@check("rpdo.extended", "A frame with a 29-bit identifier is not an RPDO", _PDO)
 def _(t: NodeTester) -> None:
     rpdo = _Reception(t, 255)
     t.send_special(rpdo.can_id, rpdo.data())

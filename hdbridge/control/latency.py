@@ -112,7 +112,7 @@ RULE_PERCENT: Final = 99.99
 RULE_SHARE: Final = 0.2
 RULE_MAXIMUM_SHARE: Final = 0.5
 RULE: Final = (
-    f"a machine carries a cycle when {RULE_PERCENT:g} % of the wake-ups are late by less than "
+    f"a computer sustains a cycle if {RULE_PERCENT:g} % of the wake-ups are late by less than "
     f"{100 * RULE_SHARE:g} % of it and none by more than {100 * RULE_MAXIMUM_SHARE:g} %"
 )
 ENOUGH: Final = 10_000
@@ -169,12 +169,12 @@ class LatencyReport:
         """Result in one line."""
         if self.carried_s is None:
             return (
-                f"this machine carries none of these cycle times ({RULE}); "
+                f"this computer sustains none of these cycle times ({RULE}); "
                 "close other programs, allow real-time priority, or use a kernel with PREEMPT_RT"
             )
         few = min(each.histogram.total for each in self.measurements)
         more = f"; only {few} wake-ups were measured, take {ENOUGH} or more" if few < ENOUGH else ""
-        return f"this machine carries a cycle of {1e3 * self.carried_s:g} ms ({RULE}){more}"
+        return f"this computer sustains a cycle of {1e3 * self.carried_s:g} ms ({RULE}){more}"
 
     def table(self) -> str:
         """Returns the measurements and their combined histogram as plain text."""

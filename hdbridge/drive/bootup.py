@@ -339,7 +339,7 @@ class BootUp:
         if found is not None and not row.holds(found):
             raise DriveError(
                 f"{sdo.describe(row.index, row.sub)}: was written {value} ({row.why}), but reads back "
-                f"{found}; the drive does not take this value{self._decides(row)}"
+                f"{found}; the drive does not accept this value{self._decides(row)}"
             )
 
     def _refused(self, row: PlannedWrite, error: SdoError) -> SdoError:

@@ -91,7 +91,7 @@ class Commander:
                 raise self.fault(f"while waiting for {what}")
             if self.link.now() >= deadline_s:
                 raise TransitionError(
-                    f"{self.name}: {what} did not come about within {timeout_s:g} s; the drive is in "
+                    f"{self.name}: {what} did not occur within {timeout_s:g} s; the drive is in "
                     f"'{decode(statusword).value}' (statusword {statusword:04X}h); check its enable input, "
                     "supply and error display"
                 )

@@ -71,8 +71,10 @@ _GO, _FREEZE, _STOP, _LATCH = Reaction.GO, Reaction.FREEZE, Reaction.QUICK_STOP,
 
 TABLE: Final[tuple[Row, ...]] = (
     Row(Fault.LOST_TPDO, _FREEZE, 2, _STOP, "check the cable, the bus load and the drive's PDOs"),
-    Row(Fault.OVERRUN, _GO, 2, _STOP, "see 'hdbridge latency' for the cycle time that this machine carries"),
-    Row(Fault.HANG, _STOP, 1, _STOP, "see 'hdbridge latency' for what this machine carries; keep it awake"),
+    Row(
+        Fault.OVERRUN, _GO, 2, _STOP, "see 'hdbridge latency' for the cycle time that this computer sustains"
+    ),
+    Row(Fault.HANG, _STOP, 1, _STOP, "see 'hdbridge latency' for what this computer sustains; keep it awake"),
     Row(Fault.DUPLICATE_TPDO, _GO, 1, _GO, "look for a second node with the drive's node id"),
     Row(Fault.WRONG_LENGTH, _FREEZE, 2, _STOP, "boot the drive again: its PDO mapping (1A00h) was changed"),
     Row(Fault.DISCARDED_FRAME, _GO, 1, _GO, "look for a node that is not CANopen, or restart the drive"),

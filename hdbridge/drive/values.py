@@ -61,7 +61,8 @@ class Object:
                 return float(struct.unpack(form, _fitting(data, struct.calcsize(form)))[0])
         except ValueError as problem:
             raise InputError(
-                f"{self}: answered {problem}, which is no {self.type_name}; check that drive.eds is the EDS "
+                f"{self}: answered {problem}, which is not of the type {self.type_name}; check that "
+                f"drive.eds is the EDS "
                 "of this drive"
             ) from None
         if self.data_type == datatypes.UNICODE_STRING:

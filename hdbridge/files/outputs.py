@@ -77,8 +77,8 @@ def check_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = ()) -> Non
         for other in outputs[:number]:
             if not _endless(output.path) and _same(output.path, other.path):
                 raise InputError(
-                    f"{output.path}: {other.option} and {output.option} both write there; expected different "
-                    f"places"
+                    f"{output.path}: {other.option} and {output.option} both write to this path; expected "
+                    f"different paths"
                 )
 
 
@@ -162,7 +162,7 @@ def _check_folder(output: Output, inputs: Sequence[Path]) -> None:
             )
     for each in inputs:
         if _same(folder, each):
-            raise InputError(f"{folder}: {output.option} is what this command reads; expected a new folder")
+            raise InputError(f"{folder}: {output.option} is an input of this command; expected a new folder")
     existing = place
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent

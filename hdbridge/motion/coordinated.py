@@ -69,7 +69,7 @@ def coordinated(
                 )
             _check_inside(name, point[name], limits[name])
     if not names:
-        raise InputError("a coordinated move of no axis; expected a target for at least one")
+        raise InputError("a coordinated move without an axis; expected a target for at least one")
     here = np.array([starts_deg[each] for each in names])
     if not np.isfinite(here).all():
         raise InputError(f"the coordinated move begins at {here.tolist()} deg; expected finite angles")

@@ -207,7 +207,7 @@ class Record:
             cure = origin.clock_cure(record.time_s)
             raise InputError(
                 f"{origin.place(row)}: time_s: {record.time_s[row]:g} after {record.time_s[row - 1]:g}; "
-                f"expected time that does not run backwards{f': {cure}' if cure else ''}"
+                f"expected times that do not decrease{f': {cure}' if cure else ''}"
             )
         return record
 

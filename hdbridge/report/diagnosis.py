@@ -321,7 +321,7 @@ def _could(diagnosis: Diagnosis) -> Section:
         "What this record could show",
         "From which peak on each cause would be named, and what it would be taken for; or why it cannot be "
         "seen.",
-        [Table(["cause", Heading("from"), "not distinguished from, or why not"], rows)],
+        [Table(["cause", Heading("from"), "not separable from, or why not"], rows)],
     )
 
 

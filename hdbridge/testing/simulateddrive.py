@@ -204,7 +204,7 @@ class SimulatedDrive:
         end_s = self._clock.now() + timeout_s
         while not condition():
             if self._clock.now() >= end_s:
-                raise TimeoutError(f"{what} did not come about in {timeout_s:g} s\n{self.report()}")
+                raise TimeoutError(f"{what} did not occur in {timeout_s:g} s\n{self.report()}")
             self.sleep(POLL_S)
 
     def open_bus(self, **options: Any) -> can.BusABC:

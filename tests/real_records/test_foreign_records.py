@@ -426,7 +426,7 @@ def test_too_short_a_travel_to_know_radians_is_remarked(
 def test_a_wrapping_clock_is_reported_with_its_period(tmp_path: Path) -> None:
     path = tmp_path / "bench.csv"
     path.write_text(text(time=(TIME * 1000.0 + 65_000.0) % 65_536.0))
-    with pytest.raises(InputError, match=r"time that does not run backwards: .* pass --unwrap time=65536$"):
+    with pytest.raises(InputError, match=r"times that do not decrease: .* pass --unwrap time=65536$"):
         Record.read_csv(path, units="time=ms")
     record = Record.read_csv(path, units="time=ms", unwrap="time=65536")
     np.testing.assert_allclose(np.diff(record.time_s), 0.01)

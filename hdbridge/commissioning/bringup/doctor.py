@@ -92,7 +92,7 @@ def answers(context: BringUpContext) -> Verdict:
             *(lines if found.nodes else (wiring, *lines)),
         )
     if complaints := [*device_type_complaints(axis, device_type)]:
-        return failed(f"device type {device_type:08X}h is no CiA-402 drive", *complaints)
+        return failed(f"device type {device_type:08X}h is not a CiA-402 drive", *complaints)
     return passed(f"node {axis.drive.node_id}, device type {device_type:08X}h (CiA 402)")
 
 

@@ -109,7 +109,7 @@ def _why_not(finding: Finding, rivals: Sequence[str]) -> str:
     for rival in rivals:
         if not CATALOGUE[rival].compensable.possible:
             return (
-                f"{finding.cause} is not compensated: not yet distinguished from {rival}, which must not "
+                f"{finding.cause} is not compensated: not yet separated from {rival}, which must not "
                 f"be: {CATALOGUE[rival].compensable.why}"
             )
     return ""

@@ -74,8 +74,8 @@ async def _unexpected(request: Request, error: Exception) -> Response:
     _log.error("failed", {"method": request.method, "path": request.url.path, "error": repr(error)})
     return answer(
         refusal(
-            500, "an error in hdbridge, told in the daemon's log; whether it was done is not known",
-            "HdbridgeError", "look at the state before going on",
+            500, "an error in hdbridge, see the daemon's log; the outcome of the request is unknown",
+            "HdbridgeError", "check the state before continuing",
         )
     )  # fmt: skip
 

@@ -313,7 +313,7 @@ class Watch:
             self._faulty = status.fault is not None
             self._observations.clear()
             self._zero = None
-            reason = status.reason or "nothing speaks against the load encoder"
+            reason = status.reason or "no evidence against the load encoder"
             raised.append(Raised(self.verdict, reason))
         self._observations.extend(observations)
         self._new |= bool(observations)

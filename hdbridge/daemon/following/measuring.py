@@ -176,7 +176,8 @@ def _terms(model: TransmissionModel, parameters: Sequence[str] | None) -> tuple[
             close = nearest(each, list(offered))
             hint = f"did you mean '{close}'?" if close else f"expected {', '.join(offered) or 'none'}"
             raise InputError(
-                f"adaptation.parameters: '{each}' is nothing that wear or temperature moves in this model; "
+                f"adaptation.parameters: '{each}' is not a parameter that wear or temperature changes in "
+                f"this model; "
                 f"{hint}"
             )
     terms: list[Term] = []

@@ -139,7 +139,7 @@ def records_of(file: BinaryIO, where: Path) -> Iterator[McapRecord]:
     except (InvalidMagic, struct.error) as problem:
         if file.tell() > 16:
             return
-        raise InputError(f"{where}: is no MCAP file; expected a flight recording") from problem
+        raise InputError(f"{where}: is not an MCAP file; expected a flight recording") from problem
     except TORN:
         return
 

@@ -136,4 +136,4 @@ class FlightRecorder:
             try:
                 flight.flush() if going else flight.close()
             except Exception:
-                _log.exception("the recorder failed; it goes on")
+                _log.exception("the recorder failed; it continues")

@@ -295,10 +295,10 @@ class ServiceBridge:
             )
         elif not core.observer.alive:
             warnings.append(
-                "the control process does not turn: it hangs or is gone, and is started again by itself"
+                "the control process does not turn: it hangs or is gone, and is restarted automatically"
             )
         if not self._bus_up:
-            warnings.append("the bus is down: bring the interface up; it is opened again by itself")
+            warnings.append("the bus is down: bring the interface up; it is reopened automatically")
         if core.observer.lost:
             warnings.append(
                 f"{core.observer.lost} cycles were lost before they were read: this machine is too busy"
@@ -337,7 +337,7 @@ class ServiceBridge:
     ) -> None:
         """Moves several axes so that all begin and end together; ``speed`` is a share of the limits."""
         if not moves:
-            raise InputError("a coordinated move of no axis; expected a target for at least one")
+            raise InputError("a coordinated move without an axis; expected a target for at least one")
         axes = [self._axis(name) for name in moves]
         await run_together(holder, axes, moves, speed, wait=wait)
 

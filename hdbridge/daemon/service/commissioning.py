@@ -193,7 +193,7 @@ class Commissioning:
         """Reads an object by its number or its EDS name."""
         wanted = find_object(object_, self._drive.sdo.od)
         if not wanted.readable:
-            raise InputError(f"{wanted}: is write-only by the EDS")
+            raise InputError(f"{wanted}: is write-only in the EDS")
         with self._asked(f"{object_} is being read"):
             return wanted, wanted.decode(self._drive.sdo.read_bytes(wanted.index, wanted.sub))
 
@@ -201,7 +201,7 @@ class Commissioning:
         """Writes an object; the control process refuses this while the axis is enabled."""
         wanted = find_object(object_, self._drive.sdo.od)
         if not wanted.writable:
-            raise InputError(f"{wanted}: can only be read, by the EDS")
+            raise InputError(f"{wanted}: is read-only in the EDS")
         data = wanted.encode(text)
         with self._asked(f"{object_} is being written"):
             self._drive.sdo.write_bytes(wanted.index, wanted.sub, data)

@@ -77,7 +77,7 @@ class Core:
             if self.timing.clock.now() >= deadline_s:
                 raise DaemonError(
                     f"the control process did not answer {kind.name} within {within_s:g} s: it hangs or is "
-                    "gone; it is started again by itself, with every axis disabled"
+                    "gone; it is restarted automatically, with every axis disabled"
                 )
             await self.timing.sleep(POLL_S)
         if answer.kind is EventKind.REFUSED:

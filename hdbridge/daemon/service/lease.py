@@ -89,7 +89,7 @@ class Lease:
         """Raises LeaseError unless ``token`` is the present holder's; extends the lease by its time-out."""
         holder = self.holder
         if holder is None:
-            raise LeaseError("nobody holds the right to move, or it has run out: take the lease first")
+            raise LeaseError("the lease is free or has expired: take it first")
         assert self._token is not None
         if not compare_digest(token.encode(), self._token.encode()):
             raise LeaseError(

@@ -214,7 +214,7 @@ class AxisMotion:
         if not (math.isfinite(target_deg) and limits.contains(target_deg)):
             raise InputError(
                 f"{self._link.name}: a target of {target_deg!r} deg; the position limits are "
-                f"{limits.position_min_deg:g} and {limits.position_max_deg:g} deg; nothing of it was begun"
+                f"{limits.position_min_deg:g} and {limits.position_max_deg:g} deg; nothing was begun"
             )
 
     def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
@@ -276,7 +276,7 @@ async def _follow(waiting: dict[ServiceAxis, list[Knot]], activities: Mapping[Se
     except BaseException:
         for axis, activity in activities.items():
             if not activity.over:
-                activity.end("another axis of a coordinated move did not go on")
+                activity.end("another axis of a coordinated move did not continue")
                 with suppress(HdbridgeError):
                     await axis.link.do(CommandKind.STOP)
         raise

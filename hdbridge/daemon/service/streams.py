@@ -88,7 +88,7 @@ class Knots:
             if not next_.time_s > one.time_s:
                 raise InputError(
                     f"a set-point at {next_.time_s:g} s after one at {one.time_s:g} s: each must be later "
-                    "than the one before; none of these was taken"
+                    "than the one before; none of these was accepted"
                 )
 
 
@@ -162,7 +162,7 @@ class ServiceStream:
             self._link.look(self._activity)
         if self._activity.over or self._ended:
             why = self._activity.over or "it was ended"
-            raise RefusedError(f"{self._link.name}: the stream is over: {why}")
+            raise RefusedError(f"{self._link.name}: the stream has ended: {why}")
 
     async def __aenter__(self) -> Self:
         return self

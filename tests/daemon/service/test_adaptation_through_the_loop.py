@@ -126,4 +126,4 @@ async def test_an_impossible_adaptation_does_not_block_the_axis(service: Service
         await work(bridge, token, 1)
         frozen = bridge.axis_state("axis1").adaptation.frozen
         assert frozen is not None
-        assert "'backlash.gap_arcsec' is nothing that wear or temperature moves" in frozen
+        assert "'backlash.gap_arcsec' is not a parameter that wear or temperature changes" in frozen
