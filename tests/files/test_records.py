@@ -33,44 +33,29 @@ def record(samples: int = 101, ratio: float = 50.0, travel_deg: float = 400.0, *
     [
         (b"", ": the file is empty; expected a header line and one row per sample"),
         (b"\n\n", ": the file is empty; expected a header line and one row per sample"),
-        (b"time_s,motor_position_deg\n0,1\n", ":1: column 'load_position_deg' is missing; found time_s, "
-            "motor_position_deg; pass --columns load=COLUMN"),
-        (b"time_s,motor_position_deg,load_pos_deg\n0,1,2\n", ":1: column 'load_position_deg' is missing; "
-            "found time_s, motor_position_deg, load_pos_deg; pass --columns load=load_pos_deg"),
-        (b"time_s;motor_position_deg;load_position_deg\n0;1;2\n1;1;x\n", ":3: load_position_deg: 'x' is "
-            "not a number; expected a number"),
-        (b"0,1,2\n1,2,3\n", ": the first line holds numbers and columns 'time_s', 'motor_position_deg', "
-            "'load_position_deg' are missing; name the columns by their numbers, 1 to 3: --columns "
-            "time=N,motor=N,load=N"),
-        (f"{HEAD},time_s\n0,1,2,3\n".encode(), ":1: two columns are called 'time_s'; expected each name "
-            "once: name the column by its number, as in 1"),
-        (f"{HEAD}\n0,1,2\n1,abc,2\n".encode(), ":3: motor_position_deg: 'abc' is not a number; expected a "
-            "number"),
+        (b"time_s,motor_position_deg\n0,1\n", ":1: column 'load_position_deg' is missing; found time_s, motor_position_deg; pass --columns load=COLUMN"),
+        (b"time_s,motor_position_deg,load_pos_deg\n0,1,2\n", ":1: column 'load_position_deg' is missing; found time_s, motor_position_deg, load_pos_deg; pass --columns load=load_pos_deg"),
+        (b"time_s;motor_position_deg;load_position_deg\n0;1;2\n1;1;x\n", ":3: load_position_deg: 'x' is not a number; expected a number"),
+        (b"0,1,2\n1,2,3\n", ": the first line holds numbers and columns 'time_s', 'motor_position_deg', 'load_position_deg' are missing; name the columns by their numbers, 1 to 3: --columns time=N,motor=N,load=N"),
+        (f"{HEAD},time_s\n0,1,2,3\n".encode(), ":1: two columns are called 'time_s'; expected each name once: name the column by its number, as in 1"),
+        (f"{HEAD}\n0,1,2\n1,abc,2\n".encode(), ":3: motor_position_deg: 'abc' is not a number; expected a number"),
         (f"{HEAD}\n0,1,2\n1,,2\n".encode(), ":3: motor_position_deg: no value; expected a number"),
-        (f"{HEAD}\n0,1,2\n1,1_0,2\n".encode(), ":3: motor_position_deg: '1_0' is not a number; expected a "
-            "number"),
+        (f"{HEAD}\n0,1,2\n1,1_0,2\n".encode(), ":3: motor_position_deg: '1_0' is not a number; expected a number"),
         (f"{HEAD}\n0,1,2\n\n1,1,nan\n".encode(), ":4: load_position_deg: nan; expected a finite number"),
         (f"{HEAD}\n0,1,2\n1,1,-inf\n".encode(), ":3: load_position_deg: -inf; expected a finite number"),
-        (f"{HEAD},temperature_c\n0,1,2,20\n1,1,2,nan\n".encode(), ":3: temperature_c: nan; expected a "
-            "finite number"),
-        (f"{HEAD},temperature_c\n0,1,2,20\n1,1,2,\n".encode(), ":3: temperature_c: no value; expected a "
-            "number"),
-        (f"\n{HEAD}\r\n0,1,2\r\n1,1,x\r\n".encode(), ":4: load_position_deg: 'x' is not a number; expected "
-            "a number"),
-        (f"{HEAD}\n0,1,2\n2,1,2\n\n1.5,1,2\n".encode(), ":5: time_s: 1.5 after 2; expected times that do "
-            "not decrease"),
+        (f"{HEAD},temperature_c\n0,1,2,20\n1,1,2,nan\n".encode(), ":3: temperature_c: nan; expected a finite number"),
+        (f"{HEAD},temperature_c\n0,1,2,20\n1,1,2,\n".encode(), ":3: temperature_c: no value; expected a number"),
+        (f"\n{HEAD}\r\n0,1,2\r\n1,1,x\r\n".encode(), ":4: load_position_deg: 'x' is not a number; expected a number"),
+        (f"{HEAD}\n0,1,2\n2,1,2\n\n1.5,1,2\n".encode(), ":5: time_s: 1.5 after 2; expected times that do not decrease"),
         (f"{HEAD}\n0,1,2\n1,1\n".encode(), ":3: 2 values; expected 3, one for each column"),
         (f"{HEAD}\n0,1,2\n1,1,2,3\n".encode(), ":3: 4 values; expected 3, one for each column"),
         (f"{HEAD}\n0,1,2,3\n1,1,2,3\n".encode(), ":2: 4 values; expected 3, one for each column"),
         (f"{HEAD}\n0,1,2\n".encode(), ": 1 sample; expected at least 2"),
         (f"{HEAD}\n".encode(), ": 0 samples; expected at least 2"),
-        (f"{HEAD},note\n0,1,2,\x81\n".encode("latin-1"), ":2: neither UTF-8 nor Windows-1252 text; "
-            "expected CSV in UTF-8"),
-        (b"PK\x03\x04\x14\x00\x06\x00\x08\x90", ": a ZIP archive, such as an Excel workbook; expected CSV: "
-            "export the samples as CSV"),
+        (f"{HEAD},note\n0,1,2,\x81\n".encode("latin-1"), ":2: neither UTF-8 nor Windows-1252 text; expected CSV in UTF-8"),
+        (b"PK\x03\x04\x14\x00\x06\x00\x08\x90", ": a ZIP archive, such as an Excel workbook; expected CSV: export the samples as CSV"),
         (b"PAR1\x15\x04\x15\x00\x90", ": a Parquet file; expected CSV: export the samples as CSV"),
-        (gzip.compress(f"{HEAD}\n0,1,2\n".encode(), mtime=0)[:-9], ": gzip data are damaged or cut off "
-            "(Compressed file ended before the end-of-stream marker was reached)"),
+        (gzip.compress(f"{HEAD}\n0,1,2\n".encode(), mtime=0)[:-9], ": gzip data are damaged or cut off (Compressed file ended before the end-of-stream marker was reached)"),
     ],
 )  # fmt: skip
 def test_bad_input_gets_one_line_with_file_and_row(tmp_path, text, expected):
@@ -178,16 +163,10 @@ def test_a_model_follows_the_commanded_angle_if_recorded():
 @pytest.mark.parametrize(
     ("one", "ratio", "expected"),
     [
-        (record(ratio=40.0), 50.0, "the motor makes 40 turns per turn of the load (measured over 320 deg "
-            "of the load); expected a ratio of 50: correct the ratio, or the counts per turn of an encoder"),
-        (record(ratio=160.0), 161.0, "the motor makes 160 turns per turn of the load (measured over 398 "
-            "deg of the load); expected a ratio of 161: correct the ratio, or the counts per turn of an "
-            "encoder"),
-        (record(ratio=-50.0), 50.0, "the motor makes 50 turns per turn of the load, against it (measured "
-            "over 400 deg of the load); expected a ratio of 50: turn the direction of one encoder round"),
-        (Record({**record().columns, "load_position_deg": np.zeros(101)}), 50.0, "the load stands still "
-            "while the motor turns (measured over 400 deg of the load); expected a ratio of 50: look at "
-            "the load encoder's column"),
+        (record(ratio=40.0), 50.0, "the motor makes 40 turns per turn of the load (measured over 320 deg of the load); expected a ratio of 50: correct the ratio, or the counts per turn of an encoder"),
+        (record(ratio=160.0), 161.0, "the motor makes 160 turns per turn of the load (measured over 398 deg of the load); expected a ratio of 161: correct the ratio, or the counts per turn of an encoder"),
+        (record(ratio=-50.0), 50.0, "the motor makes 50 turns per turn of the load, against it (measured over 400 deg of the load); expected a ratio of 50: turn the direction of one encoder round"),
+        (Record({**record().columns, "load_position_deg": np.zeros(101)}), 50.0, "the load stands still while the motor turns (measured over 400 deg of the load); expected a ratio of 50: look at the load encoder's column"),
     ],
 )  # fmt: skip
 def test_a_wrong_ratio_is_refused_with_the_measured_one(one, ratio, expected):
