@@ -53,7 +53,7 @@ def fleet_page(summary: Summary, folder: Path, pages: Mapping[str, str] = NO_PAG
     commands = []
     if without is not None:
         line = shlex.join(["hdbridge", "fleet", "report", str(folder), "--joint", without])
-        about = f"writes the page of {without}; with --pages, those of all joints of the list"
+        about = f"writes the page of {without}; with --pages, those of all listed joints"
         commands.append(Command(line, about))
     return Page(
         title=f"Fleet of {summary.joints:,} joints",
@@ -75,7 +75,7 @@ def _verdict(summary: Summary) -> str:
             text += f", {summary.limit_arcsec:g} arcsec in {hours_words(soonest.remaining)} h"
         text += "."
     elif summary.recordings > len(summary.failed):
-        text = f"No joint of {summary.joints:,} stands out by a cause that repeats and is not common to all."
+        text = f"None of {summary.joints:,} joints has a cause that repeats and is not common to all."
     else:
         text = "No joint can be judged."
     if wrong := len(summary.failed):
@@ -92,13 +92,13 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
         f"be wrong. Limit: a peak of {summary.limit_arcsec:g} arcsec."
     )
     yield from _table(
-        "Look at first",
+        "Inspect first",
         text,
         ["joint", "cause", Heading("to the limit", "h"), Heading("peak"),
          Heading("growth", "arcsec per 1000 h"), Heading("probability", ""), "named in", "data",
          "also changed"],
         [_candidate(each, joint) for each in summary.first],
-    ) if summary.first else [Section("Look at first", f"{text}\n\nThere is none.")]  # fmt: skip
+    ) if summary.first else [Section("Inspect first", f"{text}\n\nNone.")]  # fmt: skip
     for attribute, causes in summary.prevalence.items():
         yield from _table(
             f"Causes by {attribute}",
@@ -117,8 +117,8 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
     mistaken = sorted(summary.mistaken, key=lambda each: ([*_KINDS].index(each.kind), each.joint, each.path))
     yield from _table(
         "Exchanged joints, other encoders, duplicates",
-        "Recordings that are not of their joint as it was. Those of another joint, of another encoder, and "
-        "second copies count nowhere else on this page.",
+        "Recordings that do not match their joint. Recordings of another joint or encoder, and duplicates, "
+        "are excluded from the rest of this page.",
         ["joint", "what", "why", "recording"],
         [
             *([joint(each.joint), _KINDS[each.kind], each.text, each.path] for each in mistaken),
@@ -138,7 +138,7 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
     )
     yield from _table(
         "Silent joints",
-        "Joints of which nothing is known now.",
+        "Joints without current information.",
         ["joint", "why"],
         [[joint(name), why] for name, why in summary.silent],
     )
@@ -151,9 +151,10 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
     )
     rates = sorted(summary.rates.items(), key=lambda each: -each[1][0])
     yield from _table(
-        "How often which cause is named",
-        "Estimated from the fleet: the share of joints with the cause, and how often a recording names it in "
-        "a joint with it and in one without. What is named as often without it is not worth a line.",
+        "Findings by cause",
+        "Estimated from the fleet: the share of joints with the cause, and the rates of findings in "
+        "recordings of joints with and without it. A finding that is as frequent without the cause is not "
+        "informative.",
         ["cause", Heading("share", "of joints"), Heading("named with it", "of recordings"),
          Heading("without", "of recordings")],
         [[_words(cause), *(f"{100.0 * each:.1f} %" for each in own)] for cause, own in rates],

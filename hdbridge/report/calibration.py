@@ -104,7 +104,9 @@ def _status(result: Calibration) -> tuple[Status, tuple[Command, ...]]:
         return of_offer(result.offer)
     records = " ".join(result.recordings)
     return Status.MEASURED, (
-        Command(f"hdbridge diagnose {records} --model MODEL.yaml", "says what the fitted model still lacks"),
+        Command(
+            f"hdbridge diagnose {records} --model MODEL.yaml", "lists the causes that the fitted model lacks"
+        ),
     )
 
 
@@ -252,7 +254,7 @@ def _residual(result: Calibration) -> Iterator[Block]:
     yield Facts(
         [
             ("residual of the model, rms of a sample", f"{noise.residual_arcsec:.2f} arcsec"),
-            ("... with what was fitted in addition to it", f"{noise.fitted_arcsec:.2f} arcsec"),
+            ("... with the terms fitted in addition", f"{noise.fitted_arcsec:.2f} arcsec"),
             (
                 "noise at rest",
                 "not measured" if noise.standing_arcsec is None else f"{noise.standing_arcsec:.2f} arcsec",
@@ -345,7 +347,7 @@ def _provenance(result: Calibration) -> Facts:
         for name, value in (("date", result.date), ("plan", result.plan), ("axis", result.axis))
         if value is not None
     ]
-    rows += [("the plan gave up", each) for each in result.shortened]
+    rows += [("shortened parts of the plan", each) for each in result.shortened]
     rows += [(name.replace("_", " "), _text(value)) for name, value in result.model.provenance.items()]
     return Facts(rows)
 

@@ -120,7 +120,9 @@ def of_offer(offer: Offer) -> tuple[Status, tuple[Command, ...]]:
         return Status.REFUSED, ()
     if offer.pending is None:
         return Status.OFFERED, (
-            Command("hdbridge model log PROFILE", "says whether this model waits, or was committed since"),
+            Command(
+                "hdbridge model log PROFILE", "shows whether this model is pending or has been committed"
+            ),
         )
     profile = offer.pending.parent
     return Status.PENDING, (
@@ -176,7 +178,7 @@ def stepping_page(
                 "count.",
                 [Grid(_remaining(results[best], floor_arcsec))],
             ),
-            Section("What was done", blocks=[Facts([*facts.items()])]),
+            Section("Test conditions", blocks=[Facts([*facts.items()])]),
         ],
         footer=f"hdbridge {__version__}. Errors are arcseconds at the load; {SIGMA} is three standard "
         "deviations about the mean.",

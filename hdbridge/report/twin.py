@@ -86,7 +86,7 @@ def twin_page(report: TwinReport) -> Page:
     """Returns the page."""
     sections = [
         Section(
-            "How far simulation and axis are apart",
+            "Differences between simulation and axis",
             "Each figure is the rms difference of the two records, sample by sample or stop by stop, also "
             "in units of the noise of the measured channel. Two equal axes differ by less than one.",
             [Table(*figures(report))],
@@ -94,12 +94,12 @@ def twin_page(report: TwinReport) -> Page:
     ]
     if report.named:
         rows = [[each.cause, each.text] for each in report.named]
-        sections.append(Section("What was wrong with the simulation", "", [Table(["cause", ""], rows)]))
+        sections.append(Section("Errors of the initial simulation", "", [Table(["cause", ""], rows)]))
     sections += [_pictures(name, report) for name in report.now.traces]
     sections.append(
         Section(
             "By kind of motion",
-            "The same figures, leg by leg of one kind.",
+            "The same figures for the legs of each kind.",
             [Table(*figures(report, by_kind=True))],
         )
     )
@@ -118,8 +118,8 @@ def twin_page(report: TwinReport) -> Page:
         sections.append(
             Section(
                 "From the model",
-                "What became of each effect of the axis's model in the simulated plant.",
-                [Table(["effect", "place in the truth file", "what differs there"], rows)],
+                "Translation of each effect of the axis's model to the simulated plant.",
+                [Table(["effect", "path in the truth file", "differences"], rows)],
             )
         )
     if report.facts:
@@ -132,8 +132,8 @@ def twin_page(report: TwinReport) -> Page:
         status=report.status,
         commands=report.commands,
         sections=sections,
-        footer=f"hdbridge {__version__}. The load error is load angle less motor angle over the ratio, in "
-        "arcsec at the load; the following error is command less motor angle. Both records got the same "
+        footer=f"hdbridge {__version__}. The load error is load angle minus motor angle over the ratio, in "
+        "arcsec at the load; the following error is command minus motor angle. Both records have the same "
         "commands.",
     )
 
@@ -216,9 +216,9 @@ def _pictures(name: str, report: TwinReport) -> Section:
             [
                 _chart(f"{TITLES[name].capitalize()} over the whole record", label, trace, slice(None)),
                 _chart(
-                    "Where the simulation was off most"
+                    "Largest deviation of the initial simulation"
                     if report.after
-                    else "Where the simulation is off most",
+                    else "Largest deviation of the simulation",
                     label,
                     trace,
                     worst,
@@ -245,7 +245,7 @@ def _difference(caption: str, before: Trace, after: Trace | None) -> Chart:
     series = [Series(BEFORE if after is not None else DIFFERENCE, before.time_s, before.difference, colour=2)]
     if after is not None:
         series.append(Series("now", after.time_s, after.difference, colour=1))
-    return Chart(caption, "time, s", "measured less simulated", series, height_px=260)
+    return Chart(caption, "time, s", "measured minus simulated", series, height_px=260)
 
 
 def _spectrum(name: str, spectrum: Spectrum | None) -> list[Chart]:

@@ -53,8 +53,8 @@ def bench(tmp_path, profile):
         ("fit one.csv --ratio 50 --json one.csv", "--json would overwrite one.csv, which this command reads"),
         ("fit one.csv --ratio 50 --html sub/../one.csv", "--html would overwrite one.csv"),
         ("fit one.csv --ratio 50 --json other.csv", "which is not a result of hdbridge"),
-        ("fit one.csv --ratio 50 --out out --json out", "--out and --json both write there"),
-        ("fit one.csv --ratio 50 --out Out --json out", "both write there"),
+        ("fit one.csv --ratio 50 --out out --json out", "--out and --json both write to this path"),
+        ("fit one.csv --ratio 50 --out Out --json out", "both write to this path"),
         ("fit one.csv --ratio 50 --out p/model.yaml", "hdbridge model commit"),
         ("fit one.csv --ratio 50 --out p/axis.yaml", "file of a profile"),
         ("fit rec --ratio 50 --json rec/sweep.csv", "of the recording"),
@@ -187,7 +187,7 @@ def _linked(path: Path, link: typing.Callable[[Path, Path], None]) -> Path:
 
 
 def _is_seen_to_be_one(one: Path, other: Path) -> None:
-    with pytest.raises(InputError, match="both write there"):
+    with pytest.raises(InputError, match="both write to this path"):
         check_outputs([Output("--json", one, Kind.JSON), Output("--html", other, Kind.JSON)])
     check_outputs([Output("--json", one, Kind.JSON), Output("--html", other.parent / "two", Kind.PAGE)])
 

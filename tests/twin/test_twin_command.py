@@ -211,7 +211,7 @@ def test_a_better_twin_is_kept_as_pending(profile: Path, recording: Path, run: R
     assert figures(told, "after")["motor_torque"]["difference"] < 0.008
     (friction,) = told["parameters"]
     assert (friction["before"], friction["value"], friction["ci95"]) == (0.068, 0.034, [0.033, 0.035])
-    assert "What was wrong with the simulation" in page
+    assert "Errors of the initial simulation" in page
     assert "model commit" in page
 
 

@@ -271,7 +271,7 @@ def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> Mo
     none = runner.run("without correction", replace(model.only(()), response=None))
     runner.lag_s = following_lag_s(none)
     static_model = replace(model, response=None)
-    static = runner.run("correction of rest", static_model)
+    static = runner.run("static correction", static_model)
     if not measure:
         return _tested(runner, model, none, static)
     limits = Limits.of(axis, model)
