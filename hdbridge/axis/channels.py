@@ -90,9 +90,9 @@ class Quantity(Strict):
 
     source: ChannelSource = Field(description="object with the reading")
     per_count: float = Field(ge=-1e6, le=1e6, description="its unit per count")
-    at_zero: float = Field(0.0, ge=-1e9, le=1e9, description="what a reading of zero means, in its unit")
-    minimum: float = Field(-1e9, description="below this a reading is not believed")
-    maximum: float = Field(1e9, description="above this a reading is not believed")
+    at_zero: float = Field(0.0, ge=-1e9, le=1e9, description="value at a reading of zero, in its unit")
+    minimum: float = Field(-1e9, description="lower limit of plausible readings")
+    maximum: float = Field(1e9, description="upper limit of plausible readings")
     every_cycles: EveryCycles = 1
     hold_ms: HoldMs = 100.0
 

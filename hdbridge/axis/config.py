@@ -257,7 +257,7 @@ class RealtimeConfig(Strict):
 class AxisConfig(OtherChannels):
     """An axis: bus, drive, encoders, gear, limits and compensation."""
 
-    schema_: Literal["hdbridge.axis/1"] = Field(alias="schema", description="kind and version of this file")
+    schema_: Literal["hdbridge.axis/1"] = Field(alias="schema", description="schema and version of this file")
     name: str = Field(
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name: letters, digits, '.', '_', '-'"
     )

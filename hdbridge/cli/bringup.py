@@ -561,7 +561,7 @@ def latency(
         Option("--cycle-ms", min=0.1, max=1000, help="Only this cycle time; may be repeated."),
     ] = None,
     realtime: Annotated[
-        bool, Option(help="Ask for real-time priority and locked memory, as the control loop does.")
+        bool, Option(help="Request real-time priority and locked memory, like the control loop.")
     ] = True,
     json_file: opt.Json = None,
 ) -> None:

@@ -38,17 +38,21 @@ class Measured:
         Option(
             "--plan",
             metavar="quick|full|dynamics|FILE",
-            help="What is measured: a bundled plan, or a file. A twin needs dynamics, too.",
+            help="Plan to measure: a bundled plan, or a file. A twin also needs dynamics.",
         ),
     ] = "quick"
     out: Annotated[
         Path | None,
-        Option("--out", metavar="FOLDER", help="Where the recordings go; else recordings/AXIS-DATE-TIME."),
+        Option(
+            "--out",
+            metavar="FOLDER",
+            help="Write the recordings to this folder; else to recordings/AXIS-DATE-TIME.",
+        ),
         Kind.FOLDER,
     ] = None
     resume: Annotated[
         Path | None,
-        Option("--resume", metavar="FOLDER", help="Continue what was interrupted in this folder."),
+        Option("--resume", metavar="FOLDER", help="Continue the interrupted measurement in this folder."),
     ] = None
 
     def of(self, session: Session) -> Measurement:

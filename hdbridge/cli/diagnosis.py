@@ -65,7 +65,7 @@ def diagnose(
         Option(
             "--prior",
             metavar="FLEET.parquet",
-            help="fleet.parquet of hdbridge fleet run: how often each cause is there.",
+            help="fleet.parquet of hdbridge fleet run: prevalence of each cause.",
         ),
     ] = None,
     group: Annotated[

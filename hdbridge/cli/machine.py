@@ -44,7 +44,7 @@ _EXTRA = ("fastapi", "uvicorn", "websockets", "mcap", "prometheus_client")
 def run(
     machine: opt.Machine,
     simulate: Annotated[
-        bool, Option("--simulate", help="Hold simulated drives in place of the bus.")
+        bool, Option("--simulate", help="Control simulated drives in place of the bus.")
     ] = False,
     speed: Annotated[
         float,

@@ -18,7 +18,7 @@ from hdbridge.files.profile import Profile
 from hdbridge.files.yamlfile import read_yaml
 from hdbridge.units import figure, with_interval
 
-ReasonOption = Annotated[str, Option("--reason", help="Why, for the log.")]
+ReasonOption = Annotated[str, Option("--reason", help="Reason, for the log.")]
 TwinOption = Annotated[bool, Option("--twin", help="The twins of the axis instead of its models.")]
 
 

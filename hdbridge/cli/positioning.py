@@ -183,7 +183,11 @@ def step(
     html_file: opt.Html = None,
     record: Annotated[
         Path | None,
-        Option("--record", metavar="FOLDER", help="Keep what was measured: one CSV file per scheme."),
+        Option(
+            "--record",
+            metavar="FOLDER",
+            help="Write the measured data to this folder: one CSV file per scheme.",
+        ),
         Kind.FOLDER,
     ] = None,
 ) -> None:
@@ -451,7 +455,9 @@ def print_motion(result: MotionTest) -> None:
 def demo(
     out: Annotated[
         Path | None,
-        Option("--out", metavar="FOLDER", help="Where the results go; else demo-output, numbered."),
+        Option(
+            "--out", metavar="FOLDER", help="Write the results to this folder; else to demo-output, numbered."
+        ),
         Kind.FOLDER,
     ] = None,
     count: Annotated[int, Option("--count", min=2, max=2000, help="Steps each way.")] = 240,

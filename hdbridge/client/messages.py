@@ -157,7 +157,7 @@ class Problem(Report):
         examples=["'cell controller' holds the lease for another 4.2 s; wait, or take it with force"],
     )
     axis: str | None = Field(None, description="the axis concerned", examples=["joint-3"])
-    hint: str | None = Field(None, description="what a person does about it")
+    hint: str | None = Field(None, description="advice to the user")
     errors: list[str] = Field(
         default=[],
         description="complaints about an invalid request, each with its key",
@@ -202,20 +202,20 @@ class LeaseGrant(Report):
     """Granted lease, whose token goes into the header ``X-Lease`` of each request that moves an axis."""
 
     token: str = Field(description="secret that permits motion", examples=["mZ3sWJx0b0lq"])
-    client: str = Field(description="who holds it")
-    timeout_s: Seconds = Field(description="it ends when it was not used for so long", examples=[5.0])
+    client: str = Field(description="name of the holder")
+    timeout_s: Seconds = Field(description="time without use after which it ends", examples=[5.0])
 
 
 class LeaseState(Report):
     """State of the lease, without its token."""
 
     held: bool = Field(description="True if a client holds it")
-    client: str | None = Field(None, description="who holds it", examples=["cell controller"])
+    client: str | None = Field(None, description="name of the holder", examples=["cell controller"])
     since: datetime | None = Field(None, description="time at which it was taken")
     remaining_s: float | None = Field(
         None, description="time until it expires; each use extends it", examples=[4.2]
     )
-    timeout_s: float = Field(description="it ends when it was not used for so long", examples=[5.0])
+    timeout_s: float = Field(description="time without use after which it ends", examples=[5.0])
 
 
 # ---------------------------------------- requests
@@ -325,10 +325,10 @@ class Home(Request):
         description="homing method, 6098h: see the drive's manual", examples=[37]
     )
     switch_velocity_deg_s: Speed | None = Field(
-        None, description="speed towards the switch, deg/s at the load; else as the daemon finds right"
+        None, description="speed towards the switch, deg/s at the load; else chosen by the daemon"
     )
     zero_velocity_deg_s: Speed | None = Field(
-        None, description="speed towards the zero, deg/s at the load; else as the daemon finds right"
+        None, description="speed towards the zero, deg/s at the load; else chosen by the daemon"
     )
     acceleration_deg_s2: Acceleration | None = Field(
         None, description="acceleration, deg/s2 at the load; else the axis's limit"
@@ -406,7 +406,7 @@ class Event(Report):
     cycle: int | None = Field(None, description="cycle of the loop")
     axis: Name | None = Field(None, description="None for the machine")
     text: str = Field("", description="in words", examples=["cycle 120: a TPDO is missing (282h): freeze"])
-    hint: str | None = Field(None, description="what a person does about it")
+    hint: str | None = Field(None, description="advice to the user")
 
 
 class Events(Report):
@@ -496,7 +496,7 @@ class Fault(Report):
 
     name: str = Field(description="the row of the fault table", examples=["LOST_TPDO"])
     text: str = Field(description="what happened, in words", examples=["a TPDO is missing, twice in a row"])
-    hint: str = Field(description="what a person does about it", examples=["check the cable"])
+    hint: str = Field(description="advice to the user", examples=["check the cable"])
     cycle: int | None = Field(None, description="cycle of the loop in which it was seen")
     date: datetime | None = Field(None, description="when it was seen, by the machine's clock")
     needs_verification: bool = Field(
@@ -522,21 +522,21 @@ class ModelInUse(Report):
 
     version: int | None = Field(None, description="number in the history; None without one", examples=[4])
     file: str = Field(description="its file on the daemon's machine")
-    date: datetime | None = Field(None, description="when it was made")
-    age_s: float | None = Field(None, ge=0, description="since it was made, seconds")
-    reason: str = Field("", description="why it was made", examples=["calibration"])
+    date: datetime | None = Field(None, description="time of its creation")
+    age_s: float | None = Field(None, ge=0, description="age, seconds")
+    reason: str = Field("", description="reason for its creation", examples=["calibration"])
     effects: list[str] = Field(default=[], examples=[["synchronous", "hysteresis"]])
 
 
 class LoadLoopState(Report):
     """State of the load loop, a slow integral of the measured error."""
 
-    configured: bool = Field(description="whether the machine file has one for this axis")
+    configured: bool = Field(description="True if the machine file has one for this axis")
     on: bool = False
     correction_arcsec: float = Field(0.0, description="present correction")
     doubt: str | None = Field(
         None,
-        description="why it does not act: the load encoder is in doubt, or the error is beyond its bound",
+        description="reason for not acting: the load encoder is in doubt, or the error exceeds its bound",
         examples=["the mean error at rest is 46.3 arcsec without the loop, which adds at most 20"],
     )
 
@@ -578,7 +578,7 @@ class OuterState(Report):
     """Axis as a drive of another master, through the gateway."""
 
     node_id: int = Field(ge=1, le=255, description="on the bus of that master; 255: LSS took it away")
-    alive: bool = Field(description="whether the gateway process runs")
+    alive: bool = Field(description="True if the gateway process runs")
     nmt: int = Field(description="NMT state of the node as in a heartbeat", examples=[5])
     statusword: int = Field(description="6041h as that master sees it", examples=[0x1237])
     error_code: int = Field(0, description="603Fh as that master sees it; 0: no error", examples=[0x8700])
@@ -593,7 +593,7 @@ class OuterState(Report):
         "without targets",
         examples=[0.0061],
     )
-    latency_99_s: float | None = Field(None, description="99 % of them are not longer", examples=[0.008])
+    latency_99_s: float | None = Field(None, description="99th percentile of that time", examples=[0.008])
 
 
 class AxisState(Report):
@@ -621,15 +621,16 @@ class AxisState(Report):
         default={}, description="measured channels by their column", examples=[{"temperature_c": 31.5}]
     )
 
-    scheme: Scheme = Field(description="which parts of the model compensate")
-    compensating: bool = Field(description="whether the correction is in the target now")
+    scheme: Scheme = Field(description="parts of the model that compensate")
+    compensating: bool = Field(description="True if the correction is in the target now")
     correction_arcsec: float | None = Field(None, description="in the target now")
     predicted_arcsec: float | None = Field(None, description="transmission error by the model, now")
     weight: float | None = Field(None, description="share of the correction that is ramped in, 0 to 1")
     limited: bool = Field(False, description="the correction is at its limit or changes as fast as it may")
     changing: bool = Field(False, description="a change of model or scheme is being ramped")
     memory_known: bool = Field(
-        description="whether the state of the hysteresis is known: the axis turned past its width both ways"
+        description="True if the state of the hysteresis is known: the axis has turned past its width both "
+        "ways"
     )
     underrun: bool = Field(False, description="the last stream ran out of points in motion")
 
@@ -641,10 +642,10 @@ class AxisState(Report):
     outer: OuterState | None = Field(None, description="None: the axis is not in a gateway")
     advice: list[str] = Field(
         default=[],
-        description="what the load-encoder watch says",
+        description="verdict of the load-encoder watch",
         examples=[["recalibrate: the residual left what the model's intervals allow"]],
     )
-    queued: int = Field(0, ge=0, description="way points that wait")
+    queued: int = Field(0, ge=0, description="waiting way points")
 
 
 class BusState(Report):
@@ -663,11 +664,11 @@ class CycleState(Report):
 
     period_s: float = Field(gt=0, examples=[0.004])
     cycle: int = Field(description="number of the newest cycle")
-    alive: bool = Field(description="whether the loop turned lately")
+    alive: bool = Field(description="True if the loop has turned recently")
     pid: int = Field(0, ge=0, description="process id of the control process; 0 if there is none")
     skipped: int = Field(0, ge=0, description="periods left out because the loop was late")
-    late_us: float | None = Field(None, description="how late the newest cycle began")
-    busy_us: float | None = Field(None, description="how long the newest cycle took")
+    late_us: float | None = Field(None, description="lateness of the newest cycle")
+    busy_us: float | None = Field(None, description="duration of the newest cycle")
 
 
 class RecorderState(Report):
@@ -676,7 +677,7 @@ class RecorderState(Report):
     on: bool
     folder: str | None = None
     dropped: int = Field(0, ge=0, description="samples that were not written, a full disk for example")
-    note: str | None = Field(None, description="what a person should know", examples=["the disk is full"])
+    note: str | None = Field(None, description="remarks for the user", examples=["the disk is full"])
 
 
 class MachineState(Report):
@@ -691,4 +692,4 @@ class MachineState(Report):
     cycle: CycleState
     lease: LeaseState
     recorder: RecorderState
-    warnings: list[str] = Field(default=[], description="what a person should look at")
+    warnings: list[str] = Field(default=[], description="warnings for the user")

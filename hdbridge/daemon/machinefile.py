@@ -173,7 +173,7 @@ class MachineFile(_Part):
     """Content of a machine file."""
 
     schema_: Literal["hdbridge.machine/1"] = Field(
-        alias="schema", description="kind and version of this file"
+        alias="schema", description="schema and version of this file"
     )
     name: str = Field(pattern=NAME, description="name: letters, digits, '.', '_', '-'")
     axes: tuple[AxisEntry, ...] = Field(

@@ -71,7 +71,7 @@ class RecordingFile(Strict):
     """Content of ``recording.yaml``."""
 
     schema_: Literal["hdbridge.recording/1"] = Field(
-        alias="schema", description="kind and version of this file"
+        alias="schema", description="schema and version of this file"
     )
     axis: str | None = Field(None, description="name of the axis")
     ratio: float | None = Field(None, gt=0, le=1000, description="N: motor turns per load turn")

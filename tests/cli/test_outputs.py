@@ -222,6 +222,6 @@ def test_every_output_option_is_guarded():
                 )
                 says = (info.help or "") if info else ""
                 names_a_place = bool not in typing.get_args(hint)  # a flag does not
-                writes = names_a_place and says.startswith(("Write", "Keep what", "Where the re"))
+                writes = names_a_place and says.startswith("Write")
                 guarded = any(isinstance(each, Kind) for each in getattr(hint, "__metadata__", ()))
                 assert writes == guarded, (name, parameter, says)

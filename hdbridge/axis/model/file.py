@@ -48,7 +48,9 @@ class EffectEntry(BaseModel):
 class ModelFile(BaseModel):
     """Content of a model file; each effect checks its own parameters."""
 
-    schema_: Literal["hdbridge.model/1"] = Field(alias="schema", description="kind and version of this file")
+    schema_: Literal["hdbridge.model/1"] = Field(
+        alias="schema", description="schema and version of this file"
+    )
     ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")
     effects: tuple[EffectEntry, ...] = Field(description="effects, whose sum is the transmission error")
     provenance: Provenance | None = Field(None, description="origin of the numbers")

@@ -46,7 +46,7 @@ class Activation(BaseModel):
 
     date: str = Field(description="date, ISO 8601")
     action: Action = Field(description="action")
-    version: int = Field(ge=1, description="number of the version")
+    version: int = Field(ge=1, description="version number")
     reason: str = Field("", description="why, in words")
 
 
@@ -56,7 +56,7 @@ class LogFile(BaseModel):
     model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
     schema_: Literal["hdbridge.history/1"] = Field(
-        alias="schema", description="kind and version of this file"
+        alias="schema", description="schema and version of this file"
     )
     activations: tuple[Activation, ...] = Field(description="activations, oldest first")
 
@@ -257,7 +257,7 @@ class Store(Generic[K]):
         return number
 
     def _keep(self, profile: Path, content: bytes) -> int:
-        """Returns the number of the version with this content, which is added to the history if necessary."""
+        """Returns the version number of this content, which is added to the history if necessary."""
         number = self._number(profile, content)
         if number is None:
             number = max(self._history(profile), default=0) + 1

@@ -100,7 +100,7 @@ _AXIS: Final = (
         "Time from the other master's SYNC to the drive's first frame with its target, median.",
         "outer.latency_s",
     ),
-    ("outer_latency_99_seconds", "The same, 99 % of them are not longer.", "outer.latency_99_s"),
+    ("outer_latency_99_seconds", "The same, 99th percentile of that time.", "outer.latency_99_s"),
 )
 """Name, description and field of each axis metric."""
 
@@ -117,7 +117,7 @@ class _Scrape(Collector):
         yield metrics.late.family("cycle_late_seconds", "Delay of the start of cycles.")
         yield metrics.busy.family("cycle_busy_seconds", "Duration of cycles.")
         yield _gauge("info", "1.", [((state.name, state.version), 1)], ("machine", "version"))
-        yield _gauge("loop_alive", "1 if the control loop turns.", [((), state.cycle.alive)])
+        yield _gauge("loop_alive", "1 if the control loop is running.", [((), state.cycle.alive)])
         yield _gauge("cycle_period_seconds", "Period of the cycle.", [((), state.cycle.period_s)])
         skipped = [((), state.cycle.skipped)]
         yield _counter("cycles_skipped", "Periods skipped because the loop was late.", skipped)

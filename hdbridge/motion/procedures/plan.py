@@ -193,7 +193,7 @@ class ValidationEntry(Strict):
 class Plan(Strict):
     """A plan file."""
 
-    schema_: Literal["hdbridge.plan/1"] = Field(alias="schema", description="kind and version of this file")
+    schema_: Literal["hdbridge.plan/1"] = Field(alias="schema", description="schema and version of this file")
     name: str = Field(
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name: letters, digits, '.', '_', '-'"
     )

@@ -60,7 +60,9 @@ class TrueTemperature(Strict):
 class Truth(Strict):
     """Truth of the simulated axis."""
 
-    schema_: Literal["hdbridge.truth/1"] = Field(alias="schema", description="kind and version of this file")
+    schema_: Literal["hdbridge.truth/1"] = Field(
+        alias="schema", description="schema and version of this file"
+    )
     name: str = Field(
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name: letters, digits, '.', '_', '-'"
     )
