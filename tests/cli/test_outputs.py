@@ -26,7 +26,9 @@ RECORD = "time_s,motor_position_deg,load_position_deg\n" + "".join(
 
 @pytest.fixture
 def bench(tmp_path, profile):
-    """A folder with a profile, a record and a recording, and a function that says whether they stand."""
+    """A folder with a profile, a record and a recording, and a function that checks that they are
+    unchanged.
+    """
     (tmp_path / "one.csv").write_text(RECORD)
     (tmp_path / "other.csv").write_text(RECORD)
     shutil.copytree(profile.folder, tmp_path / "p")
@@ -210,7 +212,7 @@ def test_aliases_of_a_future_file_are_recognised(tmp_path_factory, names):
 
 
 def test_every_output_option_is_guarded():
-    """`--json` and `--html` everywhere; whatever else names what it writes, by the word in its help."""
+    """`--json` and `--html` are outputs everywhere; other outputs begin their help with "Write"."""
     for name in (name for panel in PANELS.values() for name in panel):
         loaded = load(name)
         groups = [each.typer_instance for each in loaded.registered_groups]

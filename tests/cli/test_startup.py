@@ -50,7 +50,7 @@ def test_overview_repeats_the_commands_own_summary(name, summary):
 
 
 def test_help_loads_no_numeric_or_bus_modules():
-    """All commands are imported as their help needs them; what they run with is not."""
+    """Commands are imported for their help, without the modules that they need to run."""
     program = (
         "import sys\nfrom hdbridge.cli import PANELS, load\n"
         "for panel in PANELS.values():\n    for name in panel:\n        load(name)\n"

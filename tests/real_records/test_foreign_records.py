@@ -171,7 +171,7 @@ FINE_LOAD = np.round(LONG_LOAD / GRID) * GRID
 
 
 def counter(bits: int, counts: np.ndarray, start: float = 0.0) -> np.ndarray:
-    """An unsigned counter of so many bits."""
+    """Unsigned counter with this many bits."""
     return (counts + start) % 2.0**bits
 
 

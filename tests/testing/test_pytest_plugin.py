@@ -26,7 +26,7 @@ def session(pytester):
 
 
 def show(name: str) -> str:
-    """A test that prints what it got."""
+    """Test that prints its settings."""
     return f"def test_it(hdbridge_drive):\n    print('got', hdbridge_drive.{name}, repr(hdbridge_drive))\n"
 
 

@@ -70,7 +70,7 @@ def trips(truth: Truth, folder: Path) -> Path:
 
 @pytest.fixture
 def profile(tmp_path: Path) -> Path:
-    """The demo's profile, whose truth file says twice the friction."""
+    """Profile of the demo, with twice the friction in its truth file."""
     folder = tmp_path / "demo"
     shutil.copytree(DEMO, folder)
     text = (folder / "truth.yaml").read_text()
@@ -160,7 +160,7 @@ def test_a_recording_of_another_axis_or_without_commands_is_refused(profile: Pat
 
 
 def fitted(truth: Truth, values: str = "axis", times_noise: float = 2.5) -> Callable[..., Twin]:
-    """In place of a fit, which takes minutes: this is what it comes to."""
+    """Result of a fit, which itself would take minutes."""
 
     def fit_twin(recordings: Any, axis: AxisConfig, start: Truth, progress: Any) -> Twin:
         (recording,) = recordings

@@ -197,7 +197,7 @@ def test_knots_of_an_earlier_stream_are_discarded(enabled: SteppedDaemon) -> Non
 
 
 def test_early_knots_of_the_next_stream_are_kept(enabled: SteppedDaemon) -> None:
-    """A leg's end is told, and the next one is handed over within the same period."""
+    """The end of a leg is reported and the next leg handed over within the same period."""
     begin = enabled.axes[0].set_point.position_deg
     enabled.stream({0: [(t, begin + p, v) for t, p, v in quintic(0.4, 1.0)]}, timeout_s=10.0)
     enabled.until(lambda: enabled.axes[0].set_point.position_deg == pytest.approx(begin + 1.0))

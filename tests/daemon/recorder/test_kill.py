@@ -145,7 +145,7 @@ def test_the_next_start_mends_files_and_keeps_those_with_faults(killed, tmp_path
 
 
 def test_the_recorder_never_blocks_its_caller(tmp_path, monkeypatch):
-    """Its queue is full at once here: what does not fit is dropped and counted."""
+    """Its queue is full at once here; excess data are dropped and counted."""
     monkeypatch.setattr("hdbridge.daemon.recorder.recorder.QUEUE_BATCHES", 1)
     monkeypatch.setattr(FlightRecorder, "_run", lambda *_: None)
     said = []

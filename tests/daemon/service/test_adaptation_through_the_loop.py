@@ -25,7 +25,7 @@ QUICK = AdaptationSettings(mode="on", interval_s=3.0, rate_arcsec_per_hour=7200.
 
 @pytest.fixture
 def service(tmp_path: Path):
-    """An axis whose loop is a tenth higher than its model says."""
+    """Axis whose loop is a tenth higher than that of its model."""
     truth = tmp_path / "truth.yaml"
     grown = truth_of(1e-3, growth=0.1, second_order_arcsec=0.0)
     truth.write_text(yaml.safe_dump(grown.model_dump(mode="json", by_alias=True, exclude_none=True)))

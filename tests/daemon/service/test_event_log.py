@@ -9,7 +9,7 @@ from hdbridge.motion import MotionMode
 
 
 class EventReader:
-    """A reader of events that a test has told."""
+    """Reader of events supplied by a test."""
 
     def __init__(self) -> None:
         self.events: list[Event] = []
