@@ -155,7 +155,8 @@ class LoadLoop:
         return self._doubt
 
     def use_models(self, whole: TransmissionModel, predicting: TransmissionModel) -> None:
-        """Sets the models: ``whole`` has the full hysteresis, ``predicting`` provides ``motor`` of `step`.
+        """Sets the models: ``whole`` has the full hysteresis, ``predicting`` predicts the ``motor`` argument
+        of `step`.
 
         The load may lag the motor by the unpredicted part of the hysteresis, and by a share of the predicted
         part. Without a known hysteresis, only the loop's own bound limits the lag.

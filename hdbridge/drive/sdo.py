@@ -176,7 +176,7 @@ class SdoClient:
             kind = integer_type(variable)
             if kind is None:
                 raise SdoError(
-                    f"{self.describe(index, sub)}: is not an integer by the EDS (type {variable.data_type}h)"
+                    f"{self.describe(index, sub)}: is not an integer in the EDS (type {variable.data_type}h)"
                 )
             return kind
         known = STANDARD.get((index, sub))

@@ -284,7 +284,7 @@ def agreed_ratio(recordings: Mapping[Path, Recording], said: Iterable[tuple[str,
     known = [(where, value) for where, value in said if value is not None]
     if not known:
         raise InputError(
-            f"{next(iter(recordings))}: the ratio of the gear is not known; say it, or name the axis (on the "
+            f"{next(iter(recordings))}: the ratio of the gear is unknown; state it, or name the axis (on the "
             "command line: --ratio N or --axis PROFILE)"
         )
     for where, value in known[1:]:

@@ -46,7 +46,7 @@ class Reach:
         return _nothing
 
     def wish(self, name: str, value: object) -> End:
-        """Sets an attribute of the drive's fault settings; its end restores the previous value."""
+        """Sets an attribute of the drive's fault settings; ending the fault restores the previous value."""
         wishes = self.drive.faults
         before = getattr(wishes, name)
         setattr(wishes, name, value)

@@ -82,7 +82,8 @@ class Knots:
                 )
             if first.time_s == 0.0 and first.velocity_deg_s:
                 raise InputError(
-                    f"a stream begins with {first.velocity_deg_s:g} deg/s, but the axis stands: begin at rest"
+                    f"a stream begins with {first.velocity_deg_s:g} deg/s, but the axis is at rest: begin "
+                    f"at rest"
                 )
         for one, next_ in pairwise(chain):
             if not next_.time_s > one.time_s:
