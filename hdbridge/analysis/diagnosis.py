@@ -28,6 +28,7 @@ from hdbridge.analysis.findings import (
 from hdbridge.analysis.gain import held_out, of_written
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.identifiability import identifiability
+from hdbridge.analysis.linear import Nuisances, unknown
 from hdbridge.analysis.parameters import confounded, covariance, parameters_of, precisely
 from hdbridge.analysis.prepared import Observed, gather
 from hdbridge.analysis.probability import Context, Prior, weighed
@@ -39,7 +40,7 @@ from hdbridge.analysis.search import (
     waves_alike,
     with_measured,
 )
-from hdbridge.analysis.swing import Swing, seen_swing, settled, without
+from hdbridge.analysis.swing import Swing, between_samples, seen_swing, settled, without
 from hdbridge.analysis.unexplained import (
     Rest,
     is_unexplained,
@@ -100,27 +101,33 @@ def diagnose(
     )
     scales = scales or Scales()
     progress("searching for causes")
-    swing = seen_swing(data.full, model.effects, scales)
-    search, found = _searched(data, model, scales, swing)
+    between = between_samples(data.full, model.effects, data.period_s)
+    swing = seen_swing(data.full, model.effects, between, scales)
+    search, found = _searched(data, model, scales, between, swing)
     if swing is None:  # a larger cause may hide it; wind-up in acceleration is its slow part
         others = [each for each in found.hypothesis.effects if each.channels != {Channel.ACCELERATION}]
-        swing = seen_swing(data.full, others, scales)
+        swing = seen_swing(data.full, others, between, scales)
         if swing is not None:
-            search, found = _searched(data, model, scales, swing)
+            search, found = _searched(data, model, scales, between, swing)
     progress("judging what was found")
     diagnosis = _Judge(search, model, prior).of(found)
     return replace(diagnosis, remarks=(*remarks, *diagnosis.remarks))
 
 
 def _searched(
-    data: Observed, model: TransmissionModel, scales: Scales, swing: Swing | None
+    data: Observed, model: TransmissionModel, scales: Scales, between: Nuisances, swing: Swing | None
 ) -> tuple[Search, Fitted]:
     """Returns the search and its result on the data less the swing."""
     if swing is not None:
         data = without(data, swing)
-    search = _search(data, model, scales)
+    search = _search(data, model, scales, between)
+    begun = search.begun()
+    if between.strain(begun.nuisances) > scales.enter:  # no load that is too stiff for the sampling does this
+        between = unknown(np.empty((len(data.full), 0)), ())
+        begun = _search(data, model, scales, between).begun()
     if swing is None or not swing.soft:
-        search = _search(settled(search.estimator, search.begun(), swing), model, scales)
+        data = settled(search.estimator, begun, swing)
+    search = _search(data, model, scales, between)
     estimator = search.estimator
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)
@@ -130,12 +137,14 @@ def _searched(
     return search, search.run()
 
 
-def _search(data: Observed, model: TransmissionModel, scales: Scales) -> Search:
+def _search(data: Observed, model: TransmissionModel, scales: Scales, between: Nuisances) -> Search:
     estimator = Estimator(data, scales)
     estimator.calibrated = calibrated(
         model.effects, model.uncertainty, lambda effect: estimator.columns(effect, Start.VIRGIN), scales
     )
-    estimator.begins = estimator.begins_of(model.effects)
+    between = replace(between, columns=estimator.at_points(between.columns))
+    begins = estimator.begins_of(model.effects)
+    estimator.unknown = between if begins is None else between.and_also(begins)
     return Search(estimator, model.effects)
 
 
@@ -152,6 +161,8 @@ def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Judged:
+    judged: Fitted
+    """Fit with the effects of the findings."""
     fitted: Fitted
     """Fit without a free-form loop."""
     findings: list[Finding]
@@ -179,14 +190,19 @@ class _Judge:
             fitted = self.search.instead(passed, names[0] - names[1])
         fitted = with_measured(self.search, fitted)
         fitted = as_calibrated(estimator, fitted, given)
-        judged = self._likely_only(fitted)
-        fitted, findings = judged.fitted, judged.findings
+        while True:
+            judged = self._likely_only(fitted)
+            findings = self._with_unexplained(judged.findings, judged.left)
+            fitted, findings, extended = self._written(judged.fitted, findings)
+            lost = [each for each in findings if each.gain and not (each.within or each.gain.predicts)]
+            if not lost:
+                break
+            self.considered.extend(f"{each.cause}: {LOSES}" for each in lost)
+            fitted = self._without(judged.judged, lost)
         known = {each.cause for each in findings} | {each.split(":")[0] for each in self.considered}
-        refused = self.search.reported_refusals(fitted)
+        refused = self.search.reported_refusals(judged.fitted)
         self.considered.extend(each for each in refused if each.split(":")[0] not in known)
-        findings = self._with_unexplained(findings, judged.left)
-        refitted = estimator.fit(Hypothesis(given, fitted.hypothesis.start))
-        fitted, findings, extended = self._written(fitted, findings)
+        refitted = estimator.fit(Hypothesis(given, judged.fitted.hypothesis.start))
         before, _ = estimator.left_by(given)
         after, start = estimator.left_by(extended.effects)
         measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
@@ -229,22 +245,26 @@ class _Judge:
     ) -> tuple[Fitted, list[Finding], TransmissionModel]:
         """Returns the extended model, its fit, and the findings that it contains.
 
-        Drops a finding if its parameters are out of bounds, if the compensation could not invert the model
-        with it, or if the record does not determine it.
+        A finding that cannot be written is dropped: its parameters are out of bounds, the compensation could
+        not invert the model with it, or the record does not determine it. The given effects stay as they are
+        if refitted ones do not predict what was left out.
         """
         estimator, given = self.estimator, self.model.effects
         while True:
             as_reported = as_named(estimator, fitted, given, {each.cause for each in findings})
             alone = {each.cause for each in findings if each.left_alone}
             spread = covariance(estimator, as_reported)
-            sound = supported(estimator, as_reported, given, alone)
-            as_reported = replace(as_reported, hypothesis=replace(as_reported.hypothesis, effects=sound))
+            as_reported = as_reported.having(supported(estimator, as_reported, given, alone))
             named = {each.cause for each in findings if not each.within}
+            sound = as_reported.hypothesis.effects
             chosen = [place for place in range(len(given), len(sound)) if sound[place].name in named]
+            (gain,) = of_written(estimator, as_reported, given, [chosen], [*range(len(given)), *chosen])
+            if gain and not gain.predicts:
+                as_reported = as_reported.having((*given, *sound[len(given) :]))
             reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
             extended = extended_model(self.model, as_reported, chosen, spread, reason, len(given))
-            changed = [new for new in extended.effects if new not in given]
-            missing = [each for each in findings if not (each.left_alone or _is_in(each, changed))]
+            written = [new for new in extended.effects if new not in given]
+            missing = [each for each in findings if not (each.left_alone or _is_in(each, written))]
             if not missing:
                 return as_reported, self._with_gains(as_reported, findings, chosen), extended
             self.considered.extend(f"{each.cause}: it cannot be written into the model" for each in missing)
@@ -296,7 +316,6 @@ class _Judge:
 
         Improbable findings are also removed from the fit.
         """
-        base = len(self.model.effects)
         while True:
             judged = self._judged(fitted)
             likely = [
@@ -308,19 +327,23 @@ class _Judge:
                 + f" (prior: {each.prior})" * bool(each.prior)
                 for each in doubted
             )
-            effects = {id(each.effect) for each in doubted}
-            kept = [
-                each
-                for i, each in enumerate(fitted.hypothesis.effects)
-                if i < base or id(each) not in effects
-            ]
-            if len(kept) == len(fitted.hypothesis.effects):
+            left = self._without(fitted, doubted)
+            if left is fitted:
                 break  # the others are changes of the baseline, which stay in it
-            fitted = self.estimator.fit(replace(fitted.hypothesis, effects=tuple(kept)))
-            fitted = self.search.with_best_law(fitted)
+            fitted = left
         usual = {each.cause for each in likely if _ordinary(each)}
         self.considered.extend(f"{cause}: no more than usual" for cause in sorted(usual))
         return replace(judged, findings=[each for each in likely if each.cause not in usual])
+
+    def _without(self, fitted: Fitted, findings: Sequence[Finding]) -> Fitted:
+        """Fits again without the effects of findings; changes of the baseline stay in it."""
+        effects, base = {id(each.effect) for each in findings}, len(self.model.effects)
+        kept = tuple(
+            each for i, each in enumerate(fitted.hypothesis.effects) if i < base or id(each) not in effects
+        )
+        if len(kept) == len(fitted.hypothesis.effects):
+            return fitted
+        return self.search.with_best_law(self.estimator.fit(replace(fitted.hypothesis, effects=kept)))
 
     def _judged(self, fitted: Fitted) -> _Judged:
         """Judges the findings of a hypothesis."""
@@ -335,14 +358,14 @@ class _Judge:
         findings.sort(key=lambda each: -each.robust)
         excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
         # A model cannot contain a free-form loop, so the figures exclude it.
-        fitted = estimator.fit(replace(fitted.hypothesis, nuisances=None))
+        judged, fitted = fitted, estimator.fit(replace(fitted.hypothesis, nuisances=None))
         left = rest(estimator, fitted)
         unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
         context = Context(left.arcsec, excess, unknown)
         findings = weighed(findings, context, estimator.scales, self.prior)
         if estimator.data.reversals < 2:  # speed, torque, place and time are correlated
             findings = [self._one_way(each) for each in findings]
-        return _Judged(fitted, findings, left, context)
+        return _Judged(judged, fitted, findings, left, context)
 
     def _one_way(self, finding: Finding) -> Finding:
         """Limits the probability of a cause seen in one direction only."""

@@ -163,6 +163,11 @@ def _driving(
     noise = _noise(lag, target, count)
     if noise >= 0.5 * count and float(np.std(rest)) > 0.45 * count + 1e-6:
         line = line + uniform_filter1d(rest, 2 * window + 1, mode="nearest")
+    # Weighted means of line and reading: a line that misses its cell says nothing about the place in it.
+    read = noise**2 + count**2 / 12.0
+    missed = uniform_filter1d((lag - line) ** 2, 2 * window + 1, mode="nearest") - read
+    share = read / (read + np.maximum(missed, 0.0)) if read else np.ones(len(lag))
+    line = lag + share * (line - lag)
     # A motor that sticks at a reversal or overshoots a stop is where its encoder says.
     cell = max(0.5 * count, 3.0 * noise)
     line = np.clip(line, lag - cell, lag + cell)

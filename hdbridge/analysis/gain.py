@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hdbridge.analysis.hypothesis import Estimator, Fitted
-from hdbridge.analysis.linear import Linearised, counted, of_number, steps_without
+from hdbridge.analysis.linear import counted, of_number, steps_without
 from hdbridge.analysis.noise import White
 from hdbridge.analysis.prepared import REPEATS
 from hdbridge.axis.effects import Effect, FloatArray, IntArray
@@ -19,6 +19,8 @@ SURE = 2.0
 """Minimum significance of a gain, standard errors."""
 NEARLY_ALL = 0.75
 """Minimum share of recordings that a cause must predict better: all of three or four, four of five."""
+SHARED = 1.5
+"""Minimum number of stretches that share a gain; one event is one or, at their border, two unequal ones."""
 RECORDINGS = "recordings"
 
 
@@ -72,8 +74,14 @@ class Gain:
 
     @property
     def predicts(self) -> bool:
-        """True if the part reduces the held-out error; for whole recordings, in nearly all of them."""
-        return self.recovered > 0.0 and (self.repeated or self.over != RECORDINGS)
+        """True if it lowers the error of what was left out, in nearly all recordings or more than one part.
+
+        The square of the sum over the sum of squares is the number of stretches among which the fall is
+        shared.
+        """
+        fall = self.before_arcsec2 - self.after_arcsec2
+        shared = float(np.sum(fall)) ** 2 > SHARED * float(fall @ fall)
+        return self.recovered > 0.0 and (self.repeated if self.over == RECORDINGS else shared)
 
     def as_dict(self) -> dict[str, float | str]:
         """Returns the entries for the provenance of a model file."""
@@ -115,8 +123,8 @@ def held_out(estimator: Estimator, before: Fitted, after: Fitted) -> Gain | None
 
     None if the record is too short.
     """
-    (gain,) = _compared(estimator, [before.linearised], after.linearised)
-    return gain
+    parts = _Parts.of(estimator, after.count())
+    return None if parts is None else parts.gain(parts.unseen(before), parts.unseen(after))
 
 
 def of_written(
@@ -128,49 +136,60 @@ def of_written(
 ) -> list[Gain | None]:
     """Returns the gain of the written model for each finding.
 
-    The reference is the ``given`` model with the ``others``, the remaining findings; ``written`` and
-    ``others`` are places of effects in the fit. The other findings are not refitted without the finding, so a
-    fresh record can repeat the comparison.
+    Both are places of effects in the fit. Neither is fitted again, so a fresh record can repeat the
+    comparison; the written one also leaves what its fit loses in repetitions that it has not seen.
     """
-    before = [_as_written(estimator, fitted, given, places, ()) for places in others]
-    return _compared(estimator, before, _as_written(estimator, fitted, given, written, written))
+    others = [*others]
+    parts = _Parts.of(estimator, fitted.count())
+    if parts is None:
+        return [None] * len(others)
+    effects = [each.tidied(estimator.data.ratio) for each in fitted.hypothesis.effects]
+
+    def squares(places: Collection[int]) -> FloatArray:
+        used = [
+            effects[at] if at in places else given[at]
+            for at in range(len(effects))
+            if at in places or at < len(given)
+        ]
+        return parts.squares(estimator.left_by(used)[0])
+
+    lost = parts.unseen(fitted) - parts.squares(fitted.residual / estimator.weight)
+    after = squares(written) + lost
+    return [parts.gain(squares(each), after) for each in others]
 
 
-def _as_written(
-    estimator: Estimator,
-    fitted: Fitted,
-    given: Sequence[Effect],
-    places: Collection[int],
-    free: Collection[int],
-) -> Linearised:
-    """Returns the linearised fit of the zeros and the effects at the places ``free``.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Parts:
+    """What repeats in a record, and is left out in turn."""
 
-    Effects outside ``places`` are as in the given model, or absent.
-    """
-    effects, full = fitted.hypothesis.effects, fitted.linearised
-    used = [
-        effects[at] if at in places else given[at]
-        for at in range(len(effects))
-        if at in places or at < len(given)
-    ]
-    columns = np.concatenate([np.arange(len(fitted.zeros)), *(fitted.places(at) for at in sorted(free))])
-    left, _ = estimator.left_by(used)
-    return Linearised(full.columns[:, columns], left * estimator.weight, full.known[columns])
+    estimator: Estimator
+    stretch: IntArray
+    """Number of each point's stretch, shape (m,)."""
+    over: str
 
+    @classmethod
+    def of(cls, estimator: Estimator, parameters: int) -> _Parts | None:
+        """Returns the parts; None if the record is too short for this number of parameters."""
+        stretch, over = repeats(estimator)
+        largest = np.max(np.bincount(stretch % FOLDS))
+        if np.max(stretch) + 1 < REPEATS or len(stretch) - largest < parameters:
+            return None
+        return cls(estimator, stretch, over)
 
-def _compared(estimator: Estimator, before: Sequence[Linearised], after: Linearised) -> list[Gain | None]:
-    stretch, over = repeats(estimator)
-    fold = stretch % FOLDS
-    samples = np.bincount(stretch).astype(np.float64)
-    if len(samples) < REPEATS or len(stretch) - np.max(np.bincount(fold)) < after.columns.shape[1]:
-        return [None] * len(before)
+    def squares(self, left_arcsec: FloatArray) -> FloatArray:
+        """Returns the sum of squares of each stretch, arcsec2."""
+        return np.asarray(np.bincount(self.stretch, left_arcsec**2))
 
-    def squares(fit: Linearised) -> FloatArray:
+    def unseen(self, fitted: Fitted) -> FloatArray:
+        """Returns the squares of each stretch, as predicted by a fit without its fold."""
+        fit, fold = fitted.linearised, self.stretch % FOLDS
         left = fit.residual.copy()
         steps = steps_without(fit, fold, lambda rows: White(np.ones(np.count_nonzero(rows))))
         for number, step in enumerate(steps):
             left[fold == number] -= fit.columns[fold == number] @ step
-        return np.asarray(np.bincount(stretch, (left / estimator.weight) ** 2), dtype=np.float64)
+        return self.squares(left / self.estimator.weight)
 
-    folds, later = int(np.max(fold)) + 1, squares(after)
-    return [Gain(over, folds, samples, squares(each), later) for each in before]
+    def gain(self, before: FloatArray, after: FloatArray) -> Gain:
+        """Returns the gain from the sums of squares."""
+        samples = np.bincount(self.stretch).astype(np.float64)
+        return Gain(self.over, int(np.max(self.stretch % FOLDS)) + 1, samples, before, after)

@@ -93,6 +93,15 @@ class Fitted:
     _solution: Solution = field(repr=False)
     _weight: FloatArray = field(repr=False)
 
+    @property
+    def nuisances(self) -> FloatArray:
+        """Coefficients of the nuisance columns after the zeros, those of every hypothesis first."""
+        return self._solution.nuisances[len(self.zeros) :]
+
+    def having(self, effects: tuple[Effect, ...]) -> Fitted:
+        """Returns the fit with other effects at the same places."""
+        return replace(self, hypothesis=replace(self.hypothesis, effects=effects))
+
     @cached_property
     def linearised(self) -> Linearised:
         """Fit linearised at its minimum, in units of the noise."""
@@ -150,8 +159,8 @@ class Estimator:
         """Sign of the loop's offset; -1 if the load lags."""
         self.calibrated: tuple[CalibratedPart, ...] = ()
         """Priors from the calibration for the first effects of each hypothesis."""
-        self.begins: Nuisances | None = None
-        """Elastic states at the start of each part of the record."""
+        self.unknown: Nuisances | None = None
+        """Nuisance columns of every hypothesis: motion between samples, elastic states at the start."""
 
     @property
     def motion(self) -> Motion:
@@ -230,19 +239,28 @@ class Estimator:
         return self.weighted(np.column_stack(columns))
 
     def turned(self, effects: Sequence[Effect], start: Start) -> tuple[IntArray, FloatArray]:
-        """Returns the turning points, and each sample's change due to their errors, arcsec, shape (n,)."""
+        """Returns the turning points and what their errors change in each sample, arcsec, shape (n,).
+
+        The errors of stops are among them.
+        """
         full, loops = self.data.full, with_memory(effects)
         change = np.zeros(len(full))
         if not loops:
             return np.empty(0, dtype=np.intp), change
         turning, signs = branches(full.motor_deg, start)
         turns = np.array(turning[1:-1], dtype=np.intp)
+        if not signs:
+            return turns, change
         count = full.reading.resolution_deg if full.commanded else CHATTER_COUNTS * full.reading.unaided_deg
         beyond = (COUNTS * count + missed_deg(full.motor_deg, turns)) * np.array(signs[:-1])
-        later, earlier = full.motor_deg.copy(), full.motor_deg.copy()
+        later, earlier, over = (full.motor_deg.copy() for _ in range(3))
         later[turns] += beyond
         earlier[turns - 1] = full.motor_deg[turns] + beyond
-        for moved in (later, earlier):
+        # A motor that overshoots a stop by less than chatter turns twice, unseen.
+        stops = np.flatnonzero(np.diff((full.speed_deg_s == 0.0).astype(np.int8)) > 0) + 1
+        leg = np.clip(np.searchsorted(turning, stops) - 1, 0, len(signs) - 1)
+        over[stops] += COUNTS * CHATTER_COUNTS * full.reading.resolution_deg * np.array(signs)[leg]
+        for moved in (later, earlier, over):
             motion = replace(full.motion, motor_deg=moved)
             moved_by = sum(each.predict(motion, start) - each.predict(full.motion, start) for each in loops)
             change = np.where(np.abs(moved_by) > np.abs(change), moved_by, change)
@@ -380,8 +398,8 @@ class Estimator:
     def _nuisances(self, hypothesis: Hypothesis) -> Nuisances:
         """Returns the columns of the zeros and of the hypothesis's own nuisances."""
         own = zeros(self.zero, self.data.full.zeros)
-        if self.begins is not None:
-            own = own.and_also(self.begins)
+        if self.unknown is not None:
+            own = own.and_also(self.unknown)
         return own if hypothesis.nuisances is None else own.and_also(hypothesis.nuisances)
 
     def _sign(self, effect: Effect) -> float:

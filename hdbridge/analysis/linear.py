@@ -12,7 +12,6 @@ from itertools import compress
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.linalg.lapack import dposv
 
 from hdbridge.axis.effects import BoolArray, Effect, FloatArray, IntArray
 from hdbridge.axis.effects.described import Moves
@@ -28,6 +27,8 @@ SUSPECT = 1e-6
 
 def solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Solves a positive semi-definite system with scaled columns; undetermined directions stay at zero."""
+    from scipy.linalg.lapack import dposv  # noqa: PLC0415 - the daemon's service starts without scipy
+
     if not len(matrix):
         return np.zeros_like(right)
     seen = np.diag(matrix) > 0.0
@@ -191,6 +192,14 @@ class Nuisances:
     """Shape (b, q)."""
     names: tuple[str, ...]
     prior: tuple[Prior, ...]
+
+    def strain(self, coefficients: FloatArray) -> float:
+        """Returns the squared distance of the coefficients from their priors, standard deviations squared.
+
+        Further coefficients belong to other columns.
+        """
+        pairs = zip(self.prior, coefficients.tolist(), strict=False)
+        return float(sum(each.information * (value - each.mean) ** 2 for each, value in pairs))
 
     def and_also(self, other: Nuisances) -> Nuisances:
         """Returns these columns followed by others."""

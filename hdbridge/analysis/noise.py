@@ -10,7 +10,6 @@ than one with white noise (Rybicki and Press 1995).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
 from typing import NamedTuple
 
@@ -24,18 +23,16 @@ from hdbridge.axis.effects import BoolArray, FloatArray, IntArray
 PIECES = 16
 PIECE_BLOCKS = 250
 SMALLEST_ARCSEC, LARGEST_ARCSEC = 1e-3, 1e3
-DIFFERENCE = 1e-4
-"""Step of the likelihood's derivatives, in logarithms. With a smaller one, rounding stops the fit early."""
+ABSENT_ARCSEC = 2.0 * SMALLEST_ARCSEC
+"""A drift that a fit leaves below this, at its lower limit, is omitted: each makes all products slower."""
 COLUMNS_AT_ONCE = 8
-CHAINS_KEPT = 12
-"""Size of the cache of chains: a derivative needs two at each length and one at a step from each."""
 LOOP_LENGTH = 0.3
 """Correlation length of the misfit of a loop's shape, as a share of the travel over which the misfit
 decays."""
 LOOP_DEG = 8.0, 40.0
 """Range of that travel, derived from the widths of loops. A longer one is a drift, a shorter one ringing."""
-SAME_LEG = 1e-8
-"""Step between blocks of a leg in correlation lengths: practically zero, for an error constant over a leg."""
+SHORTEST_STEP = 1e-8
+"""Step of a drift between blocks at one place, correlation lengths: practically zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,73 +79,65 @@ class White:
 
 
 class _Chain(NamedTuple):
-    """Drift of unit size along some blocks: its inverse covariance, and its share in each block's mean."""
+    """A drift of unit size along some blocks: its inverse covariance, and its share in each block's mean.
+
+    Each is followed by its derivative by the logarithm of the correlation length.
+    """
 
     diagonal: FloatArray
+    diagonal_slope: FloatArray
     off_diagonal: FloatArray
+    off_diagonal_slope: FloatArray
     log_determinant: float
+    log_determinant_slope: float
     load: FloatArray
+    load_slope: FloatArray
 
 
-class _Wanders:
-    """Cache of the chains of a set of blocks, because a noise fit requests the same lengths repeatedly."""
-
-    def __init__(self, blocks: Blocks) -> None:
-        self._blocks = blocks
-        self._fresh = np.diff(blocks.chain) != 0
-        self._kept: dict[object, _Chain] = {}
-
-    def in_time(self, length_s: float) -> _Chain:
-        """Returns the drift in time."""
-        blocks = self._blocks
-        return self._once(("time", length_s), lambda: self._along(blocks.time_s, blocks.duration_s, length_s))
-
-    def in_place(self, length_deg: float) -> _Chain:
-        """Returns the drift over the motor's travel."""
-        blocks = self._blocks
-        return self._once(
-            ("place", length_deg), lambda: self._along(blocks.travel_deg, blocks.extent_deg, length_deg)
-        )
-
-    def over_legs(self) -> _Chain:
-        """Returns the error that is constant over a leg, of the size given in the blocks."""
-        blocks = self._blocks
-        return self._once(
-            "leg",
-            lambda: _chain(np.where(np.diff(blocks.leg) != 0, np.inf, SAME_LEG), blocks.locked_arcsec),
-        )
-
-    def over_branches(self, length_deg: float) -> _Chain:
-        """Returns the misfit of the loop's shape, which decays over each branch, anew for each."""
-
-        def make() -> _Chain:
-            crossed = self._blocks.since_turn_deg / length_deg
-            way = np.maximum(np.abs(np.diff(crossed)) / LOOP_LENGTH, SAME_LEG)
-            fresh = self._fresh | (np.diff(self._blocks.leg) != 0)
-            return _chain(np.where(fresh, np.inf, way), 1.0 / (1.0 + crossed**2))
-
-        return self._once(("loop", length_deg), make)
-
-    def _along(self, place: FloatArray, extent: FloatArray, length: float) -> _Chain:
-        way = np.maximum(np.abs(np.diff(place)), 1e-9 * length) / length
-        return _chain(np.where(self._fresh, np.inf, way), np.sqrt(_averaged(extent / length)))
-
-    def _once(self, key: object, make: Callable[[], _Chain]) -> _Chain:
-        if key not in self._kept:
-            if len(self._kept) >= CHAINS_KEPT:
-                del self._kept[next(iter(self._kept))]
-            self._kept[key] = make()
-        return self._kept[key]
+def _along(blocks: Blocks, place: FloatArray, extent: FloatArray, length: float) -> _Chain:
+    """Returns a drift along ``place``, averaged over the ``extent`` of each block."""
+    step = np.where(np.diff(blocks.chain) != 0, np.inf, np.abs(np.diff(place)) / length)
+    # the variance of the mean over x correlation lengths
+    x = np.maximum(extent / length, 1e-6)
+    fallen = -np.expm1(-x)
+    averaged = np.where(x < 1e-3, 1.0 - x / 3.0, 2.0 * (x - fallen) / x**2)
+    load = np.sqrt(averaged)
+    return _chain(step, load, (averaged - fallen / x) / load)
 
 
-def _chain(step: FloatArray, load: FloatArray) -> _Chain:
+def _over_branches(blocks: Blocks, length_deg: float) -> _Chain:
+    """Returns the misfit of the loop's shape, which fades over each branch and differs between them."""
+    crossed = blocks.since_turn_deg / length_deg
+    fresh = (np.diff(blocks.chain) != 0) | (np.diff(blocks.leg) != 0)
+    step = np.where(fresh, np.inf, np.abs(np.diff(crossed)) / LOOP_LENGTH)
+    load = 1.0 / (1.0 + crossed**2)
+    return _chain(step, load, 2.0 * (crossed * load) ** 2)
+
+
+def _over_legs(blocks: Blocks) -> _Chain:
+    """Returns the error that is constant over a leg, with the size given in the blocks."""
+    step = np.where(np.diff(blocks.leg) != 0, np.inf, 0.0)
+    return _chain(step, blocks.locked_arcsec, np.zeros(len(blocks)))
+
+
+def _chain(step: FloatArray, load: FloatArray, load_slope: FloatArray) -> _Chain:
     """Builds a chain from the steps between blocks in correlation lengths (infinite: independent)."""
-    spread = -np.expm1(-2.0 * step)
+    step_slope = np.where((step > SHORTEST_STEP) & np.isfinite(step), -step, 0.0)
+    step = np.maximum(step, SHORTEST_STEP)
     decay = np.exp(-step)
-    diagonal = np.ones(len(load))
-    diagonal[:-1] += decay**2 / spread
-    diagonal[1:] += decay**2 / spread
-    return _Chain(diagonal, -decay / spread, float(-np.sum(np.log(spread))), load)
+    spread = -np.expm1(-2.0 * step)
+    inward = decay**2 / spread
+    inward_slope = -2.0 * inward / spread * step_slope
+    return _Chain(
+        1.0 + np.append(inward, 0.0) + np.append(0.0, inward),
+        np.append(inward_slope, 0.0) + np.append(0.0, inward_slope),
+        -decay / spread,
+        decay * (1.0 + decay**2) / spread**2 * step_slope,
+        float(-np.sum(np.log(spread))),
+        float(-2.0 * inward @ step_slope),
+        load,
+        load_slope,
+    )
 
 
 class Precision:
@@ -158,51 +147,47 @@ class Precision:
     K^-1 = w - w H (P + H' w H)^-1 H' w, and the bracket is banded.
     """
 
-    def __init__(
-        self,
-        noise: NoiseModel,
-        blocks: Blocks,
-        left_out: BoolArray | None = None,
-        wanders: _Wanders | None = None,
-    ) -> None:
-        """Treats blocks in ``left_out`` as unobserved; ``wanders`` is the cache of the blocks, if any."""
+    def __init__(self, noise: NoiseModel, blocks: Blocks, left_out: BoolArray | None = None) -> None:
+        """Blocks in ``left_out`` count as not observed."""
         weight = 1.0 / noise.white_variance(blocks)
         if left_out is not None:
             weight = np.where(left_out, 0.0, weight)
         self.weight: FloatArray = weight
+        self._noise, self._blocks = noise, blocks
         self._log_determinant = float(np.sum(np.log(weight[weight > 0])))
-        wanders = wanders or _Wanders(blocks)
-        chains: list[_Chain] = []
-        self._loads: list[FloatArray] = []
+        chains: dict[str, tuple[float, _Chain]] = {}
         if noise.slow_arcsec > 0:
-            chains.append(wanders.in_time(noise.slow_s))
-            self._loads.append(noise.slow_arcsec * chains[-1].load)
+            chain = _along(blocks, blocks.time_s, blocks.duration_s, noise.slow_s)
+            chains["slow"] = noise.slow_arcsec, chain
         if noise.place_arcsec > 0:
-            chains.append(wanders.in_place(noise.place_deg))
-            self._loads.append(noise.place_arcsec * chains[-1].load)
+            chain = _along(blocks, blocks.travel_deg, blocks.extent_deg, noise.place_deg)
+            chains["place"] = noise.place_arcsec, chain
         if noise.loop_arcsec > 0:
-            chains.append(wanders.over_branches(noise.loop_deg))
-            self._loads.append(noise.loop_arcsec * chains[-1].load)
+            chains["loop"] = noise.loop_arcsec, _over_branches(blocks, noise.loop_deg)
         if np.any(blocks.locked_arcsec):
-            chains.append(wanders.over_legs())
-            self._loads.append(chains[-1].load)
-        for chain in chains:
+            chains["leg"] = 1.0, _over_legs(blocks)
+        self._chains = chains
+        self._loads = np.zeros((len(chains), len(blocks)))
+        for number, (size, chain) in enumerate(chains.values()):
+            self._loads[number] = size * chain.load
             self._log_determinant += chain.log_determinant
-        self._factor = self._factored(chains) if chains else None
+        if chains:
+            self._band = self._bracket()
+            self._factor: FloatArray = cholesky_banded(self._band, lower=True, check_finite=False)
+            self._log_determinant -= 2.0 * float(np.sum(np.log(self._factor[0])))
 
-    def _factored(self, chains: list[_Chain]) -> FloatArray:
-        """Returns the Cholesky factor of the bracket, with the drifts interleaved."""
-        width, count = len(chains), len(self.weight)
+    def _bracket(self) -> FloatArray:
+        """Returns P + H' w H as a lower band, with the drifts interleaved."""
+        width, count = len(self._chains), len(self.weight)
         band = np.zeros((width + 1, width * count))
-        for number, chain in enumerate(chains):
-            band[0, number::width] = chain.diagonal + self.weight * self._loads[number] ** 2
+        loads = self._loads
+        for number, (_, chain) in enumerate(self._chains.values()):
+            weighted = self.weight * loads[number]
+            band[0, number::width] = chain.diagonal + weighted * loads[number]
             band[width, number : width * (count - 1) : width] = chain.off_diagonal
-        for apart in range(1, width):
-            for number in range(width - apart):
-                band[apart, number::width] = self.weight * self._loads[number] * self._loads[number + apart]
-        factor: FloatArray = cholesky_banded(band, lower=True, check_finite=False)
-        self._log_determinant -= 2.0 * float(np.sum(np.log(factor[0])))
-        return factor
+            for apart in range(1, width - number):
+                band[apart, number::width] = weighted * loads[number + apart]
+        return band
 
     def apply(self, columns: FloatArray) -> FloatArray:
         """Returns K^-1 times columns of shape (b,) or (b, p)."""
@@ -217,27 +202,91 @@ class Precision:
 
     def _applied(self, rows: FloatArray) -> FloatArray:
         """Returns K^-1 times columns given as rows, (p, b)."""
-        weighted = self.weight * rows
-        if self._factor is None:
-            return weighted
-        loads = np.stack(self._loads, axis=1)
-        right = weighted[:, :, np.newaxis] * loads
-        shape = right.shape
+        if not self._chains:
+            return self.weight * rows
+        back = np.einsum("pbw,wb->pb", self._drifts(rows), self._loads)
+        return np.asarray(self.weight * (rows - back))
+
+    def _drifts(self, rows: FloatArray) -> FloatArray:
+        """Returns the expected drifts given observations (p, b), shape (p, b, drifts)."""
+        right = (self.weight * rows)[:, :, np.newaxis] * np.ascontiguousarray(self._loads.T)
         inner = cho_solve_banded(
-            (self._factor, True), right.reshape(shape[0], -1).T, overwrite_b=True, check_finite=False
+            (self._factor, True), right.reshape(len(rows), -1).T, overwrite_b=True, check_finite=False
         )
-        back = np.einsum("pbw,bw->pb", inner.T.reshape(shape), loads)
-        return np.asarray(weighted - self.weight * back)
+        return np.asarray(inner.T.reshape(right.shape))
+
+    def _drift_covariance(self) -> tuple[FloatArray, FloatArray]:
+        """Returns the covariance of the drifts given the observations.
+
+        The first array is that within each block, (drifts, drifts, b), the second that of each drift with its
+        value in the next block, (drifts, b - 1). The inverse at a block follows from the elimination
+        of all blocks before it and of all behind it.
+        """
+        width = len(self._chains)
+        mirrored = np.zeros_like(self._band)
+        for apart, row in enumerate(self._band):
+            mirrored[apart, : len(row) - apart] = row[: len(row) - apart][::-1]
+        before = _pivots(self._factor)
+        behind = _pivots(cholesky_banded(mirrored, lower=True, check_finite=False))[::-1, ::-1, ::-1]
+        pivots = before + behind - (self.weight * self._loads)[:, np.newaxis] * self._loads
+        for number, (_, chain) in enumerate(self._chains.values()):
+            pivots[number, number] -= chain.diagonal
+        within = _inverses(pivots)
+        coupling = self._band[width].reshape(-1, width).T[:, :-1]
+        between = -np.einsum("ijb,jb,jib->ib", _inverses(before)[:, :, :-1], coupling, within[:, :, 1:])
+        return within, between
 
     def log_likelihood(self, residual: FloatArray) -> float:
         """Returns the Gaussian log likelihood of the observed blocks up to a constant."""
         return 0.5 * (self._log_determinant - float(residual @ self.apply(residual)))
 
+    def score(self, residual: FloatArray) -> FloatArray:
+        """Returns the derivatives of `log_likelihood` by the logarithms of the noise model's fields, (8,).
 
-def _averaged(extent: FloatArray) -> FloatArray:
-    """Returns the variance of a drift's block mean relative to the drift's; extent: correlation lengths."""
-    x = np.maximum(extent, 1e-6)
-    return np.where(x < 1e-3, 1.0 - x / 3.0, 2.0 * (x - 1.0 + np.exp(-x)) / x**2)
+        The model must have a drift. By Fisher's identity, they follow from the mean and the covariance of the
+        drifts given the residual.
+        """
+        weight, loads, moving = self.weight, self._loads, self._blocks.moving
+        drifts = np.ascontiguousarray(self._drifts(residual[np.newaxis])[0].T)
+        within, between = self._drift_covariance()
+        left = residual - np.sum(loads * drifts, axis=0)
+        shared = np.einsum("ijb,jb->ib", within, loads)
+        sampled = np.where(weight > 0, 1.0 - weight * self._blocks.blur, 0.0)
+        white = sampled * (weight * (left**2 + np.sum(loads * shared, axis=0)) - 1.0)
+        slopes = {"standing": [np.sum(white[~moving])], "moving": [np.sum(white[moving])]}
+        by_load = weight * (left * drifts - shared)
+        squares = drifts**2 + np.einsum("iib->ib", within)
+        products = drifts[:, :-1] * drifts[:, 1:] + between
+        for number, (name, (size, chain)) in enumerate(self._chains.items()):
+            by_length = 0.5 * (chain.log_determinant_slope - squares[number] @ chain.diagonal_slope)
+            by_length += (
+                size * by_load[number] @ chain.load_slope - products[number] @ chain.off_diagonal_slope
+            )
+            slopes[name] = [by_load[number] @ loads[number], by_length]
+        absent = [0.0, 0.0]
+        parts = ("standing", "moving", "slow", "place", "loop")
+        return np.concatenate([slopes.get(each, absent) for each in parts])
+
+
+def _pivots(factor: FloatArray) -> FloatArray:
+    """Returns the pivots of a block elimination, (drifts, drifts, b), from the banded Cholesky factor."""
+    width = len(factor) - 1
+    root = np.zeros((width, width, factor.shape[1] // width))
+    for row in range(width):
+        for column in range(row + 1):
+            root[row, column] = factor[row - column, column::width]
+    return np.asarray(np.einsum("ikb,jkb->ijb", root, root))
+
+
+def _inverses(matrices: FloatArray) -> FloatArray:
+    """Inverts small positive definite matrices, shape (n, n, b), all at once (Gauss-Jordan)."""
+    result = matrices.copy()
+    for k, row in enumerate(result):
+        inverse = 1.0 / row[k]
+        scaled, column = row * inverse, result[:, k].copy()
+        result -= column[:, np.newaxis] * scaled
+        result[k], result[:, k], result[k, k] = scaled, -column * inverse, inverse
+    return result
 
 
 def fit_noise(residual: FloatArray, blocks: Blocks, parameters: int, begin: NoiseModel = BEGIN) -> NoiseModel:
@@ -260,23 +309,25 @@ def fit_noise(residual: FloatArray, blocks: Blocks, parameters: int, begin: Nois
     lower = np.log([least, least, least, 0.3, least, 0.01, least, LOOP_DEG[0]])
     upper = np.log([most, most, most, 600.0, most, 60.0, most, LOOP_DEG[1]])
 
-    wanders = _Wanders(part)
-
-    def cost(x: FloatArray) -> float:
-        return -Precision(model(x), part, wanders=wanders).log_likelihood(left)
+    def cost(x: FloatArray) -> tuple[float, FloatArray]:
+        precision = Precision(model(x), part)
+        return -precision.log_likelihood(left), -precision.score(left)
 
     x = np.log(np.maximum(astuple(begin), SMALLEST_ARCSEC))
     found = minimize(
         cost,
         np.clip(x, lower, upper),
         method="L-BFGS-B",
+        jac=True,
         bounds=list(zip(lower, upper, strict=True)),
-        options={"eps": DIFFERENCE, "ftol": 1e-7},
+        options={"ftol": 1e-7},
     )
     best = model(found.x)
+    drifts = {name: getattr(best, name) for name in ("slow_arcsec", "place_arcsec", "loop_arcsec")}
+    absent = {name: 0.0 for name, size in drifts.items() if size < ABSENT_ARCSEC}
     share = 1.0 / np.sqrt(max(1.0 - parameters / max(len(blocks), 1), 0.1))
     white = {name: share * getattr(best, name) for name in ("standing_arcsec", "moving_arcsec")}
-    return replace(best, **white)
+    return replace(best, **white, **absent)
 
 
 def _pieces(blocks: Blocks) -> IntArray:

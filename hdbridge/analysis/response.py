@@ -107,22 +107,20 @@ class Limits(NamedTuple):
             axis.limits.acceleration_deg_s2,
         )
 
-    def amplitude_arcsec(self, frequency_hz: float) -> float:
-        """Returns the amplitude of the largest order that reaches this frequency."""
-        return max((each for top_hz, each in self.orders if top_hz >= frequency_hz), default=0.0)
-
     def excess(self, gain: float, frequency_hz: float) -> float:
         """Returns the factor by which the largest order exceeds half of the permitted size or slew, or 1."""
-        reach_arcsec = gain * self.amplitude_arcsec(frequency_hz)
+        largest_arcsec = max((size for top_hz, size in self.orders if top_hz >= frequency_hz), default=0.0)
+        reach_arcsec = gain * largest_arcsec
         slew_arcsec_s = math.tau * frequency_hz * reach_arcsec
         return max(1.0, 2.0 * reach_arcsec / self.maximum_arcsec, 2.0 * slew_arcsec_s / self.slew_arcsec_s)
 
-    def full_speed_deg_s(self, reach_arcsec: float) -> float:
-        """Returns the load speed from which a filter with this largest correction acts in full, deg/s.
+    def full_speed_deg_s(self, hertz: FloatArray, gains: FloatArray) -> float:
+        """Returns the load speed from which a filter with these gains works in full, deg/s.
 
         While the correction fades out at the end of a stop, it may contribute up to `FADE_SHARE` of the
         load's speed.
         """
+        reach_arcsec = max(size * np.max(gains[hertz <= top_hz], initial=0.0) for top_hz, size in self.orders)
         return math.sqrt(2.0 * self.acceleration_deg_s2 * reach_arcsec / ARCSEC_PER_DEG / FADE_SHARE)
 
 
@@ -672,12 +670,7 @@ def _filter(
     return LeadFilter(
         lead_cycles=LEAD_CYCLES,
         per_cycle=per_cycle,
-        full_speed_deg_s=limits.full_speed_deg_s(
-            max(
-                each * limits.amplitude_arcsec(at)
-                for each, at in zip(abs(wanted).tolist(), hertz.tolist(), strict=True)
-            )
-        ),
+        full_speed_deg_s=limits.full_speed_deg_s(hertz, np.abs(wanted)),
         weights=tuple(float(f"{each:.9g}") for each in weights),
         feedback=tuple(float(f"{each:.9g}") for each in feedback),
     )

@@ -15,14 +15,17 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.linalg import solve_banded
+from scipy.linalg.blas import dtbsv
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import minimize
 
 from hdbridge.analysis.driving import SETTLE_S
 from hdbridge.analysis.hypothesis import Estimator, Fitted
-from hdbridge.analysis.linear import about_zeros
+from hdbridge.analysis.linear import Nuisances, Prior, about_zeros
+from hdbridge.analysis.nuisances import zeros
 from hdbridge.analysis.prepared import Observed, Samples
 from hdbridge.analysis.scales import Scales
 from hdbridge.axis.effects import Effect, FloatArray, IntArray, Part, Start
@@ -35,6 +38,16 @@ HERTZ = np.geomspace(0.4 * ORDINARY_HZ, 16.0 * ORDINARY_HZ, 23)
 DAMPING = (0.05, 0.2, 0.5)
 """Initial natural frequencies and damping ratios, before the refinement."""
 MOST_DAMPED = 0.9
+LAGS = range(-3, 2)
+"""Samples whose second differences move a load that is too stiff for the sampling: from three before to the
+next, on which the motion before it depends."""
+UNRESOLVED = 0.1
+"""Prior standard deviation of the response at each lag, relative to the second difference there."""
+STATIC_S2 = 7e-6
+"""Prior standard deviation of the response to a steady acceleration: 1 / (2 pi f)^2 of a load with natural
+frequency f = 60 Hz."""
+UNEVEN = 0.3
+"""Deviation of a time step from the median, relative to it, above which second differences are not used."""
 LEAST_SEEN = 0.1
 """Minimum share of a residual's sum of squares that a swing must explain, because any oscillation explains a
 little."""
@@ -104,11 +117,10 @@ def swing(
     for each in (own, cross, other):
         each[begins[1:] - 1] = 0.0
     right.reshape(-1, 2)[begins[1:]] = 0.0
-    band = np.zeros((4, len(right)))
-    band[0] = 1.0
+    band = np.zeros((4, len(right)), order="F")
     band[2, 0:-2:2], band[1, 1:-1:2] = -own, -cross
     band[3, 0:-2:2], band[2, 1:-1:2] = cross, -other
-    state = solve_banded((3, 0), band, right, overwrite_ab=True, overwrite_b=True, check_finite=False)
+    state = dtbsv(3, band, right, lower=1, diag=1, overwrite_x=1)  # the diagonal is one
     return Swing(frequency_hz, damping, state[::2], np.zeros(len(bend)))
 
 
@@ -125,43 +137,84 @@ def bend_of(base_arcsec: FloatArray, step_s: FloatArray, parts: Sequence[slice])
     return np.asarray(solve_banded((1, 1), band, right, check_finite=False))
 
 
-def seen_swing(full: Samples, effects: Sequence[Effect], scales: Scales) -> Swing | None:
-    """Fits the swing to the residual of the given model; None if no swing is visible."""
+def best_error(full: Samples, effects: Sequence[Effect]) -> FloatArray:
+    """Returns the error of the effects from the elastic start that fits best, arcsec, shape (n,)."""
     weight = full.usable / full.sigma_arcsec**2
-    step_s, parts = np.maximum(np.diff(full.time_s), 1e-9), [each.rows for each in full.chains]
 
-    def cost(residual: FloatArray, rows: slice) -> float:
-        return float(weight[rows] @ about_zeros(residual, full.zero[rows], weight[rows]) ** 2)
+    def cost(error: FloatArray) -> float:
+        return float(weight @ about_zeros(full.error_arcsec - error, full.zero, weight) ** 2)
 
-    every = slice(0, len(full))
-    errors = [
+    errors = (
         sum((each.predict(full.motion, start) for each in effects), np.zeros(len(full))) for start in Start
-    ]
-    error = min(errors, key=lambda each: cost(full.error_arcsec - each, every))
-    fast = [*_fast_waves(full, effects, float(np.median(step_s)))]
+    )
+    return np.asarray(min(errors, key=cost))
+
+
+def slow_base(full: Samples, error: FloatArray, fast: Sequence[_Fast]) -> FloatArray:
+    """Returns the base of the spring, load arcsec, shape (n,), without the waves too fast for a spline."""
     base = ARCSEC_PER_DEG / full.ratio * full.motor_deg + error
     for each in fast:
         base[each.rows] -= each.phasor.real
-    bend = bend_of(base, step_s, parts)
+    return np.asarray(base)
+
+
+def between_samples(full: Samples, effects: Sequence[Effect], period_s: float) -> Nuisances:
+    """Returns the swing that depends on the motion between samples, for each sample, arcsec, shape (n, k).
+
+    A drive that follows its command in straight lines, or with a ripple of its own, accelerates between
+    samples as no spline through them shows. The load's response at the samples is a filter of their second
+    differences: one column for a steady acceleration, and one for each other of `LAGS` less that.
+    """
+    base = slow_base(full, best_error(full, effects), [*_fast_waves(full, effects, period_s)])
+    even = np.abs(np.diff(full.time_s) / period_s - 1.0) < UNEVEN
+    columns = np.zeros((len(full), len(LAGS)))
+    for rows in (each.rows for each in full.chains if each.rows.stop - each.rows.start > 2):
+        alike = even[rows.start : rows.stop - 1]
+        bend = np.pad(np.diff(base[rows], 2) * (alike[1:] & alike[:-1]), 1)
+        columns[rows] = sliding_window_view(np.pad(bend, (-LAGS.start, LAGS.stop - 1)), len(LAGS))
+    now = LAGS.index(0)
+    columns[:, np.arange(len(LAGS)) != now] -= columns[:, [now]]
+    names = tuple(f"between samples {each}" for each in LAGS)
+    sizes = [STATIC_S2 / period_s**2 if each == 0 else UNRESOLVED for each in LAGS]
+    return Nuisances(columns, names, tuple(Prior(0.0, each**-2) for each in sizes))
+
+
+def seen_swing(full: Samples, effects: Sequence[Effect], between: Nuisances, scales: Scales) -> Swing | None:
+    """Fits the swing to the residual of the given model; None if nothing of it is seen.
+
+    It has to explain what ``between``, the motion between samples, does not.
+    """
+    weight = full.usable / full.sigma_arcsec**2
+    step_s, parts = np.maximum(np.diff(full.time_s), 1e-9), [each.rows for each in full.chains]
+    residual = full.error_arcsec - best_error(full, effects)
+    fast = [*_fast_waves(full, effects, float(np.median(step_s)))]
+    bend = bend_of(slow_base(full, full.error_arcsec - residual, fast), step_s, parts)
     size = np.concatenate([[0.0], np.cumsum(bend**2)])
     begin = int(np.argmax(size[LONGEST:] - size[:-LONGEST])) if len(full) > LONGEST else 0
     rows = slice(begin, min(begin + LONGEST, len(full)))
     first = [0, *(each.start - begin for each in parts if rows.start < each.start < rows.stop)]
     inside = [each.within(rows) for each in fast]
-    residual = full.error_arcsec - error
+    root = np.sqrt(weight[rows])
+    others = zeros(full.zero[rows], full.zeros).and_also(replace(between, columns=between.columns[rows]))
+    held = np.diag(np.sqrt([each.information for each in others.prior]))
+    explained = np.linalg.qr(np.vstack([root[:, np.newaxis] * others.columns, held]))[0][: len(root)]
+
+    def cost(left: FloatArray) -> float:
+        left = root * left
+        return float(left @ left - np.sum((explained.T @ left) ** 2))
 
     def tried(hertz: float, damping: float) -> float:
         damping = min(damping, MOST_DAMPED)
         one = swing(bend[rows], step_s[rows.start : rows.stop - 1], first, hertz, damping)
         for each in inside:
             one.does_arcsec[each.rows] += each.does(hertz, damping).real
-        return cost(residual[rows] - one.does_arcsec, rows)
+        return cost(residual[rows] - one.does_arcsec)
 
     start = min(product(HERTZ.tolist(), DAMPING), key=lambda each: tried(*each))
     found = minimize(
         lambda x: tried(*np.exp(x).tolist()), np.log(start), method="Nelder-Mead", options={"maxfev": REFINED}
     )
-    whole = cost(residual[rows], rows)
+    whole = cost(residual[rows])
     if whole - found.fun < max(scales.enter + 2.0 * scales.penalty, LEAST_SEEN * whole):
         return None
     hertz, damping = np.exp(found.x).tolist()

@@ -31,7 +31,6 @@ from hdbridge.axis.effects import Channel, Effect, Moment, Start, Tracker, compe
 from hdbridge.axis.effects.described import Level, Memoryless
 from hdbridge.axis.effects.motion import MEASURED
 from hdbridge.axis.model import ModelTracker, TransmissionModel
-from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.control.prefilter import Prefilter
 from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG
@@ -328,11 +327,15 @@ class Compensation:
         self._target = 0.0
         self.correction_arcsec = self._static = 0.0
         """Correction in force, arcsec at the load: the error that the motor target compensates."""
-        self._prefilter = (
-            None
-            if model.response is None
-            else Prefilter(_lead(model.response, period_s), period_s, self._inverse.needs)
-        )
+        self._prefilter: Prefilter | None = None
+        if (response := model.response) is not None:
+            if not response.fits_cycle(period_s):
+                raise InputError(
+                    f"the model's response was measured with a cycle of {response.cycle_ms:g} ms, but this "
+                    f"axis has {1000.0 * period_s:g} ms: measure it again with 'hdbridge motion AXIS "
+                    "--propose', then commit"
+                )
+            self._prefilter = Prefilter(response.filter, period_s, self._inverse.needs)
         self._known = LOSABLE
         self._fading = False
         self.needs = self._inverse.needs
@@ -465,13 +468,3 @@ class Compensation:
             self._prefilter.follow(load_deg, self._static, moment, self._predicted)
         self._inverse.advance(self._ratio * (load_deg - self._static / ARCSEC_PER_DEG), moment)
         return self._ratio * (load_deg - self.correction_arcsec / ARCSEC_PER_DEG)
-
-
-def _lead(response: Response, period_s: float) -> LeadFilter:
-    """Returns the filter of a response; InputError if it was measured at another cycle time."""
-    if response.fits_cycle(period_s):
-        return response.filter
-    raise InputError(
-        f"the model's response was measured with a cycle of {response.cycle_ms:g} ms, but this axis has "
-        f"{1000.0 * period_s:g} ms: measure it again with 'hdbridge motion AXIS --propose', then commit"
-    )

@@ -57,4 +57,7 @@ class WornTeeth:
         self._orders = Orders(truth.motor_orders)
 
     def arcsec(self, now: Conditions) -> float:
-        return self._age.grown() * self._orders.at(math.radians(now.motor_deg))
+        share = self._age.grown()
+        error, slope = self._orders.at(math.radians(now.motor_deg))
+        now.slope_arcsec += share * slope
+        return share * error

@@ -79,7 +79,7 @@ KINDS: Final[dict[Any, Kinds]] = {
         0.0,
     ),
     gear.Factor: Kinds(
-        (gear_pieces.SpeedFactor, gear_pieces.TorqueFactor, gear_pieces.WarmthFactor, ageing.AgeFactor),
+        (gear_pieces.SpeedFactor, gear_pieces.WarmthFactor, ageing.AgeFactor),
         4,
         1.0,
     ),
@@ -395,7 +395,7 @@ def _of_the_c_library(function: Any) -> None:
     """Makes numba call the C function that Python calls, because numba has none of its own."""
     same = types.ExternalFunction(function.__name__, types.float64(types.float64, types.float64))
 
-    @overload(function, strict=False)
+    @overload(function, strict=False)  # type: ignore[untyped-decorator]
     def _chosen(x: Any, y: Any) -> Any:
         floats = isinstance(x, types.Float) and isinstance(y, types.Float)
         return (lambda x, y: same(x, y)) if floats else None  # noqa: PLW0108 - numba inspects its code

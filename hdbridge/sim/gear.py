@@ -17,7 +17,6 @@ from hdbridge.sim.gear_pieces import (
     Roller,
     Seat,
     SpeedFactor,
-    TorqueFactor,
     WarmthFactor,
     Wear,
 )
@@ -61,31 +60,38 @@ class MotorOrders:
     _factors: tuple[Factor, ...]
     _flank: Flank
     _flanked: bool
+    _growth_per_nm: float
     _orders: Orders
-    _rad_per_deg: float
+    _turns: float
 
     def __init__(
         self,
         orders: tuple[TrueOrder, ...],
         turns: float = 1.0,
         flank: TrueFlank | None = None,
+        growth_per_nm: float = 0.0,
         factors: tuple[Factor, ...] = (),
     ) -> None:
         self._orders = Orders(orders)
-        self._rad_per_deg = math.radians(turns)
+        self._turns = turns
+        self._growth_per_nm = growth_per_nm
         self._flanked = flank is not None
         self._flank = Flank(flank if flank is not None else TrueFlank(shift_deg=0.0, travel_deg=1.0))
         self._factors = factors
-        self.by_motor_only = flank is None and not factors
+        self.by_motor_only = flank is None and not growth_per_nm and not factors
 
     def arcsec(self, now: Conditions) -> float:
         angle_deg = now.motor_deg
         if self._flanked:
             angle_deg += self._flank.shift_deg(angle_deg)
-        error = self._orders.at(angle_deg * self._rad_per_deg)
+        size = 1.0
         for factor in self._factors:
-            error *= factor.factor(now)
-        return error
+            size *= factor.factor(now)
+        error, slope = self._orders.at(angle_deg * math.radians(self._turns))
+        grown = self._growth_per_nm * abs(now.torque_nm)
+        # The energy stored by torque T in an error that grows with it is half of that product; see `plant`.
+        now.slope_arcsec += slope * self._turns * (1.0 + 0.5 * grown) * size
+        return error * (1.0 + grown) * size
 
 
 @state
@@ -99,7 +105,7 @@ class LoadOrders:
         self._orders = Orders(orders)
 
     def arcsec(self, now: Conditions) -> float:
-        return self._orders.at(math.radians(now.load_deg))
+        return self._orders.at(math.radians(now.load_deg))[0]
 
 
 @state
@@ -109,17 +115,31 @@ class ElasticHysteresis:
     by_motor_only: bool
     _factors: tuple[Factor, ...]
     _law: Law
+    _loop_arcsec: float
+    _loop_deg: float
+    _loop_slope: float
+    """Change of the loop over the last travel, arcsec per radian."""
+    _reaction: float
 
-    def __init__(self, law: Law, factors: tuple[Factor, ...]) -> None:
+    def __init__(self, law: Law, factors: tuple[Factor, ...], reaction: float) -> None:
         self._law = law
         self._factors = factors
+        self._reaction = reaction
+        self._loop_deg = self._loop_slope = 0.0
+        self._loop_arcsec = law.advance(0.0)
         self.by_motor_only = not factors
 
     def arcsec(self, now: Conditions) -> float:
-        error = self._law.advance(now.motor_deg)
+        loop, size = self._law.advance(now.motor_deg), 1.0
         for factor in self._factors:
-            error *= factor.factor(now)
-        return error
+            size *= factor.factor(now)
+        if self._reaction:
+            if now.motor_deg != self._loop_deg:
+                travel = math.radians(now.motor_deg - self._loop_deg)
+                self._loop_slope = (loop - self._loop_arcsec) / travel
+                self._loop_arcsec, self._loop_deg = loop, now.motor_deg
+            now.slope_arcsec += self._reaction * self._loop_slope * size
+        return loop * size
 
 
 @state
@@ -196,10 +216,11 @@ def warmth_factor(truth: Truth, per_k: float) -> WarmthFactor | None:
 def _motor_orders(truth: Truth) -> Piece:
     gear = truth.gear
     flank = gear.flank if gear.flank is not None and gear.flank.shift_deg else None
-    torque = TorqueFactor(gear.torque_growth_per_nm) if gear.torque_growth_per_nm else None
     warmth = warmth_factor(truth, truth.temperature.tooth_growth_per_k)
-    factors = tuple(factor for factor in (torque, warmth) if factor is not None)
-    return MotorOrders(gear.motor_orders, flank=flank, factors=factors)
+    factors = () if warmth is None else (warmth,)
+    return MotorOrders(
+        gear.motor_orders, flank=flank, growth_per_nm=gear.torque_growth_per_nm, factors=factors
+    )
 
 
 def _hysteresis(truth: Truth) -> list[Piece]:
@@ -214,7 +235,7 @@ def _hysteresis(truth: Truth) -> list[Piece]:
         ageing = gear.ageing if gear.ageing is not None and gear.ageing.hysteresis_growth else None
         age = AgeFactor(ageing, truth.substep_s) if ageing is not None else None
         factors = tuple(factor for factor in (rate, warmth, age) if factor is not None)
-        pieces.append(ElasticHysteresis(law, factors))
+        pieces.append(ElasticHysteresis(law, factors, gear.hysteresis_reaction))
     return pieces
 
 
@@ -247,7 +268,7 @@ class Gear:
 
     def turned_deg(self, now: Conditions) -> float:
         """Returns the angle to which the output would turn an unloaded shaft."""
-        error = 0.0
+        error = now.slope_arcsec = 0.0
         for piece in self._pieces:
             error += piece.arcsec(now)
         return now.motor_deg / self._ratio + error / ARCSEC_PER_DEG

@@ -75,19 +75,6 @@ class SpeedFactor:
 
 
 @state
-class TorqueFactor:
-    """Growth of the tooth error with the torque carried by the teeth."""
-
-    _per_nm: float
-
-    def __init__(self, per_nm: float) -> None:
-        self._per_nm = per_nm
-
-    def factor(self, now: Conditions) -> float:
-        return 1.0 + self._per_nm * abs(now.torque_nm)
-
-
-@state
 class WarmthFactor:
     """Growth with temperature; the factor is at least 0.05."""
 
@@ -250,7 +237,9 @@ class Roller:
     def arcsec(self, now: Conditions) -> float:
         pressed = 0.5 * (1.0 + math.cos(math.radians(now.load_deg - self._pressed_at_deg)))
         turned = math.radians(now.motor_deg * self._order) + self._phase_rad
-        return float(self._amplitude * pressed**self._sharpness * math.cos(turned))
+        amplitude = float(self._amplitude * pressed**self._sharpness)
+        now.slope_arcsec -= amplitude * self._order * math.sin(turned)
+        return amplitude * math.cos(turned)
 
 
 class Seat:

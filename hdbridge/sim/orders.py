@@ -23,10 +23,12 @@ class Orders:
         self._coefficients = tuple(terms.get(order, 0j) for order in range(max(terms, default=0), 0, -1))
         self._count = len(self._coefficients)
 
-    def at(self, angle_rad: float) -> float:
-        """Returns the sum in arcsec."""
+    def at(self, angle_rad: float) -> tuple[float, float]:
+        """Returns the sum in arcsec, and its derivative by the angle in arcsec per radian."""
         turn = complex(math.cos(angle_rad), math.sin(angle_rad))
-        total = 0j
+        total = slope = 0j  # of the polynomial in exp(i angle)
         for place in range(self._count):
-            total = (total + self._coefficients[place]) * turn
-        return total.real
+            total += self._coefficients[place]
+            slope = slope * turn + total
+            total *= turn
+        return total.real, -(slope * turn).imag

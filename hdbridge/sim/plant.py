@@ -4,8 +4,19 @@ The stiff linear parts (load on the gear's spring, encoder on its coupling) are 
 that moves linearly within a step. The step of the motor is implicit in its friction: Coulomb friction is a
 set-valued force, so a motor whose torque does not exceed it stands perfectly still, without creep or chatter.
 
-The gear's reaction on the motor is the spring's torque divided by the ratio. The tooth error changes the
-momentary ratio by one or two per cent; the reaction neglects this, the angles do not.
+The gear's reaction on the motor follows from the energy in its spring. With q the motor angle, p the load
+angle, e the tooth error and h the hysteresis,
+
+    V = K w^2 / 2,  w = q/N + e(q) + h - p:     torque on the load  -dV/dp = K w = T
+                                                torque on the motor -dV/dq = -T (1/N + de/dq)
+
+(Lagrange's equations; Goldstein, Classical Mechanics, chapter 1). So the tooth error changes the momentary
+ratio in the reaction as in the angles, by up to some per cent. The hysteresis is no function of the motor's
+angle. If K h is the friction torque by which the teeth drag the output along, it acts on both by the nominal
+ratio. If sticking contacts displace the output instead, they do no work, and the reaction has dh/dq too: the
+share ``gear.hysteresis_reaction`` does this. If the error grows with the torque, e (1 + g |T|), the spring
+has the stiffness K / (1 - K g e) in the direction of the torque, and dV/dq = T (1/N + (1 + g |T| / 2) de/dq).
+An error by load angle would change the torque on the load, by less than a thousandth; this is neglected.
 
 `Plant` has a linear spring and a load without external torques; `hdbridge.sim.loaded_plant` has the rest.
 """
@@ -16,6 +27,7 @@ from hdbridge.sim.gear import Gear
 from hdbridge.sim.oscillator import Transition, exact_step, transition
 from hdbridge.sim.state import Conditions, state
 from hdbridge.sim.truth import Truth
+from hdbridge.units import ARCSEC_PER_DEG
 
 RAD_PER_DEG = math.pi / 180.0
 
@@ -136,16 +148,18 @@ class Plant:
     def _turn_motor(self, torque_nm: float, brake_nm: float, spring: float) -> bool:
         """Runs the motor's part of a substep; returns True if the motor moved.
 
-        ``spring`` is the spring's torque without the contribution of the motor's own motion, arm * (old speed
-        + new speed).
+        ``spring`` is the spring's torque without the share that the motor's own motion adds: arm * lever *
+        (old speed + new speed).
         """
         now, dt, speed = self.now, self._dt, self.motor_deg_s
         held = self._coulomb + brake_nm
         if self._sticking:
             speeds = speed / self._stribeck
             held += self._sticking * math.exp(-speeds * speeds)
-        arm = self._arm / self._ratio
-        push = (self._inertia - arm) * speed + torque_nm - spring / self._ratio
+        # Nominal over momentary ratio.
+        lever = 1.0 + self._ratio * now.slope_arcsec * RAD_PER_DEG / ARCSEC_PER_DEG
+        arm = self._arm * lever * lever / self._ratio
+        push = (self._inertia - arm) * speed + torque_nm - spring * lever / self._ratio
         if push > held:
             new_speed = (push - held) / (self._inertia + arm + self._drag)
         elif push < -held:

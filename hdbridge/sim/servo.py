@@ -276,9 +276,14 @@ class Servo:
         return self._load_gain * (new_speed - speed)
 
     def _turn(self, direction: float) -> float:
-        """Reverses the friction feed-forward; returns the integral without this contribution."""
+        """Reverses the friction feed-forward; returns the integral without the part that this provides.
+
+        Loops without it know nothing of friction, so their integral stays.
+        """
         standing = self._integral + self._friction * self._direction
         self._direction = direction
+        if not self._friction:
+            return standing
         return direction * max(0.0, direction * standing - self._friction)
 
     def _interpolated(self, motor_deg: float) -> float:

@@ -29,7 +29,9 @@ class Conditions:
     torque_nm: float
     """Torque of the flexspline's spring on the load."""
     temperature_c: float
+    slope_arcsec: float
+    """Derivative of the tooth error by the motor angle, arcsec per radian; summed up by the pieces."""
 
     def __init__(self, temperature_c: float) -> None:
-        self.motor_deg = self.load_deg = self.torque_nm = 0.0
+        self.motor_deg = self.load_deg = self.torque_nm = self.slope_arcsec = 0.0
         self.temperature_c = temperature_c

@@ -588,6 +588,7 @@ EQUAL_MOTORS: Final = 4.0
 by a factor of three to five (catalogues). Without this limit, observers and filters could replace the
 inertia."""
 NOTCH: Final = ("notch frequency", "notch depth", "notch width")
+REACTION: Final = "loop reaction"
 OBSERVER: Final = ("observer frequency", "observer share", "observer inertia")
 MOST_DEAD_CYCLES: Final = 2.0
 """Maximum dead time in SYNC cycles: one to accept the demand, one to execute it (CiA 402)."""
@@ -650,7 +651,8 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
     filter.
     """
     longest_ms = min(MOST_DEAD_CYCLES * cycle_ms, DEAD_TIME.most)
-    known = {each: BY_NAME[each] for each in (*MECHANICS, *SERVOS)}
+    reaction = (REACTION,) if truth.gear.hysteresis else ()
+    known = {each: BY_NAME[each] for each in (*MECHANICS, *SERVOS, *reaction)}
     known[DEAD_TIME.name] = replace(DEAD_TIME, most=longest_ms)
     motor, usual = BY_NAME["motor inertia"], truth.motor.inertia_kg_m2
     known[motor.name] = replace(motor, least=usual / EQUAL_MOTORS, most=usual * EQUAL_MOTORS)
@@ -722,6 +724,8 @@ def more_blocks(best: Fitted) -> Iterator[Start]:
     filters = tuple(BY_NAME[each] for each in ("speed filter", "torque filter"))
     if not {*filters} & {*best.parameters}:
         yield with_sections(truth, filters), (*best.parameters, *filters)
+    if truth.gear.hysteresis and BY_NAME[REACTION] not in best.parameters:
+        yield with_values(truth, {REACTION: 0.5}), (*best.parameters, BY_NAME[REACTION])
     if BY_NAME["friction feed-forward"] not in best.parameters:
         with_friction = with_values(truth, {"friction feed-forward": 0.3 * truth.motor.coulomb_nm})
         yield with_friction, (*best.parameters, BY_NAME["friction feed-forward"])
@@ -930,7 +934,7 @@ MORE = 1.1
 accurately."""
 OPTIONAL = (
     "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay",
-    "encoder coupling", "friction growth", "moving average", *LOOP,
+    "encoder coupling", "friction growth", "moving average", REACTION, *LOOP,
 )  # fmt: skip
 """Parameters fitted only on request or if significant, because ordinary motion does not show them, others
 can replace them, or a calibration has determined them."""

@@ -138,6 +138,8 @@ PARAMETERS: Final[tuple[Parameter, ...]] = (
     Parameter("loop width", "gear.hysteresis.width_deg", "deg", 0.01, 3.6e3, 0.7, 0.15, ELASTIC, _LOOPS),
     Parameter("loop yield", "gear.hysteresis.yield_deg", "deg", 0.01, 3.6e3, 0.7, 0.15, ELASTIC, _LOOPS),
     Parameter("loop exponent", "gear.hysteresis.exponent", "", 1.0, 5.0, 0.5, 0.2, ELASTIC, _LOOPS),
+    Parameter("loop reaction", "gear.hysteresis_reaction", "", 0.0, 1.0, 0.5, 0.2, "loop reaction", _STEPS,
+        linear=True),
     Parameter("load friction", "load.coulomb_nm", "Nm", 0.0, 1e4, 5.0, 0.5, "load friction", _REVERSALS,
         linear=True),
     Parameter("temperature", "temperature.ambient_c", "\N{DEGREE SIGN}C", -60.0, 100.0, 15.0, 3.0, "warmth",

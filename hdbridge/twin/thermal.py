@@ -16,12 +16,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.signal import lfilter
 from scipy.special import chdtrc
 
 from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Channel, FloatArray
+from hdbridge.axis.effects.recurrence import recurrence
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import least_change
@@ -203,8 +203,7 @@ def _shown(parts: Sequence[_Part], place: FloatArray) -> FloatArray:
 def _body(goal_c: FloatArray, start_c: float, time_s: float) -> FloatArray:
     """Returns the first-order response of a body with this time constant to ``goal_c``."""
     nearer = -math.expm1(-STEP_S / time_s)
-    way_c, _ = lfilter([nearer], [1.0, nearer - 1.0], goal_c[1:], zi=[(1.0 - nearer) * start_c])
-    return np.append(start_c, way_c)
+    return recurrence(np.full(len(goal_c), 1.0 - nearer), nearer * goal_c, start_c)
 
 
 def _parts(

@@ -92,7 +92,7 @@ def test_effects_of_a_missing_channel_are_not_visible(speeds: list[float]) -> No
 
 
 def test_slow_reversals_and_rests_show_the_loop() -> None:
-    there, rest = [20.0] * 3, [0.0] * 2
+    there, rest = [17.3, 20.0, 23.1], [0.0] * 2
     found = shown(path([*there, *(-x for x in there), *rest, *there, *(-x for x in there)], 40.0), 40.0, 0.3)
     assert "hysteresis" in found.identified
     assert not {"no slow motion", "no reversals", "no rests"} & {*found.lacks}

@@ -67,6 +67,7 @@ class Truth:
             "gear.stiffness_nm_per_rad": m.stiffness_nm_per_rad,
             "gear.damping_nm_s_per_rad": m.damping_nm_s_per_rad,
             "load.inertia_kg_m2": m.load_inertia_kg_m2,
+            "gear.hysteresis_reaction": 1.0,
             "load.viscous_nm_s_per_rad": m.load_viscous_nm_s_per_rad,
             "load.encoder.noise_arcsec": self.encoders.load_noise_arcsec,
             "servo.dead_time_ms": self.servo.dead_time_ms,

@@ -51,8 +51,8 @@ def test_a_signal_without_counts_has_no_count():
     assert quantum_deg(np.zeros(100)) == 0.0
 
 
-def driving_angle(command, measured):
-    time = np.arange(len(measured)) / 250.0
+def driving_angle(command, measured, every_s=0.004):
+    time = np.arange(len(measured)) * every_s
     return kinematics(measured, command, time, reading_of(measured))[0]
 
 
@@ -75,6 +75,17 @@ def test_reversals_of_a_lagging_motor_use_the_actual_angle():
     path = driving_angle(command, np.round(motor / count) * count)
     assert turns(path) == turns(motor)
     assert np.max(np.abs(path - motor)) < 1.5 * count
+
+
+@pytest.mark.parametrize("every_s", [0.08, 0.004])
+def test_a_lag_of_unexpected_shape_does_not_lead_the_angle_in_its_counts(every_s):
+    """Friction holds the motor back by two counts in either direction."""
+    time, count = np.arange(0.0, 60.0, every_s), 0.045
+    command = 200.0 * np.sin(2 * np.pi * time / 8.0) + 20.0 * np.sin(2 * np.pi * time / 3.1)
+    forward = np.sign(np.gradient(command))
+    motor = command - 2.0 * count * forward
+    path = driving_angle(command, np.round(motor / count) * count, every_s)
+    assert abs(np.mean((path - motor) * forward)) < 0.1 * count
 
 
 @given(

@@ -22,6 +22,15 @@ def blocks_of(count, rng, motor=None, error=None, kind="sweep"):
     return make_blocks(samples), samples
 
 
+def mixed_blocks(rng, locked):
+    """Forty blocks on some legs, whose travel and fade of the loop are drawn."""
+    blocks, _ = blocks_of(40, rng)
+    legs = np.sort(rng.integers(0, 5, 40))
+    crossed = np.sort(rng.uniform(0.0, 3.0, 40))
+    locked_arcsec = locked * rng.uniform(size=40)
+    return replace(blocks, leg=legs, locked_arcsec=locked_arcsec, since_turn_deg=20.0 * crossed), crossed
+
+
 @settings(deadline=None, max_examples=15)
 @given(
     st.floats(0.2, 3.0), st.floats(0.0, 2.0), st.floats(0.5, 50.0), st.floats(0.0, 2.0), st.floats(1.0, 50.0),
@@ -29,12 +38,8 @@ def blocks_of(count, rng, motor=None, error=None, kind="sweep"):
 )  # fmt: skip
 def test_the_banded_inverse_is_the_dense_one(white, slow, slow_s, place, place_deg, locked, loop, seed):
     rng = np.random.default_rng(seed)
-    blocks, _ = blocks_of(40, rng)
-    legs = np.sort(rng.integers(0, 5, 40))
-    crossed = np.sort(rng.uniform(0.0, 3.0, 40))
-    blocks = replace(
-        blocks, leg=legs, locked_arcsec=locked * rng.uniform(size=40), since_turn_deg=20.0 * crossed
-    )
+    blocks, crossed = mixed_blocks(rng, locked)
+    legs = blocks.leg
     noise = NoiseModel(white, white, slow, slow_s, place, place_deg, loop, 20.0)
     dense = np.diag(noise.white_variance(blocks))
     for size, length, at in ((slow, slow_s, blocks.time_s), (place, place_deg, blocks.travel_deg)):
@@ -51,6 +56,26 @@ def test_the_banded_inverse_is_the_dense_one(white, slow, slow_s, place, place_d
     assert precision.apply(columns) == pytest.approx(np.linalg.solve(dense, columns), rel=1e-5, abs=1e-6)
     expected = -0.5 * (np.linalg.slogdet(dense)[1] + columns[:, 0] @ np.linalg.solve(dense, columns[:, 0]))
     assert precision.log_likelihood(columns[:, 0]) == pytest.approx(expected, rel=1e-5, abs=1e-5)
+
+
+@settings(deadline=None, max_examples=15)
+@given(
+    st.lists(st.floats(0.2, 3.0), min_size=8, max_size=8), st.sampled_from([0.0, 0.3]), st.booleans(),
+    st.integers(0, 1000),
+)  # fmt: skip
+def test_the_score_is_the_derivative_of_the_likelihood(values, locked, branches, seed):
+    rng = np.random.default_rng(seed)
+    blocks = replace(mixed_blocks(rng, locked)[0], moving=rng.random(40) < 0.6, blur=0.1 * rng.random(40))
+    out, residual = rng.random(40) < 0.2, 2.0 * rng.normal(size=40)
+    scale = np.array([1.0, 1.0, 1.0, 5.0, 1.0, 10.0, float(branches), 10.0])
+
+    def precision(logarithms):
+        return Precision(NoiseModel(*(scale * np.exp(logarithms)).tolist()), blocks, out)
+
+    at, step = np.log(values), 1e-3 * np.eye(8)
+    likelihoods = [[precision(at + s * e).log_likelihood(residual) for s in (1, -1)] for e in step]
+    expected = -np.diff(likelihoods)[:, 0] / 2e-3
+    assert precision(at).score(residual) == pytest.approx(expected, rel=1e-3, abs=1e-3)
 
 
 def test_excluded_blocks_have_no_influence():

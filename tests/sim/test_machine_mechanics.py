@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from hdbridge.sim.loaded_plant import LoadedPlant
 from hdbridge.sim.oscillator import exact_step
 from hdbridge.sim.plant import Plant
 from hdbridge.sim.truth import Truth
@@ -62,6 +63,41 @@ def test_without_losses_energy_and_momentum_stay(substep_ms: float) -> None:
         truth.motor.inertia_kg_m2 * plant.motor_deg_s + truth.load_.inertia_kg_m2 / 50 * plant.load_deg_s
     )
     assert momentum == pytest.approx(truth.motor.inertia_kg_m2 * 500.0, rel=0.2 * substep_ms)
+
+
+TOOTH = {"gear__motor_orders": [{"order": 4, "amplitude_arcsec": 60.0, "phase_deg": 10.0}]}
+LOOP = {"law": "dahl", "offset_arcsec": 60.0, "yield_deg": 5.0}
+
+
+@pytest.mark.parametrize("gear", [TOOTH, {"gear__hysteresis": LOOP, "gear__hysteresis_reaction": 1.0}])
+def test_a_displacement_of_the_output_takes_no_energy_and_gives_none(gear: dict[str, Any]) -> None:
+    truth = plain(
+        motor__coulomb_nm=0.0, motor__viscous_nm_s_per_rad=0.0, gear__damping_nm_s_per_rad=0.0, **gear
+    )
+    plant = Plant(truth)
+    plant.motor_deg_s, plant.load_deg_s = 1000.0, 20.0
+    energy = energy_j(plant, truth)
+    for _ in range(4000):
+        plant.step(0.0, 0.0)
+        # By the nominal ratio it would lose and gain 4 %.
+        assert energy_j(plant, truth) == pytest.approx(energy, rel=0.003)
+
+
+@pytest.mark.parametrize("growth_per_nm", [0.0, 0.02])
+def test_at_rest_a_torque_on_the_load_reaches_the_motor_by_the_momentary_ratio(growth_per_nm: float) -> None:
+    """Least friction that holds a mass, by virtual work; of a growth with the torque, half counts."""
+    torque_nm, slope = 5.0 * 9.80665 * 0.2, math.radians(600.0 / 3600.0)
+    gear = {
+        "gear__motor_orders": [{"order": 1, "amplitude_arcsec": 600.0, "phase_deg": -90.0}],
+        "gear__torque_growth_per_nm": growth_per_nm,
+        "load__gravity": {"mass_kg": 5.0, "arm_m": 0.2, "down_deg": -90.0},
+    }
+    least_nm = torque_nm * (1.0 / 50.0 + slope * (1.0 + 0.5 * growth_per_nm * torque_nm))
+    for friction_nm, holds in ((1.004 * least_nm, True), (0.996 * least_nm, False)):
+        plant = LoadedPlant(plain(motor__coulomb_nm=friction_nm, **gear))
+        for _ in range(2000):
+            plant.step(0.0, 0.0)
+        assert (plant.now.motor_deg == 0.0) == holds
 
 
 def test_friction_alone_brakes_as_newton_says() -> None:

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 _hooks: list[Callable[[str, Path], None]] = []
@@ -14,12 +15,16 @@ def _audit(event: str, arguments: tuple[object, ...]) -> None:
             each(event, Path(arguments[0]))
 
 
-sys.addaudithook(_audit)  # an audit hook cannot be removed; with no entries in `_hooks` it does nothing
+@cache
+def _installed() -> None:
+    """Installs the hook once. It cannot be removed, and with no entries in `_hooks` it does nothing."""
+    sys.addaudithook(_audit)
 
 
 @contextmanager
 def before_each(hook: Callable[[str, Path], None]) -> Iterator[None]:
     """Calls ``hook`` before any file is opened, and before any folder is listed."""
+    _installed()
     _hooks.append(hook)
     try:
         yield

@@ -27,11 +27,6 @@ class Sought(Enum):
     TONE = "one line of the spectrum over time"
     LINE = "one line of the spectrum over a turn of the load"
 
-    @property
-    def is_line(self) -> bool:
-        """True for a single sharp spectral line, which smooth effects do not resemble."""
-        return self in {Sought.TONE, Sought.LINE}
-
 
 class Moves(Enum):
     """Range in which a local step improves a shape parameter."""

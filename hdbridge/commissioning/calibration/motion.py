@@ -38,6 +38,7 @@ from hdbridge.drive.drive import Drive
 from hdbridge.drive.gains import changed_gains, read_gains
 from hdbridge.errors import InputError
 from hdbridge.motion.procedures.even_speed import SHARES, EvenRun, EvenSpeed
+from hdbridge.motion.procedures.moves import Outcome, Procedure
 from hdbridge.motion.procedures.path_test import PathRun, PathTest
 from hdbridge.motion.procedures.rehearsal import rehearse
 from hdbridge.units import ARCSEC_PER_DEG
@@ -271,9 +272,13 @@ def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> Mo
     none = runner.run("without correction", replace(model.only(()), response=None))
     runner.lag_s = following_lag_s(none)
     static_model = replace(model, response=None)
-    static = runner.run("static correction", static_model)
+    static = runner.run("correction of rest", static_model)
+    if not measure and model.response is None:
+        return MotionTest(_ripples(runner, none, static), None)
     if not measure:
-        return _tested(runner, model, none, static)
+        filtered, check = runner.check(model)
+        remarks = () if check.remark is None else (check.remark,)
+        return MotionTest(_ripples(runner, none, static, filtered, model.response), model.response, remarks)
     limits = Limits.of(axis, model)
     trials = [Trial(static)]
     highest, best = math.inf, MotionTest(_ripples(runner, none, static), None)
@@ -306,17 +311,6 @@ def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> Mo
     return replace(
         best, remarks=(f"no filter is kept: at {at} deg/s it leaves more ripple than no correction",)
     )
-
-
-def _tested(
-    runner: _Runner, model: TransmissionModel, none: tuple[Harmonics, ...], static: tuple[Harmonics, ...]
-) -> MotionTest:
-    """Tests the model's own response; remarks on it if the servo has changed since it was measured."""
-    if model.response is None:
-        return MotionTest(_ripples(runner, none, static), None)
-    filtered, check = runner.check(model)
-    remarks = () if check.remark is None else (check.remark,)
-    return MotionTest(_ripples(runner, none, static, filtered, model.response), model.response, remarks)
 
 
 @dataclass(frozen=True, slots=True)
@@ -377,17 +371,17 @@ class _Runner:
         self._model = model
         self.procedure = EvenSpeed.spread(axis_view(axis), shares)
         self._orders_only = TransmissionModel(model.ratio, (Synchronous(orders=tuple(self.motor_orders)),))
-        self.ratio, self.cycle_s = model.ratio, axis.drive.cycle_s
+        self.ratio = model.ratio
         self._drive = drive
-        self._pace = Pace(motion_test_s(axis), self.cycle_s, progress, interrupted)
+        self._pace = Pace(motion_test_s(axis), axis.drive.cycle_s, progress, interrupted)
 
     def run(self, name: str, model: TransmissionModel) -> tuple[Harmonics, ...]:
         """Runs all speeds with this model; returns the orders of each run."""
-        return self._harmonics(self._run(name, model))
+        return self._harmonics(self._run(name, model, self.procedure))
 
     def check(self, model: TransmissionModel) -> tuple[tuple[Harmonics, ...], ServoCheck]:
         """Runs all speeds with a model that has a response; also compares the motor's response with it."""
-        stored, runs = model.response, self._run("filtered correction", model)
+        stored, runs = model.response, self._run("filtered correction", model, self.procedure)
         assert stored is not None
         answers = Answers(stored, self.motor_orders, self.ratio)
         for run in runs:
@@ -397,10 +391,10 @@ class _Runner:
         lag_ms = 1000.0 * following_lag_s(found)
         return found, ServoCheck(stored.following_lag_ms, lag_ms, answers.difference)
 
-    def _run(self, name: str, model: TransmissionModel) -> tuple[EvenRun, ...]:
+    def _run(self, name: str, model: TransmissionModel, procedure: Procedure[Outcome]) -> Outcome:
         self._pace.begin(name)
         bench = bench_on(self._drive, compensation_for(self.axis, model), interrupted=self._pace.interrupted)
-        return bench.run(self.procedure).outcome
+        return bench.run(procedure).outcome
 
     def _harmonics(self, runs: tuple[EvenRun, ...]) -> tuple[Harmonics, ...]:
         if self.axis.load_encoder.is_motor_encoder:
@@ -421,9 +415,8 @@ class _Runner:
         )
 
     def run_paths(self, model: TransmissionModel) -> tuple[PathRun, ...]:
-        self._pace.begin("path error")
-        compensation = compensation_for(self.axis, model)
-        return bench_on(self._drive, compensation, interrupted=self._pace.interrupted).run(PathTest()).outcome
+        """Runs the paths with this model."""
+        return self._run("path error", model, PathTest())
 
 
 def wind_up_of(model: TransmissionModel) -> InertialWindup | None:

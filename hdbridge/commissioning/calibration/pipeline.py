@@ -187,7 +187,7 @@ def calibrate(
             result = replace(result, model=tested.applied(result.model), motion=tested)
     notify("testing it on the axis, before and after")
     floor = floor_of(axis, recording)
-    checked = validate(
+    checked, model = validate(
         drive,
         journal.plan,
         active,
@@ -197,7 +197,10 @@ def calibrate(
         progress=progress,
         interrupted=interrupted,
     )
-    result = replace(result, validation=checked)
+    for each in diff(result.model, model):
+        if each.changed:
+            notify(f"{each.effect}.{each.parameter} at rest: {each.after:.2f}; fitted {each.before:.2f}")
+    result = replace(result, model=model, validation=checked)
     before, after = (each.pooled.three_sigma_arcsec for each in (checked.before, checked.after))
     if not checked.improves:
         reason = (
@@ -283,11 +286,12 @@ def concluded(folder: Path) -> Calibration:
         validation = Validation.from_dict(data["stepping"]) if data["stepping"] else None
         motion = MotionTest.from_dict(data["motion"]) if data.get("motion") else None
         offer = Offer(bool(data["offered"]), str(data["reason"]))
+        model = TransmissionModel.load(folder / MODEL_NAME)
     except (ValueError, KeyError, TypeError, OSError):
         raise InputError(
             f"{path}: not the result of a calibration; restore it, or remove it and report without it"
         ) from None
-    return replace(result, validation=validation, motion=motion, offer=offer)
+    return replace(result, model=model, validation=validation, motion=motion, offer=offer)
 
 
 def active_model(

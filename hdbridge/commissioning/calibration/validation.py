@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +13,23 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects.elastic_loop import ElasticLoop
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration.identification import resting
 from hdbridge.commissioning.calibration.measure import Pace
 from hdbridge.commissioning.evaluation.accuracy import AxisAccuracy, axis_accuracy
 from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_floor_arcsec
-from hdbridge.control.bench import Bench, axis_view, compensation_for
+from hdbridge.control.bench import Bench, Run, axis_view, compensation_for
 from hdbridge.control.rig import Rig, bench_on
 from hdbridge.control.survived import Survived, lines
 from hdbridge.drive.drive import Drive
 from hdbridge.files.outputs import writing
+from hdbridge.motion.procedures.moves import Settle
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.motion.procedures.rehearsal import rehearse
+from hdbridge.motion.procedures.stepping import SteppingOutcome
 from hdbridge.records.recording import Recording
-from hdbridge.units import figure
+from hdbridge.units import ARCSEC_PER_DEG, figure
 
 WINDOW_S = 0.06
 """Averaging time of the stepping test at rest."""
@@ -168,10 +171,11 @@ def validate(
     *,
     progress: Callable[[str, float, float], None] = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
-) -> Validation:
-    """Runs the stepping and positioning tests with the previous model (None for none) and with the new one.
+) -> tuple[Validation, TransmissionModel]:
+    """Runs the stepping and positioning tests with the model before (None: none) and with the new one.
 
-    ``drive`` is booted. The samples of each run are written to ``folder``, even if it is stopped.
+    The new model is tested, and returned, with the offset of `at_rest`. ``drive`` is booted. The samples of
+    each run go to ``folder``, even if it is stopped.
     """
     axis = drive.axis
     stepping = plan.stepping(axis_view(axis))
@@ -180,17 +184,20 @@ def validate(
     results: list[Stepped] = []
     accuracies: list[AxisAccuracy] = []
     survived: list[tuple[str, tuple[Survived, ...]]] = []
-    for name, model, words in (
-        ("before", before, "the active model" if before else "no compensation"),
-        ("after", after, "the new model"),
+    model = before or TransmissionModel(axis.gear.ratio)
+    for name, words in (
+        ("before", "the active model" if before else "no compensation"),
+        ("after", "the new model"),
     ):
         pace.begin(f"stepping {name}")
-        compensation = compensation_for(axis, model or TransmissionModel(axis.gear.ratio))
+        compensation = compensation_for(axis, model)
         bench = bench_on(drive, compensation, interrupted=pace.interrupted)
         with record_kept(bench, folder / f"stepping-{name}.csv.gz"):
             run = bench.run(stepping)
             results.append(Stepped.of(words, run.outcome))
             survived.append((f"stepping {name}", run.survived))
+        if name == "before":
+            after = at_rest(after, run)
         if positioning:
             pace.begin(f"positioning {name}")
             with record_kept(bench, folder / f"positioning-{name}.csv.gz"):
@@ -204,8 +211,30 @@ def validate(
                     [each.forward for each in approaches],
                 )
             )
+        model = after
     accurate = (accuracies[0], accuracies[1]) if accuracies else (None, None)
-    return Validation(results[0], results[1], floor, accurate[0], accurate[1], tuple(lines(survived)))
+    validation = Validation(results[0], results[1], floor, accurate[0], accurate[1], tuple(lines(survived)))
+    return validation, after
+
+
+def at_rest(model: TransmissionModel, run: Run[SteppingOutcome]) -> TransmissionModel:
+    """Returns the model with the offset of its hysteresis fitted to the rests of a stepping test.
+
+    In motion, coarse motor encoders are read wrong by a part of a count, and an arriving motor that
+    overshoots by a few hundredths of a degree takes the loop back. Both add to the offset at rest.
+    """
+    loop = next((each for each in model.effects if isinstance(each, ElasticLoop)), None)
+    if loop is None:
+        return model
+    motion, stands = run.record.motion(), (*run.outcome.cw, *run.outcome.ccw)
+    ends_s = [each.end_s for each in run.segments if each.kind == Settle().kind]
+    rows = np.searchsorted(run.record.time_s, ends_s, "right") - 1
+    load_deg = np.array([each.load_deg for each in stands])
+    error = ARCSEC_PER_DEG * (load_deg - motion.motor_deg[rows] / model.ratio) - model.predict(motion)[rows]
+    columns = np.column_stack([loop.columns(motion)[rows], np.ones(len(rows))])
+    change = np.linalg.lstsq(columns, error, rcond=None)[0][0]
+    resting = loop.fitted(loop.coefficients() + change)
+    return replace(model, effects=tuple(resting if each is loop else each for each in model.effects))
 
 
 @contextmanager

@@ -21,6 +21,7 @@ longer, so one bad second or move raises nothing. There are no verdicts about th
 load encoder.
 """
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +29,6 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.special import chdtri, ndtri
 
 from hdbridge.analysis.linear import Linearised
 from hdbridge.analysis.scales import Scales
@@ -191,7 +191,7 @@ class Judge:
         moved = [self._moved(each, rows, change, spread) for each in self._drift.terms]
         if zero is not None:
             moved.append(self._zero_moved(rows, observed, zero))
-        left_allowed = self._noise * float(np.sqrt(chdtri(free, self._alpha) / free))
+        left_allowed = self._noise * float(np.sqrt(self._chi_square(free) / free))
         return Evidence(
             places=count,
             rms_arcsec=rms,
@@ -223,15 +223,21 @@ class Judge:
         free = max(len(observed) - nuisance.shape[1], 1)
         calibrated = self._calibrated[:zero, :zero]
         allowed = float(np.mean(np.einsum("ij,jk,ik->i", followed, calibrated, followed))) if zero else 0.0
-        share = chdtri(free, self._alpha) / free
+        share = self._chi_square(free) / free
         return float(np.sqrt(about @ about / free)), float(np.sqrt(share * (self._noise**2 + allowed)))
+
+    def _chi_square(self, free: int) -> float:
+        """Returns the chi square that chance exceeds at the rate of false alarms, by degrees of freedom."""
+        from scipy.special import chdtri  # noqa: PLC0415 - the daemon's service starts without scipy
+
+        return float(chdtri(free, self._alpha))
 
     def _moved(self, term: Term, rows: FloatArray, change: FloatArray, spread: FloatArray) -> Moved | None:
         """Returns the change of an effect if it exceeds the effect's interval and the errors of this fit."""
         at = term.columns
         own = change[at]
         variance = self._calibrated[at, at] + spread[at, at]
-        if float(own @ np.linalg.solve(variance, own)) < chdtri(len(own), self._alpha):
+        if float(own @ np.linalg.solve(variance, own)) < self._chi_square(len(own)):
             return None
         least = ORDER_ARCSEC
         if term.memory:
@@ -257,7 +263,7 @@ class Judge:
         change, spread = self._fit(rows[:, others], observed - rows[:, disc] @ before[1:], others)
         by = float(change[zero] - before[0])
         error = float(np.sqrt(2.0 * spread[zero, zero]))
-        if abs(by) < max(ZERO_ARCSEC, -ndtri(0.5 * self._alpha) * error):
+        if abs(by) < max(ZERO_ARCSEC, math.sqrt(self._chi_square(1)) * error):
             return None
         return Moved(f"zero: by {by:+.1f} arcsec", abs(by) <= self._zero_bound)
 

@@ -162,6 +162,8 @@ class RingReader(_Slots[T]):
         """
         first = self._next
         end: int = self._head[0]
+        if end < first:
+            return self._rows[:0], 0
         self._next = end + 1
         # The slot after the newest may be in progress, and it replaces the oldest.
         kept = self._whole(max(first, end + 2 - self._slots), end)
@@ -170,7 +172,7 @@ class RingReader(_Slots[T]):
     def _whole(self, first: int, end: int) -> npt.NDArray[np.uint8]:
         """Returns the complete slots with these numbers."""
         wanted = np.arange(first, end + 1)
-        for _ in range(RETRIES if end >= first else 1):
+        for _ in range(RETRIES):
             rows = self._rows[wanted % self._slots]
             # Slots overwritten during the copy are lost; those after them are complete.
             overwritten = self._head[0] + 2 - self._slots - first

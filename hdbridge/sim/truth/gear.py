@@ -136,6 +136,13 @@ class TrueGear(Strict):
         description="dead zone between the gear's spring and the load, from side to side",
     )
     second_hysteresis: Hysteresis | None = Field(None, description="a second law, added to the first")
+    hysteresis_reaction: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="share of the hysteresis that displaces the output and reacts by its slope; "
+        "the rest is a friction torque",
+    )
     rate_dependence: TrueRate | None = Field(None, description="hysteresis by speed; without it: none")
     wear: TrueWear | None = Field(None, description="lost motion by the travel; without it: none")
     ageing: TrueAgeing | None = Field(None, description="what hours of work change; without it: nothing")

@@ -7,12 +7,14 @@ from contextlib import contextmanager
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.characters import CHARACTERS, Character, PowerCount, every_character
+from support.characters import AWKWARD, INTERPOLATED, RESTLESS, Character, PowerCount, every_character
 from support.daemon import SteppedDaemon, stepped_daemon
 
 from hdbridge.daemon.loop.states import AxisState
 
 AWAY_S = st.sampled_from((0.0, 0.004, 0.011, 0.016, 0.03, 0.06, 0.5, 2.0))
+RESUMING = pytest.mark.parametrize("character", [RESTLESS, AWKWARD, INTERPOLATED], ids=str)
+"""The drives that resume whenever they can; `test_on_every_drive` has the others."""
 RUNNING_S = st.integers(0, 80).map(lambda turns: 0.004 * turns)
 
 
@@ -40,7 +42,7 @@ def stays_without_power(daemon: SteppedDaemon, counts: list[PowerCount]) -> None
     assert all(abs(now - then) <= 2 for now, then in zip(places(daemon), before, strict=True))
 
 
-@pytest.mark.parametrize("character", CHARACTERS, ids=str)
+@RESUMING
 @settings(max_examples=3)
 @given(RUNNING_S, AWAY_S)
 def test_after_another_start_of_the_control_process(
@@ -54,7 +56,7 @@ def test_after_another_start_of_the_control_process(
         assert daemon.states == [AxisState.UNVERIFIED] * 2
 
 
-@pytest.mark.parametrize("character", CHARACTERS, ids=str)
+@RESUMING
 @settings(max_examples=3)
 @given(RUNNING_S, AWAY_S)
 def test_after_the_bus_was_down(character: Character, running_s: float, away_s: float) -> None:
@@ -67,7 +69,7 @@ def test_after_the_bus_was_down(character: Character, running_s: float, away_s: 
         assert daemon.states == [AxisState.LATCHED] * 2
 
 
-@pytest.mark.parametrize("character", CHARACTERS, ids=str)
+@RESUMING
 @settings(max_examples=3)
 @given(RUNNING_S, st.floats(0.012, 1.0))
 def test_after_the_control_process_hung(character: Character, running_s: float, away_s: float) -> None:

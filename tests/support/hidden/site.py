@@ -103,10 +103,11 @@ class Site:
         if not self.truth.gear.motor_orders:
             raise ValueError("this axis has no tooth error by motor angle")
         if shift_deg is None:
-            return max(abs(orders.at(math.radians(each))) for each in range(360))
+            return max(abs(orders.at(math.radians(each))[0]) for each in range(360))
         off = math.radians(shift_deg)
         return max(
-            abs(orders.at(math.radians(each) + off) - orders.at(math.radians(each))) for each in range(360)
+            abs(orders.at(math.radians(each) + off)[0] - orders.at(math.radians(each))[0])
+            for each in range(360)
         )
 
 
