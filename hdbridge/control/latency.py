@@ -77,6 +77,10 @@ class Histogram:
                 return min(_bin_top_us(index), self.maximum_us)
         return self.maximum_us
 
+    def later_than_us(self, us: int) -> int:
+        """Returns the number of values above ``us``, to within a bin."""
+        return sum(count for index, count in enumerate(self._counts) if _bin_top_us(index) > us)
+
     def merge(self, other: Histogram) -> None:
         """Adds another histogram's counts."""
         self._counts = [a + b for a, b in zip(self._counts, other._counts, strict=True)]
