@@ -21,12 +21,12 @@ class NmtState(IntEnum):
 
     INITIALISING = 0x00
     BOOT_UP = 0x00
-    """Byte of a boot-up message, which is that of the state before it."""
+    """Byte of a boot-up message, which is that of the state before."""
     STOPPED = 0x04
     OPERATIONAL = 0x05
     PRE_OPERATIONAL = 0x7F
 
 
 def wrap_int32(value: int) -> int:
-    """Returns the int32 that a 32-bit object holds for an unbounded count."""
+    """Returns the value of a 32-bit object for an unbounded count."""
     return (value + INT32_RANGE // 2) % INT32_RANGE - INT32_RANGE // 2

@@ -1,6 +1,6 @@
-"""Time for the control loop: a monotonic clock that is passed in, never looked up.
+"""Time for the control loop: a monotonic clock that is passed in rather than looked up.
 
-Wall clocks step and drift, so no deadline in hdbridge depends on one.
+Wall clocks step and drift, so no deadline in hdbridge depends on them.
 """
 
 import time
@@ -8,7 +8,7 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """Monotonic clock that can be waited on."""
+    """Monotonic clock with waiting."""
 
     def now(self) -> float:
         """Returns seconds on a monotonic clock of arbitrary zero."""
@@ -20,10 +20,10 @@ class Clock(Protocol):
 
 
 class MonotonicClock:
-    """The computer's monotonic clock, with absolute deadlines.
+    """Monotonic clock of the computer, with absolute deadlines.
 
-    Sleeping to an absolute deadline does not accumulate errors: a late wake-up is followed by a shorter
-    sleep.
+    Sleeping to an absolute deadline does not accumulate errors, because a late wake-up is followed by a
+    shorter sleep.
     """
 
     def now(self) -> float:

@@ -21,7 +21,7 @@ Exit status 1 is an error in hdbridge itself; 130 is Ctrl-C.
 from typing import ClassVar, Final
 
 RESET: Final = "'hdbridge reset PROFILE', or 'hdbridge ctl reset AXIS' if a daemon holds the drive"
-"""The commands that reset a fault; every message that asks for a reset names them."""
+"""Commands that reset a fault, for all messages that request a reset."""
 
 
 class HdbridgeError(Exception):
@@ -76,7 +76,7 @@ class SafetyStop(HdbridgeError):  # noqa: N818 - it says what happened
 
 
 class OutputError(HdbridgeError):
-    """A file could not be written after all, for example on a full disk; the old one remains."""
+    """A file could not be written after all, for example on a full disk; the old file remains."""
 
     exit_status = 6
 
@@ -92,4 +92,4 @@ class LeaseError(DaemonError):
 
 
 class RefusedError(DaemonError):
-    """The axis is in the wrong state for the request, or busy with something else."""
+    """The axis is in the wrong state for the request, or busy."""

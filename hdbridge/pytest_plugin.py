@@ -46,7 +46,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def hdbridge_drive(request: pytest.FixtureRequest) -> Iterator[SimulatedDrive]:
-    """A simulated CiA-402 drive on a bus, with faults by name and the true angles: ``hdbridge.testing``."""
+    """Simulated CiA-402 drive on a bus, with faults by name and the true angles: ``hdbridge.testing``."""
     from hdbridge.errors import HdbridgeError  # noqa: PLC0415 - nothing is loaded before a test needs it
     from hdbridge.testing import simulated_drive  # noqa: PLC0415
 
@@ -71,10 +71,10 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, Any, None]:
 
 
 def _wanted(request: pytest.FixtureRequest) -> dict[str, Any]:
-    """Collects the settings from the marker, the command line, the ini file and the defaults, in this order.
+    """Collects the settings from the marker, the command line, the ini file and the defaults.
 
-    Each takes precedence over the next. A relative path starts at the test's folder, the present one, or the
-    ini file's.
+    The order is that of precedence. A relative path starts at the test's folder, the working folder, or the
+    ini file's folder.
     """
     config = request.config
     marks: dict[str, Any] = {}

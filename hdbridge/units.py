@@ -37,7 +37,7 @@ _UNITS: Final = {
 
 
 def unit_of(name: str) -> str:
-    """Returns the unit at the end of a parameter's name; 1 if there is none."""
+    """Returns the unit at the end of a parameter's name; 1 for a dimensionless parameter."""
     return _UNITS.get(_ending(name), "1")
 
 
@@ -60,7 +60,7 @@ def figure(value: float, digits: int = 4) -> str:
 
 
 def with_interval(value: float, half_width: float) -> tuple[str, str]:
-    """Formats a number and half the width of its interval: the latter with two digits, both with the same
+    """Formats a number and the half width of its interval, which has two digits and determines the
     decimals.
     """
     if not (math.isfinite(half_width) and half_width > 0.0):
@@ -68,5 +68,5 @@ def with_interval(value: float, half_width: float) -> tuple[str, str]:
     last = math.floor(math.log10(half_width)) - 1
     if 0.0 < abs(value) < 1e-4:
         return f"{value:.{max(math.floor(math.log10(abs(value))) - last, 0)}e}", f"{half_width:.1e}"
-    told, half = (f"{round(each, -last):.{max(-last, 0)}f}" for each in (value, half_width))
-    return told, half
+    rounded, half = (f"{round(each, -last):.{max(-last, 0)}f}" for each in (value, half_width))
+    return rounded, half

@@ -38,7 +38,7 @@ FOLDS = 10
 FREE = frozenset({"constant"})
 AGAINST = frozenset({"excess", "unexplained"})
 PRIOR = {"unexplained": -1.0}
-"""Coefficients that the ridge draws towards where these records say little; 0 for all others."""
+"""Coefficients to which the ridge shrinks where these records are uninformative; 0 for all others."""
 Row = dict[str, Any]
 
 

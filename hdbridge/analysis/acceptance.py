@@ -1,8 +1,9 @@
-"""Acceptance tests of a finding: block-robust evidence in the parts of the record where it must show.
+"""Acceptance tests of a finding: block-robust evidence in the parts of the record where the cause is
+visible.
 
-Chi square treats neighbouring samples as independent, which correlated noise violates. A finding's
-score is therefore summed over blocks of time, and its variance is estimated from these sums, so that
-correlation within a block does no harm.
+Chi square treats neighbouring samples as independent, which correlated noise violates. A finding's score is
+therefore summed over blocks of time, and its variance is estimated from these sums, so correlation within a
+block has no influence.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class Gate:
     """Smallest block-robust chi square over the block lengths."""
     needed: float
     reason: str = ""
-    """Reason for rejection; empty if it passed."""
+    """Reason for rejection; empty if the finding passed."""
 
 
 def robust_chi_square(
@@ -46,7 +47,7 @@ def robust_chi_square(
 ) -> float:
     """Returns the block-robust chi square of an effect's coefficients against zero.
 
-    Incidental coefficients are left out, all other parameters are refitted. ``nuisances`` are further
+    Leaves out incidental coefficients and refits all other parameters. ``nuisances`` are further
     weighted columns; ``rows`` restricts the points, ``only`` the coefficients to one number. ``laws`` are
     weighted columns of one standard deviation each of the errors of other laws.
     """
@@ -69,7 +70,7 @@ def block_robust(
     rows: BoolArray | slice = slice(None),
     laws: FloatArray | None = None,
 ) -> float:
-    """Returns the block-robust chi square of columns ``own`` of any fit with these ``coefficients``."""
+    """Returns the block-robust chi square of the columns ``own`` of a fit, for these ``coefficients``."""
     time_s = estimator.time_s[rows]
     if len(time_s) < LEAST_POINTS:
         return 0.0
@@ -95,7 +96,7 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
     if robust < needed:
         if robust_chi_square(estimator, fitted, place) < needed:
             return Gate(robust, needed, "not seen in enough independent stretches")
-        return Gate(robust, needed, "may be what the law of another cause is wrong by")
+        return Gate(robust, needed, "may be an error in the law of another cause")
     if effect.tracker().memory_deg > 0.0:
         others = fitted.hypothesis.without(place)
         laws = np.hstack([laws, estimator.turn_discrepancy(others.effects, others.start)])
@@ -105,7 +106,7 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
         free = estimator.weighted(estimator.free_loop(fitted.hypothesis.start).columns)
         robust = min(robust, robust_chi_square(estimator, fitted, place, free, laws=laws))
         if robust < needed:
-            return Gate(robust, needed, "an elastic loop of another shape does as well")
+            return Gate(robust, needed, "an elastic loop of another shape explains it as well")
     stretch = effect.shows(estimator.motion)
     if stretch is not None:
         rows = stretch.rows[estimator.index]
@@ -132,7 +133,7 @@ def gate_of_change(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gat
 
 
 def evident(effect: Effect) -> list[int]:
-    """Returns the numbers of the coefficients that count as evidence of an effect."""
+    """Returns the indices of the coefficients that count as evidence of an effect."""
     named = effect.named_coefficients()
     return [column for each in named if each.name not in effect.incidental for column in each.columns]
 
@@ -144,7 +145,7 @@ def law_discrepancies(estimator: Estimator, hypothesis: Hypothesis) -> FloatArra
 
 
 def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:
-    """Returns True if each piece of a finding is significant and exceeds the error of a larger one's law."""
+    """Returns True if each piece of a finding is significant and exceeds the law error of larger pieces."""
     effect = fitted.hypothesis.effects[place]
     pieces = range(len(effect.coefficients()))
     if not effect.inexact or len(pieces) != len(effect.pieces()):
@@ -154,7 +155,7 @@ def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:
 
 
 def _changes(estimator: Estimator, fitted: Fitted, place: int) -> bool:
-    """Returns True if a parameter that must be constant changes along the record; see `Effect.changing`."""
+    """Returns True if a parameter that must be constant changes along the record (`Effect.changing`)."""
     effect, own = fitted.hypothesis.effects[place], fitted.places(place)
     for number, piece in enumerate(effect.pieces()):
         changing = piece.changing(estimator.motion)

@@ -25,14 +25,15 @@ from hdbridge.units import ARCSEC_PER_DEG
 TARGET_BLOCKS = 30_000
 LONGEST_S = 0.25
 FINE_DEG = 0.4
-"""Scale of the block length after a reversal: a twentieth of this angle plus the angle since the reversal."""
+"""Scale of the block length after a reversal. A block is a twentieth of this angle plus the angle since the
+reversal."""
 REST_DEG_S = 0.05
 """Motor speed below which an axis counts as resting."""
 AVERAGED_COUNTS_S = 200.0
 """Count rate above which rounding averages out, because a servo passes several counts before it responds."""
 LOCKED_COUNTS = 0.15
-"""Standard deviation of the mean rounding error of a leg. Sampling in step with the counts reads an
-encoder at the same few places within a count up to the next turning point."""
+"""Standard deviation of a leg's mean rounding error. Sampling in step with the counts reads the encoder at
+the same few places within each count up to the next turning point."""
 LEAST_LOCKED_COUNTS = 0.03
 """Lower limit of that deviation at any speed."""
 
@@ -59,7 +60,7 @@ class Blocks:
     speed_deg_s: FloatArray
     moving: BoolArray
     heading: FloatArray
-    """Direction of motion, 1 or -1; at rest the last one; 0 before the first motion."""
+    """Direction of motion, 1 or -1; the last direction at rest, 0 before the first motion."""
     kind: IntArray
     zero: IntArray
     chain: IntArray
@@ -76,7 +77,6 @@ class Blocks:
     """Variance of each block due to uncertain turning points of the driving angle, arcsec squared."""
 
     def __len__(self) -> int:
-        """Number of blocks."""
         return len(self.first)
 
     @property
@@ -175,7 +175,7 @@ def _heading(motor_deg: FloatArray) -> FloatArray:
 
 
 def _cells(motor_deg: FloatArray, turning: Sequence[int], coarsest_deg: float) -> IntArray:
-    """Numbers the samples by cells of the travel since the last turning point."""
+    """Numbers the samples by cells of travel since the last turning point."""
     cells = np.zeros(len(motor_deg), dtype=np.int64)
     edge = 20.0 * coarsest_deg - FINE_DEG  # from here on all cells have the coarsest size
     base = 0
@@ -207,7 +207,7 @@ class Design:
         return cls(samples, blocks, tuple(starts), Regressors(motions, blocks.mean, len(blocks)))
 
     def beginning(self, starts: Sequence[Start]) -> Design:
-        """Returns the design with other elastic states at the start of the chains."""
+        """Returns the design with other elastic states at the starts of the chains."""
         return replace(self, starts=tuple(starts))
 
     def columns(self, effect: Effect) -> FloatArray:
@@ -219,12 +219,12 @@ class Design:
         return self.regressors.predict(effects, self.starts)
 
     def turn_effects(self, effects: Sequence[Effect]) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Returns the influence of each block's last turning point.
+        """Returns the influence of each block's last turning point, three arrays of shape (b,).
 
-        These are the change if it lay further out by its reach, arcsec (b,), the share of the reach that is
-        due to sampling (b,), and the number of the turning point (b,). The reach is the uncertainty of a
-        turning point: one count plus twice the overshoot between samples. All turning points are moved
-        outwards at once; a change on a branch is attributed to the one that began it.
+        These are the change of the error, arcsec, if the turning point lay further out by its reach; the
+        share of the reach that is due to sampling; and the number of the turning point. The reach is the
+        uncertainty of a turning point: one count plus twice the overshoot between samples. All turning points
+        are moved outwards at once; a change on a branch is attributed to the turning point at its start.
         """
         change, missed = np.zeros((2, len(self.blocks)))
         turn = np.zeros(len(self.blocks), dtype=np.intp)
@@ -261,7 +261,7 @@ class Design:
         return replace(self, blocks=replace(self.blocks, blur=change**2 / 12.0))
 
     def residual(self, effects: Sequence[Effect], rest: FloatArray) -> FloatArray:
-        """Returns observation minus effects per sample, minus ``rest`` per block; NaN if not usable."""
+        """Returns the observation minus ``effects`` per sample and ``rest`` per block; NaN where unusable."""
         left = self.samples.error_arcsec - self.regressors.predicted(effects, self.starts)
         result = np.full(len(left), np.nan)
         index = self.blocks.index
@@ -288,10 +288,10 @@ def clusters(blocks: Blocks, number: int) -> IntArray:
 
 
 def missed_deg(motor_deg: FloatArray, turns: IntArray) -> FloatArray:
-    """Returns how far the motor may have moved beyond the sample of each turning point, shape of ``turns``.
+    """Returns the possible motor travel beyond the sample of each turning point, shape of ``turns``.
 
-    With constant speed before and after, the two lines meet outside by this much. It is 0 for a motor that
-    rests at the turning point.
+    At constant speed before and after, the two lines intersect that far beyond the sample. It is 0 for a
+    motor that rests at the turning point.
     """
 
     def step(way: int) -> FloatArray:

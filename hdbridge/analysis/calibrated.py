@@ -2,9 +2,9 @@
 
 A part is a group of parameters that change together: a loop, one order, a spring. As calibrated, its
 parameters are normally distributed about those of the model file, with the 95 % intervals given there or,
-without any, by `Scales.calibrated`. A part becomes free if the data pull it further away than a change
-costs. Thus the model keeps what the data cannot separate from a new cause, and a changed loop is still
-found.
+without any, by `Scales.calibrated`. A part becomes free if the data strain it by more than the cost of a
+change. The model thus keeps its calibration if the data cannot separate a changed part from a new cause, and
+a changed loop is still found.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hdbridge.analysis.separable import on_scale, shape_value
 from hdbridge.axis.effects import Effect, FloatArray
 
 EXACT: Final = 1e-3
-"""Share of such a deviation that is practically zero."""
+"""Share of the calibrated standard deviation that is practically zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +33,11 @@ class CalibratedPart:
     place: int
     """Place of the effect in the model."""
     parameters: Mapping[str, tuple[float, float]]
-    """Mean and standard deviation by number of the coefficient or name of the shape (its logarithm if
+    """Mean and standard deviation, by index of the coefficient or name of the shape (of its logarithm if
     logarithmic)."""
     scales: Scales
     fixed: bool = False
-    """True if it cannot have changed."""
+    """True if the part cannot have changed."""
 
     @property
     def change_cost(self) -> float:
@@ -54,7 +54,7 @@ class CalibratedPart:
     def strain(self, effects: Sequence[Effect], spread: FloatArray | None = None) -> float:
         """Returns the chi square of the part's deviation from its calibration.
 
-        ``spread`` (p, p) is the covariance of the parameters of ``effects``, if they are uncertain too.
+        ``spread`` (p, p) is the covariance of the parameters of ``effects``; None treats them as exact.
         """
         effect = effects[self.place]
         coefficients = effect.coefficients()
@@ -69,7 +69,7 @@ class CalibratedPart:
         return float(off @ np.linalg.solve(np.diag(variance) + spread, off))
 
     def times(self, share: float) -> CalibratedPart:
-        """Returns the part with only a ``share`` of it visible."""
+        """Returns the part with its visibility reduced to ``share``."""
         seen = {name: (share * mean, deviation) for name, (mean, deviation) in self.parameters.items()}
         return replace(self, parameters=seen)
 

@@ -1,4 +1,4 @@
-"""Capability of a record: the causes that it can show, and those that it cannot, in one sentence."""
+"""Capability of a record: causes that are detectable in it, and causes that are not, in one sentence."""
 
 from __future__ import annotations
 
@@ -17,28 +17,29 @@ from hdbridge.axis.effects.carried import loop_of
 from hdbridge.units import DEG_PER_TURN
 
 SAMPLES_PER_WIDTH: Final = 4
-"""Samples that a slow motion needs on the width of the loop: one more than the loop has parameters."""
+"""Minimum number of samples of slow motion over the width of a loop: one more than the loop has
+parameters."""
 COMPLETE: Final = ("slow motion", "reversals", "rests")
 CERTAINTY: Final = ((0.9, ""), (0.6, "probably "), (0.0, "perhaps "))
-"""Words of probability: for each probability above the number, the word before a name."""
+"""Lower limits of probability, and the qualifier in front of a name above each."""
 
 
 def certainty(probability: float) -> str:
-    """Returns the qualifier in front of a name with this probability, with a trailing space; empty for a
-    certain name.
+    """Returns the qualifier in front of a name of this probability, with a trailing space; empty if
+    certain.
     """
     return next((word for least, word in CERTAINTY if probability > least), CERTAINTY[-1][1])
 
 
 @dataclass(frozen=True, slots=True)
 class Identifiability:
-    """Ability of a record to show a cause."""
+    """Identifiability of a cause in a record."""
 
     detectable: bool
     detection_limit_arcsec: float | None
     """Smallest peak that would be reported; None if the cause is invisible."""
     aliases: tuple[str, ...]
-    """Causes that this record could not separate from it."""
+    """Causes that are not separable from it in this record."""
     share_left: float
     """Share of its square that the baseline cannot absorb."""
     reason: str = ""
@@ -57,18 +58,18 @@ class Identifiability:
 
 @dataclass(frozen=True, slots=True)
 class Capability:
-    """Subjects of the catalogue that a record can show, by the identifiability of their causes."""
+    """Subjects of the catalogue that a record can show, from the identifiability of their causes."""
 
     lacks: tuple[str, ...]
     """Kinds of motion and channels that the record does not have."""
     identified: tuple[str, ...]
     """Subjects with a cause that is detectable and separable from all other subjects."""
     confused: tuple[tuple[str, ...], ...]
-    """Groups of subjects, each a detectable one and all those that it is not separable from."""
+    """Groups of subjects, each a detectable subject and those that are not separable from it."""
     unseen: tuple[str, ...]
     """Subjects without a detectable cause."""
     most: float
-    """Largest probability of a name in such a record."""
+    """Highest probability of any name in such a record."""
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the JSON object."""
@@ -140,7 +141,7 @@ def capability(
 
 
 def _lacks(data: Observed, base: Sequence[Effect], causes: Mapping[str, Identifiability]) -> list[str]:
-    """Returns the kinds of motion that a record lacks, and the channels that an unseen cause needs."""
+    """Returns the kinds of motion that a record lacks, and the channels that invisible causes require."""
     full = data.full
     travel_deg = float(sum(np.ptp(full.motor_deg[each.rows]) for each in full.chains))
     width_deg = loop_of(base).width_deg
@@ -160,7 +161,7 @@ def _lacks(data: Observed, base: Sequence[Effect], causes: Mapping[str, Identifi
 
 
 def _slow_travel_deg(samples: Samples, width_deg: float) -> float:
-    """Returns the motor's travel in gentle motion that is sampled densely enough for the shape of a loop."""
+    """Returns the slow motor travel that is sampled densely enough to show the shape of a loop."""
     speed, acceleration = samples.speed_deg_s, samples.motion.motor_acceleration_deg_s2
     assert acceleration is not None
     steps = np.diff(samples.time_s, append=samples.time_s[-1])

@@ -1,6 +1,6 @@
 """Changes of the model's own parts: hysteresis law and parameters, motor orders, springs.
 
-Calibrations are usually off by a few per cent. A finding must exceed that.
+Calibrations are usually off by a few per cent. A finding must exceed this deviation.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def findings(
 ) -> list[Finding]:
     """Returns the findings within the baseline.
 
-    ``spread`` is the covariance of ``precise``, the fit for parameters.
+    ``spread`` is the covariance of ``precise``, the fit that determines the parameters.
     """
     estimator = search.estimator
     # Independent of the file's intervals: temperature and time put every calibration off by as much.
@@ -70,10 +70,10 @@ class _Change(NamedTuple):
 def _finding(
     search: Search, fitted: Fitted, loose: Fitted, place: int, given: Effect, change: _Change
 ) -> Finding | None:
-    """Judges a change as any other cause: by evidence that is robust and by its gain on held-out data.
+    """Judges a change like any other cause, by its block-robust evidence and its gain on held-out data.
 
-    Both compare a fit with one that has the part as ``given``. The evidence is that of the ``loose`` fit,
-    which may have a loop of free form, unlike a model. None if the evidence is not enough.
+    Both compare the fit with one in which the part is as ``given``. The evidence is that of the ``loose``
+    fit, which unlike a model may have a free-form loop. Returns None if the evidence is insufficient.
     """
     estimator, name = search.estimator, change.effect.name
 
@@ -142,13 +142,13 @@ def _loop(
 
 
 def _apart_arcsec(estimator: Estimator, one: Fitted, other: Fitted) -> float:
-    """Returns the largest difference of two fits, arcsec, without rare extremes."""
+    """Returns the largest difference between two fits, arcsec, without rare extremes."""
     apart = np.abs(one.residual - other.residual) / estimator.weight
     return float(np.quantile(apart, 1.0 - estimator.rare))
 
 
 def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
-    """Returns the peak that a free-form loop adds to the law; 0 if the law fits as well."""
+    """Returns the peak that a free-form loop adds to the law, arcsec; 0 if the law fits as well."""
     scales, free = estimator.scales, fitted.hypothesis.nuisances
     if free is None:
         return 0.0
@@ -202,10 +202,7 @@ def _orders(
 def _freed(
     search: Search, fitted: Fitted, precise: Fitted, place: int, given: Effect, spread: FloatArray
 ) -> _Change | None:
-    """Returns a change of another part that the data pull out of its calibration.
-
-    See `hdbridge.analysis.calibrated`.
-    """
+    """Returns a change of any other part that the data pull out of its calibration (`calibrated`)."""
     estimator, own = search.estimator, precise.places(place)
     if not len(own) or np.all(precise.information[own] != 0.0):
         return None
@@ -220,7 +217,7 @@ def _freed(
         parameters_of(estimator, precise, place, spread),
         "a change of what the model has: "
         + (
-            "it is left as it was, for the record does not distinguish it from another cause"
+            "it is unchanged, because the record does not separate it from another cause"
             if aliases
             else "its own parameters take it over"
         ),
@@ -230,7 +227,7 @@ def _freed(
 
 
 def _change(estimator: Estimator, fitted: Fitted, place: int, given: Effect) -> FloatArray:
-    """Returns the change of a part's contribution from the ``given`` one, arcsec, (m,)."""
+    """Returns the change of a part's contribution from the ``given`` contribution, arcsec, shape (m,)."""
     start, now = fitted.hypothesis.start, fitted.hypothesis.effects[place]
     after = estimator.columns(now, start) @ now.coefficients()
     return np.asarray(after - estimator.columns(given, start) @ given.coefficients())
@@ -245,6 +242,6 @@ def strain(fitted: Fitted, part: CalibratedPart, spread: FloatArray) -> float:
 
 
 def causes_of(given: Effect, now: Effect) -> list[Effect]:
-    """Returns the causes that can explain the change, the more specific first."""
+    """Returns the causes that can explain the change, most specific first."""
     found = [each for kind in CATALOGUE.values() if (each := kind.of_change(given, now)) is not None]
     return sorted(found, key=lambda each: each.changes is None)

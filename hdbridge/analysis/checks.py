@@ -1,4 +1,4 @@
-"""Plausibility checks of records: rejects impossible ones and says how to read them correctly."""
+"""Plausibility checks of records: rejects impossible records and suggests how to read them correctly."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hdbridge.records.wraps import Wraps, count_of, find_wraps, period_in, unwra
 from hdbridge.units import DEG_PER_TURN
 
 LEAST_WHOLE = 10.0
-"""Minimum travel for which whole numbers only cannot be a coincidence."""
+"""Minimum travel in which nothing but whole numbers cannot be a coincidence."""
 SLOWEST_DEG_S = 6.0
 """Minimum peak motor speed of a plausible record: one turn per minute."""
 MOST_COUNTS = 2**32
@@ -27,20 +27,19 @@ TURNS_SEEN = 4.0
 PLACES = 8
 """Number of sectors of a motor turn that count as different places."""
 REPEATS_SHARE = 0.5
-"""Minimum share of the error's variance that repeats with each motor turn, over `TURNS_SEEN` turns;
-over more turns, chance explains less.
-"""
+"""Minimum share of the error's variance that repeats with each motor turn, over `TURNS_SEEN` turns. Over
+more turns, chance explains less."""
 LEAST_REPEATS_SHARE = 0.1
 """Lower bound of that share for records of more turns."""
 FOLLOWS_SHARE = 0.1
-"""Maximum share of its distance from the motor that a command keeps when it is unwrapped."""
+"""Maximum remaining share of the distance between command and motor after unwrapping the command."""
 
 
 def check_records(records: Mapping[Path, Record], ratio: float) -> None:
-    """Raises InputError for records that no axis of this ratio can have produced, or without motion.
+    """Checks that an axis of this ratio can have produced the records, and that it moved; else InputError.
 
-    Time must advance, angles must be multi-turn, units and ratio must be right, and the motor must move in at
-    least one record. Keys are the paths for the messages.
+    Time must increase, angles must be multi-turn, units and ratio must be right, and the motor must move in
+    at least one record. Keys are the paths for the messages.
     """
     for path, record in records.items():
         if len(record) > 1 and float(np.ptp(record.time_s)) == 0.0:
@@ -64,8 +63,8 @@ def check_records(records: Mapping[Path, Record], ratio: float) -> None:
 def zeros_apart_arcsec(records: Sequence[Record], ratio: float) -> float | None:
     """Returns the spread of the zeros of records with the same direction of motion.
 
-    None if it does not exceed their own variation, or there is nothing to compare. Directions are compared
-    separately, because they differ by half the height of a loop.
+    None if the spread does not exceed the variation within the records, or if there is only one zero.
+    Directions are compared separately, because they differ by half the height of a loop.
     """
     apart: list[float] = []
     for sign in (-1.0, 1.0):
@@ -99,7 +98,7 @@ def _moves(record: Record) -> bool:
 
 
 def _check_whole(path: Path, record: Record) -> None:
-    """Raises InputError for a load angle in whole numbers: no encoder reads whole degrees."""
+    """Raises InputError for a load angle in whole numbers, because no encoder reads whole degrees."""
     load, origin = record.load_position_deg, record.origin
     if origin is not None and "load" in origin.stated:
         return
@@ -119,7 +118,7 @@ def _check_whole(path: Path, record: Record) -> None:
 
 
 def _check_wrapped(path: Path, record: Record) -> None:
-    """Raises InputError for an angle that jumps by a constant (a wrapping counter), unlike the other one."""
+    """Raises InputError if one angle jumps by a constant (a wrapping counter) and the other does not."""
     motor, load, target = record.motor_position_deg, record.load_position_deg, record.motor_target_deg
     found: dict[str, Wraps] = {}
     for channel, angle, other in (("load", load, motor), ("motor", motor, load)):
@@ -153,7 +152,7 @@ def _check_wrapped(path: Path, record: Record) -> None:
 
 
 def _shown(value: float) -> str:
-    """Formats a count in full, any other value with six digits."""
+    """Formats a count in full, any other value with six significant digits."""
     return f"{value:.12g}" if value == round(value) else f"{value:.6g}"
 
 
@@ -167,7 +166,7 @@ def _counter(period: float, unit: Unit, angle: FloatArray) -> str:
 
 
 def _unwrapping(record: Record, channel: str, found: Mapping[str, Wraps]) -> str:
-    """Says how to unwrap the angles found."""
+    """Returns the instruction for unwrapping the angles found."""
     origin = record.origin
     if origin is None:
         return f"unwrap it by {found[channel].period_deg:.10g} deg"
@@ -184,7 +183,7 @@ def _unwrapping(record: Record, channel: str, found: Mapping[str, Wraps]) -> str
 
 
 def _check_speed(path: Path, record: Record) -> None:
-    """Raises InputError for unstated milliseconds or radians taken for seconds or degrees."""
+    """Raises InputError for milliseconds or radians that were read as seconds or degrees."""
     origin = record.origin
     if origin is None or "time" in origin.stated or not _moves(record):
         return
@@ -214,7 +213,7 @@ def _check_speed(path: Path, record: Record) -> None:
 
 
 def _check_turn(path: Path, record: Record, ratio: float) -> None:
-    """Raises InputError for angles in radians: the error repeats every 2 pi of the motor angle, more than
+    """Raises InputError for angles in radians: the error repeats every 2 pi of the motor angle rather than
     every 360.
     """
     origin, motor = record.origin, record.motor_position_deg

@@ -2,9 +2,9 @@
 
 The covariance of a fit under the noise model is the inverse information. If the noise model is wrong, the
 scores of longer stretches vary more than it predicts. A sandwich estimate over stretches (Liang and Zeger
-1986) shows this, and replaces the model's variance wherever it is larger. The rounding error in a wave is
-constant along a sweep and differs in the next. For waves, whole legs therefore serve as stretches too;
-because there are few legs, all waves are pooled.
+1986) shows the excess and replaces the model's variance wherever it is larger. The rounding error in a wave
+is constant along a sweep and differs in the next, so for waves whole legs also serve as stretches. Legs are
+few, so all waves are pooled.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def of_effect(solution: Solution, index: int, cov: FloatArray) -> list[Interval]
 def _between_legs(waves: FloatArray, precision: Precision, residual: FloatArray, blocks: Blocks) -> float:
     """Returns the variance of waves between legs relative to the noise model's; at least 1.
 
-    Waves (b, p) of one kind have nearly equal information and share little, so each is an independent
+    Waves (b, p) of one kind carry nearly equal information and overlap little, so each is an independent
     estimate of the ratio.
     """
     scores = sums(waves * precision.apply(residual)[:, np.newaxis], blocks.leg)
@@ -100,8 +100,8 @@ SURE = 3.0
 """Minimum significance of a difference, standard errors."""
 WORTH_ARCSEC = 0.3
 """Smallest deviation that fails a test, however significant."""
-LEAST_TOLD_ARCSEC = 0.005
-"""Smallest deviation mentioned in the text; less would be printed as 0.00."""
+LEAST_REPORTED_ARCSEC = 0.005
+"""Smallest deviation mentioned in the text; a smaller one would be printed as 0.00."""
 
 
 def residual_tests(
@@ -133,7 +133,7 @@ def _orders(name: str, left: Sequence[Line]) -> ResidualTest:
 def _contrast(
     name: str, column: FloatArray, residual: FloatArray, precision: Precision, scale: float
 ) -> ResidualTest:
-    """Fits the residual with one column and a mean by generalised least squares; size: ``scale`` columns."""
+    """Fits one column and a mean by generalised least squares; returns the size in ``scale`` columns."""
     columns = np.stack([np.ones(len(column)), column], axis=1)
     weighted = precision.apply(columns)
     information = columns.T @ weighted
@@ -159,7 +159,7 @@ def _whiteness(noise: NoiseModel) -> ResidualTest:
             (noise.slow_arcsec, f"{noise.slow_s:.1f} s"),
             (noise.place_arcsec, f"{noise.place_deg:.2f} deg of the motor"),
         )
-        if arcsec >= LEAST_TOLD_ARCSEC
+        if arcsec >= LEAST_REPORTED_ARCSEC
     ]
     text = f"correlated noise: {' and '.join(spans)}; the intervals allow for it" if spans else "white noise"
     return ResidualTest("whiteness", size < WORTH_ARCSEC, size, text)
@@ -168,7 +168,7 @@ def _whiteness(noise: NoiseModel) -> ResidualTest:
 def _level(figures: NoiseFigures) -> ResidualTest:
     rest = figures.standing_arcsec
     if rest is None:
-        return ResidualTest("noise_level", True, 0.0, "the axis never stood long enough to tell its noise")
+        return ResidualTest("noise_level", True, 0.0, "the axis never stood long enough to measure its noise")
     size = math.sqrt(max(figures.fitted_arcsec**2 - rest**2, 0.0))
     text = f"{figures.fitted_arcsec:.2f} arcsec is left, at rest the noise is {rest:.2f}"
     return ResidualTest("noise_level", size < max(rest, 1.0), size, text)
@@ -179,16 +179,17 @@ def _level(figures: NoiseFigures) -> ResidualTest:
 
 FOLDS = 4
 STRETCHES = 40
-"""Number of stretches of time; each fold takes every fourth."""
+"""Number of stretches of time. Each fold contains every fourth stretch."""
 
 
 def held_out(
     state: State, solution: Solution, measured_arcsec: FloatArray, inside_variance: float
 ) -> HeldOut:
-    """Cross-validates the model by folds, and compares it with the active model (or none).
+    """Cross-validates the model by folds, and compares it with the active model or, without one, with no
+    model.
 
     ``measured_arcsec`` (b,) is the measured error before delay correction. ``inside_variance`` is the
-    variance of samples within their blocks, which no model of this kind changes.
+    variance of samples within their blocks, which models of this kind do not change.
     """
     design, blocks, active = state.design, state.design.blocks, state.options.active
     fold, stretch, over = folds(design)
@@ -201,8 +202,8 @@ def held_out(
     own = active.effects if active else ()
     new = [solution.effects[place] for place in sorted(written)]
     for row, (effects, of) in enumerate(((own, shift), (new, kept))):
-        told, columns = design.predict(effects), solution.jacobian[:, of]
-        fit = Linearised(columns, rest_arcsec - told, solution.known[of])
+        model_arcsec, columns = design.predict(effects), solution.jacobian[:, of]
+        fit = Linearised(columns, rest_arcsec - model_arcsec, solution.known[of])
         steps = steps_without(fit, fold, lambda rows: Precision(state.noise, blocks.picked(rows)))
         for number, step in enumerate(steps):
             out = fold == number
@@ -210,7 +211,7 @@ def held_out(
             lost = ~np.isin(blocks.zero, blocks.zero[~out])
             left = fit.residual - columns @ step
             added[row, out] = about_zeros(left, blocks.zero, blocks.count * lost)[out]
-            left = measured_arcsec - told - columns[:, len(shift) :] @ step[len(shift) :]
+            left = measured_arcsec - model_arcsec - columns[:, len(shift) :] @ step[len(shift) :]
             alone[row, out] = about_zeros(left, blocks.zero, blocks.count * (lost | ~out))[out]
     used = len(fold) - np.bincount(fold)[fold] >= 2 * len(solution.columns)
     weight = blocks.count * used
@@ -234,7 +235,7 @@ def held_out(
 
 
 def gain_of_law(before: tuple[State, Solution], after: tuple[State, Solution]) -> Gain:
-    """Compares two laws by what a fit to the other folds leaves of each, with the nuisances refitted."""
+    """Compares two laws by the residual of each fold from a fit to the others, with nuisances refitted."""
     design = before[0].design
     fold, stretch, over = folds(design)
     count = design.blocks.count
@@ -255,12 +256,12 @@ def _left_out(state: State, solution: Solution, fold: IntArray) -> FloatArray:
 
 
 def folds(design: Design) -> tuple[IntArray, IntArray, str]:
-    """Returns the fold and the stretch of each block (b,), and a description of what is left out.
+    """Returns the fold and the stretch of each block (b,), and a description of the parts left out.
 
     Sweeps are divided by motor turns, every fourth one in both directions. Motion that turns back within a
-    motor turn (sines, reversals) is divided by stretches of time, so that no fold holds all reversals: the
-    others would not determine the loop. Several short recordings of unknown motion are left out whole: their
-    residual is correlated from one stretch to the next, and neighbours would predict it.
+    motor turn (sines, reversals) is divided by stretches of time, because the loop is not determined without
+    reversals, and no fold may contain them all. Several short recordings of unknown motion are left out
+    whole, because a correlated residual would be predicted by neighbouring stretches.
     """
     blocks = design.blocks
     turns = (blocks.motor_deg - np.min(blocks.motor_deg)) / DEG_PER_TURN
@@ -286,7 +287,7 @@ MOST_NAMED = 4
 def conclude(
     state: State, solution: Solution, cov: FloatArray, system: System, warnings: list[str]
 ) -> FitResult:
-    """Assembles the result of an identification; ``system`` is the state's, with the final noise."""
+    """Assembles the result of an identification; ``system`` is that of the state with the final noise."""
     design, blocks, samples = state.design, state.design.blocks, state.design.samples
     precision, chosen = state.precision(), state.selection.chosen
     intervals = [each for index in range(len(solution.effects)) for each in of_effect(solution, index, cov)]
@@ -363,7 +364,7 @@ def _inside_variance(design: Design, solution: Solution, nuisances: FloatArray) 
 
 
 def _nuisances(state: State, further: Mapping[str, tuple[float, float]]) -> tuple[Nuisance, ...]:
-    """Returns the physically meaningful nuisances; ``further`` maps names to value and half width."""
+    """Returns the nuisances with a physical meaning; ``further`` maps names to value and half width."""
     found = []
     for name in state.nuisances:
         if name in TEXTS and name in further:
@@ -372,7 +373,7 @@ def _nuisances(state: State, further: Mapping[str, tuple[float, float]]) -> tupl
             found.append(Nuisance(name, TEXTS[name], value, half, UNITS[name]))
     for order in _not_the_motors(state):
         cosine, sine = further[f"{order} cosine"], further[f"{order} sine"]
-        text = f"an error that repeats with {order}, which the model has no part for"
+        text = f"an error that repeats with {order}, for which the model has no part"
         size = math.hypot(cosine[0], sine[0])
         found.append(Nuisance(str(order), text, size, max(cosine[1], sine[1]), "arcsec"))
     return tuple(found)
@@ -386,10 +387,10 @@ def _describe_limits(state: State, lines: Sequence[Line], warnings: list[str]) -
     """Appends warnings about orders that are not separable, short travel and outliers."""
     samples, outliers = state.design.samples, state.outliers
     for alike in _families(lines):
-        warnings.append(f"{_named(alike)} cannot be distinguished at the angles of this record")
+        warnings.append(f"{_named(alike)} are not separable at the angles of this record")
     if state.selection.unresolved:
         unresolved = _named(state.selection.unresolved)
-        warnings.append(f"{unresolved} cannot be distinguished from what else was fitted")
+        warnings.append(f"{unresolved} are not separable from the other fitted terms")
     load_turns = float(np.ptp(state.design.blocks.motor_deg)) / DEG_PER_TURN / samples.ratio
     if load_turns < 0.95:
         warnings.append(
@@ -399,21 +400,21 @@ def _describe_limits(state: State, lines: Sequence[Line], warnings: list[str]) -
     if outliers.swinging:
         warnings.append(
             f"{outliers.swinging} samples ({outliers.swinging / len(samples):.2%}) in or just after fast "
-            "accelerations stand out and were given no weight: the load swings on its spring there"
+            "accelerations stand out and have no weight: the load swings on its spring there"
         )
     if others := outliers.samples - outliers.swinging:
         warnings.append(
-            f"{others} samples ({others / len(samples):.2%}, at most {outliers.longest_run} in a row) stand "
-            "out from their neighbours and were given no weight: look for lost counts, plugs, shields"
+            f"{others} samples ({others / len(samples):.2%}, at most {outliers.longest_run} in a row) "
+            f"stand out from their neighbours and have no weight: look for lost counts, plugs, shields"
         )
     for order in _not_the_motors(state):
         warnings.append(
-            f"{order} shows in this record; the model has no part for it, a diagnosis may name it"
+            f"{order} shows in this record; the model has no part for it; a diagnosis may find its cause"
         )
 
 
 def _families(lines: Sequence[Line]) -> list[list[Order]]:
-    """Returns groups of orders that are aliases of each other."""
+    """Groups orders that are aliases of each other."""
     alike = [[other.order in each.aliases for other in lines] for each in lines]
     number = connected_components(np.array(alike).reshape(len(lines), -1))[1].tolist() if lines else []
     families = [
@@ -424,7 +425,7 @@ def _families(lines: Sequence[Line]) -> list[list[Order]]:
 
 
 def _named(orders: Sequence[Order]) -> str:
-    """Lists orders by name; a long list is shortened to its first and last."""
+    """Lists orders by name; a long list is abbreviated to its first and last orders."""
     if len(orders) > MOST_NAMED:
         return f"{orders[0]} to {orders[-1]} ({len(orders)} orders)"
     return " and ".join(map(str, orders))

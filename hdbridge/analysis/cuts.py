@@ -1,7 +1,7 @@
 """Splits a concatenated record at its joins and drops invalid readings.
 
-A motor cannot be elsewhere in the next sample. A jump means that the record was joined from several, with
-unknown motion in between, or, if the next sample or two return, that they were misread.
+A motor cannot jump between two samples. A jump is a join of two records with unknown motion in between or, if
+the angle returns within a sample or two, a misreading.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
 FASTEST_DEG_S2 = 1e6
-"""Upper limit of motor acceleration: a small servo motor at peak torque (17,000 rad/s^2). With a wave
-generator on its shaft it reaches less."""
+"""Upper limit of the motor acceleration: a small servo motor at peak torque (17,000 rad/s^2). A motor with a
+wave generator on its shaft reaches less."""
 JUMP_DEG = 30.0
-"""Minimum jump of the motor angle that is not noise, a count or a lost count."""
+"""Minimum jump of the motor angle; smaller steps may be noise, a count or a lost count."""
 SPIKE_ARCSEC = 900.0
-"""Change of the error to a single sample and back that no gear can make."""
+"""Change of the error to a single sample and back that no gear can produce."""
 SLOWEST_S = 1.0
-"""Implausibly long sample period: a record needs a few samples per motor turn."""
+"""Shortest implausible sample period; a record needs a few samples per motor turn."""
 MISREAD_ROWS = 2
 """Maximum duration of a misreading, samples."""
 MISREAD_SHARE = 0.01
-"""Maximum share of misread samples; with more, the problem is another one."""
+"""Maximum share of misread samples; a larger share has another cause."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,7 +42,7 @@ class Observed:
 
     record: Record
     remarks: tuple[str, ...]
-    """Samples left out and cuts, in words."""
+    """Samples left out, and cuts, in words."""
     cuts: tuple[int, ...] = ()
     """Rows before which the motion is unknown; some of ``record.starts``."""
 
@@ -50,7 +50,7 @@ class Observed:
 def observed(record: Record, ratio: float) -> Observed:
     """Cleans a record: spreads coarse times, drops misread samples and cuts at jumps.
 
-    Returns the same record if nothing is wrong.
+    Returns an intact record unchanged.
     """
     remarks = []
     if repeated := sum(coarse(part.time_s, part.motor_position_deg) for part in record.parts()):
@@ -107,7 +107,7 @@ def _picked(record: Record, kept: BoolArray) -> Record:
 
 
 def jumps(motor_deg: FloatArray, time_s: FloatArray) -> IntArray:
-    """Returns the steps between samples that no motor can make from the speed before or after."""
+    """Returns the indices of steps between samples that no motor can make from the speed before or after."""
     step, time = np.diff(motor_deg), np.maximum(np.diff(time_s), 1e-6)
     if not len(step):
         return np.empty(0, dtype=np.intp)

@@ -75,12 +75,12 @@ def diagnose(
     scales: Scales | None = None,
     prior: Prior | None = None,
 ) -> Diagnosis:
-    """Diagnoses how a model differs from one or several recordings, and why; ``.as_dict()`` is the document.
+    """Diagnoses the causes of the difference between a model and one or several recordings.
 
     ``independent_zeros`` states that the encoders' zeros were lost between recordings. ``progress`` receives
-    a description of each step. ``scales`` overrides the decision thresholds; ``prior`` holds
-    what a fleet says of the causes. InputError if a recording is too short, does not match the model's ratio,
-    or lacks a channel that the model needs.
+    a description of each step. ``scales`` overrides the decision thresholds; ``prior`` holds the fleet's
+    prior for the causes. InputError if a recording is too short, does not match the model's ratio, or lacks a
+    channel that the model needs.
     """
     recordings = by_name(recording)
     agreed_ratio(recordings, [(str(model.path or "the model"), model.ratio)])
@@ -203,7 +203,7 @@ class _Judge:
             self.considered.extend(f"{each.cause}: {LOSES}" for each in lost)
             fitted = self._without(judged.judged, lost)
         known = {each.cause for each in findings} | {each.split(":")[0] for each in self.considered}
-        refused = self.search.told_refusals(judged.fitted)
+        refused = self.search.reported_refusals(judged.fitted)
         self.considered.extend(each for each in refused if each.split(":")[0] not in known)
         refitted = estimator.fit(Hypothesis(given, judged.fitted.hypothesis.start))
         before, _ = estimator.left_by(given)
@@ -274,7 +274,7 @@ class _Judge:
             findings = [each for each in findings if each not in missing]
 
     def _with_gains(self, fitted: Fitted, findings: list[Finding], added: list[int]) -> list[Finding]:
-        """Returns the findings with the gain of the written model, in which ``added`` are the new effects."""
+        """Returns the findings with the gain of the written model; ``added`` are its new effects."""
         effects, given = fitted.hypothesis.effects, self.model.effects
         written = [place for place, old in enumerate(given) if effects[place] != old] + added
         own = [
@@ -296,11 +296,11 @@ class _Judge:
         return [replace(each, gain=gains.get(at, each.gain)) for at, each in enumerate(findings)]
 
     def _uncalibrated(self, findings: Sequence[Finding]) -> str:
-        """Returns a remark if the probabilities of the findings were fitted to other records; else empty."""
+        """Returns a remark if the probability formula was fitted to other kinds of records; else empty."""
         return UNCALIBRATED if findings and len(self.estimator.data.full.kinds) == 1 else ""
 
     def _stopped(self, fitted: Fitted) -> tuple[int, str] | None:
-        """Returns the weakest cause that fails its gate, else an implausible or unidentifiable one."""
+        """Returns the weakest cause that fails its gate; else an implausible or unidentifiable cause."""
         places = range(len(self.model.effects), len(fitted.hypothesis.effects))
         gates = {place: gate(self.estimator, fitted, place) for place in places}
         stopped = [place for place, each in gates.items() if each.reason]
@@ -317,7 +317,7 @@ class _Judge:
     def _likely_only(self, fitted: Fitted) -> _Judged:
         """Judges the findings and removes those that are improbable or normal for any axis.
 
-        Improbable ones are removed from the fit as well.
+        Improbable findings are also removed from the fit.
         """
         while True:
             judged = self._judged(fitted)
@@ -394,7 +394,7 @@ class _Judge:
         )
 
     def _aliases(self, fitted: Fitted, without: Fitted, place: int) -> tuple[str, ...]:
-        """Returns other causes that explain the data nearly as well as this one."""
+        """Returns other causes that explain the data nearly as well as this cause."""
         effect, available = fitted.hypothesis.effects[place], self.estimator.motion.available()
         alike = lookalikes(effect, self.estimator.data.ratio)
         names = [
@@ -433,8 +433,8 @@ class _Judge:
         if many is None and loops and of_the_loop(self.estimator, left):
             # The best law is only an approximation: one finding, with its residual in the note.
             note = f"the loop has another shape than either law: {figure(left.arcsec, 3)} arcsec rms are left"
-            told = replace(loops[0], note=note, lives_in=lives)
-            return [told if each is loops[0] else each for each in findings]
+            noted = replace(loops[0], note=note, lives_in=lives)
+            return [noted if each is loops[0] else each for each in findings]
         if size < self.estimator.floor_arcsec:
             return findings
         largest = max((each.peak_arcsec for each in findings), default=0.0)
@@ -458,7 +458,7 @@ class _Judge:
 
 
 def _is_in(finding: Finding, changed: Sequence[Effect]) -> bool:
-    """Returns True if these effects, which differ from those of the given model, contain the finding."""
+    """Returns True if ``changed``, the effects that differ from the given model, contains the finding."""
     effect = finding.effect
     if effect is None:  # something unexplained
         return True

@@ -1,6 +1,6 @@
-"""Driving angle of the effects, with speed and acceleration; reversals free of chatter.
+"""Driving angle of the effects, with speed and acceleration; reversals without chatter.
 
-A reversal counts only if the motor comes back by more than the chatter.
+A reversal counts only if the motor returns by more than the chatter.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ REVERSAL_DEG = 0.3
 (0.5, `effects.elastic_loop`), and several times the settling motion of a motor (0.07 in measured
 records)."""
 JITTER_SIGMAS = 8.0
-"""Lower limit of that travel, in standard deviations of the reading error."""
+"""Lower limit of the reversal travel, in standard deviations of the reading error."""
 
 
 def steadied(path_deg: FloatArray, measured_deg: FloatArray, band_deg: float) -> FloatArray:
-    """Removes reversals smaller than ``band_deg`` of the measured angle: monotone between turning points.
+    """Removes reversals smaller than ``band_deg`` of the measured angle: the path is monotone between
+    turning points.
 
-    At each turning point the path is limited to the measured angle: the largest of many noisy angles lies too
-    far out.
+    At each turning point the path is limited to the measured angle, because the largest of many noisy angles
+    lies too far out.
     """
     changes = np.flatnonzero(np.diff(measured_deg, prepend=np.nan) != 0.0)
     until = np.append(changes[1:], len(measured_deg)) - 1
@@ -74,28 +75,27 @@ def reversals(driving_deg: FloatArray, jitter_deg: float) -> int:
 BoolArray = NDArray[np.bool_]
 
 CHATTER_COUNTS = 2.6
-"""Minimum return for a reversal of a measured angle, counts: noise of a third of a count flickers over
-two."""
+"""Minimum return for a reversal of a measured angle, counts. Noise of a third of a count flickers over two
+counts."""
 LEAST_STILL = 20
-"""Minimum number of samples with the command at rest that show the noise of the motor reading."""
+"""Minimum number of samples at a constant command for estimating the noise of the motor reading."""
 WINDOW_S = 0.03
 """Averaging window of speed and acceleration."""
 LONGEST_S = 0.05
-"""Longest window of the acceleration: moves accelerate within a tenth of a second."""
+"""Longest window of the acceleration, because moves accelerate within a tenth of a second."""
 SETTLE_S = 0.1
 """Time for the load to settle after a fast move: two periods of an oscillation at 20 Hz."""
 
 
 class Driven(NamedTuple):
-    """Motion that drove the axis in one record, arrays of shape (n,)."""
+    """Motion that drives the axis in one record, arrays of shape (n,)."""
 
     motor_deg: FloatArray
     speed_deg_s: FloatArray
     acceleration_deg_s2: FloatArray
     rested_deg: FloatArray
-    """Motor angle if the resting motor stood in the middle of its counts, not as close to the command as the
-    counts allow; without a command, the plain angle.
-    """
+    """Motor angle on the assumption that the resting motor stands in the middle of its counts rather than as
+    close to the command as the counts allow. Without a command, the plain angle."""
 
 
 def reading_of_all(angle_deg: FloatArray, parts: Sequence[slice]) -> Reading:
@@ -146,7 +146,7 @@ def _driving(
 ) -> FloatArray:
     """Returns the command plus a smooth estimate of the lag, within the cell that the encoder read.
 
-    Without a command, the angle without chatter.
+    Without a command, returns the angle without chatter.
     """
     if target is None:
         return steadied(position, position, CHATTER_COUNTS * reading.unaided_deg)
@@ -179,8 +179,9 @@ def _driving(
 def _noise(lag: FloatArray, target: FloatArray, count: float) -> float:
     """Returns the noise of the motor reading in addition to quantisation, degrees.
 
-    In a fast move the lag itself bends within a few samples, which is no noise. So it is at most what the
-    reading shows while the command rests. If counts are visible and the command never rests, it is zero.
+    In a fast move the lag itself bends within a few samples, which is not noise. The noise is therefore at
+    most the noise of the reading while the command rests. It is zero if counts are visible and the command
+    never rests.
     """
     third = np.diff(lag, 3)
     if not len(third):
@@ -210,8 +211,8 @@ def _rates(
 ) -> tuple[FloatArray, FloatArray]:
     """Returns the speed of ``smooth`` and the acceleration of ``angle``, each over its window.
 
-    At an end of a record in motion the window is incomplete: the acceleration is extrapolated as a constant,
-    the speed linearly.
+    At an end of a record in motion the window is incomplete. There the acceleration is extrapolated as a
+    constant and the speed linearly.
     """
     speed, acceleration = _slope(smooth, time, window), _curvature(_smooth(angle, bent), time, bent)
     reach = 2 * max(1, window // 2)
@@ -227,8 +228,8 @@ def _rates(
 def _unsmoothed(means: FloatArray, window: int) -> FloatArray:
     """Corrects accelerations for the second moment of their averaging weights, by second differences.
 
-    The means underestimate by a twentieth for a move that accelerates and decelerates in a third of a second,
-    sampled fifty times per second, and effects would come out larger by as much.
+    The means are a twentieth too small for a move that accelerates and decelerates in a third of a second and
+    is sampled fifty times per second. Effects would come out too large by as much.
     """
     result = means.copy()
     # Second moments in samples: differences (triangle) plus smoothing (rectangle).

@@ -15,7 +15,7 @@ from hdbridge.axis.model import TransmissionModel
 
 
 def as_named(estimator: Estimator, fitted: Fitted, given: Sequence[Effect], named: Container[str]) -> Fitted:
-    """Returns the fit with the ``given`` hysteresis law, if another one fits better but was not reported."""
+    """Returns the fit with the ``given`` hysteresis law if a better law was found but not reported."""
     for place, (old, new) in enumerate(zip(given, fitted.hypothesis.effects, strict=False)):
         if type(old) is not type(new) and new.changes is not None and new.name not in named:
             return estimator.fit(fitted.hypothesis.instead(place, *in_place(new, [type(old)])))
@@ -27,7 +27,7 @@ def supported(
 ) -> tuple[Effect, ...]:
     """Returns the effects, with those of the baseline as ``given`` if the record does not determine them.
 
-    A loop without a reversal, and orders on a short arc of their turn, take any value that suits this record.
+    A loop without a reversal, and orders on a short arc of their turn, fit this record with almost any value.
     A change of an effect in ``alone`` may be due to another cause.
     """
     start = fitted.hypothesis.start
@@ -54,7 +54,7 @@ def extended_model(
 ) -> TransmissionModel:
     """Returns ``model`` with the fitted baseline (`supported`) and the findings at ``places``.
 
-    Other effects of the hypothesis were not reported and are not included.
+    Effects that were not reported are not included.
     """
     ratio = model.ratio
     effects: tuple[Effect, ...] = tuple(each.tidied(ratio) for each in fitted.hypothesis.effects[:base])

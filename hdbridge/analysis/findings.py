@@ -1,7 +1,7 @@
 """Findings and diagnosis as plain values, and the next experiment in words.
 
-Experiments come from the causes' descriptions and include those that need a person (move a mass, re-clock
-an encoder). Automatic ones: `hdbridge.commissioning.improvement.further`.
+Experiments come from the causes' descriptions and include those that need a person (move a mass, re-clock an
+encoder). Automatic experiments: `hdbridge.commissioning.improvement.further`.
 """
 
 from __future__ import annotations
@@ -32,13 +32,12 @@ _UNEXPLAINED: Final = {
     "torque": "the same sweep with the load's mass at two places",
     "time": "an hour of returns to one reference pose, with the temperature recorded",
 }
-"""Experiments for an unexplained residual, by the variable that it depends on."""
+"""Experiments for an unexplained residual, by the coordinate that it depends on."""
 
 
 def next_experiment(cause: str, aliases: tuple[str, ...]) -> str:
-    """Returns the shortest experiment that separates the cause from its aliases.
-
-    Without aliases, the one that confirms the cause.
+    """Returns the shortest experiment that separates the cause from its aliases or, without aliases,
+    confirms it.
     """
     either = [pair for each in aliases for pair in ((cause, each), (each, cause))]
     known = [
@@ -75,7 +74,7 @@ def depends_on(lives_in: str) -> str:
 SCHEMA = "hdbridge.diagnosis/1"
 UNEXPLAINED: Final = "unexplained"
 UNWEIGHED = math.nan
-"""Probability of a finding before the findings are weighed."""
+"""Probability of a finding before it is computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,10 +98,10 @@ class Parameter:
     low: float
     high: float
     is_size: bool = False
-    """True for a size: at zero the effect would vanish."""
+    """True for a size, which is zero if the effect is absent."""
 
     def combined(self, middle: float, deviation: float) -> Self:
-        """Combines it with a normal prior; unchanged if they are three standard deviations apart."""
+        """Combines the parameter with a normal prior, unless they are three standard deviations apart."""
         own = (self.high - self.low) / (2.0 * NORMAL_95)
         if not 0.0 < own < math.inf or abs(self.value - middle) > 3.0 * math.hypot(own, deviation):
             return self
@@ -124,22 +123,22 @@ class Finding:
     probability: float
     """Probability that this cause, or one of its aliases, is present."""
     aliases: tuple[str, ...]
-    """Other causes that these data cannot separate from it."""
+    """Other causes that are not separable from it with these data."""
     parameters: Mapping[str, Parameter]
     gain: Gain | None
-    """Gain on held-out data; None without held-out data. During the search everything else is refitted. Of a
-    result, it is that of the written model over the given one with the other findings."""
+    """Gain on held-out data; None without held-out data. During the search, everything else is refitted. In
+    a result, it is the gain of the written model over the given model with the other findings."""
     experiment: str
     """Next measurement, in words."""
     peak_arcsec: float
     """Half the span of the finding's contribution in this record."""
     robust: float = 0.0
-    """Fall in chi square due to it; for a change within the model, due to the change."""
+    """Block-robust fall in chi square due to the finding."""
     left_arcsec: float = 0.0
     """Root mean square beyond the noise, for an unexplained residual."""
     left_alone: bool = False
-    """True if either a part of the model has changed or another cause is present: the model keeps its
-    part."""
+    """True if the data do not separate a changed part of the model from another cause; the model then keeps
+    its part."""
     within: bool = False
     """True for a change of a part of the model."""
     lives_in: str = ""
@@ -150,7 +149,7 @@ class Finding:
     effect: Effect | None = field(default=None, repr=False)
     """Effect to add to the model."""
     gate: Gate | None = field(default=None, repr=False)
-    """Evidence for it; None for an unexplained residual."""
+    """Acceptance tests; None for an unexplained residual."""
     terms: Mapping[str, float] = field(default_factory=dict, repr=False)
     """Terms of the probability formula."""
 
@@ -174,20 +173,20 @@ class Finding:
 
     @property
     def gains(self) -> bool:
-        """True if what is written of it predicts data that were held out better than the model does."""
+        """True if the written model predicts held-out data better than the given model."""
         return self.gain is not None and self.gain.predicts and not self.left_alone
 
     @property
     def refuted(self) -> bool:
-        """True for a cause that does not predict what was left out."""
+        """True if the cause does not predict held-out data."""
         return self.gain is not None and not (self.within or self.gain.predicts)
 
     def refusal(self) -> str:
-        """Returns the reason not to offer it as an improvement of the model; empty without a reason."""
+        """Returns the reason for not offering it as an improvement of the model; empty without a reason."""
         if self.cause == "unexplained":
             return "there is no law that could be held out or compensated"
         if self.left_alone:
-            return "the record does not distinguish a change of it from " + ", ".join(self.aliases)
+            return "the record does not separate a change of it from " + ", ".join(self.aliases)
         if self.gain is None:
             return "nothing was held out: the record is too short to leave any of it out"
         if not self.gain.predicts:
@@ -197,13 +196,13 @@ class Finding:
             )
         sizes = [each for each in self.parameters.values() if each.is_size]
         if sizes and not self.aliases and all(each.low <= 0.0 <= each.high for each in sizes):
-            return "zero is in the 95 % interval of everything that says how large it is"
+            return "the 95 % intervals of all its sizes include zero"
         return ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Traces:
-    """Arrays of equal length for plots of model and measurement on the same trajectory."""
+    """Plot data of model and measurement on the same trajectory; arrays of equal length."""
 
     measured_arcsec: FloatArray
     """Measured error about the zero of the fit."""
@@ -211,13 +210,13 @@ class Traces:
     """Prediction of the given model."""
     extended_arcsec: FloatArray
     motion: Motion
-    """Motion of the whole record, through all of which the elastic state is carried."""
+    """Motion of the whole record, along which the elastic state is carried."""
     rows: IntArray
     """Points of ``motion`` that the arrays belong to."""
     start: Start
     """Elastic state at the first point of ``motion``, as fitted."""
     samples: Motion
-    """Motion at every sample."""
+    """Motion at each sample."""
     runs: IntArray
     """First sample of each point of ``motion``."""
 
@@ -244,12 +243,13 @@ class Diagnosis:
     baseline: Figures
     """Differences of the given model."""
     refitted: Figures
-    """Differences of the model with its own parameters refitted, without new causes."""
+    """Differences of the model with refitted parameters, without new causes."""
     extended: Figures
     noise_floor_arcsec: float
     findings: tuple[Finding, ...]
     visible: Callable[[], tuple[Mapping[str, Identifiability], Capability]] = field(repr=False)
-    """Computes `identifiability` and `capability`, which take a third of the time of a diagnosis."""
+    """Computes `identifiability` and `capability` on demand, because this takes a third of the time of a
+    diagnosis."""
     by_kind: Mapping[str, tuple[Figures, Figures]]
     """Figures of the given and the extended model, by kind of motion and by direction."""
     remarks: tuple[str, ...]
@@ -257,9 +257,9 @@ class Diagnosis:
     """Extended model; the refitted one if nothing was found."""
     traces: Traces = field(repr=False)
     considered: tuple[str, ...] = ()
-    """Causes considered but not reported, with the reason."""
+    """Causes that were considered but not reported, with the reason."""
     scales: Scales = field(default_factory=Scales, repr=False)
-    """Thresholds that were used."""
+    """Thresholds of this diagnosis."""
 
     @cached_property
     def _visible(self) -> tuple[Mapping[str, Identifiability], Capability]:
@@ -300,7 +300,7 @@ class Diagnosis:
         }
 
     def views(self) -> ResidualViews:
-        """Returns its residuals and the coordinates to view them over."""
+        """Returns the residuals, and the coordinates over which to view them."""
         traces = self.traces
         return ResidualViews(
             traces.measured_arcsec - traces.model_arcsec,
@@ -311,7 +311,7 @@ class Diagnosis:
         )
 
     def verdict(self) -> str:
-        """Returns two sentences: the causes that the record can show, and those that were found."""
+        """Returns two sentences: the causes that are detectable in the record, and the causes found."""
         return f"{self.capability.sentence()} {self._found()}"
 
     def _found(self) -> str:

@@ -28,8 +28,8 @@ RECORDINGS = "recordings"
 class Gain:
     """Squared errors of stretches of a record, each predicted by a fit without it.
 
-    Only a held-out test gives them: two root mean squares of one fit are not a gain. Arrays of shape
-    (stretches,).
+    Only a held-out test provides these errors: the difference between two rms values of one fit is not a
+    gain. Arrays of shape (stretches,).
     """
 
     over: str
@@ -39,7 +39,7 @@ class Gain:
     samples: FloatArray
     """Weight of each stretch."""
     before_arcsec2: FloatArray
-    """Sum of squares without the tested part, or with the model that it is compared with."""
+    """Sum of squares without the tested part, or with the reference model."""
     after_arcsec2: FloatArray
     """Sum of squares with the tested part."""
 
@@ -55,7 +55,7 @@ class Gain:
 
     @property
     def recovered(self) -> float:
-        """Share of the mean square that it removes; negative if it increases the error."""
+        """Share of the mean square that the tested part removes; negative if the part increases the error."""
         return 1.0 - (self.after_arcsec / max(self.before_arcsec, 1e-12)) ** 2
 
     @property
@@ -100,9 +100,10 @@ STRETCHES = 64
 
 
 def repeats(estimator: Estimator) -> tuple[IntArray, str]:
-    """Numbers the points (m,) by what repeats: recordings, else moves, else stretches of time; and its name.
+    """Numbers the points (m,) by repetition (recordings, else moves, else stretches of time); also returns
+    its name.
 
-    Errors that a repetition shares are no evidence.
+    Errors that a repetition shares with another are not evidence.
     """
     points = estimator.data.points
     if estimator.data.full.repeated:
@@ -118,7 +119,7 @@ def repeats(estimator: Estimator) -> tuple[IntArray, str]:
 
 
 def held_out(estimator: Estimator, before: Fitted, after: Fitted) -> Gain | None:
-    """Leaves out repetitions in turn, and compares two fits by what they leave there.
+    """Cross-validates two fits with whole repetitions left out, and compares them.
 
     None if the record is too short.
     """
@@ -133,7 +134,7 @@ def of_written(
     others: Iterable[Collection[int]],
     written: Collection[int],
 ) -> list[Gain | None]:
-    """Compares, for each finding, the ``given`` model with the ``others`` of its findings to the written one.
+    """Returns the gain of the written model for each finding.
 
     Both are places of effects in the fit. Neither is fitted again, so a fresh record can repeat the
     comparison; the written one also leaves what its fit loses in repetitions that it has not seen.

@@ -1,6 +1,7 @@
 """Hypotheses (effects and zeros) and their joint fit with all free parameters (`separable`).
 
-The baseline is refitted with every candidate, so nothing that the baseline can absorb becomes a finding.
+The baseline is refitted with every candidate, so an error that the baseline can absorb does not become a
+finding.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from hdbridge.axis.effects.play import stop
 from hdbridge.units import ARCSEC_PER_DEG
 
 ENOUGH = Effort(steps=8, converged=0.5, roughly=2e-5)
-"""Accuracy of fits in a search, which compares chi squares that differ by tens or more."""
+"""Accuracy of fits in a search, because the compared chi squares differ by tens or more."""
 NOISY = frozenset({Channel.LOAD_TORQUE, Channel.MOTOR_TORQUE})
 """Measured channels whose reading noise enters a column directly."""
 SMOOTH = 15
@@ -47,7 +48,7 @@ WHITE = 1.17
 """Noise variance of a channel relative to the part that smoothing removes: 6/5, less 3 %, as accurately
 as it is known."""
 MOST_TURNS = 100
-"""Maximum number of turning points with an error of their own. With more, the mean is known well enough."""
+"""Maximum number of turning points with an error of their own. With more, their mean is known accurately."""
 SHORT = 10_000
 """Record length, samples, below which the number of rare samples shrinks in proportion."""
 MOST_PARTS = 20
@@ -63,7 +64,7 @@ class Hypothesis:
     effects: tuple[Effect, ...]
     start: Start = Start.VIRGIN
     nuisances: Nuisances | None = None
-    """Further columns at the usable points, in addition to the zeros; compared by identity."""
+    """Columns at the usable points in addition to the zeros; compared by identity."""
 
     def plus(self, effect: Effect) -> Hypothesis:
         """Returns the hypothesis with one more effect."""
@@ -74,7 +75,7 @@ class Hypothesis:
         return replace(self, effects=self.effects[:place] + self.effects[place + 1 :])
 
     def instead(self, place: int, effect: Effect) -> Hypothesis:
-        """Returns the hypothesis with one effect replaced."""
+        """Returns the hypothesis with the effect at ``place`` replaced."""
         return replace(self, effects=(*self.effects[:place], effect, *self.effects[place + 1 :]))
 
 
@@ -87,7 +88,7 @@ class Fitted:
     residual: FloatArray
     """Weighted residual of the usable points, shape (m,)."""
     parameters: tuple[Column, ...]
-    """Parameters that the columns of the tangent matrix belong to."""
+    """Parameters of the columns of the tangent matrix."""
     chi_square: float
     _solution: Solution = field(repr=False)
     _weight: FloatArray = field(repr=False)
@@ -114,7 +115,7 @@ class Fitted:
 
     @property
     def information(self) -> FloatArray:
-        """Prior information of each column: one over its variance, shape (p,)."""
+        """Prior information of each column (one over its variance), shape (p,)."""
         return self.linearised.known[:, 0]
 
     def count(self) -> int:
@@ -168,7 +169,7 @@ class Estimator:
 
     @property
     def rare(self) -> float:
-        """Tail share of the record that is excluded at either end when a span is measured."""
+        """Share of the record that is excluded from a span at either end."""
         return self.scales.rare / max(len(self.data.full), SHORT)
 
     @property
@@ -178,7 +179,7 @@ class Estimator:
 
     @property
     def floor_arcsec(self) -> float:
-        """Smallest peak that matters: at rest, the rounding of both encoders is the same in all readings."""
+        """Smallest relevant peak. At rest, both encoders round alike in all readings."""
         rounded = math.hypot(self.count_arcsec, self.data.load_count_arcsec) / math.sqrt(12.0)
         return max(self.scales.floor_arcsec, rounded, 0.5 * self.data.noise_arcsec)
 
@@ -192,9 +193,9 @@ class Estimator:
         return self._regressors.columns(effect, (start,))
 
     def does(self, effect: Effect, start: Start) -> FloatArray:
-        """Returns an effect's contribution at every usable sample, arcsec.
+        """Returns an effect's contribution to every usable sample, arcsec.
 
-        Averaging to points would make fast effects seem smaller.
+        Averages over points would make fast effects seem smaller.
         """
         full = self.data.full
         if len(full) == len(self.data.points):
@@ -222,10 +223,11 @@ class Estimator:
         return self.weighted(self.at_points(change)[:, np.newaxis])
 
     def turn_discrepancy(self, effects: Sequence[Effect], start: Start) -> FloatArray:
-        """Returns errors of turning points within counts, a weighted column per standard deviation, (m, k).
+        """Returns the influence of turning-point errors within counts, weighted columns of one standard
+        deviation, (m, k).
 
-        A motor with friction stops short of all turning points alike, and of each by its own amount. One
-        column is common to all; up to `MOST_TURNS` of them also have one each.
+        A motor with friction stops short of every turning point, by a common amount and an individual one.
+        One column is common to all; up to `MOST_TURNS` turning points also have their own.
         """
         turns, change = self.turned(effects, start)
         if not len(turns):
@@ -265,7 +267,7 @@ class Estimator:
         return turns, change
 
     def begun(self, effects: Sequence[Effect]) -> FloatArray:
-        """Returns half of what the elastic state at the start of its part can change in each sample, (n,)."""
+        """Returns half the range of each sample over all elastic states at the part's start, arcsec, (n,)."""
         change, loops = np.zeros(len(self.data.full)), with_memory(effects)
         for chain in self.data.full.chains if loops else ():
             motion = self.data.full.along(chain)
@@ -275,9 +277,9 @@ class Estimator:
         return change
 
     def first_branch(self, effects: Sequence[Effect]) -> FloatArray:
-        """Returns the error of the first branch of each part, standard deviations, arcsec, shape (n,).
+        """Returns the error of each part's first branch as a standard deviation, arcsec, shape (n,).
 
-        The level at the start is fitted, but its fading along the branch depends on the motion before.
+        The level at the start is fitted, but its decay along the branch depends on the motion before.
         """
         begun, result = np.abs(self.begun(effects)), np.zeros(len(self.data.full))
         for chain in self.data.full.chains:
@@ -288,9 +290,9 @@ class Estimator:
         return result
 
     def begins_of(self, effects: Sequence[Effect]) -> Nuisances | None:
-        """Returns a column for the elastic state at the start of each part.
+        """Returns a column for the elastic state at the start of each part; None without a loop.
 
-        The state is anywhere between those of a saturated start either way. None without a loop.
+        The state lies anywhere between saturation in one direction and in the other.
         """
         change, columns = self.begun(effects), []
         for chain in self.data.full.chains[:MOST_PARTS]:
@@ -312,10 +314,10 @@ class Estimator:
         return self._free_loops[start]
 
     def fit(self, hypothesis: Hypothesis, moves: frozenset[Moves] = LOCAL, effort: Effort = ENOUGH) -> Fitted:
-        """Fits a hypothesis from its present parameters; the result is never worse than these.
+        """Fits a hypothesis from its present parameters; the result is never worse than the start.
 
-        ``moves`` selects the shapes to fit. All parts start at their calibration. Those for which a change
-        costs less than the strain become free, one by one.
+        ``moves`` selects the shapes to fit. All parts start at their calibration. Parts whose strain exceeds
+        the cost of a change become free one by one.
         """
         parts, costs = list(self.calibrated), 0.0
         while True:
@@ -331,7 +333,7 @@ class Estimator:
     def _prior(
         self, hypothesis: Hypothesis, parts: Sequence[CalibratedPart]
     ) -> tuple[dict[tuple[int, str], Prior], float]:
-        """Returns priors without the information due to channel noise, and the chi-square offset."""
+        """Returns the priors less the information due to channel noise, and the offset of chi square."""
         known, offset = priors(parts), 0.0
         for place in {each.place for each in parts}:
             claimed = self.channel_noise(hypothesis.effects[place], hypothesis.start)
@@ -345,9 +347,9 @@ class Estimator:
     def channel_noise(self, effect: Effect, start: Start) -> FloatArray:
         """Returns the squared contribution of channel noise to an effect's columns, weighted, shape (p,).
 
-        Errors in variables: a fit seems better the smaller the coefficient of a noisy column is. The
-        correction (Fuller 1987, 2.2) applies to coefficients that their calibration holds; without one, a
-        coefficient distinguished only by noise could take any size.
+        Errors in variables: a fit improves spuriously as the coefficient of a noisy column shrinks. The
+        correction (Fuller 1987, 2.2) applies to coefficients with a calibration; otherwise, a coefficient
+        distinguished only by noise could take any size.
         """
         motion = self.data.full.motion
         channels = sorted(effect.needs() & NOISY & motion.measured.keys(), key=lambda each: each.value)
@@ -369,7 +371,7 @@ class Estimator:
         moves: frozenset[Moves],
         effort: Effort,
     ) -> Fitted:
-        """Fits with ``parts`` held by their calibration; adds the ``costs`` of changes of the others."""
+        """Fits with ``parts`` held at their calibration; adds the ``costs`` of the changes of the others."""
         start = hypothesis.start
         prior, offset = self._prior(hypothesis, parts)
         costs += offset
@@ -401,7 +403,7 @@ class Estimator:
         return own if hypothesis.nuisances is None else own.and_also(hypothesis.nuisances)
 
     def _sign(self, effect: Effect) -> float:
-        """Returns the sign that an effect's coefficients must have; 0 if either."""
+        """Returns the sign required of an effect's coefficients; 0 for either sign."""
         if effect.part is Part.LOOP:
             return self.loop_sign
         return 1.0 if effect.nonnegative else 0.0
@@ -418,7 +420,7 @@ class Estimator:
     def left_by(self, effects: Sequence[Effect]) -> tuple[FloatArray, Start]:
         """Returns observed minus predicted at the usable points, arcsec, (m,), and the elastic start used.
 
-        It is about the zeros and from the start that fit best.
+        Zeros and start are those that fit best.
         """
         left = {
             start: about_zeros(self.observed - self.predict(effects, start), self.zero, self.weight**2)
@@ -428,7 +430,7 @@ class Estimator:
         return left[best], best
 
     def with_load_angle(self, load_deg: FloatArray) -> None:
-        """Sets the load angle (n,) on which effects of the load encoder's lines depend."""
+        """Sets the load angle (n,) for the effects of the load encoder's lines."""
         data = self.data
         full = replace(data.full, motion=replace(data.full.motion, load_deg=load_deg))
         points = replace(data.points, motion=replace(data.points.motion, load_deg=data.mean(load_deg)))
@@ -437,7 +439,7 @@ class Estimator:
 
 
 def with_memory(effects: Sequence[Effect]) -> list[Effect]:
-    """Returns the effects whose contribution depends on earlier motion."""
+    """Returns the effects that depend on earlier motion."""
     return [each for each in effects if each.tracker().memory_deg > 0.0]
 
 

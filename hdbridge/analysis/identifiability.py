@@ -1,4 +1,4 @@
-"""Detection limits and look-alikes of each cause in a record, measured or planned."""
+"""Detection limit and look-alikes of each cause in a measured or planned record."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from hdbridge.units import ARCSEC_PER_DEG
 ENOUGH = 8_000
 """Maximum number of points used to compare shapes."""
 WORST_ARCSEC = 30.0
-"""Detection limit above which a cause counts as not detectable."""
+"""Detection limit above which a cause counts as undetectable."""
 PEAKS = 80
-"""Number of peaks that are tried, each 5 % larger than the one before."""
+"""Number of trial peaks, each 5 % larger than the last."""
 POWER = 2.0
-"""Standard deviations by which the evidence at the limit exceeds the needed: 98 % are found."""
+"""Margin of the evidence at the limit above the required evidence, standard deviations; 98 % are found."""
 
 
 def identifiability(
@@ -45,8 +45,8 @@ def identifiability(
 ) -> dict[str, Identifiability]:
     """Returns detection limit and look-alikes of each cause of the catalogue.
 
-    ``estimator`` holds the record without the causes found in it, ``fitted`` is the model's fit to that, and
-    ``context`` is the evidence against any name.
+    ``estimator`` holds the record without the causes found in it, ``fitted`` is the fit of the model to it,
+    and ``context`` is the evidence against all findings.
     """
     best, reasons = _examples(estimator, fitted, base)
     scales, spans = estimator.scales, {name: orthonormal(each.rest) for name, each in best.items()}
@@ -91,23 +91,23 @@ def identifiability(
 
 
 class _Example(NamedTuple):
-    """The candidate of a cause that a record shows best."""
+    """Most visible candidate of a cause in a record."""
 
     effect: Effect
     per_arcsec: FloatArray
     """Coefficients of one arcsec at its peak, shape (p,)."""
     rest: FloatArray
-    """Weighted columns of one arcsec at their peaks, less the parts that the background explains, (m, k)."""
+    """Weighted columns of one arcsec at their peaks, less the parts explained by the background, (m, k)."""
     strength: float
     """Root of the chi square of one arcsec."""
     share: float
-    """Largest share of a column's square that is left."""
+    """Largest remaining share of a column's square."""
 
 
 def _examples(
     estimator: Estimator, fitted: Fitted, base: Sequence[Effect]
 ) -> tuple[dict[str, _Example], dict[str, str]]:
-    """Returns the best example of each cause that the record can show, and reasons why it cannot."""
+    """Returns the best example of each visible cause, and the reason why each other cause is invisible."""
     best: dict[str, _Example] = {}
     reasons: dict[str, str] = {}
     stride = -(-len(estimator.index) // ENOUGH)
@@ -139,7 +139,7 @@ def _examples(
 
 
 def _columns(estimator: Estimator, candidate: Effect, base: Sequence[Effect], start: Start) -> FloatArray:
-    """Returns a candidate's columns, of a changed part the change alone, arcsec, shape (m, p)."""
+    """Returns a candidate's columns, arcsec, shape (m, p); for a changed part, those of the change."""
     columns = estimator.columns(candidate, start)
     if candidate.changes is None:
         return columns
@@ -154,14 +154,14 @@ def _columns(estimator: Estimator, candidate: Effect, base: Sequence[Effect], st
 
 
 def _before(estimator: Estimator, candidate: Effect, base: Sequence[Effect], start: Start) -> FloatArray:
-    """Returns the part of a candidate that an unknown motion before the record could cause, shape (m, k)."""
+    """Returns the part of a candidate that unknown motion before the record could cause, shape (m, k)."""
     own = _columns(estimator, candidate, base, start)
     others = [_columns(estimator, candidate, base, each) - own for each in Start if each is not start]
     return side_by_side(others, len(estimator.index))
 
 
 def _injected(estimator: Estimator, fitted: Fitted, example: _Example, base: Sequence[Effect]) -> Gate:
-    """Tests a cause of `WORST_ARCSEC` at its peak that is added to the record."""
+    """Injects a cause with a peak of `WORST_ARCSEC` into the record, and tests it as a finding."""
     effect, start = example.effect, fitted.hypothesis.start
     does = WORST_ARCSEC * (_columns(estimator, effect, base, start) @ example.per_arcsec)
     if effect.changes is not None:
@@ -174,9 +174,8 @@ def _injected(estimator: Estimator, fitted: Fitted, example: _Example, base: Seq
 
 
 def _named_from(injected: Gate, context: Context, scales: Scales) -> float:
-    """Returns the peak, arcsec, from which a cause passes its tests and is probable; infinity if none does.
-
-    The square root of the robust chi square grows with the peak, and its standard deviation is one.
+    """Returns the smallest peak, arcsec, at which a cause passes its tests and is probable; infinity without
+    one.
     """
     per_arcsec = math.sqrt(max(injected.robust, 0.0)) / WORST_ARCSEC
     for peak_arcsec in np.geomspace(scales.floor_arcsec, WORST_ARCSEC, PEAKS).tolist():
@@ -208,9 +207,10 @@ class _Background:
         self._bases: dict[tuple[Part | None, str], FloatArray] = {}
 
     def left(self, candidate: Effect, columns: FloatArray) -> FloatArray:
-        """Returns what the background does not explain of columns (m, k), where the candidate must show.
+        """Returns the part of columns (m, k) that the background does not explain, where the candidate is
+        visible.
 
-        A change of a part of the model is sought in addition to the rest of the model.
+        For a change of a part of the model, the rest of the model belongs to the background.
         """
         stretch = candidate.shows(self._estimator.motion)
         rows = np.ones(len(columns), dtype=bool)
@@ -228,11 +228,11 @@ def _missing(estimator: Estimator, cause: str) -> str:
     lacking = CATALOGUE[cause].channels - estimator.data.points.motion.available()
     if lacking:
         return "not recorded: " + ", ".join(sorted(each.value for each in lacking))
-    return "nothing in this record or model to see it by"
+    return "nothing in this record or model shows it"
 
 
 def _correlation(one: FloatArray, other: FloatArray) -> float:
-    """Returns the smallest canonical correlation of the smaller space with the larger."""
+    """Returns the smallest canonical correlation between two spaces, over the directions of the smaller."""
     values = np.linalg.svd(one.T @ other, compute_uv=False)
     return float(np.min(values)) if len(values) else 0.0
 
@@ -240,7 +240,7 @@ def _correlation(one: FloatArray, other: FloatArray) -> float:
 def examined(
     record: Record, model: TransmissionModel, legs: Sequence[Segment] = (), start: Start = Start.VIRGIN
 ) -> tuple[dict[str, Identifiability], Capability]:
-    """Returns what a record could show of each cause, whether it is there or not, and the summary."""
+    """Returns the visibility of each cause in a record, whether present or not, and the summary."""
     data = gather(record, model.ratio, legs, expected=lambda motion: model.predict(motion, start))
     estimator = Estimator(data)
     fitted = estimator.fit(Hypothesis(model.effects, start), effort=Effort(steps=2))
@@ -259,7 +259,7 @@ LIMITS: Final = MotionLimits(-400.0, 400.0, 20.0, 200.0, 4000.0)
 
 
 def plan_report(plan: Plan, model: TransmissionModel, limits: MotionLimits = LIMITS) -> dict[str, Any]:
-    """Returns what a plan could show of each cause (as in a diagnosis), and its duration."""
+    """Returns the visibility of each cause in a plan, as in a diagnosis, and the plan's duration."""
     view = AxisView(model.ratio, limits)
     tasks = plan.tasks(view)
     places: list[float] = []

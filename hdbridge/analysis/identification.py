@@ -40,16 +40,16 @@ from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 WORTH = 0.01
 """Minimum relative fall of the held-out rms.
 
-A smaller improvement changes no stepping test and can arise from noise alone: a second calibration of
-the unchanged demo axis improves the rms by 0.8 %."""
+A smaller improvement does not change any stepping test and can arise from noise alone: a second calibration
+of the unchanged demo axis improves the rms by 0.8 %."""
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseFigures:
-    """Noise of the record, and the residual of the model in comparison."""
+    """Noise of the record, and the model's residual for comparison."""
 
     standing_arcsec: float | None
-    """Rms about the mean of each rest; None where the axis never stood for long enough."""
+    """Rms about the mean of each rest; None if the axis never stood for long enough."""
     laps_arcsec: float | None
     """Rms difference between passes over the same angles in one direction, divided by the root of two."""
     model: NoiseModel
@@ -57,22 +57,22 @@ class NoiseFigures:
     residual_arcsec: float
     """Rms residual of the samples with the stored model, about each zero."""
     fitted_arcsec: float
-    """Rms residual with the nuisances as well: delay, rounding, other orders."""
+    """Rms residual if the nuisances (delay, rounding, other orders) are subtracted as well."""
     samples: int
     """Number of samples in the fit."""
     effective_samples: float
-    """Number of independent samples with this rms that would determine the zero equally well."""
+    """Number of independent samples of the same rms that would determine the zero as accurately."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outliers:
-    """Isolated outliers, which have zero weight."""
+    """Isolated outliers, whose weight is zero."""
 
     samples: int
     swinging: int
-    """Number of samples in or just after a high acceleration, in which the load swings on its spring."""
+    """Number of samples in or just after a high acceleration, while the load swings on its spring."""
     longest_run: int
-    """Longest run of the others, samples."""
+    """Longest run of the other outliers, samples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class ResidualTest:
     """Result of one test of the residual."""
 
     name: str
-    """One of motor_angle, load_angle, direction, time, whiteness, noise_level."""
+    """motor_angle, load_angle, direction, time, whiteness or noise_level."""
     passed: bool
     size_arcsec: float
     """Size of the deviation found."""
@@ -89,23 +89,22 @@ class ResidualTest:
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """Prediction error on parts of the record that were left out of the fit."""
+    """Prediction error on held-out parts of the record."""
 
     gain: Gain | None
-    """Gain of the model alone over the active model (or none), each about its zero; None without held-
-    out data."""
+    """Gain over the active model (or over no model), each about its zero; None without held-out data."""
     in_addition: Gain | None
-    """Gain after the nuisances (delay, load orders) have been subtracted from both."""
+    """Gain with the nuisances (delay, load orders) subtracted from both models."""
     fitted_arcsec: float
-    """Rms residual of the fit with nuisances on the same data."""
+    """Rms residual of the fit with nuisances, on the same data."""
     text: str
 
     @property
     def improves(self) -> bool:
-        """True if the model is a real improvement.
+        """True if the model is a significant improvement.
 
-        Without the nuisances the rms must fall significantly and by at least `WORTH`; with them the model
-        must not be worse.
+        Without the nuisances, the rms must fall significantly and by at least `WORTH`; with the nuisances, it
+        must not rise.
         """
         gain = self.in_addition
         return (
@@ -117,13 +116,13 @@ class HeldOut:
 
     @property
     def worse(self) -> bool:
-        """True if the model predicts the held-out data less well than the active model (or none)."""
+        """True if the model predicts the held-out data less well than the active model (or no model)."""
         return self.gain is not None and self.gain.recovered < 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Nuisance:
-    """Parameter that is fitted so that it does not bias the model, but is not part of it."""
+    """Parameter that is fitted to keep a measurement error out of the model."""
 
     name: str
     text: str
@@ -134,7 +133,7 @@ class Nuisance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Traces:
-    """Block means for plots, all shape (b,)."""
+    """Block means for plots; arrays of shape (b,)."""
 
     time_s: FloatArray
     motor_deg: FloatArray
@@ -142,7 +141,7 @@ class Traces:
     direction: FloatArray
     """Direction of motion: 1, -1, or 0 at rest."""
     kind: tuple[str, ...]
-    """Names of the leg kinds, indexed by ``kind_index``."""
+    """Kinds of legs, indexed by ``kind_index``."""
     kind_index: np.ndarray[Any, np.dtype[np.intp]]
     error_arcsec: FloatArray
     """Observed error minus its zero."""
@@ -159,10 +158,10 @@ class FitResult:
     """Fitted model with its uncertainty, tests and plot data."""
 
     model: TransmissionModel
-    """Includes ``uncertainty``: 95 % half widths, nested like the parameters."""
+    """Fitted model with ``uncertainty``: 95 % half widths, nested like the parameters."""
     intervals: tuple[Interval, ...]
     zeros_arcsec: tuple[float, ...]
-    """Offset of each absolute zero from the median of its record's error."""
+    """Offset of each absolute zero from the median error of its record."""
     nuisances: tuple[Nuisance, ...]
     noise: NoiseFigures
     outliers: Outliers
@@ -191,7 +190,7 @@ SHORTEST_REST_S = 1.0
 LONGEST_GAP_S = 0.5
 LAP_BIN_DEG = 30.0
 WINDOW = 51
-"""Window of the median that an outlier is compared with, samples."""
+"""Window of the running median with which an outlier is compared, samples."""
 OUTLYING = 6.0
 """Outlier threshold, robust standard deviations."""
 
@@ -199,7 +198,7 @@ OUTLYING = 6.0
 def standing_arcsec(samples: Samples) -> float | None:
     """Returns the rms of the load encoder about the mean of each rest, arcsec; None without a long rest.
 
-    A motor that rests between two counts flickers, which is not noise of the load. Sines and sweeps are
+    A motor resting between two counts flickers, which is not noise of the load. Sines and sweeps are
     excluded: within one count they seem to rest while the load moves.
     """
     still = samples.usable & (np.abs(samples.speed_deg_s) < REST_DEG_S)
@@ -222,9 +221,9 @@ def standing_arcsec(samples: Samples) -> float | None:
 
 
 def laps_arcsec(samples: Samples) -> float | None:
-    """Returns the rms difference of passes in one direction, divided by the root of two; None if too few.
+    """Returns the rms difference of passes in one direction, divided by the root of two.
 
-    Errors are averaged over bins of `LAP_BIN_DEG`.
+    Errors are averaged over bins of `LAP_BIN_DEG`. None if too few bins have two passes.
     """
     passes: dict[int, list[dict[int, float]]] = {1: [], -1: []}
     sweep = samples.usable & samples.of_kind("sweep")
@@ -253,9 +252,10 @@ def outlying(
 ) -> tuple[FloatArray, Outliers]:
     """Returns weights (n,): 0 for samples far from the median of their neighbours, else 1 (also for NaN).
 
-    Comparison with neighbours, not with the model, keeps effects that the model lacks and lasting steps
-    (lost counts). ``swings`` is the mask of `swinging`, shape (n,). ``count_arcsec`` is the motor encoder's
-    count at the load: a motor between two counts alternates between them, and only the mean is right.
+    The comparison is with neighbours rather than with the model, so effects that the model lacks and lasting
+    steps (lost counts) are kept. ``swings`` is the mask of `swinging`, shape (n,). ``count_arcsec`` is the
+    motor encoder's count at the load: a motor between two counts alternates between them, and only the mean
+    is right.
     """
     weight = np.ones(len(residual))
     index = np.flatnonzero(np.isfinite(residual))
@@ -290,7 +290,7 @@ def _accelerating(samples: Samples) -> BoolArray:
 
 MINIMUM_SAMPLES = 8
 SETTLE_SHARE = 0.2
-"""Maximum share of the travel to the next turning point that is dropped after a turning point. There the
+"""Maximum share of the travel to the next turning point that is dropped after a turning point, where the
 hysteresis changes too steeply for a load on a spring to follow."""
 STANDING_DEG_S = 1e-3
 """Load speed below which an axis counts as standing."""
@@ -303,7 +303,8 @@ KNOWN = (*RESTING, *ON_THE_WAY, *SLOW)
 
 
 def usable_samples(measured: Measured, ratio: float, slow_deg_s: float | None = None) -> Samples:
-    """Prepares the samples of a calibration: errors about the median of each zero, usable samples marked.
+    """Prepares the samples of a calibration: errors about the median of each zero, with usable samples
+    marked.
 
     ``slow_deg_s`` is the maximum load speed of usable samples, by default that of the slow legs. InputError
     if there are too few samples or the ratio does not match the record.
@@ -324,8 +325,8 @@ def usable_samples(measured: Measured, ratio: float, slow_deg_s: float | None = 
 def _slow(samples: Samples, slow_deg_s: float | None) -> BoolArray:
     """Selects samples at rest and in slow motions, but not within `SETTLE_S` after fast ones.
 
-    A motion is judged as a whole, from rest or turning point to the next, so the start of a fast move is
-    not slow. Of moves and steps only the rests are used. In motions of unknown kind, samples with high
+    A motion is judged as a whole, from rest or turning point to the next, so the start of a fast move is not
+    slow. Only the rests of moves and steps are used. In motions of unknown kind, samples with high
     acceleration are dropped.
     """
     speed = samples.speed_deg_s / samples.ratio
@@ -362,20 +363,20 @@ class FitOptions:
     """Options of an identification; the defaults suit the bench's recordings."""
 
     effects: tuple[Effect, ...] = (USUAL_LOOP,)
-    """Effects to fit in addition to the ripple. Shapes that the data cannot determine stay as given here."""
+    """Effects to fit in addition to the ripple. Undetermined shapes keep the values given here."""
     highest_order: int = 24
     """Highest candidate motor order."""
     load_orders: int = 4
-    """Highest order of the load and of the flexspline that is fitted in addition to the model if
-    significant."""
+    """Highest order of load and flexspline that is fitted in addition to the model if significant."""
     family_wise: float = 0.01
     """Probability that noise alone selects any order."""
     smallest_arcsec: float = 0.1
-    """Minimum amplitude of an order, however significant."""
+    """Minimum amplitude of an order, whatever its significance."""
     start: Start | None = None
-    """Elastic state at the first sample: `Start.FORWARD` after the bench's preconditioning; None: fitted."""
+    """Elastic state at the first sample: `Start.FORWARD` after the bench's preconditioning; None to fit
+    it."""
     active: TransmissionModel | None = None
-    """Model to compare with, and source of shapes that the data cannot determine."""
+    """Model to compare with, which also provides the undetermined shapes."""
 
     def prototype(self, effect: Effect) -> Effect:
         """Returns an effect of this kind with the parameters of the active model, else of the options."""
@@ -393,7 +394,7 @@ LINEAR_ONLY: Final = Effort(steps=1)
 
 
 def searched(fit: Separable, effects: tuple[Effect, ...]) -> Solution:
-    """Fits from the best point of a grid over the shapes of each effect."""
+    """Fits from the best point of a grid over the shapes of the effects."""
     for index, effect in enumerate(effects):
         axes = [each.grid(GRID_LOGARITHMIC if each.logarithmic else GRID_LINEAR) for each in effect.shape]
         names = [each.name for each in effect.shape]
@@ -411,7 +412,7 @@ def searched(fit: Separable, effects: tuple[Effect, ...]) -> Solution:
 
 PARTS = ("cosine", "sine")
 WHOLE_TURN = 0.95
-"""Minimum travel that counts as one whole turn, turns."""
+"""Minimum travel that counts as a whole turn, turns."""
 COVERED_DEG = 30.0
 """Cell size of the coverage of motor angles."""
 
@@ -440,7 +441,7 @@ class State(NamedTuple):
         return Precision(self.noise, self.design.blocks)
 
     def in_addition(self) -> Nuisances:
-        """Returns columns of zeros and nuisances."""
+        """Returns the columns of zeros and nuisances."""
         waves = []
         for order, amplitude_arcsec, phase_deg in self.ripple.waves() if self.ripple else ():
             at = 2 * self.candidates.index(Order.motor(round(order)))
@@ -450,11 +451,11 @@ class State(NamedTuple):
         return nuisances_of(self.design, self.nuisances, self.effects, waves)
 
     def candidate_waves(self) -> Nuisances:
-        """Returns columns of all candidate orders, with unknown amplitudes."""
+        """Returns the columns of all candidate orders, with unknown amplitudes."""
         return unknown(self.waves, [f"{each} {part}" for each in self.candidates for part in PARTS])
 
     def columns(self) -> Nuisances:
-        """Returns columns of zeros, nuisances and the selected orders of load and flexspline."""
+        """Returns the columns of zeros, nuisances and the selected orders of load and flexspline."""
         others = [
             (f"{order} {part}", 2 * at + number)
             for at, order in enumerate(self.candidates)
@@ -465,12 +466,12 @@ class State(NamedTuple):
         return self.in_addition().and_also(unknown(picked, [name for name, _ in others]))
 
     def model(self) -> tuple[Effect, ...]:
-        """Returns the selected motor orders as the ripple, followed by the other effects."""
+        """Returns the ripple of the selected motor orders, and the other effects."""
         motor = [each.number for each in self.selection.chosen if each.family is Family.MOTOR]
         return ((ripple(motor),) if motor else ()) + self.effects
 
     def under(self, weighting: Weighting, columns: Nuisances) -> Separable:
-        """Returns a solver for effects with this weighting and these further columns."""
+        """Returns a solver for effects with this weighting and these additional columns."""
         return Separable(Terms(self.design.blocks.error_arcsec, self.design.columns, weighting, columns))
 
     def fitted(self) -> Solution:
@@ -480,7 +481,7 @@ class State(NamedTuple):
     def information(self) -> System:
         """Returns J' K^-1 J and J' K^-1 y of [candidates | zeros and nuisances | effects and their tangents].
 
-        The tangents allow the shapes to be refitted with every candidate order.
+        With the tangents, the shapes are refitted with every candidate order.
         """
         precision, nuisances = self.precision(), self.candidate_waves().and_also(self.in_addition())
         found = self.under(precision, nuisances).fit(self.effects, LINEAR_ONLY)
@@ -490,7 +491,9 @@ class State(NamedTuple):
         return found.information, right
 
     def selected(self, system: System | None = None) -> State:
-        """Selects the orders significant at the current noise; ``system`` is `information`, if known."""
+        """Selects the orders that are significant at the current noise; ``system``: `information` if
+        known.
+        """
         options = self.options
         found = select(
             self.candidates, system or self.information(), options.family_wise, options.smallest_arcsec
@@ -498,13 +501,13 @@ class State(NamedTuple):
         return self._replace(selection=found)
 
     def after(self, solution: Solution) -> State:
-        """Takes over the effects of a solution, and their blur within blocks."""
+        """Returns the state with the effects of a solution, and their blur within blocks."""
         effects = tuple(each for each in solution.effects if not is_ripple(each) and not each.violations())
         own = next(filter(is_ripple, solution.effects), None)
         return self._replace(effects=effects, design=self.design.blurred(effects), ripple=own)
 
     def remade(self, samples: Samples, weight: FloatArray, delay_ms: float) -> State:
-        """Rebuilds the blocks from delay-corrected samples, without outliers."""
+        """Rebuilds the blocks from delay-corrected samples without outliers."""
         design = Design.of(samples, make_blocks(samples, weight), self.design.starts).blurred(self.effects)
         waves = harmonics(design, [each.per_motor_turn for each in self.candidates])
         return self._replace(design=design, waves=waves, delay_ms=delay_ms)
@@ -534,7 +537,7 @@ def candidate_orders(design: Design, options: FitOptions) -> tuple[Order, ...]:
 
 
 def turns_covered(design: Design) -> float:
-    """Returns the distinct motor angles covered about one zero, in turns; the largest over the zeros."""
+    """Returns the distinct motor angles covered about one zero, in turns; the maximum over the zeros."""
     blocks = design.blocks
     cell = np.floor(blocks.motor_deg / COVERED_DEG).astype(np.intp)
     seen = (len(np.unique(cell[blocks.zero == zero])) for zero in range(design.samples.zeros))

@@ -42,12 +42,12 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 MINIMUM_USABLE = 50
 LEAST_TRAVEL_DEG = 10.0
-"""Minimum motor travel. Less is a rest and the beginning of a move, and half of a loop."""
+"""Minimum motor travel. A shorter record has only a rest, the beginning of a move and half of a loop."""
 NO_DEGREES = "where the axis went further, both angles are in radians or turns: convert them to degrees"
-"""Hint about units. If both angles are in another unit, the ratio is right and only the short travel
-shows it."""
+"""Hint about units. If both angles are in the same wrong unit, the ratio is right, and only the short travel
+reveals the error."""
 EFFECT_SHARE = 1e-3
-"""Share of an effect's columns not explained by zeros and orders, below which it is not in the record."""
+"""Share of an effect's columns not explained by zeros and orders; below it, the effect is not visible."""
 ROUNDS = 3
 
 
@@ -113,7 +113,7 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
         prototype = options.prototype(effect)
         if share_left(design.columns(prototype), always, weight) < EFFECT_SHARE:
             warnings.append(
-                f"{effect.name}: left out: not distinguished from the zero in this record (no reversal?); "
+                f"{effect.name}: left out: not separable from the zero in this record (no reversal?); "
                 "record both directions"
             )
             continue
@@ -126,7 +126,7 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
         nuisances.append(DELAY)
     elif effects and size > 0.05:
         warnings.append(
-            "a delay between the two encoders is not distinguished from the hysteresis' offset at one speed: "
+            "a delay between the two encoders is not separable from the hysteresis offset at one speed: "
             f"one millisecond would be {size:.2f} arcsec; record a second speed"
         )
     if samples.count_deg and effects:
@@ -139,7 +139,7 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
 
 
 def _search(state: State, warnings: list[str]) -> State:
-    """Finds shapes on a grid, unknown elastic states at the start, and a first noise model."""
+    """Finds shapes on a grid, unknown elastic states at the start, and an initial noise model."""
     simple = state._replace(nuisances=tuple(each for each in state.nuisances if each != TURNS))
     columns = simple.in_addition().and_also(state.candidate_waves())
 
@@ -167,7 +167,7 @@ def _search(state: State, warnings: list[str]) -> State:
 
 
 def _settle(state: State) -> tuple[State, Solution, System]:
-    """Iterates orders, outliers, delay and noise until they agree, refitting everything each time."""
+    """Iterates orders, outliers, delay and noise to convergence, refitting everything each time."""
     state = state.selected()
     solution = state.fitted()
     samples = state.design.samples
@@ -204,7 +204,7 @@ def _settle(state: State) -> tuple[State, Solution, System]:
 
 
 def _with_best_law(state: State, solution: Solution, system: System) -> tuple[State, Solution, System]:
-    """Exchanges a law for an alternative that clearly better predicts what was left out of the fit."""
+    """Exchanges a law for an alternative with clearly better held-out predictions."""
     for effect in state.effects:
         for law in in_place(effect, CATALOGUE.values()):
             effects = tuple(law if each is effect else each for each in state.effects)
@@ -228,7 +228,7 @@ def _value(solution: Solution, nuisance: str) -> float:
 def _hold_what_is_unknown(
     state: State, solution: Solution, warnings: list[str]
 ) -> tuple[Solution, FloatArray]:
-    """Resets shapes that the data cannot determine to their initial values, and refits the rest."""
+    """Resets undetermined shapes to their initial values, and refits the rest."""
     options, blocks = state.options, state.design.blocks
     cov = covariance(solution, state.precision(), blocks)
     effects = list(solution.effects)

@@ -27,7 +27,7 @@ class Interval:
     value: float
     half_width: float
     identifiable: bool = True
-    """False if the data do not determine it; the interval is then the whole range of the parameter."""
+    """False if the data do not determine the parameter; the interval is then its whole range."""
 
     @property
     def low(self) -> float:
@@ -41,7 +41,7 @@ class Interval:
 
 
 def intervals_of(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> list[Interval]:
-    """Returns the intervals of one effect's parameters; ``cov`` (c, c): covariance of its ``columns``."""
+    """Returns the intervals of one effect's parameters; ``cov`` (c, c) is that of its ``columns``."""
     shapes = {each.name: each for each in effect.shape}
     base = dict(leaves(effect.parameters()))
     result = []
@@ -57,7 +57,7 @@ def intervals_of(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> 
 
 
 def half_widths(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> dict[str, float]:
-    """Returns `NORMAL_95` standard deviations of each parameter, by its derivatives."""
+    """Returns `NORMAL_95` standard deviations of each parameter, from its derivatives."""
     steps = 0.05 * np.sqrt(np.maximum(np.diag(cov), 1e-24))
     return {
         name: NORMAL_95 * math.sqrt(max(float(slope @ cov @ slope), 0.0))
@@ -66,7 +66,7 @@ def half_widths(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> d
 
 
 def slopes(effect: Effect, columns: Sequence[Column], steps: FloatArray) -> dict[str, FloatArray]:
-    """Returns the derivatives of an effect's parameters by the columns of a fit, (c,) each.
+    """Returns the derivatives of an effect's parameters with respect to the columns of a fit, (c,) each.
 
     They are central differences with ``steps`` (c,), only for parameters that depend on a column.
     """
@@ -107,7 +107,7 @@ def nested_half_widths(effect: Effect, intervals: list[Interval]) -> dict[str, A
 
 
 def leaves(parameters: Any, path: str = "") -> Iterator[tuple[str, float]]:
-    """Yields every floating-point parameter with its path; list items are labelled by ``order`` if any."""
+    """Yields each floating-point parameter with its path; list items are labelled by ``order`` if any."""
     if isinstance(parameters, dict):
         for key, part in parameters.items():
             yield from leaves(part, joined(path, key))
@@ -128,7 +128,7 @@ def joined(path: str, key: str) -> str:
 
 
 def labelled(parameters: Any, path: Iterable[str | int]) -> str:
-    """Returns the dotted path, as `leaves` yields it, of nested keys and list indices."""
+    """Returns the dotted path, as in `leaves`, of nested keys and list indices."""
     said = ""
     for key in path:
         parameters = parameters[key]
@@ -137,14 +137,14 @@ def labelled(parameters: Any, path: Iterable[str | int]) -> str:
 
 
 def difference(name: str, low: float, high: float) -> float:
-    """Returns the difference of two values of a parameter with this path (`leaves`); phases are wrapped."""
+    """Returns the difference of two values of the parameter at a path (`leaves`); phases are wrapped."""
     if re.search(r"phase_deg$", name):
         return (high - low + 180.0) % 360.0 - 180.0
     return high - low
 
 
 def _free_move(effect: Effect, name: str, step: float) -> Effect:
-    """Moves one shape parameter without regard to its range (only for differentiation)."""
+    """Moves one shape parameter regardless of its range (only for differentiation)."""
     shape = next(each for each in effect.shape if each.name == name)
     here = shape_value(effect, name)
     there = here * float(np.exp(step)) if shape.logarithmic else here + step

@@ -1,6 +1,6 @@
 """Linear algebra of fits: possibly singular symmetric systems, sandwich covariance, priors, held-out steps.
 
-Columns that a record cannot separate share what they explain.
+Columns that are not separable in a record share the variance they explain.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ from hdbridge.axis.effects import BoolArray, Effect, FloatArray, IntArray
 from hdbridge.axis.effects.described import Moves
 
 NOTHING = 1e-20
-"""Information below which a column counts as unseen."""
+"""Information below which a column counts as invisible."""
 SEEN = 1e-9
-"""Share of the largest eigenvalue of scaled columns below which the data do not determine a direction."""
+"""Share of the largest eigenvalue of the scaled columns; a direction with a smaller eigenvalue is
+undetermined."""
 SUSPECT = 1e-6
-"""Square of a Cholesky factor's diagonal below which the eigenvalues are computed."""
+"""Square of a Cholesky factor's diagonal below which the eigenvalues are computed instead."""
 
 
 def solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
@@ -54,7 +55,7 @@ def inverse_symmetric(matrix: FloatArray) -> FloatArray:
 
 
 def seen_directions(gram: FloatArray) -> FloatArray:
-    """Returns a factor R, shape (p, r), with R' gram R = 1 over the directions that the data determine.
+    """Returns a factor R, shape (p, r), with R' gram R = 1 over the directions determined by the data.
 
     R R' is the pseudo-inverse of the scaled matrix, and ``columns @ R`` is an orthonormal basis of the
     columns.
@@ -113,7 +114,7 @@ def sums(rows: FloatArray, number: IntArray) -> FloatArray:
 def sandwich(influence: FloatArray, number: IntArray) -> FloatArray:
     """Returns the covariance (p, p) of the sum of the influences of all points, (n, p).
 
-    Influences of one number may be correlated (Liang and Zeger 1986).
+    Influences with the same number may be correlated (Liang and Zeger 1986).
     """
     summed = sums(influence, number)
     count = len(summed)
@@ -121,7 +122,7 @@ def sandwich(influence: FloatArray, number: IntArray) -> FloatArray:
 
 
 def about_zeros(left_arcsec: FloatArray, zero: IntArray, weight: FloatArray) -> FloatArray:
-    """Subtracts the weighted mean of each absolute zero from a residual (n,); unchanged without weight."""
+    """Subtracts the weighted mean of each absolute zero from a residual (n,); 0 without weight."""
     total, weights = np.bincount(zero, weight * left_arcsec), np.bincount(zero, weight)
     return np.asarray(left_arcsec - (total / np.maximum(weights, 1e-300))[zero])
 
@@ -130,7 +131,7 @@ def about_zeros(left_arcsec: FloatArray, zero: IntArray, weight: FloatArray) -> 
 
 
 LOCAL = frozenset({Moves.ANYWHERE})
-"""Shapes that local steps can improve from any start."""
+"""Shapes that local steps improve from any start."""
 FOUND = LOCAL | {Moves.NEARBY}
 """`LOCAL` shapes, and shapes that a search has brought close to their best value."""
 
@@ -141,16 +142,16 @@ class Weighting(Protocol):
     """The inverse covariance of the noise, K^-1."""
 
     def apply(self, columns: FloatArray) -> FloatArray:
-        """K^-1 times columns of shape (m,) or (m, p)."""
+        """Returns K^-1 times columns of shape (m,) or (m, p)."""
         ...
 
 
 class Prior(NamedTuple):
-    """Prior of a coefficient or shape (of a logarithmic shape: of its logarithm)."""
+    """Prior of a coefficient or shape, or of the logarithm of a logarithmic shape."""
 
     mean: float
     information: float
-    """One over the variance. A negative value compensates for information that noisy columns seem to add."""
+    """One over the variance. A negative value compensates for the apparent information of noisy columns."""
 
 
 FREE = Prior(0.0, 0.0)
@@ -158,25 +159,25 @@ FREE = Prior(0.0, 0.0)
 
 
 class Column(NamedTuple):
-    """Parameter that a column of the fit belongs to."""
+    """Parameter of one column of the fit."""
 
     effect: int
     """Place of the effect, or -1 for a nuisance."""
     name: str
-    """Number of the coefficient, name of the shape, or name of the nuisance."""
+    """Index of the coefficient, name of the shape, or name of the nuisance."""
     shape: bool = False
     logarithmic: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """Limits of the iterations of a fit."""
+    """Limits of a fit's iterations."""
 
     steps: int = 25
     converged: float = 1e-4
     """Predicted or actual fall in chi square below which the fit ends."""
     roughly: float = 0.0
-    """Tolerance as a share of chi square, because a large residual needs no accuracy."""
+    """Tolerance as a share of chi square, because a large residual requires no accuracy."""
 
     def enough(self, chi_square: float) -> float:
         """Returns the fall in chi square below which the fit ends."""
@@ -191,7 +192,6 @@ class Nuisances:
     """Shape (b, q)."""
     names: tuple[str, ...]
     prior: tuple[Prior, ...]
-    """Prior of each coefficient."""
 
     def strain(self, coefficients: FloatArray) -> float:
         """Returns the squared distance of the coefficients from their priors, standard deviations squared.
@@ -202,7 +202,7 @@ class Nuisances:
         return float(sum(each.information * (value - each.mean) ** 2 for each, value in pairs))
 
     def and_also(self, other: Nuisances) -> Nuisances:
-        """Returns these and further columns."""
+        """Returns these columns followed by others."""
         return Nuisances(
             side_by_side([self.columns, other.columns], len(self.columns)),
             (*self.names, *other.names),
@@ -210,7 +210,7 @@ class Nuisances:
         )
 
     def without(self, left_out: Callable[[str], bool]) -> Nuisances:
-        """Returns the columns for whose names ``left_out`` is False."""
+        """Returns the columns for whose names ``left_out`` returns False."""
         keep = np.array([not left_out(each) for each in self.names])
         return Nuisances(
             self.columns[:, keep], tuple(compress(self.names, keep)), tuple(compress(self.prior, keep))
@@ -218,7 +218,7 @@ class Nuisances:
 
 
 def unknown(columns: FloatArray | BoolArray, names: Sequence[str]) -> Nuisances:
-    """Returns columns without prior information."""
+    """Returns nuisances without prior information."""
     return Nuisances(np.asarray(columns, dtype=np.float64), tuple(names), (FREE,) * len(names))
 
 
@@ -229,18 +229,18 @@ class Terms:
     observed: FloatArray
     """Observations, arcsec, shape (m,)."""
     columns: Columns
-    """Columns of an effect, (m, p), independent of its coefficients."""
+    """Returns the columns of an effect, (m, p), independent of its coefficients."""
     weighting: Weighting
     nuisances: Nuisances
     prior: Mapping[tuple[int, str], Prior] = field(default_factory=dict)
-    """Priors by place of the effect, and number of the coefficient or name of the shape."""
+    """Priors by place of the effect, and index of the coefficient or name of the shape."""
     sign: Callable[[Effect], float] = lambda _: 0.0
-    """Sign that an effect's coefficients must have; 0 if either."""
+    """Sign required of an effect's coefficients; 0 for either sign."""
     moves: frozenset[Moves] = LOCAL
-    """Kinds of shapes that are fitted; the others stay fixed."""
+    """Kinds of shapes to fit; all others stay fixed."""
 
     def known(self, columns: Sequence[Column]) -> FloatArray:
-        """Returns prior mean and information of columns that begin with the nuisances, shape (p, 2)."""
+        """Returns prior mean and information of columns, the nuisances first, shape (p, 2)."""
         others = columns[len(self.nuisances.prior) :]
         own = [self.prior.get((each.effect, each.name), FREE) for each in others]
         return np.array([*self.nuisances.prior, *own], dtype=np.float64).reshape(-1, 2)
@@ -258,7 +258,7 @@ class Linearised:
     residual: FloatArray
     """Residual, shape (m,)."""
     known: FloatArray
-    """Prior information of each column, and that times (prior mean - value), shape (p, 2)."""
+    """Prior information of each column, and its product with (prior mean - value), shape (p, 2)."""
 
     @cached_property
     def directions(self) -> FloatArray:
@@ -267,12 +267,12 @@ class Linearised:
 
     @cached_property
     def basis(self) -> FloatArray:
-        """B, shape (m, r): the fit leaves c'c - (B'c)'(B'c) of a column c; orthonormal without priors."""
+        """B, shape (m, r): a column's square c'c falls to c'c - (B'c)'(B'c); orthonormal without priors."""
         return np.asarray(self.columns @ self.directions)
 
     @cached_property
     def slack(self) -> FloatArray:
-        """s, shape (r,): the fit leaves c'r - (B'c)'s of a column's moment c'r; zero at the minimum."""
+        """s, shape (r,): a column's moment c'r with the residual falls to c'r - (B'c)'s; 0 at the minimum."""
         return np.asarray(self.directions.T @ (self.columns.T @ self.residual + self.known[:, 1]))
 
     def of(self, places: IntArray) -> Linearised:
@@ -280,22 +280,23 @@ class Linearised:
         return Linearised(self.columns[:, places], self.residual, self.known[places])
 
     def left(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Returns the remaining Gram matrix (k, k) and moment (k,) of other columns (m, k) after the fit."""
+        """Returns Gram matrix (k, k) and moment (k,) of other columns (m, k) after the fit."""
         shadow = self.basis.T @ columns
         return columns.T @ columns - shadow.T @ shadow, columns.T @ self.residual - shadow.T @ self.slack
 
     def taken_over(self, columns: FloatArray) -> FloatArray:
-        """Returns the coefficients with which the fit would absorb other columns (m, k), shape (p, k)."""
+        """Returns the coefficients by which the fit would absorb other columns (m, k), shape (p, k)."""
         return np.asarray(self.directions @ (self.basis.T @ columns))
 
 
 def steps_without(
     fit: Linearised, fold: IntArray, weighting: Callable[[BoolArray], Weighting]
 ) -> list[FloatArray]:
-    """Returns, for each fold, the step (p,) to the fit without it; ``weighting`` weights some of the rows.
+    """Returns, for each fold, the step (p,) to the fit without that fold; ``weighting`` weights a subset of
+    rows.
 
-    Each fold is weighted separately, so that correlated noise carries nothing between folds. Parameters that
-    only the fold itself determines stay unchanged.
+    Each fold is weighted separately, so correlated noise does not connect folds. Parameters that only the
+    fold itself determines stay unchanged.
     """
     grams, moments = [], []
     for number in range(int(np.max(fold)) + 1):

@@ -1,11 +1,11 @@
 """Coloured noise, and least squares weighted by it.
 
-The noise has five parts: white noise (which may differ between standing and moving); a drift in time;
-a drift over the motor's *travel*, because an axis rests anywhere within a count of its encoder, constant
-during a stop and different at the next one; the misfit of the loop's shape, which fades over each branch and
-differs between branches; and the rounding error that is constant over a leg, whose size follows from the
-count. The drifts are first-order Markov processes, so the inverse of their covariance is banded, and a fit
-costs no more than one with white noise (Rybicki and Press 1995).
+The noise has five parts: white noise, which may differ between standing and moving; a drift in time; a drift
+over the motor's *travel*, because an axis rests anywhere within a count of its encoder, constant during a
+stop and different at the next; the misfit of the loop's shape, which decays over each branch and differs
+between branches; and the rounding error that is constant over a leg, whose size follows from the count. The
+drifts are first-order Markov processes, so the inverse of their covariance is banded, and a fit costs no more
+than one with white noise (Rybicki and Press 1995).
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ ABSENT_ARCSEC = 2.0 * SMALLEST_ARCSEC
 """A drift that a fit leaves below this, at its lower limit, is omitted: each makes all products slower."""
 COLUMNS_AT_ONCE = 8
 LOOP_LENGTH = 0.3
-"""Correlation length of the misfit of a loop's shape, as a share of the travel over which it fades."""
+"""Correlation length of the misfit of a loop's shape, as a share of the travel over which the misfit
+decays."""
 LOOP_DEG = 8.0, 40.0
-"""Range of that travel, as of the widths of loops. A longer one is a drift, a shorter one ringing."""
+"""Range of that travel, derived from the widths of loops. A longer one is a drift, a shorter one ringing."""
 SHORTEST_STEP = 1e-8
 """Step of a drift between blocks at one place, correlation lengths: practically zero."""
 
@@ -50,10 +51,10 @@ class NoiseModel:
     """Drift over the motor's travel: standard deviation and correlation length."""
     loop_arcsec: float = 0.0
     loop_deg: float = 10.0
-    """Misfit of the loop's shape: standard deviation at a turning point, and travel over which it fades."""
+    """Misfit of the loop's shape: standard deviation at a turning point, and travel over which it decays."""
 
     def white_variance(self, blocks: Blocks) -> FloatArray:
-        """Returns the white variance of each block's mean; infinite for blocks without samples."""
+        """Returns the white-noise variance of each block's mean; infinite for blocks without samples."""
         sample = np.where(blocks.moving, self.moving_arcsec, self.standing_arcsec) ** 2
         mean = np.divide(sample, blocks.count, out=np.full(len(blocks), np.inf), where=blocks.count > 0)
         return np.asarray(mean + blocks.blur)
@@ -71,7 +72,7 @@ class White:
         self._precision = weight**2
 
     def apply(self, columns: FloatArray) -> FloatArray:
-        """K^-1 times columns of shape (m,) or (m, p)."""
+        """Returns K^-1 times columns of shape (m,) or (m, p)."""
         return np.asarray(
             (self._precision if columns.ndim == 1 else self._precision[:, np.newaxis]) * columns
         )
@@ -120,7 +121,7 @@ def _over_legs(blocks: Blocks) -> _Chain:
 
 
 def _chain(step: FloatArray, load: FloatArray, load_slope: FloatArray) -> _Chain:
-    """Builds a chain from steps between blocks, in correlation lengths (infinite: independent)."""
+    """Builds a chain from the steps between blocks in correlation lengths (infinite: independent)."""
     step_slope = np.where((step > SHORTEST_STEP) & np.isfinite(step), -step, 0.0)
     step = np.maximum(step, SHORTEST_STEP)
     decay = np.exp(-step)
@@ -140,7 +141,7 @@ def _chain(step: FloatArray, load: FloatArray, load_slope: FloatArray) -> _Chain
 
 
 class Precision:
-    """Inverse covariance of the noise of some blocks, applied without forming the matrix.
+    """Inverse covariance of the noise of a set of blocks, applied without forming the matrix.
 
     K = W + H S H', with W white and S of the drifts. By Woodbury, with P = S^-1 (tridiagonal for each drift),
     K^-1 = w - w H (P + H' w H)^-1 H' w, and the bracket is banded.
@@ -189,7 +190,7 @@ class Precision:
         return band
 
     def apply(self, columns: FloatArray) -> FloatArray:
-        """K^-1 times columns of shape (b,) or (b, p)."""
+        """Returns K^-1 times columns of shape (b,) or (b, p)."""
         if columns.ndim == 1:
             return np.asarray(self._applied(columns[np.newaxis])[0])
         result = np.empty(columns.shape)
@@ -200,7 +201,7 @@ class Precision:
         return result
 
     def _applied(self, rows: FloatArray) -> FloatArray:
-        """Returns K^-1 times columns that are given as rows, (p, b)."""
+        """Returns K^-1 times columns given as rows, (p, b)."""
         if not self._chains:
             return self.weight * rows
         back = np.einsum("pbw,wb->pb", self._drifts(rows), self._loads)
@@ -236,7 +237,7 @@ class Precision:
         return within, between
 
     def log_likelihood(self, residual: FloatArray) -> float:
-        """Returns the Gaussian log likelihood up to a constant; only observed blocks count."""
+        """Returns the Gaussian log likelihood of the observed blocks up to a constant."""
         return 0.5 * (self._log_determinant - float(residual @ self.apply(residual)))
 
     def score(self, residual: FloatArray) -> FloatArray:
@@ -330,7 +331,7 @@ def fit_noise(residual: FloatArray, blocks: Blocks, parameters: int, begin: Nois
 
 
 def _pieces(blocks: Blocks) -> IntArray:
-    """Selects blocks of some pieces spread evenly over the record."""
+    """Selects the blocks of several pieces spread evenly over the record."""
     count = len(blocks)
     if count <= PIECES * PIECE_BLOCKS:
         return np.arange(count)

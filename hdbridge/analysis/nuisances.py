@@ -1,13 +1,13 @@
 """Nuisance columns, fitted so that measurement errors do not bias the model: zeros and encoder faults.
 
-A load encoder that is read later than the motor encoder looks like hysteresis at one speed. An encoder of
-whole counts reads a motor that creeps from count to count, or rests just short of one, wrong by a fraction
-of a count *in the direction of motion*. That looks like hysteresis too, and depends on speed. Each turning
-point is known only to within a count and the travel between two samples (its reach), and a narrow or steep
-hysteresis is known no better than its turning points. Each has a column whose coefficient is a bounded
-share of its reach. With fine encoders and fast sampling these columns vanish. The load on the gear's spring
-amplifies the error that excites it, more at higher speed. Two speeds separate this swing from
-the amplitudes of the orders; at one speed these are less certain.
+A delay of the load encoder looks like hysteresis at a single speed. If a motor creeps from count to count, or
+rests just short of a count, an encoder of whole counts is wrong by a fraction of a count *in the direction of
+motion*. This error also looks like hysteresis, and depends on speed. Each turning point is known only to
+within a count and the travel between two samples (its reach), and a narrow or steep hysteresis is known only
+as accurately as its turning points. Each turning point has a column whose coefficient is a bounded share of
+its reach. With fine encoders and fast sampling these columns vanish. The load on the gear's spring amplifies
+the error that excites it, more at higher speed. This swing is separable from the orders at two speeds; at a
+single speed the amplitudes are less certain.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ UNITS = {DELAY: "ms", ROUNDING: "counts", SWING: "ms\N{SUPERSCRIPT TWO}"}
 SWING_MS2 = 25.0
 """Prior standard deviation of the swing: 1 / (2 pi f)^2 of a load with natural frequency f = 32 Hz."""
 SWING_MS3 = 50.0
-"""Prior standard deviation of the swing's damping part, for a damping ratio z: 2 z / (2 pi f)^3."""
+"""Prior standard deviation of the swing's damping part, 2 z / (2 pi f)^3, with damping ratio z."""
 SWING_COUNT_ARCSEC = 2.0
 """Largest motor count for which swing is fitted. The sawtooth of a coarser encoder also depends on speed
 and looks like swing."""
@@ -50,14 +50,13 @@ SPEEDS_COUNTS_S = (
     0, 25, *range(50, 800, 50), *range(800, 1600, 100), *range(1600, 3200, 200),
     3200, 4800, 6400, 12800, np.inf,
 )  # fmt: skip
-"""Edges of the speed classes with equal rounding, counts per second; rest is a class of its own. A drive
-that receives whole counts in every cycle, and is read in the same cycles, lags by the same fraction
-of a count at constant speed. Simulated servos were read wrong by 0.08 to 0.22 counts (rms over
-speeds) from 300 to 12,000 counts per second. With a lag of 5 ms the error repeats every 200 counts
-per second; a class is a quarter."""
+"""Edges of the speed classes of equal rounding error, counts per second; rest is a class of its own. A drive
+that receives and is read in whole counts in the same cycles lags by a constant fraction of a count at
+constant speed. Simulated servos read wrong by 0.08 to 0.22 counts (rms over speeds) from 300 to 12,000
+counts per second. With a lag of 5 ms the error repeats every 200 counts per second; a class is a quarter
+of this."""
 SHARE = 0.1
-"""Minimum share of a nuisance column that other columns do not explain; below it, the nuisance is left
-out."""
+"""Share of a nuisance column that other columns do not explain, below which the nuisance is omitted."""
 
 
 def zeros(zero: IntArray, number: int) -> Nuisances:
@@ -73,9 +72,10 @@ def delay_column(design: Design) -> FloatArray:
 
 
 def rounding_columns(design: Design) -> tuple[FloatArray, FloatArray]:
-    """Returns columns of one count in the direction of motion, arcsec, with the prior standard deviations.
+    """Returns columns of one count in the direction of motion, arcsec, and their prior standard deviations,
+    counts.
 
-    Columns, shape (b, classes + 2): at rest, all together, each speed class. Deviations in counts.
+    The columns, shape (b, classes + 2), belong to rest, all motion, and each speed class.
     """
     blocks, samples = design.blocks, design.samples
     count_arcsec = samples.count_deg / samples.ratio * ARCSEC_PER_DEG
@@ -95,8 +95,8 @@ def rounding_columns(design: Design) -> tuple[FloatArray, FloatArray]:
 def turn_columns(design: Design, effects: Sequence[Effect]) -> tuple[FloatArray, list[Prior]]:
     """Returns a column for each relevant turning point, shape (b, turns): the change if it lay further out.
 
-    A turning point lies anywhere within its count, and between its sample and the intersection of straight
-    lines; its expected place is halfway.
+    A turning point lies anywhere within its count, between its sample and the intersection of straight lines;
+    its expected position is halfway.
     """
     change, missed, turn = design.turn_effects(effects)
     weight = np.bincount(turn, design.blocks.count * change**2)
@@ -121,10 +121,11 @@ def swing(
 ) -> Nuisances:
     """Returns the swing of the load beyond the waves that excite it, arcsec per ms squared and per ms cubed.
 
-    ``rate`` (n,) is the motor speed, radians per second. ``waves`` are orders, their contribution, (n,), and
-    the same a quarter of a wave later. ``mean`` averages columns (n, 2) like the observations. Driven by a
-    cos(w t) well below its natural frequency f, a load on a spring with damping ratio z responds with (1 +
-    (w / 2 pi f)^2) a cos(w t) + 2 z (w / 2 pi f)^3 a sin(w t): larger, and later in both directions.
+    ``rate`` (n,) is the motor speed, radians per second. ``waves`` contain the orders, their contribution,
+    (n,), and that contribution a quarter of a wave later. ``mean`` averages columns (n, 2) like the
+    observations. Driven by a cos(w t) well below its natural frequency f, a load on a spring with damping
+    ratio z responds with (1 + (w / 2 pi f)^2) a cos(w t) + 2 z (w / 2 pi f)^3 a sin(w t): larger, and lagging
+    in both directions.
     """
     columns = np.zeros((len(rate), 2))
     for order, wave, later in waves:
@@ -137,7 +138,8 @@ def swing(
 def speeds_differ(speed_deg_s: FloatArray, count: FloatArray) -> bool:
     """Returns True if the speeds differ enough to separate swing from the orders that excite it.
 
-    The mean must leave more than `SHARE` of the squared speed; ``count`` (n,) weights the speeds.
+    More than `SHARE` of the squared speed must remain after subtracting the mean; ``count`` (n,) weights the
+    speeds.
     """
     squared = speed_deg_s**2
     fourth = float(count @ squared**2)
@@ -169,7 +171,7 @@ def nuisances_of(
 
 
 def share_left(columns: FloatArray, others: FloatArray, weight: FloatArray) -> float:
-    """Returns the smallest share of a column's weighted squares that the others do not explain."""
+    """Returns the smallest share of a column's weighted squares that the other columns do not explain."""
     both = np.concatenate([others, columns], axis=1)
     gram = both.T @ (weight[:, np.newaxis] * both)
     split = others.shape[1]

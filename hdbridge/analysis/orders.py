@@ -1,8 +1,8 @@
 """Selection of the orders in a record, by least squares at the true angles.
 
 Samples are never evenly spaced in angle, and a stepping test of 43.56 degrees samples a motor turn 8.26
-times: a Fourier transform by sample number would put order 6 at 2.26 and order 8 at 0.26. Fitted at the
-true angles, each order appears at its own number, or is reported as not separable from another.
+times. A Fourier transform by sample number would show order 6 at 2.26 and order 8 at 0.26. A fit at the true
+angles shows each order at its own number, or reports that it is not separable from another.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hdbridge.analysis.linear import seen_directions, solve_symmetric
 from hdbridge.axis.effects import FloatArray
 
 NOT_APART = 0.95
-"""Canonical correlation above which two orders, or two causes, are not separable in a record."""
+"""Canonical correlation above which two orders or two causes are not separable in a record."""
 
 System = tuple[FloatArray, FloatArray]
 """J' K^-1 J and J' K^-1 y of [cosine and sine pairs of the candidates | all other columns of the fit]."""
@@ -47,21 +47,20 @@ class Order:
 
     @classmethod
     def motor(cls, number: int) -> Order:
-        """Returns an order by its periods per motor turn."""
+        """Returns the order with this number of periods per motor turn."""
         return cls(Family.MOTOR, number, float(number))
 
     @classmethod
     def load(cls, number: int, ratio: float) -> Order:
-        """Returns an order by its periods per load turn."""
+        """Returns the order with this number of periods per load turn."""
         return cls(Family.LOAD, number, number / ratio)
 
     @classmethod
     def flexspline(cls, number: int, ratio: float) -> Order:
-        """Returns an order by its periods per turn of the wave generator against the flexspline."""
+        """Returns the order with these periods per turn of the wave generator against the flexspline."""
         return cls(Family.FLEXSPLINE, number, number * (1.0 + 1.0 / ratio))
 
     def __str__(self) -> str:
-        """Returns its name."""
         return f"{self.family.value} order {self.number}"
 
 
@@ -71,32 +70,32 @@ class Selection:
 
     chosen: tuple[Order, ...]
     unresolved: tuple[Order, ...]
-    """Candidates not separable from the zero, the hysteresis or a selected order in this record."""
+    """Candidates that are not separable from the zero, the hysteresis or a selected order in this record."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Estimate of one order with everything else in the fit: its value, or what it would add."""
+    """Estimate of one order next to all others: its amplitude, or the amplitude that it would add."""
 
     order: Order
     amplitude_arcsec: float
     phase_deg: float
     """Phase in amplitude * cos(order * motor angle + phase)."""
     standard_error_arcsec: float
-    """Standard error of the cosine or sine coefficient, the larger."""
+    """Standard error of the cosine or sine coefficient, whichever is larger."""
     threshold_arcsec: float
-    """Amplitude that noise alone reaches at any of the orders in one record of a hundred."""
+    """Amplitude that noise alone exceeds, at any of the orders, in one of a hundred records."""
     aliases: tuple[Order, ...] = ()
-    """Orders that are not separable from it in this record."""
+    """Orders that are not separable from this order in the record."""
 
     @property
     def significant(self) -> bool:
-        """True if it exceeds noise and has no aliases."""
+        """True if the order exceeds noise and has no aliases."""
         return self.amplitude_arcsec > self.threshold_arcsec and not self.aliases
 
     @property
     def fall_in_chi_square(self) -> float:
-        """Rise in chi square without it."""
+        """Rise in chi square without the order."""
         return (self.amplitude_arcsec / max(self.standard_error_arcsec, 1e-12)) ** 2
 
     @property
@@ -108,13 +107,13 @@ class Line:
 def threshold(candidates: int, family_wise: float) -> float:
     """Returns the fall in chi square (two coefficients) that the best candidate exceeds by chance.
 
-    ``family_wise`` is the probability of that.
+    ``family_wise`` is the probability of this.
     """
     return -2.0 * math.log(family_wise / max(candidates, 1))
 
 
 class _Left(NamedTuple):
-    """Part of one order that the others in a fit leave."""
+    """Part of an order that the others in a fit do not explain."""
 
     share: float
     """Remaining share of its information."""
@@ -123,7 +122,7 @@ class _Left(NamedTuple):
     cosine: float
     sine: float
     error: float
-    """Standard error of the coefficients, the larger."""
+    """Standard error of the cosine or sine coefficient, whichever is larger."""
 
     @property
     def apart(self) -> bool:
@@ -147,7 +146,7 @@ class _Candidates:
         self.number = number
 
     def left(self, index: int, inside: Collection[int]) -> _Left:
-        """Returns the part of a candidate that the others ``inside`` leave."""
+        """Returns the part of a candidate that the others ``inside`` the fit do not explain."""
         own = [2 * index, 2 * index + 1]
         others = [2 * each + part for each in inside if each != index for part in (0, 1)]
         cross = self._information[np.ix_(others, own)]
@@ -168,7 +167,7 @@ def select(
 
     An order enters if it lowers chi square by more than `threshold` (which all candidates together exceed by
     chance with probability ``family_wise``) and its amplitude is at least ``smallest_arcsec``. It is removed
-    when later ones replace it.
+    if later ones replace it.
     """
     waves = _Candidates(len(candidates), system)
     needed = threshold(len(candidates), family_wise)
@@ -199,7 +198,7 @@ def select(
 def spectrum(
     orders: Sequence[Order], chosen: Collection[Order], system: System, family_wise: float = 0.01
 ) -> tuple[Line, ...]:
-    """Returns the line of each order; those ``chosen`` are in the fit."""
+    """Returns the line of each order; the ``chosen`` orders are in the fit."""
     waves = _Candidates(len(orders), system)
     root = math.sqrt(threshold(len(orders), family_wise))
     inside = [at for at, each in enumerate(orders) if each in chosen]
@@ -215,7 +214,7 @@ def spectrum(
 
 
 def _aliases(orders: Sequence[Order], information: FloatArray) -> dict[Order, list[Order]]:
-    """Returns, for each order, those whose largest canonical correlation with it exceeds `NOT_APART`."""
+    """Returns, for each order, the orders whose largest canonical correlation with it exceeds `NOT_APART`."""
     pairs = {order: [2 * at, 2 * at + 1] for at, order in enumerate(orders)}
     roots = {order: seen_directions(information[np.ix_(own, own)]) for order, own in pairs.items()}
     result: dict[Order, list[Order]] = {order: [] for order in orders}

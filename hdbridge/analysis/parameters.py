@@ -1,9 +1,9 @@
 """Parameters of findings with 95 % intervals, including systematic errors that leave no residual.
 
-A sandwich over blocks misses these errors, because they are constant over the whole record. Each is a
-column with a standard deviation, and shifts the parameters as the fit absorbs it. They are the
-uncertainty of an effect's law, and causes separated from a finding only by the noise of a measured channel
-(an eccentric mass winds the gear up once per turn, like run-out of the load encoder).
+A sandwich over blocks does not see these errors, because they are constant over the whole record. Each is a
+column with a standard deviation, and shifts the parameters by the amount that the fit absorbs. Its sources
+are the uncertainty of an effect's law, and causes separable from a finding only by the noise of a measured
+channel (an eccentric mass winds the gear up once per turn, like run-out of the load encoder).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from hdbridge.units import unit_of
 
 
 class Confounded(NamedTuple):
-    """Cause that may have biased a finding without being noticed."""
+    """Undetected cause that may have biased a finding."""
 
     name: str
     shift: FloatArray
@@ -39,7 +39,7 @@ class Confounded(NamedTuple):
 
 
 def confounded(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[Confounded]:
-    """Yields causes that would go unnoticed at typical size in addition to the effect at ``place``."""
+    """Yields causes of typical size that would go undetected next to the effect at ``place``."""
     effects, scales = fitted.hypothesis.effects, estimator.scales
     held = zip(fitted.parameters, fitted.information.tolist(), strict=True)
     known = {each.effect for each, information in held if information}  # as calibrated, not changed
@@ -74,9 +74,9 @@ def systematic(estimator: Estimator, fitted: Fitted) -> FloatArray:
 
 
 def _alike(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[tuple[Effect, FloatArray, float]]:
-    """Yields causes that resemble the effect except for a measured channel.
+    """Yields causes that are separable from the effect only by a measured channel.
 
-    With each: its weighted columns at typical size, and the share of channel noise in their squares.
+    Each has its weighted columns at typical size, and the share of channel noise in their squares.
     """
     effect, ratio = fitted.hypothesis.effects[place], estimator.data.ratio
     start = fitted.hypothesis.start
@@ -103,9 +103,9 @@ def _alike(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[tuple[E
 
 
 def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
-    """Refits a hypothesis with the swing that its waves excite, and with the tangents of all shapes.
+    """Refits a hypothesis with the swing excited by its waves, and with the tangents of all shapes.
 
-    At a single speed the swing is left out, because it is part of the orders.
+    At a single speed the swing is left out, because it is indistinguishable from the orders.
     """
     plain = estimator.fit(replace(fitted.hypothesis, nuisances=_shaken(estimator, fitted)))
     found = estimator.fit(plain.hypothesis, moves=FOUND)
@@ -117,7 +117,7 @@ def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
 def _shaken(estimator: Estimator, fitted: Fitted) -> Nuisances | None:
     """Returns columns of the load's swing: in phase by frequency squared, lagging by frequency cubed.
 
-    The second is odd in the direction. None without orders, or at a single speed.
+    The second changes sign with the direction. None without orders, or at a single speed.
     """
     motion = estimator.data.full.motion
     speed = motion.motor_speed_deg_s
@@ -137,7 +137,7 @@ def _shaken(estimator: Estimator, fitted: Fitted) -> Nuisances | None:
 
 WAVE: Final = ("amplitude_arcsec", "phase_deg")
 PARTS: Final = (6, 12)
-"""Numbers of equal parts of a record, each part treated as one observation."""
+"""Numbers of equal parts into which a record is divided; each part counts as one observation."""
 STEP_95: Final = 11.03
 """95 % point of the location of the maximum of a Brownian motion with drift -|t| / 2 on either side."""
 
@@ -145,11 +145,11 @@ STEP_95: Final = 11.03
 def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
     """Returns the covariance of all parameters, (p, p), scaled for 95 % intervals by `NORMAL_95`.
 
-    It is the largest of the sandwiches over blocks of seconds, for wandering noise, and over `PARTS` of the
-    record, for errors of the hypothesis that differ between them. Few parts estimate a variance poorly.
-    Student's quantile then replaces the normal one, with one degree of freedom less than the parts that
+    It is the largest of several sandwiches: over blocks of seconds, for wandering noise, and over `PARTS` of
+    the record, for errors of the hypothesis that differ between the parts. Few parts estimate a variance
+    poorly, so Student's quantile replaces the normal one, with one degree of freedom less than the parts that
     carry the parameter (Bester, Conley and Hansen 2011; effective number of clusters as in Carter, Schnepel
-    and Steigerwald 2017). Errors without residual are added (`systematic`).
+    and Steigerwald 2017). Systematic errors are added (`systematic`).
     """
     tangent, residual = fitted.tangent, fitted.residual
     directions, known = fitted.linearised.directions, fitted.linearised.known
@@ -182,7 +182,7 @@ def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
 def parameters_of(
     estimator: Estimator, fitted: Fitted, place: int, spread: FloatArray
 ) -> dict[str, Parameter]:
-    """Returns the parameters of one effect, by the names of the model file if it has them."""
+    """Returns the parameters of one effect, named as in the model file where possible."""
     effect, own = fitted.hypothesis.effects[place], fitted.places(place)
     result = named_parameters(effect, [fitted.parameters[i] for i in own], spread[np.ix_(own, own)])
     for shape in effect.shape:
@@ -201,7 +201,7 @@ def parameters_of(
 def named_parameters(effect: Effect, columns: Sequence[Column], spread: FloatArray) -> dict[str, Parameter]:
     """Returns an effect's parameters, with intervals from the covariance (c, c) of its ``columns``.
 
-    Parameters that nothing in the record depends on are left out.
+    Omits parameters without influence on the record.
     """
     names: dict[str, str] = {}
     for each in effect.named_coefficients():
@@ -233,9 +233,8 @@ def _stepwise(
 ) -> dict[str, Parameter]:
     """Returns sizes and times of steps.
 
-    A step first seen at one sample happened after the previous one. Noise may shift it by up to
-    `STEP_95` (sigma / size)^2 samples, the 95 % range of the most likely place of a step in white noise
-    (Yao 1987).
+    A step first seen at one sample happened after the previous sample. Noise may shift it by up to `STEP_95`
+    (sigma / size)^2 samples, the 95 % range of the most likely position of a step in white noise (Yao 1987).
     """
     result: dict[str, Parameter] = {}
     time_s = estimator.time_s

@@ -1,11 +1,11 @@
 """Preparation of records: white noise, driving angle, observed error, averaging.
 
 White noise is estimated from the spectrum of the error, never from the residual of a fit, because a noise
-model fitted to a residual absorbs effects. Third differences suppress slow effects of any size. They
-include fast ones (vibration, interpolation error of an encoder), so they give an upper bound. Fast effects
-are a few lines of the spectrum, and the level between the lines is the noise. Standing and moving samples
-are treated separately, with quantisation as a floor. Slow noise (wander, drift) is handled later by
-statistics over blocks of seconds.
+model fitted to a residual absorbs effects. Third differences suppress slow effects of any size. They retain
+fast effects (vibration, interpolation error of an encoder), so their deviation is an upper bound. Fast
+effects are a few lines of the spectrum, and the level between the lines is the noise. Standing and moving
+samples are treated separately, with quantisation as a lower bound. Slow noise (wander, drift) is handled
+later by statistics over blocks of seconds.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from hdbridge.records.recording import Segment
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 SEGMENTS = (128, 64, 32)
-"""Segment lengths of the spectrum, samples. The longest with enough segments is used, because its lines
-are narrowest."""
+"""Segment lengths of the spectrum, samples. The longest length with enough segments is used, because it has
+the narrowest lines."""
 ORDINATES = 150
-"""Number of ordinates that determine the level to 10 %."""
+"""Number of spectral ordinates that determine the noise level to 10 %."""
 LOWEST = 0.125
-"""Share of the sampling rate below which the spectrum may contain slow effects."""
+"""Frequency, as a share of the sampling rate, below which the spectrum may contain slow effects."""
 QUARTILE = 0.25
-"""Quantile of the spectrum taken as the noise level. White noise has less than 0.29 of its mean power at
-this share of frequencies. If lines fill a third of the spectrum, the deviation comes out a quarter
-too large."""
+"""Quantile of the spectrum that is taken as the noise level. White noise has less than 0.29 of its mean
+power at this share of frequencies. If lines fill a third of the spectrum, the deviation is overestimated
+by a quarter."""
 
 
 def noise_arcsec(
@@ -66,10 +66,10 @@ def noise_arcsec(
 
 
 def between_lines(values: FloatArray, rows: BoolArray, starts: Sequence[int] = (0,)) -> float:
-    """Returns the white noise of ``values`` in some rows, as a standard deviation.
+    """Returns the white noise of ``values`` in the given rows, as a standard deviation.
 
     It is the level between the lines of the spectra; infinite if too few rows are consecutive. Third
-    differences remove slow effects, and their spectrum is divided by that of white noise.
+    differences remove slow effects, and their spectrum is divided by that of differenced white noise.
     """
     edge = np.zeros(len(rows) + 1, dtype=bool)
     edge[1:-1] = np.diff(rows)
@@ -96,7 +96,7 @@ REPEATS = 3
 ALIKE = 2.0
 """Maximum ratio of the durations, and of the travels, of recordings that repeat each other."""
 ON_THE_WAY = ("move", "precondition", "step", "settle")
-"""Legs that only move the axis to a place. They carry the elastic state, but only their rests are used."""
+"""Legs that only move the axis into position. They carry the elastic state, but only their rests are used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,15 +104,15 @@ class Measured:
     """A record and the known properties of its samples; arrays of shape (n,)."""
 
     record: Record
-    """The measured record. The motion of the axis before each of its ``starts`` is unknown."""
+    """The measured record. The motion before each of its ``starts`` is unknown."""
     kinds: tuple[str, ...]
     """Kinds of motion, by the names of a recording's legs."""
     kind: IntArray
     """Index into ``kinds``."""
     zero: IntArray
-    """Number of the absolute zero, 0 .. zeros - 1."""
+    """Index of the absolute zero, 0 .. zeros - 1."""
     states: Mapping[int, Start] = field(default_factory=dict)
-    """Known elastic states, by first sample."""
+    """Known elastic states by sample index."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +121,7 @@ class Chain:
 
     rows: slice
     start: Start | None
-    """Elastic state at the first sample; None if fitted."""
+    """Elastic state at the first sample; None to fit it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,13 +130,13 @@ class Samples:
 
     ratio: float
     motion: Motion
-    """Driving angle, time, speed, acceleration and the channels that were recorded."""
+    """Driving angle, time, speed, acceleration and the recorded channels."""
     rested_deg: FloatArray
-    """Driving angle under another assumption about rests (`hdbridge.analysis.driving.Driven`)."""
+    """Driving angle under another assumption about rests (`Driven`)."""
     load_deg: FloatArray
     """Measured load angle."""
     error_arcsec: FloatArray
-    """Observed transmission error, about an arbitrary zero."""
+    """Observed transmission error about an arbitrary zero."""
     sigma_arcsec: FloatArray
     """White noise of each sample, standard deviation."""
     usable: BoolArray
@@ -144,16 +144,15 @@ class Samples:
     kind: IntArray
     """Index into ``kinds``."""
     zero: IntArray
-    """Number of the absolute zero, 0 .. zeros - 1."""
+    """Index of the absolute zero, 0 .. zeros - 1."""
     chains: tuple[Chain, ...]
-    """Chains, by indices of single samples."""
+    """Chains, by sample indices."""
     reading: Reading
     """Resolution of the motor encoder."""
     commanded: bool
-    """True if the record has the command."""
+    """True if the record contains the command."""
 
     def __len__(self) -> int:
-        """Number of samples."""
         return len(self.error_arcsec)
 
     @property
@@ -163,7 +162,7 @@ class Samples:
 
     @property
     def repeated(self) -> bool:
-        """True for several recordings that are alike in duration and travel; the tasks of a plan are not."""
+        """True for several recordings of similar duration and travel; not for the tasks of a plan."""
         rows = [each.rows for each in self.chains]
         durations = np.array([np.ptp(self.time_s[each]) for each in rows])
         travels = np.array([np.sum(np.abs(np.diff(self.motor_deg[each]))) for each in rows])
@@ -172,7 +171,7 @@ class Samples:
 
     @property
     def count_deg(self) -> float:
-        """Motor angle of one count of the encoder; 0 if no quantisation is visible."""
+        """One count of the motor encoder; 0 if quantisation is not visible."""
         return self.reading.count_deg
 
     @property
@@ -182,7 +181,7 @@ class Samples:
 
     @property
     def time_s(self) -> FloatArray:
-        """The record's clock."""
+        """Time on the record's clock."""
         assert self.motion.time_s is not None
         return self.motion.time_s
 
@@ -193,7 +192,7 @@ class Samples:
         return self.motion.motor_speed_deg_s
 
     def of_kind(self, *names: str) -> BoolArray:
-        """Returns a mask of the samples in legs of these names."""
+        """Returns a mask of the samples in legs of these kinds."""
         return np.isin(self.kind, [at for at, each in enumerate(self.kinds) if each in names])
 
     def along(self, chain: Chain) -> Motion:
@@ -201,7 +200,7 @@ class Samples:
         return motion_at(self.motion, chain.rows)
 
     def delayed(self, delay_s: float) -> Samples:
-        """Returns the samples with the motor angle ``delay_s`` earlier, for a load that was read late."""
+        """Returns the samples with the motor angle ``delay_s`` earlier, to correct a delayed load reading."""
         motor = self.motor_deg.copy()
         for chain in self.chains:
             time, angle = self.time_s[chain.rows], self.motor_deg[chain.rows]
@@ -233,7 +232,7 @@ def observe(
 ) -> Samples:
     """Derives driving angle, error and noise of all samples, all marked usable.
 
-    With ``against_command`` the error refers to the driving angle if there is a command, else to the
+    With ``against_command``, the error is relative to the driving angle if there is a command, else to the
     encoder's counts. ``expected`` is a model's prediction, subtracted before the noise is estimated.
     InputError if the record holds unusable values or the ratio does not match it.
     """
@@ -249,8 +248,8 @@ def observe(
             )
     for row in np.setdiff1d(np.flatnonzero(np.diff(time) < 0.0) + 1, record.starts)[:1].tolist():
         raise InputError(
-            f"{name}time_s of sample {row} lies before that of sample {row - 1}; expected time to run "
-            "forwards: sort the samples, or make two records of them"
+            f"{name}time_s of sample {row} is earlier than that of sample {row - 1}; expected increasing "
+            f"times: sort the samples, or split the record"
         )
     if not ratio > 0:
         raise InputError(f"{name}the ratio is {ratio:g}; expected more than 0")
@@ -297,11 +296,12 @@ def observe(
 
 
 MOST_POINTS = 100_000
-"""Largest number of samples that are used without averaging."""
+"""Maximum number of samples that are used without averaging."""
 AVERAGED_POINTS = 50_000
-"""Approximate number of points after averaging. It bounds time and memory, and suffices for slow effects."""
+"""Approximate number of points after averaging, which bounds time and memory and suffices for slow
+effects."""
 SHORT = 0.77
-"""Length of every other run as a share of the mean run length; the others have 1.6 times as many samples."""
+"""Length of every other run as a share of the mean; the runs between are 1.6 times as long."""
 LEAST_SAMPLES = 60
 LEAST_SETTLED = 0.2
 """Minimum share of samples outside fast moves; below it, fast moves are used as well."""
@@ -309,7 +309,7 @@ LEAST_SETTLED = 0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """A measurement prepared for diagnosis: samples and the points to fit."""
+    """Measurement prepared for diagnosis: samples and the points to fit."""
 
     ratio: float
     points: Samples
@@ -319,9 +319,9 @@ class Observed:
     runs: IntArray
     """First sample of each point's run, shape (points,)."""
     motor_count_arcsec: float
-    """One count of the motor encoder at the load; if none is visible, the count with equal jitter."""
+    """One count of the motor encoder at the load; if not visible, the count with the same jitter."""
     load_count_arcsec: float
-    """One count of the load encoder; 0 if none is visible."""
+    """One count of the load encoder; 0 if not visible."""
     noise_arcsec: float
     """White noise of a point."""
     period_s: float
@@ -337,12 +337,12 @@ class Observed:
         return replace(self, points=_averaged(self.full, runs), runs=runs)
 
     def having(self, full: Samples) -> Observed:
-        """Returns the same record with other values of its samples."""
+        """Returns the same record with other samples."""
         return replace(self, full=full, points=_averaged(full, self.runs))
 
     @property
     def motion(self) -> Motion:
-        """Motion that drove the axis, by points."""
+        """Motion of the axis at each point."""
         return self.points.motion
 
     def mean(self, values: FloatArray) -> FloatArray:
@@ -350,7 +350,7 @@ class Observed:
         return means(values, self.runs)
 
     def at_points(self, values: FloatArray) -> FloatArray:
-        """Averages a quantity of every sample to the usable points, as for the observations."""
+        """Averages a quantity of every sample over the usable points, like the observations."""
         found, usable = self.mean(values), self.points.usable
         return found if usable.all() else np.asarray(found[usable])
 
@@ -389,7 +389,7 @@ def gather(
     if not standstill:
         remarks.append("no standstill: the noise is taken from differences of neighbouring samples")
     if turns < 2:
-        remarks.append("hardly a reversal: hysteresis and all that depends on direction cannot be seen")
+        remarks.append("too few reversals: hysteresis and other effects of direction are not visible")
     span = float(np.ptp(record.motor_position_deg))
     if origin is not None and "motor" not in origin.stated and span < 2.0 * DEG_PER_TURN:
         remarks.append(f"the motor's angle spans {span:.3g}: too little to check that it is not in radians")
@@ -427,7 +427,7 @@ def _kinds(time: FloatArray, legs: Sequence[Segment]) -> tuple[tuple[str, ...], 
 def _runs(count: int, starts: Sequence[int]) -> IntArray:
     """Returns the first samples of runs to average; no run crosses a start.
 
-    Run lengths alternate, so that no period is averaged out in all runs.
+    Run lengths alternate, so no period is averaged out in all runs.
     """
     if count <= MOST_POINTS:
         return np.arange(count, dtype=np.intp)
@@ -449,7 +449,7 @@ def means(values: FloatArray, runs: IntArray) -> FloatArray:
 
 
 def _averaged(full: Samples, runs: IntArray) -> Samples:
-    """Averages samples over runs; a run with unusable samples becomes an unusable point of the path."""
+    """Averages samples over runs; a run with unusable samples becomes an unusable point."""
     if len(runs) == len(full):
         return full
     size = np.diff(np.append(runs, len(full)))

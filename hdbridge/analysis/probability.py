@@ -1,8 +1,8 @@
 """Probability of a finding: a logistic formula of the evidence for and against it.
 
-`Scales` holds its coefficients. tools/fit_probabilities.py fits them, with a ridge and with fixed signs, on
-the findings of two blind suites and of records from formulas, whose causes are known. docs/diagnosis.md
-reports the cross-validation.
+`Scales` holds its coefficients. tools/fit_probabilities.py fits them by ridge regression with fixed signs to
+findings of known cause, from two blind suites and synthetic records. docs/diagnosis.md reports the cross-
+validation.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hdbridge.analysis.findings import Finding
 from hdbridge.analysis.scales import Scales
 
 UNPROVEN = 0.5
-"""Highest probability of a cause that does not predict data that were held out."""
+"""Maximum probability of a cause that does not predict held-out data."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,23 +26,23 @@ class Context:
     left_arcsec: float
     """Root mean square of the residual beyond the noise."""
     excess: float
-    """Chi square per point of the whole fit."""
+    """Chi square per point of the complete fit."""
     unexplained: bool
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """Prior odds of a cause from other joints, before this record is seen (`hdbridge.fleet.prior`)."""
+    """Prior odds of a cause, from other joints of a fleet (`hdbridge.fleet.prior`)."""
 
     right: Mapping[str, float]
-    """Probability, by cause, that a name of it is right in a joint of this group."""
+    """Probability, by cause, that a finding of this cause is correct in a joint of this group."""
     words: Mapping[str, str]
-    """Verdict in words, for the output."""
+    """Description of the prior by cause, for the output."""
     ranges: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
     """Median and standard deviation between joints, by cause and parameter."""
 
     def log_odds(self, cause: str, scales: Scales) -> float:
-        """Returns by how much a name of the cause is more credible than in the records of the formula."""
+        """Returns the log odds of a cause relative to those in the records of the formula."""
         share = self.right.get(cause, scales.right)
         return math.log(share / (1.0 - share)) - math.log(scales.right / (1.0 - scales.right))
 
@@ -86,7 +86,7 @@ def features(
 def weighed(
     findings: Sequence[Finding], context: Context, scales: Scales, prior: Prior | None = None
 ) -> list[Finding]:
-    """Returns the findings with the probability that each (or one of its aliases) is present."""
+    """Returns the findings with the probability that each, or one of its aliases, is present."""
     largest = max((each.robust for each in findings), default=0.0)
     weighed = []
     for each in findings:
@@ -109,7 +109,7 @@ def probability(terms: Mapping[str, float], scales: Scales, prior: float = 0.0) 
 def updated(score: float, prior: float, scales: Scales) -> float:
     """Returns the probability from the log odds of the record and of a prior.
 
-    A prior does not make a name likely that the record alone does not support.
+    A prior does not make a finding likely that the record alone does not support.
     """
     alone, most = 1.0 / (1.0 + math.exp(-score)), scales.surest
     if prior and alone < scales.named_from:

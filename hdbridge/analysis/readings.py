@@ -1,7 +1,7 @@
 """Resolution of an angle: counts of its encoder, digits of its file, and jitter.
 
-Counts are visible in the record unless the file has too few digits or the noise is larger. The jitter
-is always known from third differences during motion, which suppress slow changes.
+Counts are visible in the record unless the file has too few digits or the noise is larger. The jitter is
+always known, from third differences during motion, which suppress slow changes.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from hdbridge.axis.effects import FloatArray
 
 SMALLEST_COUNT_DEG = 1e-5
 ROUNDED_DEG = 1e-6
-"""Tolerance for changes in whole counts, because of floating-point rounding."""
+"""Floating-point tolerance for changes in whole counts."""
 WHOLE_SHARE = 0.99
 """Minimum share of the changes that are whole counts."""
 NEAREST = 200
-"""Number of smallest differences between changes that show the count."""
+"""Number of smallest differences between changes from which the count is determined."""
 DIGITS = 9
 """Number of decimals from which a file counts as unrounded."""
 FINEST_COUNT_DEG = 360.0 / 2**20 - ROUNDED_DEG
-"""Smallest plausible count. Smaller steps are a digit of the file, or a count hidden by noise."""
+"""Smallest plausible count. A smaller step is a digit of the file, or a count hidden by noise."""
 COUNTS_PER_DIGIT = 6.0
 """Smallest count that can be recognised in a rounded file, in units of its last digit."""
 NEAR_COUNTS = 6
-"""Span of four readings that show jitter, counts: twice what flickers by a count."""
+"""Maximum span of four readings that show jitter, counts: twice the span of a flickering count."""
 LEAST_NEAR = 20
-"""Minimum number of such readings."""
+"""Minimum number of such groups of readings."""
 MOST_JITTER_DEG = 0.1
 """Largest plausible standard deviation of a motor reading: the rounding of 1,000 counts a turn. Third
 differences above it are fast motion."""
@@ -45,36 +45,36 @@ class Reading:
     """Resolution of an angle, degrees."""
 
     count_deg: float
-    """One count of the encoder; 0 if none is visible."""
+    """One count of the encoder; 0 if not visible."""
     jitter_deg: float
     """Standard deviation of a reading's error, including quantisation."""
 
     @property
     def resolution_deg(self) -> float:
-        """Encoder count; if it is not visible in the readings, the count whose rounding has their jitter."""
+        """Encoder count; if not visible, the count whose rounding equals the jitter."""
         if self.count_deg >= FINEST_COUNT_DEG:
             return self.count_deg
         return max(self.count_deg, self._alike_deg)
 
     @property
     def unaided_deg(self) -> float:
-        """The resolution without a command, when motor vibration and reading noise are not separable.
+        """Resolution without a command, when motor vibration and reading noise are not separable.
 
-        Noise larger than the counts then limits it too.
+        Noise larger than the counts then limits the resolution too.
         """
         return self._alike_deg if self._alike_deg > 2.0 * self.count_deg else self.resolution_deg
 
     @property
     def _alike_deg(self) -> float:
-        """Encoder count whose rounding would have the jitter of the readings."""
+        """Encoder count whose rounding equals the jitter of the readings."""
         return float(_UNIFORM * self.jitter_deg)
 
 
 def reading_of(angle_deg: FloatArray) -> Reading:
     """Returns the resolution of an angle, shape (n,).
 
-    A motion that bends within a few samples is not noise. If counts are visible, the jitter is therefore that
-    of readings within a few counts of each other, or without these that of rounding.
+    A motion that bends within a few samples is not noise. If counts are visible, the jitter is therefore
+    taken from readings within a few counts of each other or, without such readings, from rounding.
     """
     count, jitter = quantum_deg(angle_deg), min(jitter_deg(angle_deg), MOST_JITTER_DEG)
     if not count or len(angle_deg) <= 3:
@@ -89,7 +89,8 @@ def reading_of(angle_deg: FloatArray) -> Reading:
 def jitter_deg(angle_deg: FloatArray) -> float:
     """Returns the standard deviation of the reading error, degrees; 0 if too short or without motion.
 
-    It uses third differences during motion, without the largest, which are the start or end of a motion.
+    It uses third differences during motion, without the largest, which belong to the start or end of a
+    motion.
     """
     if len(angle_deg) < 8:
         return 0.0
@@ -121,8 +122,9 @@ def third_deviation(third: FloatArray) -> float:
 def quantum_deg(angle_deg: FloatArray) -> float:
     """Returns the count of an angle, degrees; 0 if no counts are visible.
 
-    Changes of a counted angle, and their differences, are multiples of the count. The smallest difference is
-    the count if nearly all changes are multiples of it, within the last digit of a rounded file.
+    The changes of a counted angle, and the differences between them, are multiples of the count. The smallest
+    difference is the count if nearly all changes are multiples of it, within the last digit of a rounded
+    file.
     """
     exact = _exact(angle_deg)
     digit = last_digit(angle_deg)
@@ -151,7 +153,7 @@ def last_digit(angle_deg: FloatArray) -> float:
 
 
 def _exact(angle_deg: FloatArray) -> float:
-    """Returns the common divisor of the changes, from the smallest differences between them (Euclid)."""
+    """Returns the common divisor of the changes by Euclid's algorithm on their smallest differences."""
     steps = np.sort(np.abs(np.diff(angle_deg)))
     gaps = np.diff(steps)
     gaps = np.sort(gaps[gaps > SMALLEST_COUNT_DEG])[:NEAREST]
@@ -171,7 +173,7 @@ def _exact(angle_deg: FloatArray) -> float:
 
 
 def _through_rounding(angle_deg: FloatArray, digit_deg: float) -> float:
-    """Returns the count of readings rounded to ``digit_deg``: changes form clusters one count apart."""
+    """Returns the count of readings rounded to ``digit_deg``, from clusters of changes one count apart."""
     steps = np.sort(np.abs(np.diff(angle_deg)))
     if len(steps) < 2:
         return 0.0
@@ -201,7 +203,7 @@ def _through_rounding(angle_deg: FloatArray, digit_deg: float) -> float:
 
 
 def coarse(time_s: FloatArray, motor_deg: FloatArray) -> int:
-    """Counts the samples with the time of the previous one and another motor angle, which is impossible."""
+    """Counts the impossible samples: same time as the previous sample, different motor angle."""
     return int(np.count_nonzero((np.diff(time_s) == 0.0) & (np.diff(motor_deg) != 0.0)))
 
 

@@ -1,4 +1,4 @@
-"""Columns of effects over all samples of a record, averaged like its observations."""
+"""Columns of effects over all samples of a record, averaged like the observations."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ class Regressors:
         return np.asarray(sum(parts, start=np.zeros(self._rows)))
 
     def predicted(self, effects: Sequence[Effect], starts: Starts) -> FloatArray:
-        """Returns the sum of the effects at every sample, shape (n,)."""
+        """Returns the sum of the effects at each sample, shape (n,)."""
         along = zip(self.motions, starts, strict=True)
         return np.concatenate(
             [sum((each.predict(*one) for each in effects), start=np.zeros(len(one[0]))) for one in along]
         )
 
     def along(self, motions: Sequence[Motion]) -> None:
-        """Switches to motions that differ from the present ones only in the predicted load angle."""
+        """Switches to motions that differ from the present motions only in the predicted load angle."""
         self.motions = tuple(motions)
         for each in [each for each in self._recent if _counts(each[0])]:
             del self._recent[each]

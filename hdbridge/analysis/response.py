@@ -1,10 +1,10 @@
 """Response of the load to its correction, from runs at constant speed, and the compensating filter.
 
-A correction u of the load target moves the load by G u. The transmission error moves it by E, with or
-without correction. With a correction c and the filter F (1 without one), the rest is E - G F c. From runs
-without and with correction, per order and speed, ``W = F E / (E - rest)`` is the filter that cancels the
-error. The model's amplitudes drop out. W depends only on frequency, so one filter along the path
-has the right gain and phase at every speed.
+A correction u of the load target moves the load by G u. The transmission error moves it by E, with or without
+correction. With a correction c and the filter F (1 without a filter), the remaining error is E - G F c. From
+runs without and with correction, per order and speed, ``W = F E / (E - remainder)`` is the filter that
+cancels the error. The model's amplitudes cancel out. W depends only on frequency, so one filter along the
+path has the right gain and phase at every speed.
 """
 
 from __future__ import annotations
@@ -34,52 +34,50 @@ FloatArray = NDArray[np.float64]
 LEAST_ARCSEC = 0.2
 """Minimum amplitude of the orders that are evaluated."""
 HIGHEST = 0.36
-"""Highest frequency that is corrected in full, as a share of the SYNC rate."""
+"""Highest fully corrected frequency, as a share of the SYNC rate."""
 STOP = 0.46
-"""Frequency from which nothing is corrected, as a share of the SYNC rate."""
+"""Lowest uncorrected frequency, as a share of the SYNC rate."""
 MIN_Z_SCORE = 4.0
-"""Amplitude over its standard deviation from which an order shows the response."""
+"""Minimum ratio of amplitude to standard deviation for an order to show the response."""
 MIN_DEVIATION = 0.01
-"""Smallest deviation of a point, as a share: the response is not exactly linear."""
+"""Minimum deviation of a point, as a share, because the response is not exactly linear."""
 MIN_APPLIED = 0.05
 """Minimum gain of a filter for its trial to be used."""
 MAX_UNCERTAINTY = 0.5
-"""95 % half width, as a share of the gain, above which a frequency counts as unknown: the correction might
-leave more than half of the order."""
+"""95 % half width, as a share of the gain, above which a frequency counts as unknown, because the correction
+might leave more than half of the order."""
 BIN_HZ = 0.5
 """Points closer than this, or closer than `BIN_SHARE` of their frequency, are merged."""
 BIN_SHARE = 0.01
 MAX_GAP = 0.12
-"""Largest gap between two points of a known range, as a share of the SYNC rate."""
+"""Maximum gap between two points of the known range, as a share of the SYNC rate."""
 LEAD_CYCLES = 8
 LAG_CYCLES = 16
-"""Reach of the filter into the past, in addition to the following lag."""
+"""Length of the filter into the past, in addition to the following lag."""
 POLES = 2
 """Poles of the filter. A resonance of the axis or a notch of its servo rings longer than the weights."""
 REFINEMENTS = 5
-"""Steps in which the poles are found (Sanathanan and Koerner, 1963)."""
+"""Number of iterations for the poles (Sanathanan and Koerner, 1963)."""
 FADE = 0.12
 """Width over which the filter falls to zero beyond the last point, as a share of the SYNC rate."""
 UNKNOWN = 0.5
 """Assumed response, relative to the transmission error, at frequencies without data."""
 DIFFERENT = 0.1
-"""Smallest relative rms difference at which two responses count as different. The correction leaves that
-much more error."""
+"""Minimum relative rms difference of different responses. The correction leaves that much more error."""
 DIFFERENT_LAG = 0.15
-"""Smallest share by which two following lags count as different."""
+"""Minimum relative difference of different following lags."""
 LAG_NOISE_MS = 0.5
 REFINED = 0.05
-"""Smallest share of the ripple, as the root of the difference of squares, that a refinement removes: half of
-`DIFFERENT`."""
+"""Minimum share of the ripple, as the root of the difference of squares, that a refinement must remove: half
+of `DIFFERENT`."""
 SHARE_NOISE = 0.02
 ERROR_CHANGE = 0.5
-"""Standard deviations of what is left and of the error without correction by another servo, as shares of the
-latter.
-"""
+"""Standard deviations of the remainder and of the error without correction due to another servo, as shares
+of the latter."""
 FIRST_STEP = 0.5
-"""Share of the change of a filter that is made first."""
+"""Share of a filter's change that is applied first."""
 MAX_RUNS = 12
-"""Number of runs that are judged together, for each frequency: one alone shows a few frequencies."""
+"""Number of runs per frequency that are evaluated together, because one run shows only a few frequencies."""
 REGULARISATION = 1e-3
 FADE_SHARE = 0.3
 SUM_WEIGHT = 1e3
@@ -87,17 +85,17 @@ SUM_WEIGHT = 1e3
 
 
 class Limits(NamedTuple):
-    """Limits of the axis on a correction, and the orders that are corrected."""
+    """Limits of the axis on a correction, and the orders to correct."""
 
     orders: tuple[tuple[float, float], ...]
-    """Highest frequency, at the speed limit, and amplitude in arcsec of each order."""
+    """Highest frequency (at the speed limit) and amplitude in arcsec of each order."""
     maximum_arcsec: float
     slew_arcsec_s: float
     acceleration_deg_s2: float
 
     @classmethod
     def of(cls, axis: AxisConfig, model: TransmissionModel) -> Self:
-        """Returns the limits of the axis file on a correction of the model's motor orders."""
+        """Returns the limits from the axis file on a correction of the model's motor orders."""
         speed = axis.limits.velocity_deg_s
         return cls(
             tuple(
@@ -119,8 +117,8 @@ class Limits(NamedTuple):
     def full_speed_deg_s(self, hertz: FloatArray, gains: FloatArray) -> float:
         """Returns the load speed from which a filter with these gains works in full, deg/s.
 
-        While the correction fades out at the end of a stop, it takes at most `FADE_SHARE` of the load's
-        speed.
+        While the correction fades out at the end of a stop, it may contribute up to `FADE_SHARE` of the
+        load's speed.
         """
         reach_arcsec = max(size * np.max(gains[hertz <= top_hz], initial=0.0) for top_hz, size in self.orders)
         return math.sqrt(2.0 * self.acceleration_deg_s2 * reach_arcsec / ARCSEC_PER_DEG / FADE_SHARE)
@@ -131,7 +129,8 @@ class Harmonics(NamedTuple):
 
     speed_deg_s: float
     amplitudes: ComplexArray
-    """The error is the real part of their sum over exp(i k motor angle), shape (orders,)."""
+    """Complex amplitudes, shape (orders,); the error is the real part of their sum over exp(i k motor
+    angle)."""
     deviations: FloatArray
     """Standard deviation of each component."""
     mean_arcsec: float
@@ -141,7 +140,7 @@ class Harmonics(NamedTuple):
 
     @property
     def over_time(self) -> ComplexArray:
-        """Amplitudes over exp(i w t): backwards the angle decreases with time."""
+        """Amplitudes over exp(i w t); conjugated in backward motion, where the angle decreases."""
         return self.amplitudes if self.speed_deg_s > 0.0 else self.amplitudes.conj()
 
 
@@ -172,7 +171,7 @@ def harmonics(run: EvenRun, orders: Sequence[int], ratio: float) -> Harmonics:
 
 
 def samples_needed(orders: int) -> int:
-    """Returns the minimum number of samples of a run that shows this number of orders."""
+    """Returns the minimum number of samples of a run for this number of orders."""
     return 4 * (2 * orders + 2)
 
 
@@ -199,13 +198,13 @@ def harmonics_of(
 
 
 def motor_orders(model: TransmissionModel) -> list[MotorOrder]:
-    """Returns the motor orders that the model corrects, by number, from `LEAST_ARCSEC` up."""
+    """Returns the motor orders that the model corrects, by number, if at least `LEAST_ARCSEC`."""
     return [each for each in compensated_orders(model.effects) if each.amplitude_arcsec >= LEAST_ARCSEC]
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Runs with one filter, in the order of the runs without correction."""
+    """Runs with one filter, in the same order as the runs without correction."""
 
     runs: tuple[Harmonics, ...]
     filter: LeadFilter | None = None
@@ -225,7 +224,7 @@ class Found(NamedTuple):
 
     frequency_hz: float
     response: complex
-    """Load per correction and transmission error."""
+    """Load motion per correction and transmission error."""
     deviation: float
     """Standard deviation of the response."""
     load: complex = 1.0
@@ -250,8 +249,8 @@ def response_of(
 ) -> Response | None:
     """Computes response and filter from runs without and with correction; None if no frequency is known.
 
-    Above ``highest_hz`` nothing is corrected in full. With ``explore`` the filter continues beyond the known
-    range with its last gain, so that a run with it shows the response there.
+    Above ``highest_hz``, the correction is partial. With ``explore``, the filter continues beyond the known
+    range with its last gain, so a run with it shows the response there.
     """
     lag_s = following_lag_s(none)
     points = _merged(_found(none, trials, orders, ratio, cycle_s, lag_s))
@@ -292,7 +291,7 @@ def _found(
     cycle_s: float,
     lag_s: float,
 ) -> list[Found]:
-    """Returns the response per order and speed from every trial that shows it, sorted by frequency."""
+    """Returns the response per order and speed from each trial that shows it, sorted by frequency."""
     found: list[Found] = []
     for trial in trials:
         for before, after in zip(none, trial.runs, strict=True):
@@ -335,10 +334,10 @@ def _mean(group: Sequence[Found]) -> Found:
 
 
 def _known(points: Sequence[Found], highest_hz: float, max_gap_hz: float, limits: Limits) -> list[Found]:
-    """Returns the points from zero up to the first gap; the last one may lie above ``highest_hz``.
+    """Returns the points from zero up to the first gap; the last point may lie above ``highest_hz``.
 
     Uncertain points are skipped. If the inverse of a response would exceed the limits, the response is
-    raised, so that the order is corrected in part.
+    increased, so that the order is corrected in part.
     """
     kept: list[Found] = []
     before_hz = 0.0
@@ -364,10 +363,11 @@ class Left(NamedTuple):
 
 
 class Answers:
-    """Answers of motor and load to the filtered correction in runs at constant speed, against the response.
+    """Motor and load responses to the filtered correction in runs at constant speed, relative to the stored
+    response.
 
-    They are kept by order and nearest frequency of the response, so that many slow runs do not hide what a
-    few fast ones show.
+    They are kept by order and nearest frequency of the response, so many slow runs do not displace a few fast
+    ones.
     """
 
     def __init__(
@@ -377,7 +377,7 @@ class Answers:
         ratio: float,
         earlier: Answers | None = None,
     ) -> None:
-        """``earlier`` are those with another filter on the same servo."""
+        """``earlier`` contains the runs with another filter on the same servo."""
         self.lags_ms: deque[float] = deque(maxlen=MAX_RUNS)
         """Lag of the motor behind its set-points in the last runs."""
         self._response, self._orders, self._ratio = response, orders, ratio
@@ -393,9 +393,9 @@ class Answers:
         motor_deg: FloatArray,
         load_deg: FloatArray,
     ) -> None:
-        """Takes a run: load target, set-points of the motor, both encoders; shape (n,) each.
+        """Adds a run: load target, motor set-points, both encoders; shape (n,) each.
 
-        A load encoder that is not believed reads NaN.
+        A distrusted load encoder reads NaN.
         """
         ratio, stored, place_of = self._ratio, self._response, self._place
         lag_s = float(np.mean(issued_deg - motor_deg)) / (ratio * speed_deg_s)
@@ -414,10 +414,11 @@ class Answers:
 
     @property
     def difference(self) -> float:
-        """Rms difference of the motor's response from the stored one, as a share of the ripple, less noise.
+        """Rms difference of the motor's response from the stored response, as a share of the ripple, less
+        noise.
 
-        It is at most what the load encoder shows to be left, so neither a change of the gear nor a fault of
-        one encoder alone is a difference.
+        It is limited by the remaining error at the load encoder, so neither a change of the gear nor a fault
+        of a single encoder counts as a difference.
         """
         if not self._motor:
             return 0.0
@@ -439,14 +440,14 @@ class Answers:
         self._left.clear()
 
     def left_arcsec2(self) -> dict[tuple[int, int], float]:
-        """Returns the mean square that is left of each order at each frequency."""
+        """Returns the remaining mean square of each order at each frequency."""
         return {
             place: sum(abs(each.share * each.size_arcsec) ** 2 for each in group) / len(group)
             for place, group in self._left.items()
         }
 
     def by_frequency(self) -> dict[int, _Seen]:
-        """Returns what is left, the orders of one frequency together."""
+        """Returns the remainders, grouped by frequency."""
         groups: dict[int, list[Left]] = {}
         for (_, place), group in self._left.items():
             groups.setdefault(place, []).extend(group)
@@ -462,14 +463,14 @@ class Answers:
     def refined(
         self, committed: Response, limits: Limits, bound: float, *, retuned: bool = False
     ) -> Response | None:
-        """Returns the response whose filter removes what is left of the load error; None if it would not.
+        """Returns the response whose filter removes the remaining load error; None without an improvement.
 
-        The rest E - G F c is a straight line over the filter's gain F, which must change by E / (E - rest), a
-        factor that is interpolated between the frequencies. E is that of the calibration, and the step is
-        shorter, until runs with another filter show E with the present servo. Unless the servo is known to
-        have changed (``retuned``), the others must predict the factor at each frequency in turn: what is left
-        on an unchanged servo differs from one frequency to the next. ``bound`` limits the deviation from the
-        committed response, as a share.
+        The remainder E - G F c is linear in the filter's gain F, which must change by E / (E - remainder).
+        This factor is interpolated between the frequencies. Until runs with another filter show E with the
+        present servo, E is that of the calibration and the step is shorter. Unless the servo is known to have
+        changed (``retuned``), the factor at each frequency must be predictable from the others, because on an
+        unchanged servo the remainder differs from one frequency to the next. ``bound`` limits the deviation
+        from the committed response, as a share.
         """
         seen = self.by_frequency()
         if len(seen) < 2:
@@ -500,7 +501,7 @@ class Answers:
 
 
 class _Seen(NamedTuple):
-    """Mean of what is left at one frequency, with the gain of the filter there."""
+    """Mean remainder at one frequency, with the filter's gain there."""
 
     frequency_hz: float
     share: complex
@@ -511,8 +512,8 @@ class _Seen(NamedTuple):
 def _error(now: _Seen, earlier: _Seen | None) -> complex:
     """Returns the error without correction, relative to that of the calibration, at one frequency.
 
-    The rest is a straight line over the gain of the filter. Two points of it are weighed against the
-    calibration, by the noise of a share and the change of the error by another servo.
+    The remainder is linear in the gain of the filter. Two points are weighed against the calibration, by the
+    noise of a share and the change of the error due to another servo.
     """
     if earlier is None:
         return 1.0
@@ -522,7 +523,7 @@ def _error(now: _Seen, earlier: _Seen | None) -> complex:
 
 
 def _bounded(change: ComplexArray, bound: float) -> ComplexArray:
-    """Returns changes of at most this size."""
+    """Limits the magnitude of changes."""
     return change * np.minimum(1.0, bound / np.maximum(abs(change), 1e-9))
 
 
@@ -543,10 +544,10 @@ def answers(
 ) -> Iterator[tuple[int, Found]]:
     """Yields the motor's responses to its set-points in a run, relative to the stored one, by index of order.
 
-    All angles have the shape (n,); ``issued_deg`` are set-points of the motor. Neither the gear's error nor
-    the model's matters. A change of the following lag, ``lag_s``, alone changes nothing: the transmission
-    error is late by it as well as the correction. Orders beyond the known range and unclear ones are left
-    out.
+    All angles have the shape (n,); ``issued_deg`` are set-points of the motor. The errors of gear and model
+    have no influence. A change of the following lag ``lag_s`` alone has no influence either, because it
+    delays the transmission error and the correction alike. Orders beyond the known range and unclear orders
+    are left out.
     """
     issued, motor = (
         harmonics_of(speed_deg_s, target_deg, ARCSEC_PER_DEG * (each / ratio - target_deg), orders, ratio)
@@ -572,7 +573,7 @@ def _left(
     orders: Sequence[MotorOrder],
     ratio: float,
 ) -> Iterator[tuple[int, Left]]:
-    """Yields what a run leaves of the load error, by index of order, up to the known frequency."""
+    """Yields the remaining load error of a run by index of order, up to the known frequency."""
     numbers = [each.order for each in orders]
     error = ARCSEC_PER_DEG * (load_deg - target_deg)
     rest = harmonics_of(speed_deg_s, target_deg, error, numbers, ratio).over_time
@@ -586,7 +587,7 @@ def _left(
 
 
 def _points(response: Response) -> ComplexArray:
-    """Returns the response at its frequencies, following lag excluded."""
+    """Returns the response at its frequencies, without the following lag."""
     turned = np.radians(response.phase_deg) + 0.002 * math.pi * response.following_lag_ms * np.array(
         response.frequency_hz
     )
@@ -595,14 +596,14 @@ def _points(response: Response) -> ComplexArray:
 
 
 def change_between(before: Response, after: Response) -> FloatArray:
-    """Returns the change at their common frequencies as a share of ``before``, shape (f,), lags excluded."""
+    """Returns the change at common frequencies as a share of ``before``, without lags, shape (f,)."""
     return np.asarray(abs(_points(after) / _points(before) - 1.0))
 
 
 def _between(
     hertz: ArrayLike, points_hz: ArrayLike, values: ComplexArray, at_rest: float = 1.0
 ) -> ComplexArray:
-    """Interpolates size (its logarithm) and phase of a function of frequency, real at 0 Hz."""
+    """Interpolates magnitude (logarithmically) and phase of a function of frequency that is real at 0 Hz."""
     at, known = np.asarray(hertz, dtype=float), np.append(0.0, points_hz)
     size = np.interp(at, known, np.log([at_rest, *abs(values)]))
     between: ComplexArray = np.exp(size + 1j * np.interp(at, known, np.unwrap([0.0, *np.angle(values)])))
@@ -633,7 +634,7 @@ def _filter(
     """Fits the filter by least squares on the relative error: the inverse response to ``edge_hz``, 0 beyond.
 
     Between the points the inverse response without its poles is interpolated, because it has no peak narrower
-    than their distance.
+    than their spacing.
     """
     lag_cycles = math.ceil(max(0.0, lag_s) / cycle_s) + LAG_CYCLES
     count = (LEAD_CYCLES + lag_cycles) * per_cycle + 1
@@ -688,7 +689,7 @@ def _least_squares(within: ComplexArray, without: ComplexArray, goal: ComplexArr
 
 
 def _stable(feedback: FloatArray, points_hz: FloatArray, cycle_s: float) -> FloatArray:
-    """Returns the feedback with stable poles, whose peaks are no narrower than the local point distance.
+    """Returns the feedback with stable poles, and no peak narrower than the local spacing of points.
 
     A pole outside the unit circle is mirrored. Beyond the last point there are no poles.
     """

@@ -1,6 +1,6 @@
 """Thresholds of the diagnosis in one table, each with its unit and source.
 
-They are passed to a diagnosis and included in its JSON, so that a result documents its criteria. At its
+They are passed to a diagnosis and included in its JSON, so a result documents its criteria. At its
 ``neutral`` value a threshold has no effect.
 """
 

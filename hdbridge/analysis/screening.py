@@ -21,14 +21,14 @@ from hdbridge.axis.effects.orders import HIGHEST_MOTOR_ORDER
 from hdbridge.units import DEG_PER_TURN
 
 SHARE_LEFT = 1e-4
-"""Share of a column's squares below which nothing of it remains."""
+"""Share of a column's squares below which the column counts as explained."""
 
 
 def candidates(observations: Observations, base: Sequence[Effect], screened: bool = True) -> list[Effect]:
     """Returns the catalogue's candidates for a record and the model ``base``, over grids of shapes.
 
-    Only those whose channels were recorded; their coefficients have no meaning. With ``screened``, only
-    additions to the model that a grid covers.
+    Includes only candidates whose channels were recorded; their coefficients are arbitrary. With
+    ``screened``, includes only additions to the model that a grid covers.
     """
     kinds = [CATALOGUE[each] for each in causes()]
     if screened:
@@ -37,7 +37,7 @@ def candidates(observations: Observations, base: Sequence[Effect], screened: boo
 
 
 def proposed(kind: type[Effect], observations: Observations, base: Sequence[Effect] = ()) -> list[Effect]:
-    """Returns a kind's proposals for a record and the model ``base``, if its channels were recorded."""
+    """Returns the proposals of a kind for a record and the model ``base``, if its channels were recorded."""
     available = observations.motion.available()
     return [each for each in kind.proposals(observations, base) if not unmet([each], available)]
 
@@ -52,10 +52,9 @@ class Score:
     freedom: int
     """Number of directions that the hypothesis does not span."""
     share: float
-    """Largest share of a column's square that the causes of the hypothesis leave.
+    """Largest share of a column's square that the causes in the hypothesis do not explain.
 
-    The model's own parts do not count, because their calibration says how large they are.
-    """
+    The model's own parts do not count, because their calibration limits their size."""
 
 
 class Screen:
@@ -73,7 +72,7 @@ class Screen:
         self._grams = [block.T @ block for block in blocks]
 
     def scores(self, fit: Linearised, causes: Linearised) -> list[Score]:
-        """Returns the score of each candidate, in their order.
+        """Returns the score of each candidate, in the same order.
 
         ``causes`` is the fit without the model's own parts.
         """
@@ -96,8 +95,8 @@ def score_of(effect: Effect, columns: FloatArray, fit: Linearised, causes: Linea
 def _score(
     effect: Effect, size: FloatArray, gram: FloatArray, moment: FloatArray, taken: FloatArray
 ) -> Score:
-    """Scores from the columns' squares, their remaining Gram matrix and moment, and the squares that other
-    causes explain.
+    """Computes the score from the columns' squares, the remaining Gram matrix and moment, and the squares
+    explained by other causes.
     """
     seen = size > 0.0
     if not np.any(seen):
@@ -119,20 +118,20 @@ def _score(
 BINS = 1 << 17
 DEFECT_BINS = 3600
 HALF_WIDTHS_DEG = (0.5, 1.2, 2.5, 4.0, 6.5, 10.0)
-"""Grids of the searches by place. A fit refines the result, and `Scales` decides whether it is reported."""
+"""Grid of the searches by position. A fit refines the result, and `Scales` decides whether to report it."""
 LEAST_LINES = 256
 """Smallest number of periods per turn of an encoder with interpolation."""
 LINE_OVER_MEAN = 12.0
-"""Minimum power of a line, relative to the mean, for a fit. It gains twice that in chi square, half of the
-required gain."""
+"""Minimum power of a line for a fit, relative to the mean. The line then gains twice that in chi square,
+half of the required gain."""
 LOWEST_HZ = 0.3
 """Lowest frequency of a tone; slower lines belong to the motion itself."""
 PEAKS = 3
-"""Number of highest lines to fit."""
+"""Maximum number of lines to fit, the highest first."""
 
 
 def filtered(estimator: Estimator, fitted: Fitted) -> list[Effect]:
-    """Returns the most promising candidates of the kinds that are found by matched filters."""
+    """Returns the most promising candidates of the kinds that matched filters find."""
     residual, load_deg = fast_residual(estimator, fitted)
     estimator.with_load_angle(load_deg)
     result: list[Effect] = []
@@ -161,7 +160,7 @@ def filtered(estimator: Estimator, fitted: Fitted) -> list[Effect]:
 
 
 def step(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float]]:
-    """Yields the time (s) of the best single step, exactly, with the hypothesis projected out."""
+    """Yields the exact time (s) of the best single step, with the hypothesis projected out."""
     weight, basis = estimator.weight, fitted.linearised.basis
     after = np.cumsum((weight * fitted.residual)[::-1])[::-1]
     square = np.cumsum((weight**2)[::-1])[::-1]
@@ -181,7 +180,7 @@ def step(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float]]:
 
 
 def bump(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float, float]]:
-    """Yields centre and half width (load degrees) of the best bump; it must not cover most of the travel."""
+    """Yields centre and half width (load degrees) of the best bump that does not cover most of the travel."""
     ratio = estimator.data.ratio
     load = estimator.motion.motor_deg[estimator.index] / ratio
     place = np.floor(np.mod(load, DEG_PER_TURN) * (DEFECT_BINS / DEG_PER_TURN)).astype(np.intp) % DEFECT_BINS
@@ -219,7 +218,7 @@ def _bump(half_deg: float) -> FloatArray:
 
 
 def fast_residual(estimator: Estimator, fitted: Fitted) -> tuple[FloatArray, FloatArray]:
-    """Returns the residual of every sample (0 if not usable), clipped, and the predicted load angle."""
+    """Returns the clipped residual of each sample (0 if unusable), and the predicted load angle."""
     full = estimator.data.full
     predicted = estimator.predicted(fitted)
     residual = np.where(full.usable, full.error_arcsec - predicted, 0.0)
@@ -232,7 +231,7 @@ def fast_residual(estimator: Estimator, fitted: Fitted) -> tuple[FloatArray, Flo
 
 
 def tones(estimator: Estimator, residual: FloatArray) -> Iterator[tuple[float]]:
-    """Yields the frequencies (Hz) of the highest lines in time."""
+    """Yields the frequencies (Hz) of the highest spectral lines in time."""
     data = estimator.data
     time_s = data.full.time_s
     slot = np.round((time_s - time_s[0]) / data.period_s).astype(np.int64)
@@ -253,7 +252,7 @@ def tones(estimator: Estimator, residual: FloatArray) -> Iterator[tuple[float]]:
 
 
 def _highest(power: FloatArray, lobe: int, least: float) -> Iterator[int]:
-    """Yields the indices of the highest peaks above ``least``, highest first, at least a ``lobe`` apart."""
+    """Yields the indices of peaks above ``least``, highest first, at least a ``lobe`` apart."""
     left = power.copy()
     for _ in range(PEAKS):
         at = int(np.argmax(left))
@@ -264,7 +263,7 @@ def _highest(power: FloatArray, lobe: int, least: float) -> Iterator[int]:
 
 
 def _off_centre(height: FloatArray, at: int) -> float:
-    """Returns the offset of a peak from its highest sample, in samples, by a parabola through three."""
+    """Returns the offset of a peak from its highest sample, in samples, by a three-point parabola."""
     if not 0 < at < len(height) - 1:
         return 0.0
     left, middle, right = (float(each) for each in height[at - 1 : at + 2])
@@ -273,7 +272,7 @@ def _off_centre(height: FloatArray, at: int) -> float:
 
 
 def load_lines(estimator: Estimator, residual: FloatArray, load_deg: FloatArray) -> Iterator[int]:
-    """Yields the periods per load turn of the highest lines beyond the orders of the mesh."""
+    """Yields the periods per load turn of the highest spectral lines beyond the mesh orders."""
     place = np.floor(np.mod(load_deg, DEG_PER_TURN) * (BINS / DEG_PER_TURN)).astype(np.intp) % BINS
     power = np.abs(np.fft.rfft(np.bincount(place, residual, BINS))) ** 2
     ratio = estimator.data.ratio

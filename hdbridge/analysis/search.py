@@ -1,7 +1,7 @@
-"""Greedy search for causes: screen all candidates, fit the best few in full, add the best one, repeat.
+"""Greedy search for causes: screens all candidates, fits the best few in full, adds the best one, repeats.
 
-`Scales` holds the gain that a cause must bring. The hysteresis law is chosen again after each of the
-first additions. At the end, causes that no longer bring that gain are removed.
+`Scales` defines the required gain of a cause. The hysteresis law is chosen again after each of the first
+additions. At the end, causes whose gain has fallen below the required gain are removed.
 """
 
 from __future__ import annotations
@@ -33,9 +33,8 @@ from hdbridge.units import DEG_PER_TURN
 
 MOST = 6
 BEST = 3
-"""Maximum number of additions (`MOST`) and of causes fitted in full at each (`BEST`); both bound the run
-time."""
-ANEW = 3
+"""Maximum number of additions (`MOST`) and of full fits for each (`BEST`), which limit the run time."""
+LAW_ROUNDS = 3
 """Number of additions after which the hysteresis law is chosen again."""
 
 
@@ -50,7 +49,7 @@ class Search:
         self._base = tuple(base)
         self._screens: dict[object, Screen] = {}
         self.refusals: dict[str, str] = {}
-        """Reason for each cause that was rejected although it improved the fit."""
+        """Reason for each rejection of a cause that improved the fit."""
         self._stopped: set[str] = set()
         """Causes that failed a test of the result."""
         law = next((each for each in self._base if each.part is Part.LOOP), None)
@@ -58,11 +57,11 @@ class Search:
             estimator.loop_sign = -1.0 if law.coefficients()[0] < 0.0 else 1.0
 
     def run(self) -> Fitted:
-        """Adds causes, best first, then removes those that no longer improve the fit enough."""
+        """Adds causes, best first, then removes causes that no longer improve the fit enough."""
         fitted = self.with_best_law(self._with_best_sign(self.begun()))
         for number in range(MOST):
             found = self._best_addition(fitted)
-            if number < ANEW and fitted.hypothesis.nuisances is None:
+            if number < LAW_ROUNDS and fitted.hypothesis.nuisances is None:
                 loose = self._with_free_loop(fitted, found)
                 if loose is not None:
                     fitted = self.with_best_law(loose)
@@ -74,14 +73,14 @@ class Search:
             fitted = found
             if number >= self.scales.few - 1 and slow and left > self.scales.large * len(found.residual):
                 break  # many small pieces approximate something that is not in the catalogue
-            if number < ANEW:
+            if number < LAW_ROUNDS:
                 fitted = self.with_best_law(fitted)
         if len(fitted.hypothesis.effects) - self.base <= self.scales.few:
             fitted = self._swapped(fitted)
         return self.with_best_law(self.eliminated(fitted, self._least, []))
 
     def instead(self, fitted: Fitted, stopped: Iterable[str]) -> Fitted:
-        """Adds causes in place of those that were ``stopped`` by a test of the result."""
+        """Adds causes in place of those ``stopped`` by a test of the result."""
         self._stopped.update(stopped)
         while len(fitted.hypothesis.effects) < self.base + MOST:
             found = self._best_addition(fitted)
@@ -98,8 +97,8 @@ class Search:
     def _with_best_sign(self, known: Fitted) -> Fitted:
         """Chooses the sign of the hysteresis loop.
 
-        The sign is reversed if that explains more than the model's sign together with the best cause (play
-        also makes the load lag).
+        The sign is reversed if the reversal explains more than the model's sign together with the best cause
+        (play also makes the load lag).
         """
         loops = [each for each in known.hypothesis.effects if each.part is Part.LOOP]
         if self.estimator.data.reversals < 2 or not loops or any(each.coefficients()[0] for each in loops):
@@ -113,9 +112,9 @@ class Search:
         return self.begun()
 
     def with_best_law(self, fitted: Fitted) -> Fitted:
-        """Exchanges the hysteresis law for an equivalent one that fits better.
+        """Replaces the hysteresis law with an equivalent law that fits better.
 
-        Another law than the model's must be better by as much as a cause.
+        A law other than the model's must be better by the required gain of a cause.
         """
         for place, effect in enumerate(fitted.hypothesis.effects[: self.base]):
             laws = in_place(effect, CATALOGUE.values()) if effect.part is Part.LOOP else ()
@@ -131,7 +130,7 @@ class Search:
         return 0.0 if same else self.scales.enter + self.scales.penalty
 
     def _with_free_loop(self, fitted: Fitted, found: Fitted | None) -> Fitted | None:
-        """Adds a free-form hysteresis, or returns None if the best cause explains more."""
+        """Adds a free-form hysteresis; None if the best cause explains more."""
         free = self.estimator.free_loop(fitted.hypothesis.start)
         loose = self.estimator.fit(replace(fitted.hypothesis, nuisances=free))
         added = loose.free() - fitted.free()
@@ -144,8 +143,8 @@ class Search:
     def _swapped(self, fitted: Fitted) -> Fitted:
         """Replaces each finding in turn by the best alternative if that lowers the cost.
 
-        Each piece that was added to a finding paid the entry penalty. The comparison charges these penalties
-        again, because the replacement has paid only one.
+        The comparison includes the entry penalty of each piece of a finding, because the replacement pays
+        only one.
         """
         for place in range(self.base, len(fitted.hypothesis.effects)):
             if place >= len(fitted.hypothesis.effects):
@@ -159,7 +158,7 @@ class Search:
         return fitted
 
     def _additions(self, effect: Effect) -> int:
-        """Returns how many additions a finding took.
+        """Returns the number of additions that built a finding.
 
         Orders are added singly or in the groups that a cause proposes.
         """
@@ -167,20 +166,20 @@ class Search:
         return max(1, len(effect.pieces()) // max(1, len(offered.pieces())))
 
     def eliminated(
-        self, fitted: Fitted, worst: Callable[[Fitted], tuple[int, str] | None], told: list[str]
+        self, fitted: Fitted, worst: Callable[[Fitted], tuple[int, str] | None], reasons: list[str]
     ) -> Fitted:
         """Removes causes and refits until ``worst`` returns None.
 
-        ``worst`` returns the place of the cause to remove and the reason, which is appended to ``told``.
+        ``worst`` returns the place of the cause to remove and the reason, which is appended to ``reasons``.
         """
         while len(fitted.hypothesis.effects) > self.base and (found := worst(fitted)) is not None:
             place, why = found
-            told.append(f"{fitted.hypothesis.effects[place].name}: {why}")
+            reasons.append(f"{fitted.hypothesis.effects[place].name}: {why}")
             fitted = self.estimator.fit(fitted.hypothesis.without(place))
         return fitted
 
     def _least(self, fitted: Fitted) -> tuple[int, str] | None:
-        """Returns the weakest cause if its gain is below the required one or its peak is below the floor."""
+        """Returns the weakest cause if its gain is below the required gain or its peak is below the floor."""
         effects = fitted.hypothesis.effects
         gains = {
             place: self._lacking(fitted, place).chi_square - fitted.chi_square
@@ -196,7 +195,7 @@ class Search:
         return None if gains[place] > needed and not small else (place, "")
 
     def _lacking(self, fitted: Fitted, place: int) -> Fitted:
-        """Fits without an effect, but keeps its incidental columns, which may be present without it."""
+        """Fits without an effect but with its incidental columns, which may be present without it."""
         effect, hypothesis = fitted.hypothesis.effects[place], fitted.hypothesis.without(place)
         columns = sorted(set(range(len(effect.coefficients()))) - set(evident(effect)))
         if columns:
@@ -209,9 +208,9 @@ class Search:
     # --- one more cause
 
     def _best_addition(self, fitted: Fitted) -> Fitted | None:
-        """Adds the best acceptable cause and refits; returns None if no cause improves the fit enough.
+        """Adds the best acceptable cause and refits; None if no cause improves the fit enough.
 
-        A rejected cause may be acceptable next to a later one, so no rejection is final.
+        A rejected cause may be acceptable next to a later one, so rejections are not final.
         """
         scores = [each for each in self._scores(fitted) if each.effect.name not in self._stopped]
         refused = set[object]()
@@ -235,18 +234,18 @@ class Search:
         return None
 
     def _gain(self, fitted: Fitted, trial: Fitted, cause: str) -> float:
-        """Returns the fall in chi square due to the last effect of this name."""
+        """Returns the fall in chi square due to the last effect of this cause."""
         place = _last(trial, cause)
         incidental = trial.hypothesis.effects[place].incidental
         lacking = self._lacking(trial, place).chi_square if incidental else math.inf
         return min(lacking, fitted.chi_square) - trial.chi_square
 
     def _too_small(self, trial: Fitted, cause: str) -> bool:
-        """Returns True if the last effect of this name is below the floor of practical relevance."""
+        """Returns True if the last effect of this cause is below the floor of practical relevance."""
         return self.peak(trial, _last(trial, cause)) < self.estimator.floor_arcsec
 
     def _refusal(self, trial: Fitted, cause: str, as_alias: bool = False) -> str:
-        """Returns the reason to reject the last effect of this name, or an empty string.
+        """Returns the reason to reject the last effect of this cause, or an empty string.
 
         The effect must be physically possible and visible in the record. An alias need not be identifiable,
         and its size need not be known.
@@ -255,7 +254,7 @@ class Search:
         effect = trial.hypothesis.effects[place]
         reason = self.refusal(effect, as_alias)
         if not reason and not as_alias and self._extrapolated(trial, place):
-            reason = "the record shows too little of it to say how large it is"
+            reason = "the record shows too little of it to determine its size"
         elif (
             not reason and Channel.TIME in effect.needs() and effect.shows(self.estimator.motion) is not None
         ):
@@ -263,13 +262,14 @@ class Search:
             # another cause, which would not be found with this one in the fit.
             reason = gate(self.estimator, trial, place).reason
             if not reason and not all_pieces_seen(self.estimator, trial, place):
-                reason = "a part of it may be what a larger one gets wrong"
+                reason = "part of it may be an error of a larger one"
         return reason
 
     def _extrapolated(self, trial: Fitted, place: int) -> bool:
-        """Returns True if a piece of an effect is much larger than what the record shows of all of its kind.
+        """Returns True if a piece of an effect is much larger than the visible sum of all effects of its
+        kind.
 
-        Pieces of one effect cancel where they are not seen, and so do two effects of a kind.
+        Pieces of one effect, and two effects of a kind, can cancel where the record shows them.
         """
         effects = trial.hypothesis.effects
         own = self.peak(trial, place)
@@ -287,11 +287,11 @@ class Search:
         data = self.estimator.data
         return effect.implausible(data) or ("" if as_alias else effect.unidentifiable(data))
 
-    def told_refusals(self, fitted: Fitted) -> list[str]:
+    def reported_refusals(self, fitted: Fitted) -> list[str]:
         """Returns the rejections to report.
 
-        These concern aliases of the causes found, and causes that by the linearised gain would still improve
-        the ``fitted`` hypothesis enough.
+        These concern aliases of the causes found, and causes that by their linearised gain would still
+        improve the ``fitted`` hypothesis enough.
         """
         if not self.refusals:
             return []
@@ -302,8 +302,8 @@ class Search:
             for each in self._scores(fitted)
             if each.gain > self.scales.penalty * each.freedom + self.scales.enter
         }
-        told = asked - causes
-        return [f"{cause}: {why}" for cause, why in self.refusals.items() if cause in told]
+        reported = asked - causes
+        return [f"{cause}: {why}" for cause, why in self.refusals.items() if cause in reported]
 
     def peak(self, fitted: Fitted, *places: int) -> float:
         """Returns half the span of the sum of effects in this record, arcsec, without rare extremes."""
@@ -315,7 +315,7 @@ class Search:
     def _shortlist(self, fitted: Fitted, scores: Sequence[Score], left_out: str = "") -> list[Score]:
         """Returns, for each of the best causes, the best candidate of each number of parameters.
 
-        A candidate with more parameters may gain more only after its shapes are fitted.
+        A candidate with more parameters may be better only after its shapes are fitted.
         """
         passed = {each.name for each in fitted.hypothesis.effects if each.usual == 1} | {left_out}
         net = {id(each): each.gain - self.scales.penalty * each.freedom for each in scores}
@@ -361,7 +361,7 @@ class Search:
 
     @contextmanager
     def held(self, places: Set[int]) -> Iterator[None]:
-        """Context in which some parts of the model are fixed at their given values."""
+        """Fixes some parts of the model at their given values (context manager)."""
         known = self.estimator.calibrated
         self.estimator.calibrated = tuple(each.as_given() if each.place in places else each for each in known)
         try:
@@ -404,13 +404,13 @@ def joined(hypothesis: Hypothesis, effect: Effect, base: int) -> Hypothesis:
 
 
 def _last(fitted: Fitted, cause: str) -> int:
-    """Returns the place of the last effect of this name."""
+    """Returns the place of the last effect of this cause."""
     effects = fitted.hypothesis.effects
     return next(i for i in range(len(effects) - 1, -1, -1) if effects[i].name == cause)
 
 
 def _key(score: Score) -> object:
-    """Returns a key of a candidate: kind, coefficient names and degrees of freedom."""
+    """Returns the key of a candidate: kind, coefficient names and degrees of freedom."""
     effect = score.effect
     if effect.sought is not None:
         return effect.name
@@ -421,11 +421,11 @@ def _key(score: Score) -> object:
 
 
 def with_measured(search: Search, fitted: Fitted) -> Fitted:
-    """Replaces a wave that resembles the effect of a measured channel by that effect if it fits as well.
+    """Replaces a wave by a similar effect of a measured channel if this fits as well.
 
-    A wave can take any phase, a wind-up only the phase of the torque. If the wind-up fits as well, apart
-    from the loss due to the channel's noise, the wave is a coincidence. Fitted together, the wave would
-    compensate for that noise and absorb most of the wind-up.
+    A wave can take any phase, a wind-up only the phase of the torque. If the wind-up fits as well, apart from
+    the loss due to the channel's noise, the wave is a coincidence. Fitted together, the wave would compensate
+    for that noise and absorb most of the wind-up.
     """
     estimator, scales, base = search.estimator, search.scales, search.base
     hypothesis = fitted.hypothesis
@@ -461,7 +461,7 @@ def together(pieces: Sequence[Effect]) -> Effect:
 
 
 def lookalikes(effect: Effect, ratio: float) -> list[tuple[type[Effect], Effect]]:
-    """Returns kinds that would resemble a piece of the effect without their channel, each with that piece."""
+    """Returns kinds that would resemble a piece of the effect without their channel, with that piece."""
     result = []
     for name in aliases_of(effect.name):
         look = CATALOGUE[name].unmeasured(ratio) if name in CATALOGUE else None
@@ -473,11 +473,12 @@ def lookalikes(effect: Effect, ratio: float) -> list[tuple[type[Effect], Effect]
 
 
 def waves_alike(estimator: Estimator, effects: Sequence[Effect], start: Start) -> Iterator[str]:
-    """Yields other kinds of waves that this record cannot separate from one of the effects, all of one kind.
+    """Yields other kinds of waves that are not separable from one of the effects, which are all of one kind.
 
     Kinds over the same angle count as similar if both can have the orders concerned. On an arc of a turn
     different orders cancel, so the comparison uses their amplitudes, not their sum. A wave over an angle is
-    compared with one in time of the frequency that it has at the usual speed: at one speed they are the same.
+    compared with a wave in time at the frequency that corresponds to the usual speed, because at a single
+    speed they are the same.
     """
     data, most = estimator.data, estimator.scales.in_step
     effects = [each for each in effects if each.waves()]
@@ -512,7 +513,7 @@ def waves_alike(estimator: Estimator, effects: Sequence[Effect], start: Start) -
 
 
 def in_time(kind: type[Effect], effect: Effect, motion: Motion) -> list[Effect]:
-    """Returns tones of a ``kind`` at the frequencies that an effect's waves have at the median speed."""
+    """Returns tones of a ``kind`` at the frequencies of an effect's waves at the median speed."""
     speed = motion.motor_speed_deg_s
     if speed is None or not np.any(speed):
         return []
@@ -535,7 +536,7 @@ def _share_in(effect: Effect, orders: Container[float]) -> float:
 def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:
     """Chooses, among equivalent parametrisations, the one that leaves the ``given`` model unchanged.
 
-    Returns ``fitted`` if there is none; see `Effect.retold`.
+    Returns ``fitted`` if none does (`Effect.retold`).
     """
     effects = fitted.hypothesis.effects
     for place in range(len(given), len(effects)):

@@ -19,15 +19,15 @@ from hdbridge.axis.effects.described import Moves, Shape
 
 LOGARITHM = 0.7
 RANGE = 0.15
-"""Largest step: in the logarithm of a shape (`LOGARITHM`), else as a share of its range (`RANGE`)."""
+"""Largest step of a shape: in its logarithm (`LOGARITHM`), else as a share of its range (`RANGE`)."""
 DIFFERENCE = 1e-3
 """Step of numerical differentiation, in the logarithm of a shape or as a share of its range."""
 LINEAR = 0.3
-"""Largest relative change of an effect within a differentiation step."""
+"""Maximum relative change of an effect within a differentiation step."""
 
 
 def unit(effect: Effect) -> Effect:
-    """Returns the effect with unit coefficients if it is linear in them: the key to its columns."""
+    """Returns the key to an effect's columns: the effect with unit coefficients, if it is linear in them."""
     return effect.fitted(np.ones(len(effect.coefficients()))) if not effect.curved else effect
 
 
@@ -35,8 +35,8 @@ def tangent(columns: Columns, effect: Effect, shape: Shape, central: bool = Fals
     """Returns the derivative of an effect by one of its shapes, shape (m,); one-sided at a bound."""
     coefficients = effect.coefficients()
     here = shape_value(effect, shape.name)
-    told = _told(columns(effect), coefficients)
-    size = float(told @ told)
+    predicted = _predicted(columns(effect), coefficients)
+    size = float(predicted @ predicted)
     length = DIFFERENCE
 
     def change(sign: float) -> tuple[FloatArray, float]:
@@ -48,10 +48,10 @@ def tangent(columns: Columns, effect: Effect, shape: Shape, central: bool = Fals
         there = float(np.clip(there, shape.lower, shape.upper))
         moved_by = np.log(there / here) if shape.logarithmic else there - here
         if not moved_by:
-            return np.zeros(len(told)), 0.0
-        there_told = _told(columns(effect.fitted(coefficients, {shape.name: there})), coefficients)
-        there_told -= told
-        return there_told, moved_by
+            return np.zeros(len(predicted)), 0.0
+        there_predicted = _predicted(columns(effect.fitted(coefficients, {shape.name: there})), coefficients)
+        there_predicted -= predicted
+        return there_predicted, moved_by
 
     up, rise = change(1.0)
     while rise and float(up @ up) > LINEAR**2 * size and length > 1e-9:
@@ -61,11 +61,11 @@ def tangent(columns: Columns, effect: Effect, shape: Shape, central: bool = Fals
         up /= rise
         return up
     down, fall = change(-1.0)
-    return np.asarray((up - down) / (rise - fall)) if rise != fall else np.zeros(len(told))
+    return np.asarray((up - down) / (rise - fall)) if rise != fall else np.zeros(len(predicted))
 
 
-def _told(columns: FloatArray, coefficients: FloatArray) -> FloatArray:
-    """Returns columns times coefficients; a scalar product for one column is ten times as fast."""
+def _predicted(columns: FloatArray, coefficients: FloatArray) -> FloatArray:
+    """Returns columns times coefficients; for one column, a scalar product is ten times as fast."""
     return columns[:, 0] * coefficients[0] if columns.shape[1] == 1 else columns @ coefficients
 
 
@@ -90,7 +90,7 @@ def moved(
 
 
 def free_shapes(effect: Effect, moves: frozenset[Moves]) -> list[Shape]:
-    """Returns the shapes to fit; one outside its range has no influence and stays fixed."""
+    """Returns the shapes to fit; a shape outside its range has no influence and stays fixed."""
     return [
         each
         for each in effect.shape
@@ -99,7 +99,7 @@ def free_shapes(effect: Effect, moves: frozenset[Moves]) -> list[Shape]:
 
 
 def shape_value(effect: Effect, name: str) -> float:
-    """Returns the value of a shape; if it is not a field, that of the first part."""
+    """Returns the value of a shape; if it is not a field, the value of the first part."""
     if name in type(effect).model_fields:
         return float(getattr(effect, name))
     parts = next(each for each in effect.parameters().values() if isinstance(each, list) and name in each[0])
@@ -107,7 +107,7 @@ def shape_value(effect: Effect, name: str) -> float:
 
 
 def on_scale(effect: Effect, shape: Shape | Column) -> float:
-    """Returns the value of a shape on the scale of steps and priors: its logarithm if logarithmic."""
+    """Returns the value of a shape on the scale of steps and priors, which may be logarithmic."""
     value = shape_value(effect, shape.name)
     return math.log(value) if shape.logarithmic else value
 
@@ -123,15 +123,14 @@ def leaves(effect: Effect, shape: Shape, move: float) -> bool:
 
 DAMPING = 1e-4
 TRIES = 6
-"""Maximum number of times that an unsuccessful step is shortened."""
+"""Maximum number of reductions of an unsuccessful step."""
 EXCHANGES = 3
-"""Maximum number of updates of the copies that effects carry of each other although chi square rises at
-first."""
+"""Maximum number of updates of the effects' copies of each other while chi square rises at first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fixed:
-    """Columns that do not change with the shapes: nuisances, then the effects in ``places``."""
+    """Columns independent of the shapes: the nuisances, then the effects in ``places``."""
 
     places: tuple[int, ...]
     units: tuple[Effect, ...]
@@ -148,16 +147,16 @@ class _Point:
     given: tuple[Effect, ...]
     """Effects from which the columns were computed."""
     effects: tuple[Effect, ...]
-    """Same effects with the fitted coefficients."""
+    """Same effects with fitted coefficients."""
     fixed: _Fixed
     moving: tuple[int, ...]
-    """Places of the effects whose columns form ``matrix``, in order."""
+    """Places of the effects whose columns form ``matrix``, in the same order."""
     matrix: FloatArray
     gram: FloatArray
-    """Gram matrix of all linear columns, those in ``fixed`` first, plus the prior information."""
+    """Gram matrix of all linear columns, the fixed ones first, plus the prior information."""
     coefficients: FloatArray
     inside: BoolArray
-    """False for coefficients that are held at zero by their sign."""
+    """False for coefficients held at zero by their sign."""
     chi_square: float
 
 
@@ -171,17 +170,17 @@ class Solution:
     chi_square: float
     """Chi square, including priors."""
     columns: tuple[Column, ...]
-    """Nuisances, then coefficients of the effects (those without free shapes first), then shapes."""
+    """Nuisances, coefficients of the effects (those without free shapes first), then shapes."""
     residual: FloatArray
     """Observed minus fitted, shape (m,)."""
     at_bound: tuple[tuple[int, str], ...]
-    """Shapes that ended at a bound: effect, name."""
+    """Shapes that ended at a bound, each with its effect and name."""
     _fit: Separable
     _point: _Point
 
     @cached_property
     def jacobian(self) -> FloatArray:
-        """Derivatives by all parameters, shape (m, p)."""
+        """Derivatives with respect to all parameters, shape (m, p)."""
         linear = side_by_side([self._point.fixed.matrix, self._point.matrix], len(self.residual))
         linear[:, ~self._point.inside] = 0.0
         if linear.shape[1] == len(self.columns):
@@ -200,7 +199,7 @@ class Solution:
 
     @cached_property
     def known(self) -> FloatArray:
-        """Prior information of each column, and that times (prior mean - value), shape (p, 2)."""
+        """Prior information of each column, and its product with (prior mean - value), shape (p, 2)."""
         mean, information = self._fit.terms.known(self.columns).T
         shapes = [on_scale(self.effects[each.effect], each) for each in self.columns if each.shape]
         value = np.concatenate([self._point.coefficients, shapes])
@@ -221,7 +220,7 @@ class Solution:
 
 
 class Separable:
-    """Fits of effects to the same data; caches everything that does not depend on shapes."""
+    """Fits effects to one data set; caches everything that does not depend on shapes."""
 
     def __init__(self, terms: Terms) -> None:
         self.terms = terms
@@ -268,7 +267,7 @@ class Separable:
     def tangents(
         self, effects: Sequence[Effect], central: bool = False
     ) -> tuple[list[tuple[int, Shape]], FloatArray]:
-        """Returns the free shapes (place, shape) and the derivatives of the effects by them, (m, s)."""
+        """Returns the free shapes (place, shape) and the effects' derivatives by them, (m, s)."""
         where = [
             (place, each)
             for place, effect in enumerate(effects)
@@ -416,7 +415,7 @@ class Separable:
         return step, float(slope @ step)
 
     def _stands(self, here: _Point, effects: Sequence[Effect]) -> bool:
-        """Returns True if the copies that effects carry of each other are those of the fit."""
+        """Returns True if the effects' copies of each other agree with the fit."""
         return all(unit(one) == unit(other) for one, other in zip(here.given, effects, strict=True))
 
     def _solution(self, here: _Point) -> Solution:
@@ -427,13 +426,13 @@ class Separable:
                 if shape_value(effect, each.name) in {each.lower, each.upper}:
                     edge.append((place, each.name))
         split = here.fixed.matrix.shape[1]
-        told = here.fixed.matrix @ here.coefficients[:split] + here.matrix @ here.coefficients[split:]
+        predicted = here.fixed.matrix @ here.coefficients[:split] + here.matrix @ here.coefficients[split:]
         return Solution(
             here.effects,
             here.coefficients[: len(self.terms.nuisances.names)],
             here.chi_square,
             tuple(columns),
-            np.asarray(self.terms.observed - told),
+            np.asarray(self.terms.observed - predicted),
             tuple(edge),
             self,
             here,

@@ -1,9 +1,9 @@
 """Swing of the load on its spring, which every axis has: wind-up in acceleration and ringing after a stop.
 
-The load follows the motor and the gear's error as a mass on a spring with damping follows its base. A
-calibration moves too slowly to show it, and it is no fault. So its frequency and damping are fitted to the
-residual of the given model, before any part of the model is free to imitate it, and the swing is subtracted.
-Samples in which more of it remains unknown than matters are left out.
+The load follows the motor and the gear's error like a mass on a damped spring follows its base. A calibration
+moves too slowly to show the swing, which is not a fault. Its frequency and damping are therefore fitted to
+the residual of the given model, before any part of the model is free to imitate it, and the swing is
+subtracted. Samples in which the uncertainty of the swing is too large are left out.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from hdbridge.axis.effects import Effect, FloatArray, IntArray, Part, Start
 from hdbridge.units import ARCSEC_PER_DEG
 
 ORDINARY_HZ = 30.0
-"""Lowest natural frequency of a load that is ordinary. The demo axis has 42 Hz; of the axes that tools/blind
-draws, 20 to 640 Hz, one in thirty is softer."""
+"""Lowest natural frequency of an ordinary load. The demo axis has 42 Hz; of the axes that tools/blind draws,
+with 20 to 640 Hz, one in thirty is softer."""
 HERTZ = np.geomspace(0.4 * ORDINARY_HZ, 16.0 * ORDINARY_HZ, 23)
 DAMPING = (0.05, 0.2, 0.5)
-"""Natural frequencies and damping ratios that are tried, before a refinement."""
+"""Initial natural frequencies and damping ratios, before the refinement."""
 MOST_DAMPED = 0.9
 LAGS = range(-3, 2)
 """Samples whose second differences move a load that is too stiff for the sampling: from three before to the
@@ -49,16 +49,17 @@ frequency f = 60 Hz."""
 UNEVEN = 0.3
 """Deviation of a time step from the median, relative to it, above which second differences are not used."""
 LEAST_SEEN = 0.1
-"""Minimum share of a residual's sum of squares that a swing must explain; any oscillation explains a little.
-"""
+"""Minimum share of a residual's sum of squares that a swing must explain, because any oscillation explains a
+little."""
 CALMEST = 0.05
-"""Minimum share of a record that is used; the calmest samples."""
+"""Minimum share of the record that is used: its calmest samples."""
 RESOLVED = 4.0
-"""Number of samples in a wave above which a spline begins to follow it; from twice that, it does."""
+"""Number of samples per wave above which a spline begins to follow it; from twice this number, the spline
+follows in full."""
 REFINED = 40
 """Number of trials of the refinement."""
 LONGEST = 20_000
-"""Maximum number of samples that a swing is fitted to: those of the hardest accelerations."""
+"""Maximum number of samples to which a swing is fitted: those of the highest accelerations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +71,7 @@ class Swing:
     does_arcsec: FloatArray
     """Error caused by the swing in each sample, shape (n,)."""
     waves_arcsec2: FloatArray
-    """Squared amplitudes of the part in waves too fast for the sampling, shape (n,)."""
+    """Squared amplitudes of the part due to waves too fast for the sampling, shape (n,)."""
 
     def wind_up_arcsec(self, full: Samples) -> FloatArray:
         """Returns the slow part: the wind-up by the motor's acceleration, shape (n,)."""
@@ -80,11 +81,11 @@ class Swing:
 
     @property
     def soft(self) -> bool:
-        """True for a load that is softer than an ordinary one, whose wind-up is a cause to be found."""
+        """True for a load softer than an ordinary load, whose wind-up is a cause to be found."""
         return self.frequency_hz <= ORDINARY_HZ
 
     def remark(self) -> str:
-        """Describes it for the report."""
+        """Describes the swing for the report."""
         return (
             f"the load swings on its spring at {self.frequency_hz:.0f} Hz (damping ratio "
             f"{self.damping:.2f}) by up to {np.max(np.abs(self.does_arcsec)):.2g} arcsec: "
@@ -227,17 +228,17 @@ def seen_swing(full: Samples, effects: Sequence[Effect], between: Nuisances, sca
 
 
 class _Fast(NamedTuple):
-    """A wave of the gear's error where it is too fast for a spline; it swings as at constant speed."""
+    """Wave of the gear's error where it is too fast for a spline; it swings as at constant speed."""
 
     rows: IntArray
-    """Samples, of which there are fewer than twice `RESOLVED` in a wave, shape (k,)."""
+    """Samples with fewer than twice `RESOLVED` samples per wave, shape (k,)."""
     phasor: NDArray[np.complex128]
     """Wave, arcsec, faded in below that number, shape (k,)."""
     rad_s: FloatArray
     """Angular frequency, signed, shape (k,)."""
 
     def within(self, rows: slice) -> _Fast:
-        """Returns the part in some rows, numbered from the first of them."""
+        """Returns the part in some rows, renumbered from the first of them."""
         part = slice(*np.searchsorted(self.rows, (rows.start, rows.stop)))
         return _Fast(self.rows[part] - rows.start, self.phasor[part], self.rad_s[part])
 
@@ -261,18 +262,18 @@ def _fast_waves(full: Samples, effects: Sequence[Effect], period_s: float) -> It
 
 
 def without(data: Observed, found: Swing) -> Observed:
-    """Returns the data less the swing, but with the wind-up of a soft load, which is a cause to be found."""
+    """Returns the data less the swing; a soft load's wind-up stays, as a cause to be found."""
     full = data.full
     does = found.does_arcsec - found.wind_up_arcsec(full) if found.soft else found.does_arcsec
     return data.having(replace(full, error_arcsec=full.error_arcsec - does))
 
 
 def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observed:
-    """Returns the data without the samples in which more of the swing is unknown than matters.
+    """Returns the data without the samples in which the uncertainty of the swing is too large.
 
-    The error of a ``found`` swing scales with the wind-up and with waves too fast for the sampling. Its share
-    is regressed on the squares of the residual in motion. The noise of a sample contains this error and that
-    of the turning points. The calmest samples always stay.
+    The error of a ``found`` swing is proportional to the wind-up and to waves too fast for the sampling. Its
+    share is found by regression on the squares of the residual in motion. The noise of a sample contains this
+    error and that of the turning points. The calmest samples are always kept.
     """
     data, weight, unknown = estimator.data, estimator.weight, np.zeros(len(estimator.data.full))
     effects = fitted.hypothesis.effects

@@ -1,9 +1,9 @@
-"""Residual that no cause explains: its size and the variable it depends on.
+"""Residual that no cause explains: its size and the coordinate it depends on.
 
-Non-parametric models (bins over every coordinate of `residual_views`) are tested on stretches of time that
-they were not fitted to, by the criteria for causes. If one of them is significant, or the residual exceeds
-the noise, something is missing from the catalogue. A residual near the reversals only may belong to the
-loop, whose law is not known exactly.
+Non-parametric models (bins over every coordinate of `residual_views`) are tested on stretches of time to
+which they were not fitted, by the criteria for causes. If one of them is significant, or the residual exceeds
+the noise, a cause is missing from the catalogue. A residual near the reversals only may belong to the loop,
+whose law is not known exactly.
 """
 
 from __future__ import annotations
@@ -27,14 +27,13 @@ from hdbridge.axis.effects.coordinate import since_reversal
 from hdbridge.axis.effects.kinematics import direction_of
 
 BINS = {"load angle": (72, 360, 1800), "position": (72, 360, 1800), "time": (25,)}
-"""Number of bins per coordinate. Bins of angles suit a wide bump, a narrow bump and waves of the motor
-orders; each bin of time has several stretches.
-"""
+"""Number of bins per coordinate. The angle bins suit a wide bump, a narrow bump and waves of the motor
+orders; each time bin contains several stretches."""
 BLOCK_S = 0.2
 FEW = 50
-"""Minimum number of points for a statement about a record."""
+"""Minimum number of points for a conclusion about a record."""
 TAIL = 3.0
-"""Travel after a reversal, in widths of a loop, after which even a gradual memory has faded."""
+"""Travel after a reversal, in loop widths, after which even a slowly fading memory has vanished."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,17 +43,17 @@ class Rest:
     arcsec: float
     """Root mean square beyond the noise, over short blocks."""
     apart_arcsec: float
-    """Root mean square in motion beyond the memory of a loop."""
+    """Root mean square in motion, beyond the reach of a loop's memory."""
     peak_arcsec: float
     """Half the span of the residual beyond the noise, without rare extremes."""
     fast_arcsec: float
-    """Root mean square over all points beyond the noise; includes parts too fast for the blocks."""
+    """Root mean square over all points beyond the noise, including parts too fast for the blocks."""
     standing_arcsec: float
     """Drift at rest; 0 if the axis never rests."""
     lives_in: str
-    """Coordinate on which it depends most; time if none."""
+    """Coordinate on which the residual depends most; time if on none."""
     seen: bool
-    """True if that dependence passes the criteria for a cause, apart from the reversals."""
+    """True if that dependence passes the criteria for a cause."""
     remark: str
     """Describes a dependence that passes the criteria but is too small to act on; else empty."""
 
@@ -106,7 +105,7 @@ def is_unexplained(estimator: Estimator, left: Rest) -> bool:
 
 
 def many_of_one(findings: Sequence[Finding], scales: Scales) -> list[Finding] | None:
-    """Returns near-equal findings of one kind that exceed its usual number, else None.
+    """Returns the nearly equal findings of one kind that exceed its maximum number, else None.
 
     They are sidebands of a cause outside the catalogue.
     """
@@ -124,7 +123,7 @@ def many_of_one(findings: Sequence[Finding], scales: Scales) -> list[Finding] | 
 def of_the_loop(estimator: Estimator, left: Rest) -> bool:
     """Returns True if the whole residual may belong to the loop.
 
-    It must be below the threshold where the axis moves beyond the memory of any loop.
+    Where the axis moves beyond the memory of any loop, the residual must be below the threshold.
     """
     counts = _angle_step_arcsec(estimator) / np.sqrt(12.0)
     most = np.linalg.norm((estimator.scales.floor_arcsec, counts, left.standing_arcsec))
@@ -161,7 +160,7 @@ def _angle_step_arcsec(estimator: Estimator) -> float:
 
 
 def near_reversals(estimator: Estimator, fitted: Fitted) -> BoolArray:
-    """Returns a mask (m,) of points within a loop's memory of the last reversal; all if there are none."""
+    """Returns a mask (m,) of points within a loop's memory of the last reversal; else all True."""
     memory_deg = max((each.tracker().memory_deg for each in fitted.hypothesis.effects), default=0.0)
     near = (since_reversal(estimator.motion).values <= TAIL * memory_deg)[estimator.index]
     return np.asarray(near if np.any(near) else np.ones_like(near))
@@ -175,17 +174,17 @@ def _views(estimator: Estimator, residual: FloatArray, rows: BoolArray) -> Itera
     for name, each in coordinates(motion, index, estimator.data.ratio).items():
         for both in (False, True)[: 1 + each.both_ways]:
             for bins in BINS.get(name, (each.bins,)):
-                told = predicted(replace(each, both_ways=both, bins=bins), values, direction, fold)
-                gain = float(np.sum(weight**2 * (values**2 - (values - told) ** 2)))
-                yield _View(gain, f"{name} and direction" if both else name, told)
+                fitted_arcsec = predicted(replace(each, both_ways=both, bins=bins), values, direction, fold)
+                gain = float(np.sum(weight**2 * (values**2 - (values - fitted_arcsec) ** 2)))
+                yield _View(gain, f"{name} and direction" if both else name, fitted_arcsec)
 
 
 def _seen(
     estimator: Estimator, fitted: Fitted, rows: BoolArray, views: Iterable[_View]
 ) -> tuple[list[_View], str]:
-    """Returns the views that pass the criteria for a cause and are large enough to be reported.
+    """Returns the views that pass the criteria for a cause and are large enough to report, and a remark.
 
-    Without such a view, also returns a remark on the best one below that size; else an empty remark.
+    The remark describes the best view below that size; it is empty if a view is returned or none passes.
     """
     scales, start, weight = estimator.scales, fitted.hypothesis.start, estimator.weight[rows]
     count_arcsec = estimator.count_arcsec
@@ -239,13 +238,14 @@ def _standing(estimator: Estimator, residual: FloatArray) -> float:
 
 
 MOST = 0.5
-"""Share of the model's squared residual above which a loop is its main error. It decides on a remark only."""
+"""Share of the model's squared residual above which a missing loop is its main error. Used only for a
+remark."""
 
 
 def unfitted(estimator: Estimator, effects: tuple[Effect, ...]) -> str:
     """Returns a remark if the model lacks a loop that would explain most of its residual; else empty.
 
-    Other errors show only with the loop in the fit, so findings without it mean little.
+    Other errors become visible only with the loop in the fit, so findings without it mean little.
     """
     if estimator.data.reversals < 2 or any(each.part is Part.LOOP for each in effects):
         return ""

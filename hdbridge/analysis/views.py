@@ -1,8 +1,8 @@
-"""Residuals of a model as functions of every variable that a cause may depend on.
+"""Residuals of a model over every coordinate that a cause may depend on.
 
-The variables are motor angle, load angle, direction, speed, acceleration, torque, temperature, time, and
+The coordinates are motor angle, load angle, direction, speed, acceleration, torque, temperature, time, and
 travel and time since the last reversal. Residuals are averaged over bins, and the bin means are tested as
-predictions of stretches of time that were not used for them.
+predictions of stretches of time from which they were not computed.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from hdbridge.axis.effects.kinematics import direction_of
 COARSE: Final = 16
 """Number of time bins, few enough that each has several stretches."""
 SHRUNK: Final = 2.0
-"""Number of zero-valued points added to each bin: a mean of few points has no predictive value."""
+"""Number of zero-valued points added to each bin, because a mean of few points has no predictive value."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualViews:
-    """Two residuals and the coordinates to view them over; arrays of shape (m,)."""
+    """Two residuals, and the coordinates over which to view them; arrays of shape (m,)."""
 
     given_arcsec: FloatArray
     """Measurement minus the given model, about zero."""
@@ -37,12 +37,12 @@ class ResidualViews:
     direction: FloatArray
     time_s: FloatArray
     coordinates: Mapping[str, Coordinate]
-    """Coordinates by name."""
 
     def shares(self) -> dict[str, tuple[float, float]]:
-        """Returns, per coordinate, the share of the mean square that bin means predict, 0 to 1.
+        """Returns, per coordinate, the shares of the mean square that bin means predict, 0 to 1.
 
-        The pair is that of the given and of the extended model. Noise has a share of zero.
+        The first share is that of the given model, the second that of the extended model. Noise has a share
+        of zero.
         """
         fold = folds(self.time_s)
 
@@ -58,7 +58,7 @@ class ResidualViews:
 
 
 def coordinates(motion: Motion, rows: IntArray, ratio: float) -> dict[str, Coordinate]:
-    """Returns the coordinates at some points of a record; only those that were recorded and vary."""
+    """Returns the recorded coordinates that vary, at some points of a record."""
     found = (
         over.motor_angle(motion),
         over.load_angle(motion, ratio),
@@ -84,7 +84,7 @@ def folds(time_s: FloatArray) -> IntArray:
 def predicted(
     coordinate: Coordinate, values: FloatArray, direction: FloatArray, fold: IntArray
 ) -> FloatArray:
-    """Predicts the points of each fold by the bin means of all others, shape (m,)."""
+    """Predicts the points of each fold by the bin means of all other folds, shape (m,)."""
     number = coordinate.numbers()
     if coordinate.both_ways:
         number = 2 * number + (direction < 0.0)

@@ -1,7 +1,7 @@
 """Optional measured channels of the axis file, in addition to the encoders.
 
 Each is an object of the drive that arrives by PDO, with its unit, its plausible range, and the time for which
-the last reading is held. `hdbridge.drive.channels` follows them on line.
+the last reading is held. `hdbridge.drive.channels` tracks them on line.
 """
 
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, Self
@@ -90,9 +90,9 @@ class Quantity(Strict):
 
     source: ChannelSource = Field(description="object with the reading")
     per_count: float = Field(ge=-1e6, le=1e6, description="its unit per count")
-    at_zero: float = Field(0.0, ge=-1e9, le=1e9, description="what a reading of zero means, in its unit")
-    minimum: float = Field(-1e9, description="below this a reading is not believed")
-    maximum: float = Field(1e9, description="above this a reading is not believed")
+    at_zero: float = Field(0.0, ge=-1e9, le=1e9, description="value at a reading of zero, in its unit")
+    minimum: float = Field(-1e9, description="lower limit of plausible readings")
+    maximum: float = Field(1e9, description="upper limit of plausible readings")
     every_cycles: EveryCycles = 1
     hold_ms: HoldMs = 100.0
 
@@ -104,13 +104,13 @@ class Quantity(Strict):
 
 MeasuredChannel = LoadTorque | Temperature | Quantity
 BY_KEY: Final = {each.axis_key: each for each in MEASURED if each.axis_key}
-"""Channels that the axis file can have, by their key there."""
+"""Channels of the axis file by their key."""
 
 OWN_KEYS: Final = frozenset({"load_torque", "temperature"})
 if TYPE_CHECKING:
 
     class OtherChannels(Strict):
-        """Measured channels that `AxisConfig` does not declare explicitly."""
+        """Measured channels that `AxisConfig` does not declare."""
 
 else:
     OtherChannels = create_model(

@@ -1,6 +1,6 @@
 """Axis file: drive and bus, encoders and gear, and the motion limits.
 
-``profiles/NAME/axis.yaml`` is written by the user and never rewritten by the program. Its whole content is
+``profiles/NAME/axis.yaml`` is written by the user and never changed by the program. Its whole content is
 checked before anything moves; an error names file, line and column.
 """
 
@@ -155,7 +155,7 @@ class DriveConfig(Strict):
 
 
 class Teeth(Strict):
-    """Tooth counts of the gear, to check its ratio."""
+    """Tooth counts of the gear, for checking its ratio."""
 
     flexspline: int = Field(ge=10, le=10_000, description="teeth of the flexspline, zf")
     circular_spline: int = Field(ge=11, le=10_000, description="teeth of the circular spline, zc")
@@ -257,7 +257,7 @@ class RealtimeConfig(Strict):
 class AxisConfig(OtherChannels):
     """An axis: bus, drive, encoders, gear, limits and compensation."""
 
-    schema_: Literal["hdbridge.axis/1"] = Field(alias="schema", description="kind and version of this file")
+    schema_: Literal["hdbridge.axis/1"] = Field(alias="schema", description="schema and version of this file")
     name: str = Field(
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name: letters, digits, '.', '_', '-'"
     )
@@ -279,14 +279,14 @@ class AxisConfig(OtherChannels):
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Reads an axis file, or the one in a profile's folder; raises `InputError` with file:line:column."""
+        """Reads an axis file, or that of a profile's folder; raises `InputError` with file:line:column."""
         path = Path(path)
         return cls._from_document(read_yaml(path / "axis.yaml" if path.is_dir() else path))
 
     @classmethod
     def from_text(cls, text: str, path: Path | str = "axis.yaml") -> Self:
-        """Reads an axis file's text; ``path`` names it in messages, and its folder is searched
-        for the EDS.
+        """Reads the text of an axis file. ``path`` names the file in messages; the EDS is searched for in
+        its folder.
         """
         return cls._from_document(document_from_text(text, path))
 
@@ -366,13 +366,11 @@ class AxisConfig(OtherChannels):
 
     @property
     def path(self) -> Path:
-        """File that this axis was read from."""
+        """File from which this axis was read."""
         return self._document.path if self._document is not None else Path("axis.yaml")
 
     def states(self, key: str) -> bool:
-        """Returns True if the file states a key (``drive.halt_option``) instead of leaving it
-        to its default.
-        """
+        """Returns True if the file sets a key (``drive.halt_option``) rather than leaving the default."""
         part: object = self
         for name in key.split("."):
             if not isinstance(part, Strict) or name not in part.model_fields_set:
@@ -383,8 +381,8 @@ class AxisConfig(OtherChannels):
     def where(self, key: str) -> str:
         """Returns the location of a key for messages: ``axis.yaml:12:3: drive.node_id``.
 
-        A key that is left to its default has the location of its parent mapping. An axis that was not read
-        from a file has no line.
+        A key with its default value has the location of its parent mapping. An axis that was not read from a
+        file has no line.
         """
         if self._document is None:
             return f"{self.path}: {key}"
@@ -401,7 +399,7 @@ class AxisConfig(OtherChannels):
 
     @property
     def is_from_file(self) -> bool:
-        """True if the axis was read from a file, so that its EDS file is known."""
+        """True if the axis was read from a file, so that its EDS file can be found."""
         return self._eds_path is not None
 
     @property
@@ -422,7 +420,7 @@ def _interpolation_period(cycle_ms: float) -> tuple[int, int] | None:
 
 
 def _teeth_for(ratio: float, difference: int, teeth: Teeth) -> str:
-    """Returns the tooth counts that a ratio needs, for the stated output and the same difference of teeth."""
+    """Returns the tooth counts for a ratio, with the stated output and the same difference of teeth."""
     for more in (difference, 2, 1):
         held = round(ratio * more)
         if math.isclose(held, ratio * more, rel_tol=1e-9):

@@ -17,7 +17,7 @@ INT32_MAX = 2**31 - 1
 class Scale:
     """Conversion between an encoder's counts and degrees of its shaft.
 
-    Made for the control cycle, in which pydantic's attribute look-up would take longer than the computation.
+    Made for the control cycle, where pydantic's attribute look-up would take longer than the computation.
     """
 
     direction: int
@@ -42,15 +42,12 @@ class Encoder(Strict):
 
     @property
     def scale(self) -> Scale:
-        """Conversion between counts and degrees."""
         return Scale(self.direction, self.counts_per_turn)
 
     def counts(self, deg: float) -> float:
-        """Converts degrees to counts; see `Scale.counts`."""
         return self.scale.counts(deg)
 
     def degrees(self, counts: float) -> float:
-        """Converts counts to degrees; see `Scale.degrees`."""
         return self.scale.degrees(counts)
 
     @property
@@ -60,11 +57,11 @@ class Encoder(Strict):
 
 
 class MotorEncoder(Encoder):
-    """The encoder of the motor, with which the drive closes its loop (6064h, 607Ah)."""
+    """Encoder of the motor, with which the drive closes its loop (6064h, 607Ah)."""
 
 
 class Source(Strict):
-    """Object that carries the load encoder's reading."""
+    """Object that contains the load encoder's reading."""
 
     WRAPS: ClassVar[dict[str, int]] = {"int32": 2**32, "uint32": 2**32, "int16": 2**16, "uint16": 2**16}
 
@@ -105,11 +102,11 @@ POSITION_ACTUAL: Final = (0x6064, 0)
 
 
 class LoadEncoder(Encoder):
-    """The encoder at the load, which measures the positioning error."""
+    """Encoder at the load, which measures the positioning error."""
 
     source: Source = Field(default_factory=Source, description="source of its reading")
 
     @property
     def is_motor_encoder(self) -> bool:
-        """True if the reading is that of the motor encoder: the axis has no encoder at its load."""
+        """True if the reading is that of the motor encoder, so the axis has no encoder at its load."""
         return self.source.node is None and self.source.address == POSITION_ACTUAL

@@ -34,8 +34,8 @@ PANELS: Final = {
         "setup": "Set up an axis in one sitting: bus, axis file, checks, calibration, model, first move.",
         "new": "Make the folder of an axis: a copy of a bundled profile, or from the data of a drive on the "
         "bus.",
-        "check": "Check the files of an axis or of a machine; report what they mean, or what is wrong and "
-        "where.",
+        "check": "Check the files of an axis or of a machine; report their meaning, or the errors with "
+        "their location.",
         "scan": "List the nodes on a CAN bus: type, identity, state, and lines for an axis file.",
         "doctor": "Check an axis before its first long motion: files, bus, drive, encoders, directions, "
         "ratio, stops.",
@@ -50,8 +50,8 @@ PANELS: Final = {
         "measure": "Move an axis by a plan and keep the recording, for diagnose, twin and fit.",
         "fit": "Fit a model to recordings; report parameter intervals and what the data cannot determine.",
         "report": "Fit a recording again and report the result; nothing moves.",
-        "diagnose": "Compare records with a model; name the causes that it lacks and those that cannot be "
-        "separated.",
+        "diagnose": "Compare records with a model; name the causes that it lacks, and those that are not "
+        "separable.",
         "improve": "Diagnose the active model, extend it, step with both, and keep the better one as "
         "pending.",
         "twin": "Fit the simulated drive to recordings of an axis; report its errors, and keep the twin as "
@@ -59,11 +59,11 @@ PANELS: Final = {
         "model": "Manage the models of an axis: the active one, a pending one, and all earlier ones.",
     },
     "Many joints": {
-        "fleet": "Diagnose recordings of many joints on Dask; report which joints to look at first."
+        "fleet": "Diagnose recordings of many joints on Dask; report the joints to inspect first."
     },
     "Day and night": {
-        "run": "Run the daemon: hold the drives of a machine and take load angles from clients.",
-        "ctl": "Control a running daemon: look, move, stop, compensate.",
+        "run": "Run the daemon: control the drives of a machine and accept load angles from clients.",
+        "ctl": "Control a running daemon: state, motion, stop, compensation.",
         "gateway": "The axes of a machine as drives of another master.",
         "record": "Flight recordings and bus logs: list, mend, and make records for fit and diagnose.",
         "install-service": "Show, write or remove the systemd files that run a machine's daemon from the "
@@ -72,19 +72,18 @@ PANELS: Final = {
     "Positioning": {
         "move": "Move the load to one angle or to several, compensated by the active model, and hold the "
         "last.",
-        "reset": "Reset a fault of the drive when its cause is gone; power stays off.",
+        "reset": "Reset a fault of the drive once its cause is gone; power stays off.",
         "home": "Home the drive by one of its own methods (CiA 402, mode HM); print the position of the "
         "axis.",
-        "step": "Step the axis both ways under each compensation scheme; print what the load encoder "
-        "measured.",
+        "step": "Step the axis both ways under each compensation scheme; print the results at "
+        "the load encoder.",
         "motion": "Run the axis at several speeds; print the ripple of the load without and with "
         "compensation.",
     },
 }
-"""Every command under its heading in `hdbridge --help`, with its summary there.
+"""All commands under their headings in `hdbridge --help`, with their summaries there.
 
-A command is imported only for its own help or to be run, and it imports what it computes with when it runs.
-"""
+A command is imported only for its own help or to be run, and it imports its dependencies when it runs."""
 _MODULES: Final = {
     "bringup": ("new", "check", "scan", "doctor", "latency"),
     "calibration": ("calibrate", "measure", "fit", "report"),
@@ -94,12 +93,11 @@ _MODULES: Final = {
     "positioning": ("demo", "move", "step", "motion"),
     "recordings": ("record",),
 }
-"""Modules with several commands; any other command is the module of its name.
+"""Modules with several commands; every other command is the module of its name.
 
-``COMMANDS`` of a module holds the function of a command, or the functions of a group of commands.
-"""
+``COMMANDS`` of a module contains the function of a command, or the functions of a group of commands."""
 SIGNED: Final = {"move", "sdo set", "ctl move", "ctl jog", "ctl queue", "ctl set"}
-"""Commands with a number that may be negative and would otherwise be taken for an option."""
+"""Commands with a number that may be negative and would otherwise be parsed as an option."""
 
 
 def load(name: str) -> typer.Typer:
@@ -149,7 +147,7 @@ app = typer.Typer(
     epilog=(
         "Exit status: 0 done, 2 bad input (nothing moved, nothing written), 3 bus, 4 drive, "
         "5 stopped by supervision, 6 a result could not be written (a full disk; the figures are printed), "
-        "7 the daemon is not reached or does not do it now, 130 Ctrl-C (axis stopped, record kept)."
+        "7 the daemon cannot be reached or refuses the request, 130 Ctrl-C (axis stopped, record kept)."
     ),
 )
 
@@ -163,7 +161,7 @@ for _panel, _commands in PANELS.items():
         app.command(_name, help=_summary, rich_help_panel=_panel)(_in_overview)
 
 
-def _tell_version(asked: bool) -> None:
+def _print_version(asked: bool) -> None:
     if asked:
         print(f"hdbridge {__version__}")
         raise typer.Exit
@@ -172,7 +170,7 @@ def _tell_version(asked: bool) -> None:
 @app.callback()
 def _hdbridge(
     version: Annotated[  # noqa: ARG001 - its callback has printed it by then
-        bool, typer.Option("--version", help="Print the version and exit.", callback=_tell_version)
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version)
     ] = False,
     verbose: Annotated[
         int,
@@ -187,21 +185,21 @@ def _hdbridge(
         ),
     ] = None,
 ) -> None:
-    """Make a harmonic-drive axis point where it is told: a CANopen master that knows its gear.
+    """Position a harmonic-drive axis accurately: a CANopen master that compensates for its gear.
 
     To begin: `hdbridge demo`, then docs/tutorial.md.
     """
     if verbose or log is not None:
         eventlog.begin(verbose, log)
-        eventlog.tell("command", arguments=sys.argv[1:], version=__version__)
+        eventlog.write("command", arguments=sys.argv[1:], version=__version__)
 
 
 _HANDLER: Final = "hdbridge.plain"
-"""Name of the error handler of a text stream that replaces characters which its encoding lacks."""
+"""Name of the error handler of a text stream that replaces characters outside its encoding."""
 _PLAIN: Final = str.maketrans(
     {"σ": "s", "±": "~", "→": ">", "°": " ", "²": "2", "µ": "u", "–": "-", "…": "~"}
 )
-"""One character for one, so that a table stays aligned."""
+"""Single-character replacements, so that a table stays aligned."""
 
 
 def _replaced(error: UnicodeError) -> tuple[str, int]:

@@ -124,7 +124,7 @@ CheckedArgument = Annotated[
 
 
 def check(profile: CheckedArgument, model: opt.Model = None, json_file: opt.Json = None) -> None:
-    """Check the files of an axis or of a machine; report what they mean, or what is wrong and where."""
+    """Check the files of an axis or of a machine; report their meaning, or the errors with their location."""
     from hdbridge.axis import AxisConfig
     from hdbridge.daemon.machine import Machine, machine_file
     from hdbridge.drive.link import check_interface
@@ -156,7 +156,7 @@ def check(profile: CheckedArgument, model: opt.Model = None, json_file: opt.Json
 
 
 def _check_channel(bus: BusConfig, where: str) -> None:
-    """Notes a channel that this computer lacks; it may belong to another one."""
+    """Notes a channel that this computer lacks; the file may be for another computer."""
     from hdbridge.drive.link import absent_interface
 
     if absent := absent_interface(bus):
@@ -244,7 +244,6 @@ class _Report:
         return {**self.facts, **self.rows}
 
     def print(self) -> None:
-        """Prints the report."""
         _print_facts(self.facts)
         for name, rows in self.rows.items():
             for row in rows:
@@ -276,7 +275,7 @@ def scan(
     """List the nodes on a CAN bus: type, identity, state, and lines for an axis file.
 
     Listens first, and sends nothing if another master is heard. Then reads a few objects of each node id.
-    Writes and enables nothing, and leaves a node alone that another SDO client is talking to.
+    Writes and enables nothing, and skips a node that another SDO client is using.
 
     Exit status 4 if no node was found, or PROFILE's drive is missing.
     """
@@ -398,7 +397,8 @@ _MARKS = {
 }
 _WARNING = (
     "The next checks switch the drive on and move the axis: up to a motor turn and an eighth each way (more "
-    "with a ratio above 75), slowly, with at most {torque:g} % of the rated torque. Keep the way clear and a "
+    "with a ratio above 75), slowly, with at most {torque:g} % of the rated torque. Keep the path clear "
+    "and a "
     "hardware emergency stop at hand. Move now?"
 )
 _FAST = (
@@ -436,7 +436,7 @@ def doctor(
 ) -> None:
     """Check an axis before its first long motion: files, bus, drive, encoders, directions, ratio, stops.
 
-    A failed check is followed by the line of the axis file to change, or what to do.
+    A failed check is followed by the line of the axis file to change, or by another remedy.
 
     Exit status 0 if all checks passed, 4 if one failed or motion was not confirmed, 2 if the first failure
     is a file, 3 if it is the bus. This is not a safety function: the emergency stop must be in hardware.
@@ -465,7 +465,7 @@ def doctor(
     ) as context:
         moving = next(place for place, each in enumerate(CHECKS) if each.moves)
         checks = (*CHECKS[:moving], RESPONSE, *CHECKS[moving:], SERVO) if servo else CHECKS
-        rows = run_checks(context, checks, permitted=permitted, tell=_print_row)
+        rows = run_checks(context, checks, permitted=permitted, notify=_print_row)
     failures = [row for row in rows if row.verdict.outcome is Outcome.FAIL]
     write_json(
         json_file,
@@ -506,7 +506,7 @@ def _print_row(row: Row[BringUpContext]) -> None:
 
 
 def _stored_response(context: BringUpContext) -> Verdict:
-    """Checks, before anything moves, that the model's response is one of this drive, axis and cycle."""
+    """Checks, before any motion, that the model's response belongs to this drive, axis and cycle."""
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.control.bench import compensation_for
 
@@ -522,7 +522,7 @@ def _stored_response(context: BringUpContext) -> Verdict:
 def _servo_as_measured(context: BringUpContext) -> Verdict:
     """Runs the axis at constant speeds without and with its correction, and compares the response.
 
-    The response in motion is the one that the model holds.
+    The response in motion is that of the model.
     """
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.commissioning.calibration.motion import servo_check
@@ -561,7 +561,7 @@ def latency(
         Option("--cycle-ms", min=0.1, max=1000, help="Only this cycle time; may be repeated."),
     ] = None,
     realtime: Annotated[
-        bool, Option(help="Ask for real-time priority and locked memory, as the control loop does.")
+        bool, Option(help="Request real-time priority and locked memory, like the control loop.")
     ] = True,
     json_file: opt.Json = None,
 ) -> None:
@@ -574,11 +574,11 @@ def latency(
 
     periods = tuple(each / 1000.0 for each in cycle_ms) if cycle_ms else CANDIDATES_S
 
-    def tell(done: Measurement) -> None:
+    def notify(done: Measurement) -> None:
         note(f"measured {1e3 * done.period_s:g} ms")
 
     with prepare_realtime() if realtime else nullcontext("ordinary priority") as conditions:
-        report = measure(MonotonicClock(), duration_s, periods, conditions=str(conditions), progress=tell)
+        report = measure(MonotonicClock(), duration_s, periods, conditions=str(conditions), progress=notify)
     write_json(json_file, report.as_dict())
     say(report.table())
 

@@ -38,17 +38,21 @@ class Measured:
         Option(
             "--plan",
             metavar="quick|full|dynamics|FILE",
-            help="What is measured: a bundled plan, or a file. A twin needs dynamics, too.",
+            help="Plan to measure: a bundled plan, or a file. A twin also needs dynamics.",
         ),
     ] = "quick"
     out: Annotated[
         Path | None,
-        Option("--out", metavar="FOLDER", help="Where the recordings go; else recordings/AXIS-DATE-TIME."),
+        Option(
+            "--out",
+            metavar="FOLDER",
+            help="Write the recordings to this folder; else to recordings/AXIS-DATE-TIME.",
+        ),
         Kind.FOLDER,
     ] = None
     resume: Annotated[
         Path | None,
-        Option("--resume", metavar="FOLDER", help="Continue what was interrupted in this folder."),
+        Option("--resume", metavar="FOLDER", help="Continue the interrupted measurement in this folder."),
     ] = None
 
     def of(self, session: Session) -> Measurement:
@@ -76,7 +80,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """Plan to be measured into a folder, or the rest of one that was begun there."""
+    """Plan to be measured into a folder, or the remaining part of an interrupted measurement."""
 
     session: Session
     plan: Plan
@@ -86,7 +90,7 @@ class Measurement:
     """Journal of the recording to continue; None for a new one."""
 
     def announce(self, after: str = "") -> None:
-        """Prints what is left of the plan and its duration; ``after`` describes what follows."""
+        """Prints the remaining part of the plan and its duration; ``after`` describes the next step."""
         from hdbridge.commissioning.calibration.measure import outlook
 
         done = self.journal.done if self.journal else ()
@@ -100,7 +104,7 @@ class Measurement:
         )
 
     def begun(self, drive: Drive) -> Journal:
-        """Returns the journal to continue, else a new one for this booted drive."""
+        """Returns the journal to continue, else a new journal for this booted drive."""
         from hdbridge.commissioning.calibration import start_journal
 
         if self.journal is not None:
@@ -113,8 +117,8 @@ class Measurement:
     def booted(self) -> Iterator[tuple[Drive, Callable[[str, float, float], None], Callable[[], bool]]]:
         """Yields the booted drive, and functions that show progress and report a request to end.
 
-        Locks the axis against other measurements. If the measurement fails, the place of its record is
-        printed; an empty folder is removed.
+        Locks the axis against other measurements. If the measurement fails, prints the location of its
+        record; removes an empty folder.
         """
         from hdbridge.axis.model.store import measuring
 
@@ -127,7 +131,7 @@ class Measurement:
                 yield drive, progress, interrupted
         except BaseException:
             if (self.folder / "recording.yaml").exists():
-                note(f"what was measured is kept; go on with --resume {self.folder}")
+                note(f"the measured data are kept; continue with --resume {self.folder}")
             raise
         finally:
             with suppress(OSError):
@@ -136,7 +140,7 @@ class Measurement:
 
 @contextmanager
 def phases() -> Iterator[Callable[[str, float, float], None]]:
-    """Yields a progress function with one bar per phase; a phase is identified by its total duration, s."""
+    """Yields a progress function with one bar per phase, identified by its total duration, s."""
     with progress_bar() as bar:
         bars: dict[float, int] = {}
 
@@ -175,7 +179,7 @@ def calibrate(
             work.date,
             progress=progress,
             interrupted=interrupted,
-            tell=note,
+            notify=note,
         )
     _conclude(result, work.folder, json_file, html_file, session)
 
@@ -187,7 +191,7 @@ def _conclude(
     html_file: Path | None,
     session: Session | None = None,
 ) -> None:
-    """Writes and prints the result; for a measurement of a session, also the next steps."""
+    """Writes and prints the result; for a measurement in a session, also the next steps."""
     page = html_file or folder / "report.html"
     write_json(json_file, result.as_dict())
     write_calibration_page(page, result)
@@ -250,7 +254,7 @@ def fit(
 
     A CSV file needs `time_s`, `motor_position_deg` and `load_position_deg` (multi-turn), or other names by
     --columns; `motor_target_deg` helps. Nothing is activated. A model that is worse on held-out data than
-    that of --model, or than none, is not written.
+    that of --model, or than no model, is not written.
     """
     from hdbridge.axis import AxisConfig
     from hdbridge.axis.model import TransmissionModel
@@ -293,7 +297,8 @@ def report(
 
 
 TAKEN_OFF = 0.95
-"""Terms fitted in addition to the model are reported if they reduce the residual to this share or less."""
+"""Maximum remaining share of the residual with the terms fitted in addition to the model, for reporting
+them."""
 
 
 def print_calibration(result: Calibration) -> None:
@@ -352,7 +357,7 @@ def write_calibration_page(path: Path, result: Calibration) -> None:
 
 
 def print_next(offer: Offer | None, session: Session) -> None:
-    """Prints the commands for a pending model. The daemon that lent its bus commits it, and uses it."""
+    """Prints the commands for a pending model. A daemon that lent its bus commits and uses the model."""
     if offer is not None and offer.made:
         folder = session.files.axis.parent
         daemon = f"hdbridge ctl model {session.axis.name} pending"
@@ -361,7 +366,7 @@ def print_next(offer: Offer | None, session: Session) -> None:
 
 
 def print_stepping(checked: Validation) -> None:
-    """Prints the stepping test with the previous and the new model, next to the floor of the axis."""
+    """Prints the stepping test with the previous and the new model, and the floor of the axis."""
     print_steps("Stepping test: load error at rest, arcsec", (checked.before, checked.after))
     print_worse("stepping", checked.worse)
     _print_accuracy(checked)
@@ -386,7 +391,7 @@ def print_steps(title: str, tests: Iterable[Stepped], first: str = "with") -> No
 
 
 def print_worse(test: str, ways: Iterable[str]) -> None:
-    """Prints what got worse in one direction."""
+    """Prints the deterioration in one direction."""
     for each in ways:
         say(f"{test}: {each}", style="bold")
 

@@ -60,12 +60,12 @@ def conform(
         ),
     ] = None,
     only: Annotated[
-        list[str] | None, Option("--only", metavar="ID", help="Only checks whose id begins so.")
+        list[str] | None, Option("--only", metavar="ID", help="Only checks whose id begins with this.")
     ] = None,
     timeout_ms: Annotated[
         float, Option("--timeout-ms", min=1.0, max=60_000.0, help="Longest time to an SDO answer.")
     ] = 500.0,
-    list_checks: Annotated[bool, Option("--list", help="List the checks and end.")] = False,
+    list_checks: Annotated[bool, Option("--list", help="List the checks and exit.")] = False,
     json_file: opt.Json = None,
 ) -> None:
     """Check a node against CiA 301 and CiA 402: NMT, SDO, PDO, SYNC, EMCY, its EDS, the drive profile.

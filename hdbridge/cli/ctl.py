@@ -1,4 +1,4 @@
-"""``hdbridge ctl``: control of a running daemon: look, move, stop, compensate."""
+"""``hdbridge ctl``: control of a running daemon: state, motion, stop, compensation."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ class Daemon:
 
     @contextmanager
     def moving(self, name: str | None) -> Iterator[Axis]:
-        """Yields an axis with the lease to move it; Ctrl-C or another end of the command stops it.
+        """Yields an axis with the lease for moving it; Ctrl-C or any other end of the command stops it.
 
-        Without a name it is the only axis; raises `InputError` if there are several.
+        The name may be omitted for a single axis; raises `InputError` if there are several.
         """
         with connected(self.at) as client:
             if name is None:
@@ -77,10 +77,10 @@ class Daemon:
             with client.lease(force=self.force), stopped_by_signals(client, name):
                 yield client.axis(name)
 
-    def tell(self, state: AxisState) -> None:
+    def print_state(self, state: AxisState) -> None:
         """Writes and prints the state of an axis after a command."""
         write_json(self.json_file, document("ctl-axis", state))
-        tell(state)
+        print_state(state)
 
 
 on_daemon = taking(Daemon)
@@ -98,7 +98,7 @@ def connected(at: str | None, *, named: bool = True) -> Client:
 
 
 def _name(at: str | None, client: Client) -> None:
-    """Reports the machine that a command acts on if the command did not name it."""
+    """Reports the machine on which a command acts, if the command did not name it."""
     if at is not None:
         return
     place = client.address.socket
@@ -110,7 +110,7 @@ def _name(at: str | None, client: Client) -> None:
 
 @contextmanager
 def stopping(at: str | None) -> Iterator[Client]:
-    """Yields the daemon's client for a stop. If it fails, the error names the process that holds the bus."""
+    """Yields the daemon's client for a stop. If it fails, the error names the holder of the bus."""
     from hdbridge.client import Client
 
     try:
@@ -124,7 +124,9 @@ def stopping(at: str | None) -> Iterator[Client]:
 
 
 def _who_holds(at: str | None) -> str:
-    """Describes who holds an interface or listens at the daemon's socket, and how to end them."""
+    """Describes the processes that hold an interface or listen at the daemon's socket, and how to end
+    them.
+    """
     from hdbridge.client.address import find
     from hdbridge.daemon.api.sockets import daemon_of
     from hdbridge.drive.interfacelock import holders, process_words
@@ -165,7 +167,7 @@ def stopped_by_signals(client: Client, name: str) -> Iterator[None]:
             signal.signal(each, handler)
 
 
-def tell(state: AxisState) -> None:
+def print_state(state: AxisState) -> None:
     """Prints the state of an axis after a command."""
     load = "" if state.load_position_deg is None else f", load encoder {state.load_position_deg:.4f} deg"
     error = "" if state.error_arcsec is None else f", error {state.error_arcsec:+.2f} arcsec"
@@ -209,7 +211,7 @@ AXES: Final = (
 
 
 def figure(value: float | None, digits: int) -> str:
-    """Formats a number in a table; None is a dash."""
+    """Formats a number in a table; None becomes a dash."""
     return "-" if value is None else f"{value:z.{digits}f}"
 
 
@@ -271,7 +273,7 @@ def watch(
         bool, Option("--lines", help="Print a JSON object per line in place of a table.")
     ] = False,
 ) -> None:
-    """Show the state of a machine until Ctrl-C; it moves nothing."""
+    """Show the state of a machine until Ctrl-C; nothing moves."""
     with connected(at, named=False) as client:
         if lines:
             for _ in _looks(count, every_s):
@@ -290,7 +292,7 @@ def events(
     follow: Annotated[bool, Option("--follow", "-f", help="Continue until Ctrl-C.")] = False,
     json_file: opt.Json = None,
 ) -> None:
-    """List faults, states, refused commands and remarks; oldest first."""
+    """List faults, states, refused commands and remarks, oldest first."""
     with connected(at) as client:
         found = client.events(since)
         write_json(json_file, document("ctl-events", found))
@@ -308,7 +310,7 @@ def events(
 
 @on_daemon
 def lease(daemon: Daemon) -> None:
-    """Report who has the right to move; with --force take it from its holder, and release it."""
+    """Report who has the right to move; with --force, take it from its holder and release it."""
     with connected(daemon.at) as client:
         if daemon.force:
             with client.lease(force=True):
@@ -387,28 +389,28 @@ def _event_line(event: Event) -> str:
 def enable(daemon: Daemon, axis: OneAxisArgument = None) -> None:
     """Switch power on at standstill; boots and verifies the drive first if necessary."""
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.enable())
+        daemon.print_state(moved.enable())
 
 
 @on_daemon
 def disable(daemon: Daemon, axis: OneAxisArgument = None) -> None:
     """Brake to rest, then switch power off. A suspended load needs a brake."""
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.disable())
+        daemon.print_state(moved.disable())
 
 
 @on_daemon
 def reset(daemon: Daemon, axis: OneAxisArgument = None) -> None:
-    """Release a latched stop when its cause is gone; the axis stays disabled."""
+    """Release a latched stop once its cause is gone; the axis stays disabled."""
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.reset())
+        daemon.print_state(moved.reset())
 
 
 @taking(Daemon, opt.Homing)
 def home(daemon: Daemon, homing: opt.Homing, axis: OneAxisArgument = None) -> None:
     """Home by one of the drive's own methods; the axis is disabled before and after."""
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.home(**vars(homing)))
+        daemon.print_state(moved.home(**vars(homing)))
 
 
 def stop(axes: AxesArgument = None, at: AtOption = None) -> None:
@@ -416,7 +418,7 @@ def stop(axes: AxesArgument = None, at: AtOption = None) -> None:
     with stopping(at) as client:
         states = [client.axis(each).stop() for each in axes] if axes else client.stop().axes
     for each in states:
-        tell(each)
+        print_state(each)
 
 
 def quick_stop(axes: AxesArgument = None, at: AtOption = None) -> None:
@@ -424,7 +426,7 @@ def quick_stop(axes: AxesArgument = None, at: AtOption = None) -> None:
     with stopping(at) as client:
         states = [client.axis(each).quick_stop() for each in axes] if axes else client.quick_stop().axes
     for each in states:
-        tell(each)
+        print_state(each)
 
 
 @on_daemon
@@ -443,7 +445,7 @@ def move(
 ) -> None:
     """Move the load to one angle or to several, and hold the last.
 
-    The axis has to be enabled. Ctrl-C stops it; it stays enabled.
+    The axis must be enabled. Ctrl-C stops it; it stays enabled.
     """
     if not wait and len(angles_deg) > 1:
         raise InputError("--no-wait goes to one angle: give one, or use 'hdbridge ctl queue'")
@@ -456,7 +458,7 @@ def move(
             state = moved.move(
                 before_deg, velocity_deg_s=velocity_deg_s, acceleration_deg_s2=acceleration_deg_s2, wait=wait
             )
-            (daemon.tell if given_deg is angles_deg[-1] else tell)(state)
+            (daemon.print_state if given_deg is angles_deg[-1] else print_state)(state)
 
 
 @on_daemon
@@ -468,11 +470,11 @@ def jog(
         float, Option("--for", min=0.05, max=86_400.0, help="Time, s; Ctrl-C ends it earlier.")
     ] = 1.0,
 ) -> None:
-    """Turn an axis at a speed for a time, then brake to rest; also if this command is killed."""
+    """Turn an axis at a speed for a time, then brake to rest, even if this command is killed."""
     with daemon.moving(axis) as moved:
         note_clamped(moved.state().limits, velocity_deg_s=velocity_deg_s)
         moved.jog(velocity_deg_s, duration_s)
-        daemon.tell(moved.rest())
+        daemon.print_state(moved.rest())
 
 
 @on_daemon
@@ -496,7 +498,7 @@ def queue(
     points = [QueueItem.given(target_deg=each, dwell_s=dwell_s, **limits) for each in angles_deg or ()]
     with daemon.moving(axis) as moved:
         note_clamped(moved.state().limits, **limits)
-        daemon.tell(moved.clear_queue() if clear else moved.queue(points))
+        daemon.print_state(moved.clear_queue() if clear else moved.queue(points))
 
 
 # ---------------------------------------------------------------- compensation and models
@@ -513,7 +515,7 @@ def compensate(
     The change is ramped, also in motion.
     """
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.compensate(scheme.value))
+        daemon.print_state(moved.compensate(scheme.value))
 
 
 @on_daemon
@@ -532,7 +534,7 @@ def model(
     if version not in {"pending", "active"} and not (version.isascii() and version.isdigit()):
         raise InputError(f"VERSION: found {version!r}; expected a number, pending or active")
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.activate_model(int(version) if version.isdigit() else version))
+        daemon.print_state(moved.activate_model(int(version) if version.isdigit() else version))
 
 
 @on_daemon
@@ -549,7 +551,7 @@ def adapt(
     if back == (mode is not None):
         raise InputError("expected either a mode or --back")
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.adaptation_back() if mode is None else moved.adapt(mode.value))
+        daemon.print_state(moved.adaptation_back() if mode is None else moved.adapt(mode.value))
 
 
 @on_daemon
@@ -558,7 +560,7 @@ def load_loop(
 ) -> None:
     """Switch the slow integral of the load error on or off, if the machine file has one."""
     with daemon.moving(axis) as moved:
-        daemon.tell(moved.load_loop(on))
+        daemon.print_state(moved.load_loop(on))
 
 
 # ---------------------------------------------------------------- objects of the drive

@@ -1,4 +1,4 @@
-"""Commands that name what a model lacks: `diagnose`, `improve`."""
+"""Commands that report the deficiencies of a model: `diagnose`, `improve`."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from hdbridge.records.recording import Recording
 
 
-WORTH_TELLING = 0.01
-"""Minimum share of the difference for a coordinate to be printed."""
+WORTH_PRINTING = 0.01
+"""Minimum share of the difference for printing a coordinate."""
 
 
 @taking(Part, opt.CsvFormat)
@@ -65,7 +65,7 @@ def diagnose(
         Option(
             "--prior",
             metavar="FLEET.parquet",
-            help="fleet.parquet of hdbridge fleet run: how often each cause is there.",
+            help="fleet.parquet of hdbridge fleet run: prevalence of each cause.",
         ),
     ] = None,
     group: Annotated[
@@ -85,7 +85,7 @@ def diagnose(
         ),
     ] = None,
 ) -> None:
-    """Compare records with a model; name the causes that it lacks and those that cannot be separated."""
+    """Compare records with a model; name the causes that it lacks, and those that are not separable."""
     from hdbridge.analysis.diagnosis import diagnose
     from hdbridge.analysis.identifiability import plan_report
     from hdbridge.axis.model import TransmissionModel
@@ -177,7 +177,7 @@ def _prior(path: Path | None, groups: Sequence[str]) -> Prior | None:
 
 
 def print_diagnosis(result: Diagnosis) -> None:
-    """Prints verdict, findings, next experiments, and causes that were not named."""
+    """Prints verdict, findings, next experiments, and causes that were not reported."""
     say(result.verdict())
     if result.findings:
         rows = [
@@ -200,7 +200,7 @@ def print_diagnosis(result: Diagnosis) -> None:
 
 
 def _details(finding: Finding) -> Iterator[str]:
-    """Yields the details of a finding that its line in the table omits."""
+    """Yields the details of a finding that are not in its table row."""
     said = [f"{name} {_number(each)}" for name, each in finding.parameters.items()]
     if finding.aliases:
         said.insert(0, f"it may also be: {', '.join(finding.aliases)}")
@@ -235,7 +235,7 @@ def _print_shares(shares: dict[str, dict[str, float]]) -> None:
     rows = [
         (name, *(f"{100.0 * value:.1f} %" for value in each.values()))
         for name, each in sorted(shares.items(), key=lambda each: -each[1]["share_of_baseline"])
-        if max(each.values()) >= WORTH_TELLING
+        if max(each.values()) >= WORTH_PRINTING
     ]
     print_table(("", "as given", "extended"), rows, "share of the difference explained by")
 
@@ -268,7 +268,7 @@ def _print_plan(report: dict[str, Any]) -> None:
             f"{limit:.2g} arcsec" if each["detectable"] else f"no: {each.get('reason') or 'limit too high'}"
         )
         rows.append((name, words, ", ".join(each["aliases"])))
-    print_table(("cause", "detected from", "not distinguished from"), rows)
+    print_table(("cause", "detected from", "not separable from"), rows)
     for each in report["notes"]:
         note(each)
 
@@ -329,7 +329,7 @@ def improve(
             rounds=rounds if auto else 0,
             progress=progress,
             interrupted=interrupted,
-            tell=note,
+            notify=note,
         )
     _conclude(result, work.folder, session, json_file, html_file)
 

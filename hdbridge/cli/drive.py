@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 @on_axis
 def reset(session: Session, json_file: opt.Json = None) -> None:
-    """Reset a fault of the drive when its cause is gone; power stays off.
+    """Reset a fault of the drive once its cause is gone; power stays off.
 
     Boots the drive, prints the error code and the last emergency, and resets the fault. Nothing moves. Exit
-    status 4 if the fault returns at once. With a daemon use `hdbridge ctl reset`.
+    status 4 if the fault returns at once. With a daemon, use `hdbridge ctl reset`.
     """
     from hdbridge.drive.states import State
 
@@ -78,7 +78,7 @@ def get(session: Session, object_: opt.Object, json_file: opt.Json = None) -> No
         drive.listen()
         wanted = find_object(object_, drive.sdo.od)
         if not wanted.readable:
-            raise InputError(f"{wanted}: is write-only by the EDS")
+            raise InputError(f"{wanted}: is write-only in the EDS")
         value = wanted.decode(drive.sdo.read_bytes(wanted.index, wanted.sub))
     write_json(json_file, _document(wanted, value))
     print_object(str(wanted), value, wanted.type_name)
@@ -97,7 +97,7 @@ def put(session: Session, object_: opt.Object, value: opt.Value, json_file: opt.
     axis = session.axis
     wanted = find_object(object_, load_eds(axis.eds_path, axis.drive.node_id))
     if not wanted.writable:
-        raise InputError(f"{wanted}: can only be read, by the EDS; nothing was written")
+        raise InputError(f"{wanted}: is read-only in the EDS; nothing was written")
     data = wanted.encode(value)
     with session.drive() as drive:
         drive.listen()

@@ -1,7 +1,7 @@
 """Event log of hdbridge's actions on the bus: on standard error, or as lines of JSON.
 
-The library reports events through `logging`: a name and a dictionary of facts. Nothing is logged within the
-control cycle; its events are logged when the axis is at rest.
+The library reports events through `logging`, with a name and a dictionary of facts. Nothing is logged within
+the control cycle; its events are logged once the axis is at rest.
 """
 
 import logging
@@ -19,7 +19,7 @@ _given: tuple[int, Path | None] = (0, None)
 
 
 def begin(verbose: int, path: Path | None) -> None:
-    """Starts reporting events; raises `InputError` if the file cannot be written."""
+    """Begins logging; raises `InputError` if the file cannot be written."""
     global _given  # noqa: PLW0603 - the handlers are the process's as well
     _given = verbose, path
     _ROOT.propagate = False
@@ -39,13 +39,13 @@ def begin(verbose: int, path: Path | None) -> None:
     _ROOT.setLevel(logging.DEBUG)
 
 
-def tell(event: str, **facts: object) -> None:
-    """Reports an event of the command line itself."""
+def write(event: str, **facts: object) -> None:
+    """Logs an event of the command line itself."""
     logging.getLogger(__name__).debug(event, facts)
 
 
 def handed_over() -> tuple[int, Path | None]:
-    """Returns the settings to a command with its own logging, and stops reporting here."""
+    """Returns the settings to a command with its own logging, and stops logging here."""
     for each in tuple(_ROOT.handlers):
         _ROOT.removeHandler(each)
         each.close()
@@ -54,8 +54,8 @@ def handed_over() -> tuple[int, Path | None]:
 
 
 def end(exit_status: int) -> int:
-    """Reports the last event and stops; returns the exit status, changed only if just the log failed."""
-    tell("end", exit_status=exit_status)
+    """Logs the last event and stops; returns the exit status, changed only if nothing but the log failed."""
+    write("end", exit_status=exit_status)
     for each in tuple(_ROOT.handlers):
         _ROOT.removeHandler(each)
         each.close()

@@ -47,7 +47,7 @@ PagesOption = Annotated[
 
 @dataclass(frozen=True)
 class Fleet:
-    """Recordings to diagnose, as the user of `run` or `watch` names them; InputError names a wrong option."""
+    """Recordings to diagnose, from the options of `run` or `watch`; InputError names a wrong option."""
 
     sources: Annotated[
         list[str] | None,
@@ -113,14 +113,14 @@ class Fleet:
 
     @cached_property
     def dataset(self) -> Dataset:
-        """The data set of the results."""
+        """Data set of the results."""
         from hdbridge.fleet.dataset import Dataset
 
         assert self.out is not None
         return Dataset(self.out)
 
     def find(self, stored: Stored, *, may_be_empty: bool = False) -> Sequence[Source]:
-        """Returns the recordings that are there; raises `InputError` for a wrong source or manifest."""
+        """Returns the available recordings; raises `InputError` for a wrong source or manifest."""
         from hdbridge.fleet.sources import find_sources
 
         return find_sources(
@@ -135,7 +135,7 @@ class Fleet:
     def diagnose(
         self, found: Sequence[Source], interrupted: Callable[[], bool], retried: Collection[str] | None = None
     ) -> None:
-        """Runs over the recordings with a progress bar."""
+        """Processes the recordings with a progress bar."""
         from hdbridge.fleet.engine import RETRIED, Cluster, Progress
         from hdbridge.fleet.engine import run as run_fleet
 
@@ -143,7 +143,7 @@ class Fleet:
         with progress_bar() as bar:
             task = bar.add_task("diagnosing", total=len(found))
 
-            def tell(now: Progress) -> None:
+            def notify(now: Progress) -> None:
                 words = f"{now.done} of {now.total}" + f", {now.failed} failed" * bool(now.failed)
                 bar.update(task, completed=now.done, total=max(now.total, 1), description=words)
 
@@ -153,7 +153,7 @@ class Fleet:
                 Cluster(self.scheduler, self.workers, self.memory),
                 model=self.model,
                 models=self.models,
-                progress=tell,
+                progress=notify,
                 interrupted=interrupted,
                 retried=RETRIED if retried is None else retried,
             )
@@ -166,7 +166,7 @@ class Fleet:
         return _summarise(self.dataset, self.limit_arcsec, pages=self.pages)
 
     def say_interrupted(self) -> None:
-        """Reports that the finished part is kept."""
+        """Reports that the results so far are kept."""
         note(f"interrupted; {self.dataset.folder} keeps what is done, and the same command continues")
 
 
@@ -237,7 +237,7 @@ def report(
         list[str] | None, Option("--joint", metavar="NAME", help="Also write the page of this joint.")
     ] = None,
 ) -> None:
-    """Write the page of a run again, and print which joints to look at first."""
+    """Write the page of a run again, and print the joints to inspect first."""
     from hdbridge.fleet.dataset import Dataset
 
     need_extra("a fleet needs", _EXTRA, "fleet")
@@ -256,7 +256,7 @@ def simulate(
 ) -> None:
     """Make recordings of a simulated fleet: growing known causes, damaged files, exchanged joints.
 
-    FOLDER gets the recordings, `manifest.csv`, and the truth, `answers.json`.
+    FOLDER receives the recordings, `manifest.csv`, and the truth, `answers.json`.
     """
     from hdbridge.fleet.simulate import simulate as make
 
@@ -322,7 +322,7 @@ def _summarise(
 
 
 def _with_pages(folder: Path, latest: Mapping[str, Row], wanted: Collection[str]) -> dict[str, str]:
-    """Writes the wanted pages of joints that are missing; returns the addresses of all that are there."""
+    """Writes missing pages of the wanted joints; returns the addresses of all existing pages."""
     from hdbridge.fleet.report import links, write_page
 
     there = links(folder, latest)
@@ -339,7 +339,7 @@ def _with_pages(folder: Path, latest: Mapping[str, Row], wanted: Collection[str]
 
 
 _note_once = cache(note)
-"""Prints a remark the first time only, because `watch` reads the manifest again and again."""
+"""Prints a remark only the first time, because `watch` reads the manifest repeatedly."""
 
 
 def _check_memory(text: str) -> None:

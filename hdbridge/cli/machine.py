@@ -44,7 +44,7 @@ _EXTRA = ("fastapi", "uvicorn", "websockets", "mcap", "prometheus_client")
 def run(
     machine: opt.Machine,
     simulate: Annotated[
-        bool, Option("--simulate", help="Hold simulated drives in place of the bus.")
+        bool, Option("--simulate", help="Control simulated drives in place of the bus.")
     ] = False,
     speed: Annotated[
         float,
@@ -69,12 +69,13 @@ def run(
     port: Annotated[int, Option("--port", min=0, max=65_535, help="Port of --page; 0: any.")] = 8402,
     force: opt.Force = False,
 ) -> None:
-    """Run the daemon: hold the drives of a machine and take load angles from clients.
+    """Run the daemon: control the drives of a machine and accept load angles from clients.
 
-    Nothing moves until a client enables an axis. SIGTERM, Ctrl-C and SIGHUP stop the axes in order and end
-    the daemon; a second one stops them at the quick-stop ramp. A drive fault is reported and latched.
+    Nothing moves until a client enables an axis. SIGTERM, Ctrl-C and SIGHUP stop the axes in an orderly way
+    and end the daemon; a second signal stops them at the quick-stop ramp. A drive fault is reported and
+    latched.
 
-    Exit status: 0 ended in order, 1 a process died repeatedly, 2 bad input, 3 the bus cannot be opened or has
+    Exit status: 0 orderly end, 1 a process died repeatedly, 2 bad input, 3 the bus cannot be opened or has
     another master, 7 another daemon has the API's address.
     """
     check_bus_options(interface, channel, simulate=simulate)
@@ -138,7 +139,7 @@ def install_service(
 ) -> None:
     """Show, write or remove the systemd files that run a machine's daemon from the start of the computer.
 
-    Nothing is started; the commands for that are printed.
+    Nothing is started; the necessary commands are printed.
     """
     from hdbridge.daemon.machine import Machine
     from hdbridge.daemon.systemd import service_files
@@ -153,12 +154,14 @@ def install_service(
     files = service_files(held, user=user, account=account)
     foreign = [each.path for each in files if not each.ours]
     if foreign and (yes or remove):
-        raise InputError(f"{foreign[0]}: is not of this program, or cannot be read; move it away first")
+        raise InputError(
+            f"{foreign[0]}: was not written by this program, or cannot be read; move it away first"
+        )
     if remove:
         _remove(files)
     elif yes:
         _write(files)
-        _tell_what_next(held, files, user=user)
+        _print_next_steps(held, files, user=user)
     else:
         for file in files:
             say(f"# {file.path}")
@@ -195,7 +198,7 @@ def _refused(file: ServiceFile, problem: OSError) -> str:
     return f"{file.path}: {problem.strerror}; expected the rights of root (sudo), or --user"
 
 
-def _tell_what_next(machine: Machine, files: list[ServiceFile], *, user: bool) -> None:
+def _print_next_steps(machine: Machine, files: list[ServiceFile], *, user: bool) -> None:
     control = "systemctl --user" if user else "systemctl"
     unit = files[0].path.name
     say("next:")
@@ -274,7 +277,7 @@ def doctor(
 
 
 def eds_of(axis: AxisConfig, settings: GatewaySettings, model: TransmissionModel) -> ObjectDictionary:
-    """The object dictionary of a gateway axis, read from its EDS as another master does."""
+    """Returns the object dictionary of a gateway axis, read from its EDS like another master does."""
     from hdbridge.daemon.gateway.objects import write_eds
     from hdbridge.files.edsfile import read_eds
 
@@ -298,7 +301,7 @@ def _heard(settings: GatewaySettings, duration_s: float) -> Iterator[Frame]:
 
 
 def _begun(frames: Iterator[Frame]) -> Iterator[Frame]:
-    """Returns the same frames, the first of them read already, so that a wrong file is refused first."""
+    """Returns the same frames after reading the first, so that a wrong file is refused early."""
     return chain(list(islice(frames, 1)), frames)
 
 
@@ -315,9 +318,9 @@ def _logged(path: Path) -> Iterator[Frame]:
 
 
 def gateway_axis(machine: str, name: str | None) -> tuple[AxisConfig, GatewaySettings, TransmissionModel]:
-    """An axis of a machine's gateway, the gateway, and the axis's model.
+    """Returns an axis of a machine's gateway, the gateway, and the axis's model.
 
-    InputError if the machine has no gateway, or the name is needed.
+    InputError if the machine has no gateway, or if the name is required.
     """
     from hdbridge.daemon.machine import Machine
 

@@ -1,4 +1,4 @@
-"""``hdbridge model``: the history of an axis's model or twin: look, compare, commit, go back."""
+"""``hdbridge model``: history of an axis's model or twin: list, compare, commit, roll back."""
 
 from collections.abc import Sequence
 from datetime import datetime
@@ -18,7 +18,7 @@ from hdbridge.files.profile import Profile
 from hdbridge.files.yamlfile import read_yaml
 from hdbridge.units import figure, with_interval
 
-ReasonOption = Annotated[str, Option("--reason", help="Why, for the log.")]
+ReasonOption = Annotated[str, Option("--reason", help="Reason, for the log.")]
 TwinOption = Annotated[bool, Option("--twin", help="The twins of the axis instead of its models.")]
 
 
@@ -49,7 +49,7 @@ def compare(
     twin: TwinOption = False,
     json_file: opt.Json = None,
 ) -> None:
-    """Show what changed between two models, parameter by parameter."""
+    """Show the differences between two models, parameter by parameter."""
     folder, store = _folder(profile), _store(twin)
     names = {name for each in store.log(folder) for name in _names(each)}
     if after is None and before is None and PENDING not in names:
@@ -76,7 +76,7 @@ def compare(
 
 
 def commit(profile: opt.Profile, twin: TwinOption = False) -> None:
-    """Make the pending model the active one; the one before stays in the history."""
+    """Make the pending model the active one; the previous model stays in the history."""
     store = _store(twin)
     number = store.commit(_folder(profile), _now())
     say(f"{store.noun} {number} is active")
@@ -102,7 +102,7 @@ def rollback(profile: opt.Profile, reason: ReasonOption = "", twin: TwinOption =
 
 
 def discard(profile: opt.Profile, twin: TwinOption = False) -> None:
-    """Throw the pending model away; the recording that it came from stays."""
+    """Discard the pending model; its recording stays."""
     store = _store(twin)
     store.discard(_folder(profile))
     say(f"the pending {store.noun} is gone; its recording is kept")
@@ -117,7 +117,7 @@ def _store(twin: bool) -> Store[Any]:
 
 
 def _rows(before: Any, after: Any) -> list[Difference]:
-    """Returns the differences of two models or of two twins; ``before`` may be None."""
+    """Returns the differences between two models or two twins; ``before`` may be None."""
     if isinstance(after, TransmissionModel):
         return diff(before or after.only(()), after)
     from hdbridge.twin.twin import diff as diff_of_twins
@@ -126,7 +126,7 @@ def _rows(before: Any, after: Any) -> list[Difference]:
 
 
 def _folder(profile: str) -> Path:
-    """Returns the folder of an axis's models; raises `InputError` without an axis file, valid or not."""
+    """Returns the folder of an axis's models, even with an invalid axis file; InputError without one."""
     axis = Profile.find(profile).axis
     data = read_yaml(axis).data
     if not (isinstance(data, dict) and str(data.get("schema")).startswith("hdbridge.axis/")):
@@ -139,7 +139,7 @@ def _now() -> datetime:
 
 
 def _print_diff(title: str, rows: Sequence[Difference]) -> None:
-    """Prints the differences effect by effect; without the columns of a previous model if there was none."""
+    """Prints the differences effect by effect, without the columns of a previous model if there was none."""
     compared = any(row.before is not None for row in rows if row.effect)
     columns = ("before", "after", "change", "± 95 %") if compared else ("value", "± 95 %")
     table: list[Sequence[str | Text]] = []
@@ -170,7 +170,7 @@ def _cells(row: Difference) -> tuple[str, str, str, str]:
 
 
 def _cell(value: Any, half_width: float | None) -> tuple[str, str]:
-    """Formats a value and half its interval: to the interval's digits, else to four."""
+    """Formats a value and the half width of its interval, with the digits of the interval or else four."""
     if isinstance(value, float):
         return (figure(value), "-") if half_width is None else with_interval(value, half_width)
     return "-" if value is None else str(value), "-" if half_width is None else figure(half_width, 2)

@@ -1,7 +1,7 @@
-"""Options of several commands, and the checks of a command's outputs before it runs.
+"""Options shared by commands, and the checks of a command's outputs before it runs.
 
-An option that writes carries its `Kind` in its annotation, `Annotated[Path | None, Option(...), Kind.JSON]`.
-Every other file or folder that a command is given counts as an input.
+An option for an output has its `Kind` in its annotation, `Annotated[Path | None, Option(...), Kind.JSON]`.
+Every other file or folder given to a command counts as an input.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ Value = Annotated[str, Argument(metavar="VALUE", help="Decimal or 0x...; text, o
 
 @dataclass(frozen=True)
 class Homing:
-    """Options of a homing run, as `hdbridge.drive.drive.Drive.home` takes them."""
+    """Options of a homing run, as parameters of `hdbridge.drive.drive.Drive.home`."""
 
     method: Annotated[
         int, Option("--method", min=-128, max=127, help="Homing method, 6098h: see the manual.")
@@ -168,7 +168,7 @@ class CsvFormat:
     ] = None
 
     def load(self, paths: Sequence[Path]) -> dict[Path, Recording]:
-        """Loads recordings and CSV files, by path; prints what was assumed about other programs' files."""
+        """Loads recordings and CSV files by path; prints the assumptions about other programs' files."""
         from hdbridge.analysis.checks import check_once
         from hdbridge.records.recording import Recording
 
@@ -181,9 +181,10 @@ class CsvFormat:
 
 
 def taking(*groups: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Gives a command the fields of dataclasses as options; it receives these as its first arguments.
+    """Adds the fields of dataclasses to a command as options; the command receives these as its first
+    arguments.
 
-    Arguments of the groups stand first, their options behind the command's own.
+    Arguments of the groups come first, their options after those of the command.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -284,7 +285,7 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _check_truths(given: Path | list[Path] | None) -> None:
-    """Loads the truth files, so that a wrong one is refused before folders are made for results."""
+    """Loads the truth files, so that a wrong file is refused before folders for results are created."""
     if given:
         from hdbridge.sim.truth import Truth
 
@@ -294,7 +295,7 @@ def _check_truths(given: Path | list[Path] | None) -> None:
 
 @contextmanager
 def _naming(options: Mapping[str, tuple[str, Kind | None]]) -> Iterator[None]:
-    """Replaces the parameter name in an error of the library by the option that the user typed."""
+    """Replaces the parameter name in an error of the library by the option on the command line."""
     try:
         yield
     except InputError as problem:
@@ -305,7 +306,7 @@ def _naming(options: Mapping[str, tuple[str, Kind | None]]) -> Iterator[None]:
 
 
 def _options_of(command: Callable[..., Any]) -> Iterator[tuple[str, tuple[str, Kind | None]]]:
-    """Yields for each parameter its option and the kind of its output, None if it writes nothing."""
+    """Yields for each parameter its option and the kind of its output; None without an output."""
     for parameter in _parameters(command):
         metadata = getattr(parameter.annotation, "__metadata__", ())
         kinds = (each for each in metadata if isinstance(each, Kind))

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 # ---------------------------------------------------------------- move
 
 KEPT_S = 60.0
-"""Duration of the samples kept while the axis holds; s."""
+"""Duration of the kept samples while the axis holds; s."""
 
 
 @on_axis
@@ -98,14 +98,14 @@ def move(
             try:
                 run = bench.run(way, show, keep_s=KEPT_S)
             except KeyboardInterrupt:
-                _tell_where_it_stands(drive)
+                _print_position(drive)
                 raise
     write_json(json_file, _move_document(axis.name, chosen, run.outcome))
     _print_move(axis.name, chosen, run.outcome)
 
 
-def _tell_where_it_stands(drive: Drive) -> None:
-    """Prints the position after a stop on the way; nothing if the drive does not answer any more."""
+def _print_position(drive: Drive) -> None:
+    """Prints the position after a stop on the way; nothing if the drive no longer answers."""
     with suppress(HdbridgeError):
         stands_deg = drive.read_positions().motor_deg / drive.axis.gear.ratio
         note(f"stopped on the way, at {stands_deg:.4f} deg by the motor encoder; power is off")
@@ -114,7 +114,7 @@ def _tell_where_it_stands(drive: Drive) -> None:
 def _compensating(
     files: Profile, given: Path | None, ratio: float, *, compensated: bool
 ) -> TransmissionModel:
-    """Returns the compensating model; one without effects without a model or if not ``compensated``."""
+    """Returns the compensating model; without a model or ``compensated``, one without effects."""
     from hdbridge.axis.model import TransmissionModel
 
     if not compensated:
@@ -183,11 +183,15 @@ def step(
     html_file: opt.Html = None,
     record: Annotated[
         Path | None,
-        Option("--record", metavar="FOLDER", help="Keep what was measured: one CSV file per scheme."),
+        Option(
+            "--record",
+            metavar="FOLDER",
+            help="Write the measured data to this folder: one CSV file per scheme.",
+        ),
         Kind.FOLDER,
     ] = None,
 ) -> None:
-    """Step the axis both ways under each compensation scheme; print what the load encoder measured.
+    """Step the axis both ways under each compensation scheme; print the results at the load encoder.
 
     Uses the article's four schemes, and the whole model if it has more than their two parts.
     """
@@ -203,7 +207,7 @@ def step(
     if model is not None or not scheme or set(scheme) != {Scheme.NONE}:  # the scheme none needs no model
         chosen = compensating_model(files, session.profile, model, ", or step without one: --scheme none")
 
-    def tell(comparison: Comparison) -> None:
+    def notify(comparison: Comparison) -> None:
         write_json(json_file, comparison.as_dict())
         if html_file is not None:
             _write_stepping_page(html_file, axis, chosen, comparison, stepping, session.simulated_seed)
@@ -215,7 +219,7 @@ def step(
         stepping,
         scheme,
         record=record,
-        tell=tell,
+        notify=notify,
     )
 
 
@@ -226,11 +230,11 @@ def run_comparison(
     schemes: list[Scheme] | None,
     *,
     record: Path | None = None,
-    tell: Callable[[Comparison], None],
+    notify: Callable[[Comparison], None],
 ) -> None:
     """Connects, boots and compares; keeps each scheme's record as soon as it is complete.
 
-    ``tell`` receives the result, also of an interrupted test: then that of the completed schemes.
+    ``notify`` receives the result. For an interrupted test, this is the result of the completed schemes.
     """
     from hdbridge.commissioning.evaluation.comparison import compare_schemes
     from hdbridge.control.bench import compensation_for
@@ -267,7 +271,7 @@ def run_comparison(
         note(f"stopped in '{scheme.value}' after {seconds:.1f} s, {kept}")
 
     with (
-        _told_when_stopped(axis, done, tell),
+        _reported_when_stopped(axis, done, notify),
         session.booted() as (drive, interrupted),
         progress_bar() as bar,
     ):
@@ -293,12 +297,12 @@ def run_comparison(
             finished=keep,
             stopped=stopped,
         )
-    tell(comparison)
+    notify(comparison)
 
 
 @contextmanager
-def _told_when_stopped(
-    axis: AxisConfig, done: dict[Scheme, Run[SteppingOutcome]], tell: Callable[[Comparison], None]
+def _reported_when_stopped(
+    axis: AxisConfig, done: dict[Scheme, Run[SteppingOutcome]], notify: Callable[[Comparison], None]
 ) -> Iterator[None]:
     """Reports the results of the completed schemes if a test is interrupted."""
     from hdbridge.commissioning.evaluation.comparison import Comparison
@@ -307,12 +311,11 @@ def _told_when_stopped(
         yield
     except BaseException:
         if done:
-            tell(Comparison.of(axis, done))
+            notify(Comparison.of(axis, done))
         raise
 
 
 def _print_stepping(axis: AxisConfig, comparison: Comparison) -> None:
-    """Prints the result."""
     title = f"Load error at rest, arcsec: axis '{axis.name}'"
     print_steps(title, comparison.results.values(), "compensation")
     for line in comparison.survived:
@@ -333,7 +336,7 @@ def _write_stepping_page(
     stepping: Stepping,
     simulated_seed: int | None,
 ) -> None:
-    """Writes the result as a self-contained page, with what was stepped, when, and by which model."""
+    """Writes the result as a self-contained page with axis, date and model of the test."""
     from hdbridge.report.page import render
     from hdbridge.report.stepping import stepping_page
 
@@ -452,7 +455,9 @@ def print_motion(result: MotionTest) -> None:
 def demo(
     out: Annotated[
         Path | None,
-        Option("--out", metavar="FOLDER", help="Where the results go; else demo-output, numbered."),
+        Option(
+            "--out", metavar="FOLDER", help="Write the results to this folder; else to demo-output, numbered."
+        ),
         Kind.FOLDER,
     ] = None,
     count: Annotated[int, Option("--count", min=2, max=2000, help="Steps each way.")] = 240,
@@ -460,7 +465,7 @@ def demo(
 ) -> None:
     """Step a simulated axis 240 times each way under four compensation schemes.
 
-    Table, JSON, records and a page go to FOLDER.
+    FOLDER receives table, JSON, records and a page.
     """
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.motion.procedures.stepping import Stepping
@@ -470,12 +475,12 @@ def demo(
     stepping = Stepping(count=count)
     folder = new_folder(Path("demo-output")) if out is None else make_folder(out)
 
-    def tell(comparison: Comparison) -> None:
+    def notify(comparison: Comparison) -> None:
         write_json(folder / "stepping.json", comparison.as_dict())
         _write_stepping_page(folder / "stepping.html", axis, files.model, comparison, stepping, seed)
         _print_stepping(axis, comparison)
 
-    run_comparison(session, TransmissionModel.load(files.model), stepping, None, record=folder, tell=tell)
+    run_comparison(session, TransmissionModel.load(files.model), stepping, None, record=folder, notify=notify)
     say(f"\nopen {folder / 'stepping.html'} in a browser for the picture; next: docs/tutorial.md")
 
 

@@ -1,4 +1,4 @@
-"""Printing of every command: lines and tables of the result, remarks, progress, result files."""
+"""Printing of all commands: lines and tables of the result, remarks, progress, result files."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def note(line: str) -> None:
 
 
 def progress_bar() -> Progress:
-    """Returns a progress bar with the time left, on standard error; plain lines if that is not a terminal."""
+    """Returns a progress bar with the time left, on standard error; plain lines without a terminal."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -59,15 +59,15 @@ def progress_bar() -> Progress:
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str = "") -> None:
-    """Prints a table uncropped; always as one table into a pipe or a file. An empty row ends a section."""
+    """Prints a table uncropped, always as one table into a pipe or a file. An empty row ends a section."""
     for each in tables(columns, rows, title):
         console.print(each, crop=False)
 
 
 def tables(columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str = "") -> list[Table]:
-    """Returns a table at its natural width; on a narrow terminal several, each with the first column.
+    """Returns a table at its natural width; on a narrow terminal several tables, each with the first column.
 
-    No figure is cut off.
+    Figures are never truncated.
     """
     parts: list[Table] = []
     rest = [*range(1, len(columns))]

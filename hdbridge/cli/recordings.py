@@ -33,7 +33,7 @@ FlightsArgument = Annotated[
 
 @dataclass(frozen=True)
 class Part:
-    """Options that select one axis and a time of flight recordings."""
+    """Options that select one axis and a period of flight recordings."""
 
     axis: Annotated[
         str | None,
@@ -48,9 +48,9 @@ class Part:
     ] = None
 
     def read(self, paths: Sequence[Path], *, all_states: bool = False) -> tuple[Recording, ModelUsed | None]:
-        """Reads MCAP files and folders of them, and the model that was used at the end; None if none was.
+        """Reads MCAP files and folders of them, and the model in use at the end, or None.
 
-        Raises `InputError` if the axis or the time is not in the recordings.
+        Raises `InputError` if the axis or the period is not in the recordings.
         """
         need_reader()
         from hdbridge.daemon.recorder.export import axis_of, exported, last_model
@@ -77,7 +77,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Export:
-    """Options for the record that a command makes."""
+    """Options for the record created by a command."""
 
     out: Annotated[
         Path | None,
@@ -106,7 +106,7 @@ class Export:
 
 
 def is_flight(path: Path) -> bool:
-    """Returns True for an MCAP file, and for a folder that has some and is not a recording."""
+    """Returns True for an MCAP file, and for a folder with MCAP files that is not a recording."""
     if path.is_dir():
         return not (path / "recording.yaml").exists() and next(path.rglob("*.mcap*"), None) is not None
     return path.name.endswith((".mcap", ".mcap.part"))
@@ -179,7 +179,7 @@ def info(
     missing = int(np.sum(steps[steps > 1] - 1))
 
     def outer_of(axis: str) -> dict[str, Any] | None:
-        """Returns the connection of another master to an axis of a gateway; None without one."""
+        """Returns the connection of another master to a gateway axis, or None."""
         rows = found.axes[axis]
         asked = ~np.isnan(rows["outer_target_deg"])
         if not asked.any():
@@ -267,9 +267,9 @@ def export(
         Kind.MODEL,
     ] = None,
 ) -> None:
-    """Make a record of one axis, as `fit` and `diagnose` read it.
+    """Make a record of one axis for `fit` and `diagnose`.
 
-    Missing cycles or a disabled axis begin a new part, which needs a recording folder.
+    Missing cycles or a disabled axis begin a new part, which requires a recording folder.
     """
     out = to.checked()
     recording, used = part.read(flights, all_states=to.all_states)
@@ -292,7 +292,7 @@ def import_(
         str | None, Option("--channel", metavar="NAME", help="The bus, if the node is on several in the log.")
     ] = None,
 ) -> None:
-    """Make a record of a bus log, as `fit` and `diagnose` read it. Any master may have driven the axis.
+    """Make a record of a bus log for `fit` and `diagnose`. Any master may have driven the axis.
 
     Log from the drive's boot-up on: the PDO mapping comes from its SDO traffic, else from the axis file.
     """
@@ -305,7 +305,7 @@ def import_(
     _write(recording, out)
     note(f"PDO mapping {recording.notes['mapping']}")
     if cut_off := recording.notes.get("cut_off"):
-        note(f"{log}: {cut_off}; what comes before is imported")
+        note(f"{log}: {cut_off}; the part before that is imported")
     if recording.record.motor_target_deg is None:
         note("no command in each cycle: the record has no motor_target_deg")
     _print_export(recording, out)

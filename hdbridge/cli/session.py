@@ -1,4 +1,4 @@
-"""The axis of a command: its profile, its options, and its drive on the bus or a simulated one."""
+"""Axis of a command: its profile, its options, and its real or simulated drive."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BusOptions:
-    """Options of every command that reaches a node on a bus, or a simulated one."""
+    """Options of every command for a real or simulated node."""
 
     simulate: opt.Simulate = False
     truth: opt.Truth = None
@@ -48,7 +48,7 @@ class BusOptions:
 
     @contextmanager
     def bare(self, settings: BusConfig) -> Iterator[tuple[can.BusABC, Clock]]:
-        """Yields a bus that is not an axis's, and the monotonic clock.
+        """Yields a bus without an axis, and the monotonic clock.
 
         With ``force``, the bus is opened even if another process on this computer masters it.
         """
@@ -61,21 +61,21 @@ class BusOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Session(BusOptions):
-    """An axis as the user of one command names it. Nothing is connected before it is asked for.
+    """Axis named by the user of one command. Nothing is connected before it is needed.
 
-    The fields are the options of every command that reaches an axis: see `on_axis`.
+    The fields are the options of every command for an axis; see `on_axis`.
     """
 
     profile: opt.Profile
 
     @cached_property
     def files(self) -> Profile:
-        """Files of the profile; raises `InputError` if there is no such profile."""
+        """Files of the profile; raises `InputError` if the profile does not exist."""
         return Profile.find(self.profile)
 
     @cached_property
     def axis(self) -> AxisConfig:
-        """The axis file, with the bus replaced by the options."""
+        """Axis file, with the bus replaced by the options."""
         from hdbridge.axis import AxisConfig
         from hdbridge.drive.link import check_interface
 
@@ -89,12 +89,12 @@ class Session(BusOptions):
 
     @property
     def simulated_seed(self) -> int | None:
-        """Seed of the simulated axis; None for a real one."""
+        """Seed of the simulated axis; None for a real axis."""
         return self.seed if self.simulate else None
 
     @contextmanager
     def connected(self) -> Iterator[tuple[can.BusABC, Clock]]:
-        """Yields the axis's bus and its clock: those of a simulated drive, or the real ones.
+        """Yields the real or simulated bus of the axis, and its clock.
 
         With ``force``, the bus is opened even if another process on this computer masters it.
         """
@@ -149,9 +149,9 @@ on_axis = taking(Session)
 
 @contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Defers signals to end: within the block they only set a flag, which the yielded function reports.
+    """Defers termination signals: within the block they only set a flag, which the yielded function returns.
 
-    A closed terminal (SIGHUP) or SIGQUIT thus also stops the axis in an orderly way. A signal that was
+    A closed terminal (SIGHUP) or SIGQUIT therefore also stops the axis in an orderly way. A signal that was
     ignored from the start (`nohup`) stays ignored. The third signal interrupts at once.
     """
     wishes = 0
@@ -175,7 +175,7 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
 
 
 def check_bus_options(interface: str | None, channel: str | None, *, simulate: bool) -> None:
-    """Refuses a bus option for a simulated drive, which would not use it."""
+    """Refuses a bus option for a simulated drive, which does not use it."""
     if simulate and (interface is not None or channel is not None):
         raise InputError(
             "--simulate has a bus of its own in this process: leave out --interface and --channel; a "
@@ -184,7 +184,7 @@ def check_bus_options(interface: str | None, channel: str | None, *, simulate: b
 
 
 def _borrow(bus: BusConfig) -> None:
-    """Makes the daemon that holds a bus release it; does nothing if no program holds the bus.
+    """Makes the daemon that holds a bus release it; does nothing for a free bus.
 
     Raises `BusInUseError` if the holder is not a daemon that this user may ask.
     """
@@ -211,7 +211,7 @@ def _borrow(bus: BusConfig) -> None:
 
 
 def simulated_by(files: Profile, truth: Path | None) -> Path:
-    """Returns the file that describes the simulated axis; prints a note if it is the axis's twin."""
+    """Returns the file that describes the simulated axis; prints a note if this is the axis's twin."""
     plant = truth or files.simulated
     if plant == files.twin:
         note(f"simulated by the axis's twin, {plant}")
@@ -219,9 +219,9 @@ def simulated_by(files: Profile, truth: Path | None) -> Path:
 
 
 def model_file(text: str) -> Path:
-    """Returns the model file that an option names, directly or through a profile with an active model.
+    """Returns the model file named by an option, directly or through a profile with an active model.
 
-    Raises `InputError` if there is neither, or if the profile has no model yet.
+    Raises `InputError` if neither exists, or if the profile has no model yet.
     """
     path = Path(text)
     if path.is_file() and path.name != "axis.yaml":
@@ -245,9 +245,9 @@ def model_file(text: str) -> Path:
 
 
 def compensating_model(files: Profile, profile: str, model: Path | None, otherwise: str = "") -> Path:
-    """Returns the model file to compensate with: the given one, else the profile's.
+    """Returns the compensating model file: the given file, else the profile's.
 
-    Raises `InputError` without a model; ``otherwise`` adds an alternative to its text.
+    Raises `InputError` without a model; ``otherwise`` adds an alternative to the message.
     """
     if model is None and not files.model.exists():
         raise InputError(
@@ -260,7 +260,7 @@ def compensating_model(files: Profile, profile: str, model: Path | None, otherwi
 def note_clamped(limits: Any, **wanted: float | None) -> None:
     """Reports each velocity or acceleration above the axis's limit, which is used instead.
 
-    ``limits`` must have the attributes that are named: ``velocity_deg_s``, ``acceleration_deg_s2``.
+    ``limits`` must have the named attributes: ``velocity_deg_s``, ``acceleration_deg_s2``.
     """
     for name, value in wanted.items():
         limit = getattr(limits, name)

@@ -33,7 +33,7 @@ QUESTIONS: Final = (
     ("limits.acceleration_deg_s2", "highest acceleration of the load, deg/s2"),
     ("limits.torque_percent", "highest motor torque, percent of the rated torque"),
 )
-"""Keys that the user has to know or at least confirm."""
+"""Keys whose values the user must know or at least confirm."""
 _FILL_IN: Final = "# fill in"
 _UP: Final = 1
 """IFF_UP of linux/if.h, in the flags of an interface."""
@@ -62,7 +62,7 @@ def setup(
 ) -> None:
     """Set up an axis in one sitting: bus, axis file, checks, calibration, model, first move.
 
-    Prints each command before it runs it, asks for what cannot be measured, and asks before each motion.
+    Prints each command before running it, asks for data that cannot be measured, and asks before each motion.
     The same command resumes an interrupted set-up.
     """
     work = _Setup(folder, simulate=simulate, seed=seed, yes=yes)
@@ -77,12 +77,12 @@ def setup(
     except (HdbridgeError, KeyboardInterrupt, typer.Abort, typer.Exit):
         note(f"resume: hdbridge setup {shlex.quote(str(folder))}")
         raise
-    work.tell_next()
+    work.print_next()
 
 
 @dataclass
 class _State:
-    """Completed steps, each with the digest of the axis file that it was done for."""
+    """Completed steps, each with the digest of the axis file used."""
 
     simulated: bool = False
     seed: int = 0
@@ -144,14 +144,14 @@ class _Setup:
         self._finish("facts")
 
     def examine(self) -> None:
-        """Checks the files, then the drive, until the doctor finds nothing."""
+        """Checks the files, then the drive, until the doctor finds no fault."""
         while True:
             self._run("check", self._folder)
             if self._is_done("doctor"):
                 return
             self._confirm(
                 "The doctor switches the drive on and moves the axis slowly, up to a motor turn and an "
-                "eighth each way. Keep the way clear and a hardware emergency stop at hand. Move now?"
+                "eighth each way. Keep the path clear and a hardware emergency stop at hand. Move now?"
             )
             try:
                 self._run("doctor", self._folder, *self._how, "--yes", "--json", self._folder / DOCTOR)
@@ -170,7 +170,7 @@ class _Setup:
 
         cycle_ms = AxisConfig.load(self._folder).drive.cycle_ms
         self._run("latency", "--cycle-ms", f"{cycle_ms:g}")
-        self._confirm(f"Does this computer carry {cycle_ms:g} ms, by the table above?")
+        self._confirm(f"Does this computer sustain {cycle_ms:g} ms, by the table above?")
         self._finish("latency")
 
     def calibrate(self, plan: str) -> None:
@@ -215,7 +215,7 @@ class _Setup:
         self._run("move", self._folder, *self._how, "--hold", "1", *places)
         self._finish("move")
 
-    def tell_next(self) -> None:
+    def print_next(self) -> None:
         """Prints the page of the calibration and the commands for daily use."""
         how = " --simulate" if self._state.simulated else ""
         say(
@@ -231,7 +231,7 @@ class _Setup:
         return ("--simulate", "--seed", str(self._state.seed)) if self._state.simulated else ()
 
     def _run(self, *arguments: object) -> None:
-        """Prints a command of hdbridge and runs it. Raises its error."""
+        """Prints and runs an hdbridge command. Raises its error."""
         from hdbridge.cli import app
 
         words = [str(each) for each in arguments]
@@ -257,7 +257,7 @@ class _Setup:
             raise typer.Exit(130)
 
     def _mended(self) -> bool:
-        """Changes the key that the doctor suspects first, if the user agrees."""
+        """Changes the key most suspected by the doctor, if the user agrees."""
         checks = json.loads((self._folder / DOCTOR).read_text(encoding="utf-8"))["checks"]
         remedies = [remedy for check in checks for remedy in check.get("remedies", ())]
         match = next(filter(None, map(_REMEDY.search, remedies)), None)
@@ -293,7 +293,7 @@ def _read(path: Path) -> _State:
 
 
 def _check_interface(interface: str, channel: str, bitrate_bps: int | None) -> None:
-    """Raises `BusError` with the command that brings it up, if a SocketCAN interface is missing or down."""
+    """Raises `BusError` with the remedial command if a SocketCAN interface is missing or down."""
     if interface != "socketcan":
         return
     flags = Path(f"/sys/class/net/{channel}/flags")
@@ -305,7 +305,7 @@ def _check_interface(interface: str, channel: str, bitrate_bps: int | None) -> N
 
 
 def value_of(text: str, key: str) -> tuple[str, bool] | None:
-    """Returns the value of ``section.key`` in an axis file's text, and True if it is to be filled in."""
+    """Returns the value of ``section.key`` in an axis file's text, and True if it is yet to be filled in."""
     match = _line(key).search(text)
     if match is None:
         return None

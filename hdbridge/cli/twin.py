@@ -155,7 +155,7 @@ def _values(before: Truth, after: Truth) -> list[Learned]:
 def _check(
     files: Profile, axis: AxisConfig, recording: Recording, json_file: Path | None, html_file: Path | None
 ) -> None:
-    """Reports the changes since the profile's twin was made in one sentence."""
+    """Reports the changes since the profile's twin was made, in one sentence."""
     from hdbridge.twin.check import check
     from hdbridge.twin.twin import KeptTwin
 
@@ -188,7 +188,7 @@ def _check(
 
 
 def _joined(axis: AxisConfig, recordings: dict[Path, Recording]) -> Recording:
-    """Returns all recordings as one; raises `InputError` if one is not of this axis or has no command."""
+    """Returns all recordings as one; raises `InputError` if one is of another axis or without a command."""
     from hdbridge.analysis.checks import check_records
     from hdbridge.records.recording import Recording
 

@@ -1,4 +1,4 @@
-"""Refused command lines, reported in the one-line form of every hdbridge error."""
+"""Rejected command lines, reported in the one-line form of all hdbridge errors."""
 
 import errno
 import math
@@ -14,14 +14,15 @@ import typer
 from hdbridge.errors import InputError
 
 UsageError: Any = typer.BadParameter.__mro__[1]
-"""Error of a wrong command line. typer takes it from click or brings its own, and exports only a subclass."""
+"""Error of a wrong command line. typer takes it from click or defines its own, and exports only a
+subclass."""
 _PLACES = ("PROFILE", "MACHINE")
-"""Metavars of parameters that take a path or the name of a bundled profile."""
+"""Metavars of parameters with a path or the name of a bundled profile."""
 _KINDS = {"int": "an integer", "float": "a number", "bool": "true or false"}
 
 
 def refusal(error: Any) -> str:
-    """Returns one line: the option, its value, the expected value, and where all options are listed."""
+    """Returns one line with the option, its value, the expected value, and where to find all options."""
     from hdbridge.files.expectation import one_line
 
     context = getattr(error, "ctx", None)
@@ -33,7 +34,8 @@ def refusal(error: Any) -> str:
 def strict(command: Any) -> Any:
     """Makes a command refuse values that typer accepts: empty texts, NaN and infinity, impossible paths.
 
-    They are checked before the command runs and before its outputs are; raises a one-line `InputError`.
+    They are checked before the command runs and before its outputs are checked; raises a one-line
+    `InputError`.
     """
     for each in getattr(command, "commands", {}).values():
         strict(each)
@@ -70,12 +72,12 @@ def _wrong(param: Any, context: Any, found: object, expected: str) -> InputError
 
 
 def asks_for_help(error: Any) -> bool:
-    """Returns True if only a command is missing, so that the error's text is the help."""
+    """Returns True if only a command is missing, in which case the error's text is the help."""
     return type(error).__name__ == "NoArgsIsHelpError"
 
 
 def _about_value(error: Any) -> str | None:
-    """Describes a wrong option value: found and expected, like a key in a file. None for other errors."""
+    """Describes a wrong option value, found and expected, as for a file; None for other errors."""
     param, cause = getattr(error, "param", None), error.__cause__
     if param is None or not hasattr(cause, "errors"):
         return None

@@ -1,4 +1,4 @@
-"""Address of a daemon, and its discovery: a single daemon on this computer needs no address."""
+"""Address of a daemon, and discovery of the only daemon on this computer."""
 
 import os
 import re
@@ -17,7 +17,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """A Unix socket, or a URL with its token."""
+    """Unix socket, or URL with its token."""
 
     socket: Path | None = None
     url: str = "http://hdbridge"
@@ -41,11 +41,11 @@ class Address:
 def find(
     text: str | Path | None = None, token: str | None = None, environment: Mapping[str, str] = os.environ
 ) -> Address:
-    """Returns the address of a daemon, given by socket, URL, machine's name, or nothing if only one runs.
+    """Returns the address of a daemon, given by socket, URL or machine name, or omitted if only one runs.
 
     Without ``text``, ``$HDBRIDGE_SOCKET`` is used, then ``$HDBRIDGE_URL`` (with the token
     ``$HDBRIDGE_TOKEN``), then the sockets of this user's daemons and of the service manager's. Raises
-    DaemonError if there is none, or more than one to choose from, and InputError for an invalid address.
+    DaemonError unless exactly one is found, and InputError for an invalid address.
     """
     given = str(text or environment.get("HDBRIDGE_SOCKET") or environment.get("HDBRIDGE_URL") or "")
     token = token or environment.get("HDBRIDGE_TOKEN") or None
@@ -72,7 +72,7 @@ def find(
 
 
 def running(environment: Mapping[str, str] = os.environ) -> list[Address]:
-    """Returns the addresses of all daemons of this computer that this user may ask."""
+    """Returns the addresses of all daemons of this computer that are accessible to this user."""
     return [Address(socket=each) for each in _sockets(environment)]
 
 
@@ -106,7 +106,7 @@ def _sockets(environment: Mapping[str, str]) -> list[Path]:
 
 
 def _is_trusted(folder: Path) -> bool:
-    """Returns True if a folder is ours or the system's, because anyone can create folders below /tmp."""
+    """Returns True for a folder of this user or the system; anyone can create folders below /tmp."""
     try:
         found = folder.lstat()
     except OSError:

@@ -8,8 +8,8 @@
         for target_deg in (10, 20, 30):
             print((await axis.move(target_deg)).error_arcsec)
 
-Motion requires the lease. A method that moves an axis takes it while it runs, unless `AsyncClient.lease`
-holds it already. Every error is one of `hdbridge.errors`.
+Motion requires the lease. A method that moves an axis holds it for its duration, unless `AsyncClient.lease`
+already holds it. All errors are those of `hdbridge.errors`.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ FAILURES: Final = (OSError, EOFError, ConnectionClosed, InvalidHandshake)
 """Exceptions of a WebSocket."""
 POLL_S: Final = 0.1
 JOG_S: Final = 0.5
-"""Time-out of a jog after the last request of its client."""
+"""Time-out of a jog after the client's last request."""
 RENEWALS: Final = 3
-"""Renewals of a lease per time-out."""
+"""Lease renewals per time-out."""
 MESSAGE_MAXIMUM: Final = 32 << 20
 """Maximum size of a WebSocket message in bytes, enough for the largest batch of samples of many axes."""
 CLOSE_S: Final = 1.0
@@ -59,11 +59,11 @@ Point = messages.StreamPoint | tuple[float, float] | tuple[float, float, float]
 
 
 class AsyncClient:
-    """Client of a daemon. Close it, or use it as a context manager.
+    """Client of a daemon, which must be closed or used as a context manager.
 
-    ``address`` is a Unix socket, a URL or a machine's name; `hdbridge.client.address.find` finds the daemon
-    without it. ``token`` is required over TCP; others see ``name`` while the client holds the lease. Safe
-    for concurrent use.
+    ``address`` is a Unix socket, a URL or a machine's name; without it, `hdbridge.client.address.find` finds
+    the daemon. ``token`` is required over TCP; others see ``name`` while the client holds the lease. Safe for
+    concurrent use.
     """
 
     def __init__(
@@ -129,7 +129,8 @@ class AsyncClient:
     async def lend_bus(self) -> MachineState:
         """Stops all axes and makes the daemon release its bus to another program of its computer.
 
-        That program has ten seconds to open the bus. The daemon takes the bus back when it is closed.
+        That program has ten seconds to open the bus. The daemon takes the bus back when the program closes
+        it.
         """
         return await self.ask("POST", "/bus/lend", MachineState, moving=True, waits=True)
 
@@ -146,7 +147,7 @@ class AsyncClient:
 
     @asynccontextmanager
     async def lease(self, *, force: bool = False) -> AsyncIterator[LeaseGrant]:
-        """Holds the lease within the block; it is renewed meanwhile.
+        """Holds the lease within the block, renewing it meanwhile.
 
         A nested block reuses the lease. Raises LeaseError if another client holds it.
         """
@@ -166,7 +167,7 @@ class AsyncClient:
     async def live(
         self, *, every: int = 1, axes: Sequence[str] | None = None
     ) -> AsyncGenerator[messages.Samples]:
-        """Yields batches of samples of one cycle in ``every``; each has the number lost by a slow reader."""
+        """Yields batches of samples of every ``every``-th cycle, with the number lost by a slow reader."""
         wanted = messages.LiveOptions(every=every, axes=None if axes is None else list(axes))
         async with self.connected("/live") as link:
             await link.send(wanted)
@@ -209,8 +210,8 @@ class AsyncClient:
     ) -> M:
         """Sends a request and returns its answer. Takes the lease if the request moves an axis.
 
-        One that ``waits`` is answered when a motion has ended, so it has no time-out: the daemon's
-        supervision bounds it.
+        A request that ``waits`` is answered at the end of a motion, so it has no time-out; it is limited by
+        the daemon's supervision.
         """
         headers = {} if body is None else {"Content-Type": "application/json"}
         content = None if body is None else body.model_dump_json(exclude_none=True)
@@ -261,7 +262,7 @@ class AsyncClient:
 
 
 class AsyncAxis:
-    """An axis. Methods that move it return when it is at rest again, unless ``wait`` is False."""
+    """Axis of a daemon. Methods that move it return when it is at rest again, unless ``wait`` is False."""
 
     def __init__(self, client: AsyncClient, name: str) -> None:
         self.client = client
@@ -323,7 +324,7 @@ class AsyncAxis:
         return await self._post("move", body, waits=True)
 
     async def jog(self, velocity_deg_s: float, duration_s: float | None = None) -> AxisState:
-        """Turns at a speed for a time, then brakes; without a time, call it again within `JOG_S`.
+        """Turns at a speed for a time, then brakes; without a time, must be called again within `JOG_S`.
 
         Raises LeaseError without a time if the lease is not held, because it would end with this call.
         """
@@ -368,7 +369,8 @@ class AsyncAxis:
 
     @asynccontextmanager
     async def stream(self, timeout_s: float = JOG_S) -> AsyncIterator[AsyncStream]:
-        """Follows set-points that are put within the block; the axis rests at the last one when it ends.
+        """Follows set-points that are put within the block; at its end, the axis comes to rest at the last
+        one.
 
         The first set-point is the axis's position. The axis brakes if no point is left for ``timeout_s``, or
         if an error leaves the block.
@@ -418,7 +420,7 @@ class AsyncAxis:
 
 
 class AsyncStream:
-    """An open stream of set-points."""
+    """Open stream of set-points."""
 
     def __init__(self, link: AsyncLink) -> None:
         self._link = link
@@ -456,14 +458,13 @@ class AsyncStream:
 
 
 class AsyncLink:
-    """A WebSocket that raises errors of hdbridge."""
+    """WebSocket that raises errors of hdbridge."""
 
     def __init__(self, connection: ClientConnection, address: Address) -> None:
         self._connection = connection
         self._address = address
 
     async def send(self, message: BaseModel) -> None:
-        """Sends a message."""
         try:
             await self._connection.send(message.model_dump_json())
         except FAILURES as problem:
@@ -485,7 +486,7 @@ def _check(address: Address) -> None:
 
 
 def _read(kind: type[M], content: str | bytes, what: str) -> M:
-    """Parses an answer to ``what``; raises DaemonError if it is another message."""
+    """Parses an answer to ``what``; raises DaemonError for a different message."""
     try:
         return kind.model_validate_json(content)
     except ValidationError as problem:
@@ -514,8 +515,8 @@ def _unreachable(address: Address, problem: Exception) -> DaemonError:
         return DaemonError(f"{address}: no daemon answers ({problem}); start it with 'hdbridge run'")
     what = "did not answer in time" if isinstance(problem, httpx.TimeoutException) else "went away"
     return DaemonError(
-        f"{address}: the daemon {what} ({problem or type(problem).__name__}); whether it was done is not "
-        "known: look at the state first"
+        f"{address}: the daemon {what} ({problem or type(problem).__name__}); the outcome is unknown: "
+        f"check the state first"
     )
 
 

@@ -1,4 +1,4 @@
-"""Typed messages between the daemon and its clients. Both ends import this and nothing of each other.
+"""Typed messages between the daemon and its clients, imported by both.
 
 Angles are degrees at the load unless the name says ``motor``; errors and corrections are arcseconds at the
 load. A request refuses unknown keys, NaN and infinity; a report ignores keys that a newer daemon adds.
@@ -20,7 +20,7 @@ _PRINTABLE: Final = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"
 """Text without characters that move a terminal's cursor, start a log line or reverse the writing
 direction."""
 Real = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-"""A number, not its text; NaN and infinity are refused."""
+"""Number, not its text; NaN and infinity are refused."""
 Angle = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e7, le=1e7)]
 """Degrees at the load, multi-turn; the axis's own limits are narrower."""
 Speed = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=1e5)]
@@ -85,7 +85,7 @@ class MotionMode(StrEnum):
     STREAM = "stream"
     STOP = "stop"
     FOLLOW = "follow"
-    """After the set-points of another master, through the gateway."""
+    """Following the set-points of another master, through the gateway."""
 
 
 class PowerState(StrEnum):
@@ -110,7 +110,7 @@ class Scheme(StrEnum):
     HYSTERESIS = "hysteresis"
     BOTH = "both"
     EXTENDED = "extended"
-    """The whole model, with effects that a diagnosis added."""
+    """Whole model, including effects added by a diagnosis."""
 
 
 class AdaptationMode(StrEnum):
@@ -147,7 +147,7 @@ STATUS: Final[dict[type[HdbridgeError], tuple[int, str]]] = {
 
 
 class Problem(Report):
-    """Problem document: the reason why a request failed."""
+    """Problem document: the reason for the failure of a request."""
 
     type: str = Field(description="kind of error, as a URN", examples=[f"{TYPE_PREFIX}LeaseError"])
     title: str = Field(description="the kind in words", examples=["The right to move is not yours"])
@@ -157,7 +157,7 @@ class Problem(Report):
         examples=["'cell controller' holds the lease for another 4.2 s; wait, or take it with force"],
     )
     axis: str | None = Field(None, description="the axis concerned", examples=["joint-3"])
-    hint: str | None = Field(None, description="what a person does about it")
+    hint: str | None = Field(None, description="advice to the user")
     errors: list[str] = Field(
         default=[],
         description="complaints about an invalid request, each with its key",
@@ -180,7 +180,7 @@ class Problem(Report):
         )
 
     def error(self) -> HdbridgeError:
-        """Returns the error to raise in the client; DaemonError for an unknown kind."""
+        """Returns the error for the client; DaemonError for an unknown kind."""
         name = self.type.removeprefix(TYPE_PREFIX)
         kind = next((each for each in STATUS if each.__name__ == name), errors.DaemonError)
         return kind("; ".join((self.detail, *self.errors)))
@@ -199,23 +199,23 @@ class LeaseRequest(Request):
 
 
 class LeaseGrant(Report):
-    """The granted lease; its token goes into the header ``X-Lease`` of each request that moves an axis."""
+    """Granted lease, whose token goes into the header ``X-Lease`` of each request that moves an axis."""
 
     token: str = Field(description="secret that permits motion", examples=["mZ3sWJx0b0lq"])
-    client: str = Field(description="who holds it")
-    timeout_s: Seconds = Field(description="it ends when it was not used for so long", examples=[5.0])
+    client: str = Field(description="name of the holder")
+    timeout_s: Seconds = Field(description="time without use after which it ends", examples=[5.0])
 
 
 class LeaseState(Report):
     """State of the lease, without its token."""
 
     held: bool = Field(description="True if a client holds it")
-    client: str | None = Field(None, description="who holds it", examples=["cell controller"])
+    client: str | None = Field(None, description="name of the holder", examples=["cell controller"])
     since: datetime | None = Field(None, description="time at which it was taken")
     remaining_s: float | None = Field(
         None, description="time until it expires; each use extends it", examples=[4.2]
     )
-    timeout_s: float = Field(description="it ends when it was not used for so long", examples=[5.0])
+    timeout_s: float = Field(description="time without use after which it ends", examples=[5.0])
 
 
 # ---------------------------------------- requests
@@ -264,7 +264,7 @@ class Jog(Request):
 
 
 class QueueItem(Request):
-    """A way point: move there, rest, continue."""
+    """Way point: a move, a rest, and the continuation."""
 
     target_deg: Angle = Field(description="load angle, degrees", examples=[45.0])
     velocity_deg_s: Speed | None = Field(None, description="highest speed, deg/s; else the axis's limit")
@@ -285,7 +285,7 @@ class Queue(Request):
 
 
 class StreamPoint(Request):
-    """One knot of a streamed path; between knots the daemon interpolates (cubic Hermite)."""
+    """Knot of a streamed path; the daemon interpolates between knots (cubic Hermite)."""
 
     time_s: Annotated[Real, Field(ge=0, le=1e7)] = Field(
         description="since the stream began, seconds; later than the knot before", examples=[0.02]
@@ -325,10 +325,10 @@ class Home(Request):
         description="homing method, 6098h: see the drive's manual", examples=[37]
     )
     switch_velocity_deg_s: Speed | None = Field(
-        None, description="speed towards the switch, deg/s at the load; else as the daemon finds right"
+        None, description="speed towards the switch, deg/s at the load; else chosen by the daemon"
     )
     zero_velocity_deg_s: Speed | None = Field(
-        None, description="speed towards the zero, deg/s at the load; else as the daemon finds right"
+        None, description="speed towards the zero, deg/s at the load; else chosen by the daemon"
     )
     acceleration_deg_s2: Acceleration | None = Field(
         None, description="acceleration, deg/s2 at the load; else the axis's limit"
@@ -338,7 +338,7 @@ class Home(Request):
 
 
 class SdoWrite(Request):
-    """A value for an object of the drive, by the type that its EDS gives it."""
+    """Value for an object of the drive, of the type given by its EDS."""
 
     value: Annotated[str, StringConstraints(strict=True, min_length=1, max_length=2000)] = Field(
         description="decimal or 0x...; text, or bytes in hexadecimal", examples=["0x10"]
@@ -346,7 +346,7 @@ class SdoWrite(Request):
 
 
 class SdoValue(Report):
-    """An object of the drive as it was read."""
+    """Value read from an object of the drive."""
 
     index: int = Field(ge=0, le=0xFFFF, description="number of the object", examples=[0x6064])
     subindex: int = Field(ge=0, le=0xFF, examples=[0])
@@ -358,7 +358,7 @@ class SdoValue(Report):
 
 
 class Mark(Request):
-    """A remark for the flight recorder, at the present cycle."""
+    """Remark for the flight recorder, at the present cycle."""
 
     text: Words = Field(min_length=1, examples=["coupling tightened"])
 
@@ -398,7 +398,7 @@ class EventKind(StrEnum):
 
 
 class Event(Report):
-    """An event."""
+    """Event of the loop or the service."""
 
     sequence: int = Field(ge=0, description="counts from the start of the service", examples=[17])
     kind: EventKind
@@ -406,7 +406,7 @@ class Event(Report):
     cycle: int | None = Field(None, description="cycle of the loop")
     axis: Name | None = Field(None, description="None for the machine")
     text: str = Field("", description="in words", examples=["cycle 120: a TPDO is missing (282h): freeze"])
-    hint: str | None = Field(None, description="what a person does about it")
+    hint: str | None = Field(None, description="advice to the user")
 
 
 class Events(Report):
@@ -436,7 +436,7 @@ class AxisColumns(Report):
 
 
 class Samples(Report):
-    """A batch of cycles in columns, oldest first."""
+    """Batch of cycles in columns, oldest first."""
 
     type: Literal["samples"] = "samples"
     time_s: list[float] = Field(description="time of SYNC, by the machine's monotonic clock")
@@ -464,7 +464,7 @@ class LiveOptions(Request):
 
 
 class StreamBegin(Request):
-    """The first message of a stream."""
+    """First message of a stream."""
 
     lease: str = Field(max_length=200, description="the token of the lease")
     timeout_s: Annotated[Real, Field(gt=0, le=5)] = Field(
@@ -473,14 +473,14 @@ class StreamBegin(Request):
 
 
 class StreamPoints(Request):
-    """Knots to append; the stream ends where the last one has speed 0 and ``end`` is set."""
+    """Knots to append; the stream ends if the last one has speed 0 and ``end`` is set."""
 
     points: list[StreamPoint] = Field(max_length=POINTS_MAXIMUM)
     end: bool = Field(False, strict=True, description="no more points follow")
 
 
 class StreamAnswer(Report):
-    """The answer to each message of a stream."""
+    """Answer to each message of a stream."""
 
     accepted: int = Field(ge=0, description="number of points accepted")
     problem: Problem | None = Field(
@@ -496,7 +496,7 @@ class Fault(Report):
 
     name: str = Field(description="the row of the fault table", examples=["LOST_TPDO"])
     text: str = Field(description="what happened, in words", examples=["a TPDO is missing, twice in a row"])
-    hint: str = Field(description="what a person does about it", examples=["check the cable"])
+    hint: str = Field(description="advice to the user", examples=["check the cable"])
     cycle: int | None = Field(None, description="cycle of the loop in which it was seen")
     date: datetime | None = Field(None, description="when it was seen, by the machine's clock")
     needs_verification: bool = Field(
@@ -518,31 +518,31 @@ class Limits(Report):
 
 
 class ModelInUse(Report):
-    """The model that compensates an axis."""
+    """Model that compensates an axis."""
 
     version: int | None = Field(None, description="number in the history; None without one", examples=[4])
     file: str = Field(description="its file on the daemon's machine")
-    date: datetime | None = Field(None, description="when it was made")
-    age_s: float | None = Field(None, ge=0, description="since it was made, seconds")
-    reason: str = Field("", description="why it was made", examples=["calibration"])
+    date: datetime | None = Field(None, description="time of its creation")
+    age_s: float | None = Field(None, ge=0, description="age, seconds")
+    reason: str = Field("", description="reason for its creation", examples=["calibration"])
     effects: list[str] = Field(default=[], examples=[["synchronous", "hysteresis"]])
 
 
 class LoadLoopState(Report):
     """State of the load loop, a slow integral of the measured error."""
 
-    configured: bool = Field(description="whether the machine file has one for this axis")
+    configured: bool = Field(description="True if the machine file has one for this axis")
     on: bool = False
     correction_arcsec: float = Field(0.0, description="present correction")
     doubt: str | None = Field(
         None,
-        description="why it does not act: the load encoder is in doubt, or the error is beyond its bound",
+        description="reason for not acting: the load encoder is in doubt, or the error exceeds its bound",
         examples=["the mean error at rest is 46.3 arcsec without the loop, which adds at most 20"],
     )
 
 
 class RefinedResponse(Report):
-    """Response in motion that is used in place of the model's."""
+    """Response in motion that replaces that of the model."""
 
     date: datetime | None = Field(None, description="when it was refined last; None: before the daemon began")
     low_hz: float = Field(description="lowest frequency at which it differs by 1 % or more")
@@ -575,10 +575,10 @@ class AdaptationState(Report):
 
 
 class OuterState(Report):
-    """The axis as a drive of another master, through the gateway."""
+    """Axis as a drive of another master, through the gateway."""
 
     node_id: int = Field(ge=1, le=255, description="on the bus of that master; 255: LSS took it away")
-    alive: bool = Field(description="whether the gateway process runs")
+    alive: bool = Field(description="True if the gateway process runs")
     nmt: int = Field(description="NMT state of the node as in a heartbeat", examples=[5])
     statusword: int = Field(description="6041h as that master sees it", examples=[0x1237])
     error_code: int = Field(0, description="603Fh as that master sees it; 0: no error", examples=[0x8700])
@@ -593,7 +593,7 @@ class OuterState(Report):
         "without targets",
         examples=[0.0061],
     )
-    latency_99_s: float | None = Field(None, description="99 % of them are not longer", examples=[0.008])
+    latency_99_s: float | None = Field(None, description="99th percentile of that time", examples=[0.008])
 
 
 class AxisState(Report):
@@ -621,15 +621,16 @@ class AxisState(Report):
         default={}, description="measured channels by their column", examples=[{"temperature_c": 31.5}]
     )
 
-    scheme: Scheme = Field(description="which parts of the model compensate")
-    compensating: bool = Field(description="whether the correction is in the target now")
+    scheme: Scheme = Field(description="parts of the model that compensate")
+    compensating: bool = Field(description="True if the correction is in the target now")
     correction_arcsec: float | None = Field(None, description="in the target now")
     predicted_arcsec: float | None = Field(None, description="transmission error by the model, now")
     weight: float | None = Field(None, description="share of the correction that is ramped in, 0 to 1")
     limited: bool = Field(False, description="the correction is at its limit or changes as fast as it may")
     changing: bool = Field(False, description="a change of model or scheme is being ramped")
     memory_known: bool = Field(
-        description="whether the state of the hysteresis is known: the axis turned past its width both ways"
+        description="True if the state of the hysteresis is known: the axis has turned past its width both "
+        "ways"
     )
     underrun: bool = Field(False, description="the last stream ran out of points in motion")
 
@@ -641,14 +642,14 @@ class AxisState(Report):
     outer: OuterState | None = Field(None, description="None: the axis is not in a gateway")
     advice: list[str] = Field(
         default=[],
-        description="what the load-encoder watch says",
+        description="verdict of the load-encoder watch",
         examples=[["recalibrate: the residual left what the model's intervals allow"]],
     )
-    queued: int = Field(0, ge=0, description="way points that wait")
+    queued: int = Field(0, ge=0, description="waiting way points")
 
 
 class BusState(Report):
-    """The CAN bus of the machine."""
+    """CAN bus of the machine."""
 
     interface: str = Field(examples=["socketcan"])
     channel: str = Field(examples=["can0"])
@@ -659,24 +660,24 @@ class BusState(Report):
 
 
 class CycleState(Report):
-    """The control loop."""
+    """Control loop of the machine."""
 
     period_s: float = Field(gt=0, examples=[0.004])
     cycle: int = Field(description="number of the newest cycle")
-    alive: bool = Field(description="whether the loop turned lately")
+    alive: bool = Field(description="True if the loop has turned recently")
     pid: int = Field(0, ge=0, description="process id of the control process; 0 if there is none")
     skipped: int = Field(0, ge=0, description="periods left out because the loop was late")
-    late_us: float | None = Field(None, description="how late the newest cycle began")
-    busy_us: float | None = Field(None, description="how long the newest cycle took")
+    late_us: float | None = Field(None, description="lateness of the newest cycle")
+    busy_us: float | None = Field(None, description="duration of the newest cycle")
 
 
 class RecorderState(Report):
-    """The flight recorder."""
+    """Flight recorder of the machine."""
 
     on: bool
     folder: str | None = None
     dropped: int = Field(0, ge=0, description="samples that were not written, a full disk for example")
-    note: str | None = Field(None, description="what a person should know", examples=["the disk is full"])
+    note: str | None = Field(None, description="remarks for the user", examples=["the disk is full"])
 
 
 class MachineState(Report):
@@ -691,4 +692,4 @@ class MachineState(Report):
     cycle: CycleState
     lease: LeaseState
     recorder: RecorderState
-    warnings: list[str] = Field(default=[], description="what a person should look at")
+    warnings: list[str] = Field(default=[], description="warnings for the user")

@@ -8,7 +8,7 @@
         for target_deg in (10, 20, 30):
             print(axis.move(target_deg).error_arcsec)
 
-Each method is that of `hdbridge.client.aio` and returns when it has ended. It may be called from any thread.
+Each method is that of `hdbridge.client.aio` and returns on completion. It may be called from any thread.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 
 class _Thread:
-    """A thread that runs coroutines until `end`, and closes the client then."""
+    """Thread that runs coroutines until `end`, and then closes the client."""
 
     def __init__(self, client: AsyncClient) -> None:
         begun: Future[asyncio.AbstractEventLoop] = Future()
@@ -91,7 +91,7 @@ def _waits(method: Callable[Concatenate[Any, P], Coroutine[Any, Any, T]]) -> Cal
 
 
 class Stream:
-    """An open stream of set-points."""
+    """Open stream of set-points."""
 
     def __init__(self, thread: _Thread, own: AsyncStream) -> None:
         self._thread, self._own = thread, own
@@ -101,7 +101,7 @@ class Stream:
 
 
 class Axis:
-    """An axis. Methods that move it return when it is at rest again, unless ``wait`` is False."""
+    """Axis of a daemon. Methods that move it return when it is at rest again, unless ``wait`` is False."""
 
     def __init__(self, client: Client, name: str) -> None:
         self.client, self.name = client, name
@@ -129,13 +129,13 @@ class Axis:
 
     @contextmanager
     def stream(self, timeout_s: float = JOG_S) -> Iterator[Stream]:
-        """Follows set-points that are put within the block, as `AsyncAxis.stream` does."""
+        """Follows set-points that are put within the block, like `AsyncAxis.stream`."""
         with self._thread.within(self._own.stream(timeout_s)) as stream:
             yield Stream(self._thread, stream)
 
 
 class Client:
-    """Client of a daemon, with the arguments of `AsyncClient`. Close it, or use it as a context manager."""
+    """Client of a daemon, with the arguments of `AsyncClient`. To be closed or used as a context manager."""
 
     def __init__(
         self,
@@ -151,7 +151,6 @@ class Client:
 
     @property
     def address(self) -> Address:
-        """Address of the daemon."""
         return self._own.address
 
     @property
@@ -194,7 +193,7 @@ class Client:
 
     @contextmanager
     def lease(self, *, force: bool = False) -> Iterator[LeaseGrant]:
-        """Holds the lease within the block; it is renewed meanwhile.
+        """Holds the lease within the block, renewing it meanwhile.
 
         A nested block reuses the lease. Raises LeaseError if another client holds it.
         """
@@ -202,7 +201,7 @@ class Client:
             yield grant
 
     def live(self, *, every: int = 1, axes: Sequence[str] | None = None) -> Iterator[Samples]:
-        """Yields batches of samples of one cycle in ``every``; each has the number lost by a slow reader."""
+        """Yields batches of samples of every ``every``-th cycle, with the number lost by a slow reader."""
         batches = self._own.live(every=every, axes=axes)
 
         async def following() -> Samples:

@@ -1,1 +1,1 @@
-"""The paths an engineer takes: bring-up, calibration, improvement, and the figures of a test."""
+"""Workflows of an engineer: bring-up, calibration, improvement, and evaluation of tests."""

@@ -1,4 +1,4 @@
-"""Conformance of any node on a bus to CiA 301 and CiA 402: timed checks, in one table for each subject.
+"""Conformance of any node on a bus to CiA 301 and CiA 402: timed checks, in one table per subject.
 
 Pure over a `Link` and its clock: the checks run on the virtual bus in simulated time and on a real bus.
 """

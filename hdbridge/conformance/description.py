@@ -27,7 +27,7 @@ check: Final = CHECKS.check
 _EDS: Final = "CiA 306"
 _SHOWN: Final = 5
 _COMMANDS: Final = frozenset({0x1003, 0x1010, 0x1011, 0x6040, 0x6060, 0x607A, 0x60C1})
-"""Objects whose values are not parameters, or whose download does something."""
+"""Objects whose values are not parameters, or whose download has an effect."""
 _PDO_PARAMETERS: Final = (0x1400, 0x1BFF)
 _INTEGERS: Final = datatypes.INTEGER_TYPES
 
@@ -56,7 +56,7 @@ def _outcome(code: int) -> str:
 
 
 def _parameters(t: NodeTester) -> Iterator[ODVariable]:
-    """Yields the integer parameters that may be written without an effect on anything else."""
+    """Yields the integer parameters that may be written without side effects."""
     for each in _entries(t):
         is_pdo = _PDO_PARAMETERS[0] <= each.index <= _PDO_PARAMETERS[1]
         if (

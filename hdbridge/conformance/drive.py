@@ -1,4 +1,4 @@
-"""Checks of CiA 402 that need no power: objects, units, modes, and the states up to *ready to switch on*."""
+"""Checks of CiA 402 that need no power: objects, units, modes, and states up to *ready to switch on*."""
 
 import struct
 from typing import Final
@@ -115,7 +115,7 @@ def _(t: NodeTester) -> None:
 
 
 def ready(t: NodeTester) -> None:
-    """Leads to READY TO SWITCH ON."""
+    """Brings the drive to READY TO SWITCH ON."""
     t.disable()
     t.control(0x06)
     t.reaches(READY_TO_SWITCH_ON)

@@ -18,7 +18,7 @@ from hdbridge.conformance.tester import (
 CHECKS: Final = Table()
 _REQUEST, _ANSWER = 0x7E5, 0x7E4
 _WAITING: Final = b"\x04".ljust(8, b"\0")
-"""Request that leads all nodes to waiting state."""
+"""Request that switches all nodes to the waiting state."""
 _NO_NODE_ID: Final = 255
 _PARTS: Final = ("vendor", "product", "revision", "serial")
 _Function = Callable[[NodeTester, list[int]], None]
@@ -68,13 +68,13 @@ def _check(name: str, text: str, *, stores: bool = False) -> Callable[[_Function
 
 
 def _numbered(t: NodeTester, identity: list[int], node_id: int) -> None:
-    """Sets the node id in use from the next reset of the communication on."""
+    """Sets the node id after the next reset of the communication."""
     _select(t, identity)
     _answered(t, _ask(t, 0x11, node_id), 0x11, 0)
 
 
 def _back(t: NodeTester, identity: list[int], now: int) -> None:
-    """Gives the node its own node id again; by frames alone, which an end of the run does not keep back."""
+    """Restores the node's own node id, by frames alone, which the end of the run does not suppress."""
     requests = [struct.pack("<BI3x", 0x40 + part, number) for part, number in enumerate(identity)]
     since = len(t.log)
     for request in (_WAITING, *requests, bytes((0x11, t.node_id)).ljust(8, b"\0"), _WAITING):
@@ -201,7 +201,7 @@ def _(t: NodeTester, _: list[int]) -> None:
 
 
 def _free_node_id(t: NodeTester) -> int:
-    """Returns a node id that no node on the bus answers to."""
+    """Returns a node id to which no node on the bus responds."""
     for node_id in range(127, 0, -1):
         since = t.mark()
         t.send(0x600 + node_id, upload_request(0x1000))

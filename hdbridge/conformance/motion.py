@@ -1,4 +1,4 @@
-"""Checks of CiA 402 with power: states, options, moves, cyclic targets, homing; the axis moves a little."""
+"""Checks of CiA 402 with power: states, options, moves, cyclic targets, homing, with small motions."""
 
 import struct
 from collections.abc import Callable
@@ -39,7 +39,7 @@ _BIT_13: Final = 1 << 13
 _MASTER: Final = 126
 _CYCLE_S: Final = 0.01
 _STOP_S: Final = 0.5
-"""Longest time from a stop command to standstill."""
+"""Maximum time from a stop command to standstill."""
 
 
 # ---------------------------------------------------------------- on the way
@@ -59,7 +59,7 @@ def _stands(t: NodeTester, duration_s: float = 0.1, within: float = 0.1) -> None
 
 
 def _moved_at_most(t: NodeTester, before: int, most: float, now: int | None = None) -> None:
-    """Fails if the axis is farther from ``before`` than this; ``now`` is its position, read by default."""
+    """Fails if the axis is further from ``before`` than ``most``; ``now``: position, by default read."""
     moved = abs((_position(t) if now is None else now) - before)
     t.true(moved <= most, f"the axis moved by {moved}", "standstill")
 
@@ -82,7 +82,7 @@ def _some_mode(t: NodeTester) -> int:
 
 
 def _bring(t: NodeTester, state: int, mode: int | None = None) -> None:
-    """Leads to a power state, at rest."""
+    """Brings the drive to a power state, at rest."""
     mode = _some_mode(t) if mode is None else mode
     t.disable()
     _select(t, mode)
@@ -366,7 +366,7 @@ def _enable_slowly(t: NodeTester) -> None:
 
 
 def _direction(t: NodeTester, distances: int) -> int:
-    """Returns 1 or -1: the side on which the software limits leave room."""
+    """Returns 1 or -1, the direction in which the software limits leave space."""
     if not t.has(0x607D, 1):
         return 1
     low, high = (t.read(0x607D, sub, signed=True) for sub in (1, 2))
@@ -398,7 +398,7 @@ def _window(t: NodeTester) -> float:
 
 
 def _arrives(t: NodeTester, target: int, timeout_s: float = 10.0) -> None:
-    """Waits for target reached; the axis must be at the target then."""
+    """Waits for target reached, when the axis must be at the target."""
     end_s = t.now + timeout_s
     while not t.read(0x6041) & _REACHED or abs(_position(t) - target) > _window(t):
         if t.now > end_s:
@@ -496,7 +496,10 @@ def _(t: NodeTester) -> None:
 
 
 def _there_and_back(t: NodeTester, extra: int) -> tuple[int, int]:
-    """A second set-point, back at the start, during the first move; (farthest distance, first distance)."""
+    """Sends a second set-point, back to the start, during the first move.
+
+    Returns the largest distance from the start, and the distance of the first set-point.
+    """
     _enable_slowly(t)
     start = _position(t)
     first = _begin_move(t, 3)
@@ -604,7 +607,7 @@ _ends_the_move("reset", "NMT reset node ends a move, and power is off", _resets)
 
 
 class _Stream:
-    """A cyclic master: RPDO with controlword and target, SYNC, TPDO with statusword and position."""
+    """Cyclic master: RPDO with controlword and target, SYNC, TPDO with statusword and position."""
 
     def __init__(self, t: NodeTester) -> None:
         self.t = t
@@ -649,7 +652,7 @@ class _Stream:
         self.cycle(5)
 
     def move(self, side: int = 0) -> float:
-        """Moves by one test distance in 0.5 s, by default to where there is room; returns the step."""
+        """Moves by one test distance in 0.5 s, by default to the side with space; returns the step."""
         step = (side or _direction(self.t, 2)) * self.t.travel * _CYCLE_S / 0.5
         self.cycle(50, step)
         return step

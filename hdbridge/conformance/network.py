@@ -27,7 +27,7 @@ _HEARTBEAT: Final = "CiA 301, 7.2.8 and object 1017h"
 _CONSUMER: Final = "CiA 301, 7.2.8 and object 1016h"
 _GUARDING: Final = "CiA 301, 7.2.8 and objects 100Ch, 100Dh"
 _MASTER: Final = 126
-"""Node id of the heartbeat that the tester produces."""
+"""Node id of the tester's heartbeat."""
 
 # ---------------------------------------------------------------- boot-up
 

@@ -31,7 +31,7 @@ _REGISTER: Final = (0x1001, 0, 8)
 _NOT_MAPPABLE: Final = (0x06040041, 0x06040042, 0x06010002, 0x06010000, *ABSENT)
 _TOO_LONG: Final = (0x06040042, *RANGE)
 _SPARE_ID: Final = 0x57D
-"""Identifier of the fourth RPDO of node 125: not used by the default identifiers of other nodes."""
+"""Identifier of the fourth RPDO of node 125, which is not a default identifier of other nodes."""
 
 
 def _word(index: int, sub: int, bits: int) -> bytes:
@@ -39,7 +39,7 @@ def _word(index: int, sub: int, bits: int) -> bytes:
 
 
 def _syncs(t: NodeTester, can_id: int, count: int, counter: int | None = None) -> list[int]:
-    """Sends SYNC ``count`` times; returns the number of frames that each was answered with."""
+    """Sends SYNC ``count`` times; returns the number of frames in response to each."""
     answers = []
     for place in range(count):
         since = t.mark()
@@ -235,7 +235,7 @@ def _wrong_length(t: NodeTester) -> bytes:
 
 
 def _refuses_entry(t: NodeTester, mapping: int, word: bytes, codes: tuple[int, ...]) -> None:
-    """The node refuses a mapping entry, at the entry or when sub-index 0 activates it."""
+    """Fails unless the node refuses a mapping entry, itself or when sub-index 0 activates it."""
     answer = t.answer(expedited(mapping, 1, word))
     if answer[0] == 0x80:
         code = int.from_bytes(answer[4:], "little")
@@ -427,7 +427,7 @@ def _(t: NodeTester) -> None:
 
 
 class _Reception:
-    """The scratch object, mapped to RPDO 1 behind ``ahead``; ``value`` differs from the one ``before``."""
+    """Scratch object mapped to RPDO 1 behind ``ahead``; ``value`` differs from the value ``before``."""
 
     def __init__(
         self,
@@ -458,14 +458,14 @@ class _Reception:
         self._t.send(self.can_id, self.data() if data is None else data)
 
     def holds(self, value: int, when: str, found: int | None = None) -> None:
-        """Checks the object's value: ``found``, or the one after the time to process a frame."""
+        """Checks the object's value after the time to process a frame, or the value ``found``."""
         if found is None:
             self._t.wait(0.02)
             found = self.read()
         self._t.equal(found, value, f"{self.index:04X}h:{self.sub:02X} {when}")
 
     def after(self, data: bytes) -> int:
-        """Returns the object's value after an RPDO of a wrong length; a right one then ends the error."""
+        """Returns the object's value after an RPDO of a wrong length; a correct one then ends the error."""
         self.send(data)
         self._t.wait(0.02)
         found = self.read()
@@ -571,7 +571,7 @@ def _(t: NodeTester) -> None:
     rpdo.holds(rpdo.value, "after the RPDO", rpdo.after(rpdo.data() + b"\xff"))
 
 
-@check("rpdo.extended", "A frame with a 29-bit identifier is no RPDO", _PDO)
+@check("rpdo.extended", "A frame with a 29-bit identifier is not an RPDO", _PDO)
 def _(t: NodeTester) -> None:
     rpdo = _Reception(t, 255)
     t.send_special(rpdo.can_id, rpdo.data())

@@ -30,7 +30,7 @@ _TOGGLE: Final = (0x05030000,)
 _TEXTS: Final = (0x1008, 0x100A, 0x1009)
 _STRINGS: Final = (datatypes.VISIBLE_STRING, datatypes.OCTET_STRING, datatypes.DOMAIN)
 _NOWHERE: Final = 0x1F7F
-"""An index that no device has: reserved for CiA 302 masters."""
+"""Index that no device has, reserved for CiA 302 masters."""
 
 
 def _mux(index: int, sub: int) -> bytes:
@@ -196,7 +196,7 @@ def _(t: NodeTester) -> None:
 
 
 def _is_served(t: NodeTester) -> None:
-    """Fails unless a request is answered, at the second attempt if the first one ends the transfer before."""
+    """Fails unless a request is answered, at the second attempt if the first ends the transfer before it."""
     answer = t.ask(upload_request(0x1000))
     if answer is None or answer[0] == 0x80:
         answer = t.answer(upload_request(0x1000))
@@ -305,7 +305,7 @@ def _(t: NodeTester) -> None:
 
 
 def _downloads(t: NodeTester, request: Callable[[int, int, bytes], list[bytes]]) -> None:
-    """Writes another value by these requests and compares; restores the old one."""
+    """Writes another value by these requests and compares it; restores the old value."""
     index, sub, size = _number(t)
     before = t.upload(index, sub)
     value = ((int.from_bytes(before, "little") + 100) & 0x7FFF).to_bytes(size, "little")

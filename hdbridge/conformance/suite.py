@@ -1,4 +1,4 @@
-"""The suite: all checks in their order, and the run."""
+"""Suite: all checks in order, and the run."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -35,7 +35,7 @@ def checks(*, moves: bool = False, stores: bool = False) -> list[Check]:
 def run(
     tester: NodeTester, wanted: Sequence[Check], progress: Callable[[Result], None] = lambda _: None
 ) -> list[Result]:
-    """Runs the checks one after the other; ``progress`` receives each result.
+    """Runs the checks in order; ``progress`` receives each result.
 
     Returns the results so far if the user ends the run. Raises `DriveError` if the node does not answer, or
     if its power is on, in which case nothing is changed.

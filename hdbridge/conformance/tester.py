@@ -1,4 +1,4 @@
-"""The tester: frames, SDO, PDO configuration and power states as the checks use them.
+"""Tester: frames, SDO, PDO configuration and power states for the checks.
 
 Everything is done at the level of frames, because a check must also do what a correct master never does.
 """
@@ -53,7 +53,7 @@ POWER_STATES: Final = {
     FAULT: "fault",
 }
 ENABLING: Final = ((READY_TO_SWITCH_ON, 0x06), (SWITCHED_ON, 0x07), (OPERATION_ENABLED, 0x0F))
-"""Power states on the way to OPERATION ENABLED, each with the controlword that leads there."""
+"""Power states on the way to OPERATION ENABLED, each with the controlword that leads to it."""
 _SIGNED: Final = frozenset(datatypes.SIGNED_TYPES)
 _HEARTBEAT_MS: Final = 40
 _Found = TypeVar("_Found")
@@ -77,11 +77,11 @@ class FailedError(Exception):
 
 
 class NotApplicableError(Exception):
-    """The node lacks an optional object or service that the check needs."""
+    """The node lacks an optional object or service required by the check."""
 
 
 class AbortedError(FailedError):
-    """The node refused an SDO transfer that it should carry out."""
+    """The node refused an SDO transfer that it should have carried out."""
 
     def __init__(self, what: str, code: int) -> None:
         super().__init__(f"{what}: abort {code:08X}h", "the transfer is carried out")
@@ -89,23 +89,23 @@ class AbortedError(FailedError):
 
 
 class StoppedError(HdbridgeError):
-    """The user asked for the end of the run."""
+    """The user requested the end of the run."""
 
     exit_status = 130
 
 
 @dataclass(frozen=True)
 class Check:
-    """One check: what the standard demands, where, and the function that tests it."""
+    """One check: the requirement of the standard, its clause, and the function that tests it."""
 
     id: str
     text: str
     clause: str
     function: Callable[[NodeTester], None]
     moves: bool = False
-    """The check may switch power on."""
+    """True if the check may switch power on."""
     stores: bool = False
-    """The check writes to non-volatile memory."""
+    """True if the check writes to non-volatile memory."""
 
 
 @dataclass(frozen=True)
@@ -120,10 +120,10 @@ class Result:
 
 
 class Table(list[Check]):
-    """The checks of one subject; `check` adds a function to it."""
+    """Checks of one subject; `check` adds a function."""
 
     def __init__(self, *, drives: bool = False, moves: bool = False) -> None:
-        """``drives``: the checks are for drives of CiA 402; ``moves``: each may switch power on."""
+        """``drives``: the checks are for drives of CiA 402; ``moves``: each check may switch power on."""
         super().__init__()
         self._drives, self._moves = drives, moves
 
@@ -148,23 +148,23 @@ class Table(list[Check]):
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of the tests; s."""
+    """Time-outs and tolerances of the tests; s."""
 
     answer_s: float = 0.5
-    """Longest time to an SDO answer or another immediate reaction."""
+    """Maximum time to an SDO answer or another immediate reaction."""
     boot_s: float = 10.0
-    """Longest time to the boot-up message, and from there to the first SDO answer."""
+    """Maximum time to the boot-up message, and from there to the first SDO answer."""
     power_s: float = 10.0
-    """Longest time to a transition of the power state machine, brakes and ramps included."""
+    """Maximum time to a transition of the power state machine, including brakes and ramps."""
     jitter_s: float = 0.02
     """Tolerance of a period, in addition to a tenth of the period."""
 
 
 class NodeTester:
-    """The master's side of the checks on one node.
+    """Master's side of the checks on one node.
 
     ``travel`` is the distance of test moves in user units; None for 0.02 turns of the motor shaft (608Fh).
-    ``stopped`` is asked while the tester waits; if it returns True, `StoppedError` ends the run.
+    ``stopped`` is called while the tester waits; if it returns True, `StoppedError` ends the run.
     """
 
     def __init__(
@@ -188,9 +188,9 @@ class NodeTester:
         self.start_position: int | None = None
         """6064h before the first check."""
         self.powered = False
-        """True if a controlword that may switch power on was sent and not taken back."""
+        """True if a controlword that may switch power on was sent and not revoked."""
         self.may_power = False
-        """True while a check with the permission to move runs."""
+        """True during a check with permission to move."""
 
     # ---------------------------------------------------------------- frames and time
 
@@ -200,7 +200,6 @@ class NodeTester:
         return self.link.now()
 
     def send(self, can_id: int, data: bytes = b"") -> None:
-        """Sends a data frame."""
         self.link.send(can_id, data)
 
     def send_special(self, can_id: int, data: bytes = b"", *, remote: bool = False) -> None:
@@ -232,11 +231,11 @@ class NodeTester:
         return frame is not None or self.now < end_s
 
     def heard(self, can_id: int, since: int = 0) -> list[Frame]:
-        """Returns the frames with an identifier that have come since a place in the log."""
+        """Returns the frames with an identifier received since a place in the log."""
         return [frame for frame in self.log[since:] if frame.can_id == can_id]
 
     def hears(self, can_id: int, timeout_s: float | None = None, since: int | None = None) -> Frame | None:
-        """Waits for the next frame with an identifier; None if it does not come in time."""
+        """Waits for the next frame with an identifier; None on time-out."""
         place = len(self.log) if since is None else since
         end_s = self.now + (self.timing.answer_s if timeout_s is None else timeout_s)
         while True:
@@ -281,7 +280,7 @@ class NodeTester:
         return self.need(self.od, "no EDS is given")
 
     def near(self, found_s: float, expected_s: float, what: str) -> None:
-        """Fails unless a period or delay is right within the tolerance."""
+        """Fails unless a period or delay is within the tolerance."""
         if abs(found_s - expected_s) > 0.1 * expected_s + self.timing.jitter_s:
             self.fail(f"{what} {1000 * found_s:.1f} ms", f"{1000 * expected_s:.1f} ms")
 
@@ -302,7 +301,7 @@ class NodeTester:
         return boot
 
     def answers(self, duration_s: float) -> bool:
-        """Returns True once the node answers an SDO request, False if it does not in this time."""
+        """Returns True once the node answers an SDO request, False on time-out."""
         deadline_s = self.now + duration_s
         while self.ask(upload_request(0x1000)) is None:
             if self.now >= deadline_s:
@@ -321,13 +320,13 @@ class NodeTester:
         return frame
 
     def watch_state(self) -> None:
-        """Makes the node report its NMT state by heartbeats, or by node guarding if it has none."""
+        """Makes the node report its NMT state by heartbeats, or else by node guarding."""
         if not self._state_watched and self.has(0x1017):
             self.write(0x1017, 0, _HEARTBEAT_MS, 2)
             self._state_watched = True
 
     def state(self) -> str:
-        """Returns the NMT state that the next heartbeat, or the answer to node guarding, reports."""
+        """Returns the NMT state in the next heartbeat, or in the answer to node guarding."""
         can_id = 0x700 + self.node_id
         since = self.mark()
         if not self._state_watched:
@@ -346,7 +345,6 @@ class NodeTester:
         self.equal(self.state(), state, "NMT state")
 
     def sync(self, counter: int | None = None) -> None:
-        """Sends SYNC."""
         self.send(0x080, b"" if counter is None else bytes((counter,)))
 
     def emergencies(self, since: int) -> list[int]:
@@ -357,14 +355,14 @@ class NodeTester:
     # ---------------------------------------------------------------- SDO
 
     def ask(self, request: bytes, timeout_s: float | None = None) -> bytes | None:
-        """Sends an SDO request; returns the answer; None without one in time."""
+        """Sends an SDO request; returns the answer, or None on time-out."""
         since = self.mark()
         self.send(0x600 + self.node_id, request)
         frame = self.hears(0x580 + self.node_id, timeout_s, since)
         return None if frame is None else frame.data
 
     def answer(self, request: bytes) -> bytes:
-        """Sends an SDO request as `ask`; fails the check without an answer of eight bytes."""
+        """Sends an SDO request like `ask`; fails the check without an answer of eight bytes."""
         answer = self.ask(request)
         if answer is None:
             self.fail(
@@ -451,7 +449,7 @@ class NodeTester:
         return int.from_bytes(self.upload(index, sub), "little", signed=signed)
 
     def put(self, index: int, sub: int, value: int, size: int) -> None:
-        """Downloads an integer of ``size`` bytes, for good."""
+        """Downloads an integer of ``size`` bytes permanently."""
         self.download(index, sub, pack(value, size))
 
     def write(self, index: int, sub: int, value: int, size: int) -> None:
@@ -493,12 +491,12 @@ class NodeTester:
         return own
 
     def variables(self) -> Iterator[ODVariable]:
-        """Yields the entries of the EDS; none without one."""
+        """Yields the entries of the EDS, if any."""
         for item in (self.od or {}).values():
             yield from [item] if isinstance(item, ODVariable) else item.subindices.values()
 
     def scratch(self) -> tuple[int, int, int]:
-        """Returns (index, sub-index, bits) of an object to write, read and map that has no effect."""
+        """Returns (index, sub-index, bits) of a writable, mappable object without side effects."""
         for index in (0x6081, 0x6083, 0x607A):
             if self.od is None and self.has(index):
                 return index, 0, 32
@@ -540,7 +538,7 @@ class NodeTester:
         return power_state(self.read(0x6041))
 
     def reaches(self, *states: int) -> None:
-        """Waits for one of these power states; fails if none comes in time."""
+        """Waits for one of these power states; fails on time-out."""
         deadline_s = self.now + self.timing.power_s
         while (found := self.power_state()) not in states:
             if self.now > deadline_s:
@@ -549,13 +547,13 @@ class NodeTester:
             self.wait(0.005)
 
     def walk(self) -> None:
-        """Leads from SWITCH ON DISABLED to OPERATION ENABLED."""
+        """Walks from SWITCH ON DISABLED to OPERATION ENABLED."""
         for state, word in ENABLING:
             self.control(word)
             self.reaches(state)
 
     def stays(self, state: int, duration_s: float = 0.05) -> None:
-        """Fails if the power state is, or becomes, another one."""
+        """Fails if the power state is or becomes a different one."""
         end_s = self.now + duration_s
         while True:
             found = self.power_state()
@@ -565,7 +563,7 @@ class NodeTester:
             self.wait(0.01)
 
     def disable(self) -> None:
-        """Leads to SWITCH ON DISABLED, with the reset of a fault if there is one."""
+        """Leads to SWITCH ON DISABLED, resetting a fault if necessary."""
         self.control(0x00)
         deadline_s = self.now + self.timing.power_s
         while (state := self.power_state()) != SWITCH_ON_DISABLED:
@@ -595,7 +593,7 @@ class NodeTester:
         self.nmt(NMT_PRE_OPERATIONAL)
 
     def tidy(self) -> None:
-        """Undoes what the check has changed; resets the communication if that fails."""
+        """Undoes the changes of the check; resets the communication if that fails."""
         self.send(0x600 + self.node_id, abort())  # ends a transfer that the check has left open
         self.nmt(NMT_PRE_OPERATIONAL)
         try:
@@ -623,7 +621,7 @@ class NodeTester:
         )
 
     def abandon(self) -> None:
-        """Ends an interrupted check: quick stop, power off, and its changes undone."""
+        """Ends an interrupted check: quick stop, power off, and undoing of its changes."""
         self._stopped = lambda: False
         if self.powered:
             self.send(0x600 + self.node_id, abort())
@@ -639,7 +637,7 @@ def power_state(statusword: int) -> int:
 
 
 def pack(value: int, size: int) -> bytes:
-    """Returns the bytes of an integer, signed if it is negative."""
+    """Returns the bytes of an integer, signed if negative."""
     return value.to_bytes(size, "little", signed=value < 0)
 
 

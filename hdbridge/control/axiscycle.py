@@ -1,12 +1,12 @@
-"""One axis's part of the control cycle: feedback, fault judgement, and the RPDOs that answer it.
+"""One axis's part of the control cycle: feedback, fault judgement, and the RPDOs in reply.
 
-`BusCycle` runs the period and delivers the frames; this module judges them by the fault table and makes the
-next RPDOs. Nothing here waits or sends. An axis is
+`BusCycle` runs the period and delivers the frames. This module judges them by the fault table and builds the
+next RPDOs; it neither waits nor sends. An axis is
 
-* *silent*: it gets no RPDO. TPDOs are accepted when they arrive, and nothing is judged as a fault. This is
-  the state before `AxisCycle.begin`, after `AxisCycle.silence`, and after a reaction of `Reaction.LATCH`.
-* *speaking*: it gets an RPDO in every period, its TPDOs are awaited, and everything is judged.
-* *stopped*: speaking, with a quick stop latched. The quick stop is sent until the motor stands still, while
+* *silent*: it receives no RPDO. TPDOs are accepted when they arrive, and nothing is judged as a fault. This
+  is the state before `AxisCycle.begin`, after `AxisCycle.silence`, and after a reaction of `Reaction.LATCH`.
+* *speaking*: it receives an RPDO in every period, its TPDOs are awaited, and everything is judged.
+* *stopped*: speaking, with a latched quick stop. The quick stop is sent until the motor stands still, while
   the other axes continue. After that, or after its time-out, its TPDOs are no longer awaited.
 """
 
@@ -28,7 +28,7 @@ from hdbridge.drive.writes import drives_patience_s
 from hdbridge.errors import InputError, SafetyStop
 
 Target = int | None
-"""Motor counts for 607Ah; None repeats the last one."""
+"""Motor counts for 607Ah; None repeats the last target."""
 Command = Target | Callable[[Feedback], Target]
 
 STILL_CYCLES: Final = 3
@@ -41,10 +41,10 @@ _STILL_DRIVEN: Final = (State.OPERATION_ENABLED, State.FAULT_REACTION_ACTIVE, St
 class AxisCycle:
     """One axis on a `BusCycle`; silent until `begin`.
 
-    ``image`` gives the controlword (``image.power.go``) and the scaling; ``supervision`` holds the latch and
-    the list of faults; ``monitor`` may be shared with the boot-up. Errors of a command that are in
-    ``refused`` stop this axis, as a bad target does; any others pass through the whole cycle and so affect
-    the other axes.
+    ``image`` provides the controlword (``image.power.go``) and the scaling; ``supervision`` holds the latch
+    and the list of faults; ``monitor`` may be shared with the boot-up. Errors of a command that are in
+    ``refused`` stop this axis, like a bad target; all others propagate through the whole cycle and affect the
+    other axes.
     """
 
     __slots__ = (
@@ -70,30 +70,30 @@ class AxisCycle:
         self.name = name or axis.name
         self.monitor = monitor if monitor is not None else NetworkMonitor()
         self.command: Command = None
-        """Target in motor counts, None to repeat the last one, or a function of the cycle's feedback
-        that returns either. It is used while the drive is enabled; before that the target is the
-        actual position, so that enabling causes no motion. It stays until another is set."""
+        """Target in motor counts, None to repeat the last target, or a function of the cycle's feedback that
+        returns either. It is used while the drive is enabled. Before that, the target is the actual
+        position, so that enabling causes no motion. It remains in force until replaced."""
         self.silent = True
-        """True while it gets no RPDO."""
+        """True while the axis receives no RPDO."""
         self.feedback = Feedback(
             -1, 0.0, image.statusword or 0, image.motor_counts, image.load_counts, image.demand_counts,
             image.torque_permille, False, image.readings,
         )  # fmt: skip
-        """Feedback of the last turn; stale if that turn had none."""
+        """Feedback of the last turn; stale if the turn had none."""
         self.patience_s = drives_patience_s(axis)
         """Time without a frame of the master after which the drive stops on its own."""
         self.spoke_s = 0.0
-        """Clock time at the start of the last turn that sent it an RPDO."""
+        """Clock time at the start of the last turn that sent an RPDO to this axis."""
 
         # Between the bus and its axes:
         self.pending: list[tuple[Fault, str]] = []
-        """Faults of this turn that are not yet judged."""
+        """Faults of this turn that have not been judged yet."""
         self.needed = 0
-        """Bits of the TPDOs without which a turn's feedback is stale."""
+        """Bits of the TPDOs required for fresh feedback."""
         self.awaited = False
         """True if the turn waits for its TPDOs."""
         self.rested = True
-        """True until its first turn; frames that were queued before that do not count."""
+        """True until the first turn; frames queued before it do not count."""
         self.changed: Callable[[], None] = _nobody
         """Called when the axis changes its identifiers or state; the change takes effect with the next turn.
         """
@@ -114,7 +114,7 @@ class AxisCycle:
     def begin(self) -> None:
         """Sends RPDOs from the next turn on; earlier frames and encoder motion are not supervised.
 
-        After a `Reaction.LATCH` it stays silent unless the latch has been released.
+        After a `Reaction.LATCH`, the axis stays silent unless the latch has been released.
         """
         self.rested = True
         self.pending.clear()
@@ -125,7 +125,7 @@ class AxisCycle:
         self.changed()
 
     def silence(self) -> None:
-        """Stops sending to it and judging it, from the next turn on."""
+        """Stops sending to and judging the axis, from the next turn on."""
         self.silent = True
         self.pending.clear()
         self._commanded = False
@@ -166,13 +166,13 @@ class AxisCycle:
 
     @property
     def identifiers(self) -> frozenset[int]:
-        """Identifiers of the frames that `hear` takes."""
+        """Identifiers of the frames accepted by `hear`."""
         return self._traffic.identifiers | self._channel_ids
 
     def route(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Returns the identifiers of the TPDOs that each turn needs, and of its channel TPDOs.
+        """Returns the identifiers of the TPDOs that each turn needs, and of the channel TPDOs.
 
-        Also decides if the following turns wait for them.
+        Also decides whether the following turns wait for them.
         """
         self.awaited = not self.silent and (self.supervision.stop is None or self.riding)
         self._awaited_channels = self.image.awaited_channels()
@@ -202,7 +202,7 @@ class AxisCycle:
         return self.image.pack_rpdo_stop()
 
     def glance(self, frame: Frame) -> None:
-        """Checks the statusword of a TPDO that is too early or too late to be used."""
+        """Checks the statusword of a TPDO that came too early or too late to be used."""
         word = self.image.statusword_in(frame.can_id, frame.data)
         if self._commanded and word is not None:
             self.image.power.observe(word)
@@ -211,7 +211,7 @@ class AxisCycle:
                 self._commanded = False
 
     def hear(self, frame: Frame) -> None:
-        """Interprets a frame of the axis that is not awaited, and notes its faults."""
+        """Interprets an unawaited frame of the axis, and notes its faults."""
         can_id, data, _ = frame
         if can_id not in self._channel_ids:
             faults = list(self._traffic.faults(frame, commanded=self._commanded))
@@ -225,7 +225,7 @@ class AxisCycle:
             self.pending += faults
 
     def turn(self, now: float, count: int, time_s: float, complete: bool) -> Frames | None:
-        """Judges one period, ``complete`` if every TPDO arrived; returns the RPDOs to send, or None."""
+        """Judges one period, ``complete`` if all TPDOs arrived; returns the RPDOs to send, or None."""
         image, supervision = self.image, self.supervision
         self.spoke_s = now
         stop = supervision.stop
@@ -285,7 +285,7 @@ class AxisCycle:
             self.stale(count, time_s)
 
     def also(self, count: int, fault: Fault, detail: str) -> None:
-        """Judges a fault that occurred while the turn was answered, or after it."""
+        """Judges a fault that occurred during or after the reply of the turn."""
         if self.supervision.also(count, fault, detail) is Reaction.LATCH:
             self._latch()
 
@@ -298,7 +298,7 @@ class AxisCycle:
             self.stale(count, time_s)
 
     def stale(self, count: int, time_s: float) -> Feedback:
-        """Returns stale feedback with the last good values, for a cycle without its own."""
+        """Returns stale feedback with the last good values, for a cycle without feedback."""
         image = self.image
         if self._last is not None:
             self.feedback = self._last._replace(cycle=count, time_s=time_s, fresh=False)
@@ -312,7 +312,7 @@ class AxisCycle:
     # ---------------------------------------------------------------- the parts of a turn
 
     def _react(self, count: int, data: Frames | None, before: Feedback) -> Frames | None:
-        """Finishes a turn with a fault in this turn or the last."""
+        """Completes a turn with a fault in this turn or the last."""
         power, stop = self.image.power, self.supervision.stop
         reaction = self._judge(count)
         if reaction is Reaction.QUICK_STOP:
@@ -333,13 +333,13 @@ class AxisCycle:
         return reaction
 
     def _latch(self) -> None:
-        """Stops the set-points; the axis will start again with a drive that is not to be enabled."""
+        """Stops the set-points; the axis will restart with a disabled drive."""
         self.image.power.quick_stop()
         if not self.silent:
             self.silence()
 
     def _step_channels(self) -> None:
-        """Holds missing readings, gives up lost channels, and awaits those that are back."""
+        """Holds missing readings, gives up lost channels, and awaits recovered channels."""
         image = self.image
         faults = image.step_channels()
         if faults or len(self._awaited_channels) < len(self._channel_ids):
@@ -348,7 +348,7 @@ class AxisCycle:
                 self.changed()
 
     def _believable(self, last: Feedback, count: int) -> bool:
-        """Returns False if the positions contradict the last good ones; also notes a following error."""
+        """Returns False if the positions contradict the last good positions; also notes a following error."""
         image, plausibility = self.image, self._plausibility
         motor = image.motor_counts
         cycles = count - self._good_cycle
@@ -404,4 +404,4 @@ class AxisCycle:
 
 
 def _nobody() -> None:
-    """Does nothing: the axis is on no bus yet."""
+    """Does nothing, because the axis is not on a bus yet."""

@@ -1,6 +1,6 @@
-"""Bench: runs procedures on a drive, real or simulated, and records the measurements.
+"""Bench: runs procedures on a real or simulated drive, and records the measurements.
 
-The same code and procedures run on both; only the bus and the clock of the drive differ.
+Code and procedures are the same for both; only bus and clock of the drive differ.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _AT_REST = Moment()
 
 
 class _Leg(NamedTuple):
-    """One move of a procedure as it was run; converted to a `Segment` after the run."""
+    """Move of a procedure as executed; converted to a `Segment` after the run."""
 
     kind: str
     start_s: float
@@ -51,7 +51,7 @@ class _Leg(NamedTuple):
 
 @dataclass(frozen=True)
 class Run(Recording, Generic[Outcome]):
-    """Recording of a procedure that has run, with its outcome."""
+    """Recording of a completed procedure, with its outcome."""
 
     outcome: Outcome = field(kw_only=True)
     survived: tuple[Survived, ...] = field(default=(), kw_only=True)
@@ -72,7 +72,7 @@ def walk(
     place_deg: Callable[[], float],
     leg: Callable[[Move, Path], Sequence[Sample]],
 ) -> Outcome:
-    """Runs the legs of a procedure in sequence, without a pause between two; returns its outcome.
+    """Runs the legs of a procedure in sequence, without pauses; returns its outcome.
 
     ``place_deg`` returns the present load target; ``leg`` runs a move along its path and returns its samples.
     """
@@ -92,7 +92,7 @@ def walk(
 
 
 def record_of(samples: Sequence[Sample], axis: AxisConfig) -> Record:
-    """Returns the record of a bench's samples, without the channels that failed during the run."""
+    """Returns the record of a bench's samples, without channels that failed during the run."""
     names = Sample._fields[:-1]
     table = np.array([row[:-1] for row in samples], dtype=np.float64).reshape(-1, len(names))
     columns = dict(zip(names, table.T, strict=True))
@@ -107,12 +107,12 @@ def record_of(samples: Sequence[Sample], axis: AxisConfig) -> Record:
 
 
 def lost_channels(axis: AxisConfig, record: Record) -> tuple[str, ...]:
-    """Returns the axis file's keys of the channels that a record of `Bench` lacks."""
+    """Returns the axis-file keys of the channels missing from a record of `Bench`."""
     return tuple(key for key in axis.channels if BY_KEY[key].value not in record.columns)
 
 
 def axis_view(axis: AxisConfig) -> AxisView:
-    """Returns the properties of the axis that procedures may use."""
+    """Returns the axis properties available to procedures."""
     limits = axis.limits
     return AxisView(
         axis.gear.ratio,
@@ -131,7 +131,7 @@ def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation
     """Returns the model's inverse with the caps of the axis file, at the axis's cycle.
 
     InputError if the model is bound to another gear, axis or drive, or if an effect needs a channel that the
-    control loop does not have.
+    control loop lacks.
     """
     model.check_bound_to(axis)
     for name, channels in unmet(compensable(model.effects), known_on_line(axis)).items():
@@ -150,9 +150,9 @@ def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation
 class Bench:
     """Drive in cyclic position mode, with or without compensation.
 
-    Power is on only while a procedure runs: `run` enables the drive at standstill, and always brings it to
-    rest and disables it at the end, so that files can be written between two procedures. The compensation is
-    ramped in at the start of each.
+    Power is on only while a procedure runs. `run` enables the drive at standstill, and always brings it to
+    rest and disables it at the end, so files can be written between procedures. The compensation is ramped in
+    at the start of each procedure.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class Bench:
     ) -> None:
         """Prepares the bench; a model is converted by `compensation_for`, with its InputErrors.
 
-        ``interrupted`` is called in each cycle; True stops the axis (KeyboardInterrupt).
+        ``interrupted`` is called in each cycle and stops the axis by returning True (KeyboardInterrupt).
         """
         axis = drive.axis
         if compensation is None:
@@ -190,7 +190,7 @@ class Bench:
         self._sensed = Sensed(axis)
         self._place = 0.0
         self._most = math.inf
-        """Maximum number of samples of a leg; beyond it the first half is dropped."""
+        """Maximum number of samples of a leg; beyond it, the first half is dropped."""
         self._measured: list[list[Sample]] = []
         self._legs: list[_Leg] = []
         self._watch = Watch(self.supervision, 0)
@@ -202,12 +202,12 @@ class Bench:
         *,
         keep_s: float = math.inf,
     ) -> Run[Outcome]:
-        """Runs one procedure to its end; ``progress`` receives the share done after each leg.
+        """Runs one procedure to its end; ``progress`` receives the completed share after each leg.
 
-        ``keep_s`` limits the samples of a leg that holds the axis for hours: at least its last ``keep_s``
+        ``keep_s`` limits the samples of a leg that holds the axis for hours. At least the last ``keep_s``
         seconds are kept, at most twice as many.
 
-        InputError, before anything moves, if the procedure would leave the axis's limits or if the
+        Raises InputError before any motion if the procedure would leave the axis's limits or if the
         compensation's model is bound to another gear, axis or drive. SafetyStop if the supervision stops the
         axis, KeyboardInterrupt if interrupted; `record` then returns the samples up to the stop.
         """
@@ -224,7 +224,7 @@ class Bench:
             with resumed_realtime():
                 outcome = self._powered(procedure, rehearsal, progress)
         finally:
-            self._tell_end()
+            self._log_end()
         axis = self._drive.axis
         return Run(
             self.record(),
@@ -256,8 +256,8 @@ class Bench:
         self._rest()
         return outcome
 
-    def _tell_end(self) -> None:
-        """Logs the events of the run, once the axis is at rest: the cycle itself does not log."""
+    def _log_end(self) -> None:
+        """Logs the events of the run once the axis is at rest, because the cycle itself does not log."""
         nodes = self._drive.monitor.nodes.values()
         facts = {
             "samples": sum(len(each) for each in self._measured),
@@ -277,16 +277,16 @@ class Bench:
 
     @property
     def legs(self) -> tuple[Segment, ...]:
-        """Moves that the present procedure has run so far."""
+        """Moves of the present procedure so far."""
         return tuple(Segment(kind=each.kind, start_s=each.start_s, end_s=each.end_s) for each in self._legs)
 
     @property
     def survived(self) -> tuple[Survived, ...]:
-        """Faults tolerated by the present procedure so far, and the one that stopped it."""
+        """Faults tolerated by the present procedure so far, followed by the fault that stopped it."""
         return self._watch.survived(self.cycle.skipped)
 
     def _enable(self) -> None:
-        """Enables the drive by PDO at standstill, and starts from its position."""
+        """Enables the drive by PDO at standstill, with the compensation starting from its position."""
         self._drive.enable()
         self.cycle.restart()
         feedback = until_enabled(self.cycle.tick, self._image.power, self.cycle.period_s)

@@ -2,23 +2,23 @@
 
     wait - drain - stop before SYNC - SYNC - receive - check - RPDOs - heartbeat
 
-* *drain*: frames queued since the last cycle do not belong to this one. Heartbeats and emergencies are noted;
-  TPDOs are stale and are discarded after a check of their statusword.
+* *drain*: frames queued since the last cycle do not belong to this cycle. Heartbeats and emergencies are
+  noted; TPDOs are stale and are discarded after a check of their statusword.
 * *stop*: a drive puts its last RPDO into force with SYNC, whatever happened in between. That RPDO is
   therefore replaced by a quick stop before the first SYNC, after a stall of this process beyond the drive's
   time-out, and after a fault that stops an axis. Drives of silent axes are put into PRE-OPERATIONAL instead.
 * *receive*: until every TPDO of every axis has arrived, or the window closes. The newest of each identifier
-  wins. Those of the optional channels are awaited if they come with every SYNC and are not lost; otherwise
+  wins. TPDOs of the optional channels are awaited if they come with every SYNC and are not lost; otherwise
   they are accepted whenever they arrive.
 * *check*: axis by axis, by the fault table of `hdbridge.drive.supervision`.
-* *RPDOs*: made from this cycle's feedback; each is sent before the next axis is checked.
-* *heartbeat*: the master's heartbeat is sent only by this loop, so that the drives notice a loop that hangs.
+* *RPDOs*: built from this cycle's feedback; each is sent before the next axis is checked.
+* *heartbeat*: the master's heartbeat is sent only by this loop, so the drives notice a stalled loop.
 
-A fault of one axis stops only that axis (`hdbridge.control.axiscycle`); a fault of the bus affects all. If a
-period begins more than half a period late, it is skipped with those after it that are past, and the next
-SYNC comes at the next whole period. SYNCs are never closer together than half a period.
+A fault of one axis stops only that axis (`hdbridge.control.axiscycle`); a bus fault affects all axes. If a
+period begins more than half a period late, it and all other missed periods are skipped, and the next SYNC
+comes at the next whole period. SYNCs are never closer together than half a period.
 
-This is the one module in which speed comes before looks: no logging, no SDO, no avoidable allocation.
+In this module, speed takes precedence over style: no logging, no SDO, no avoidable allocation.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ from hdbridge.drive.traffic import bus_faults
 from hdbridge.errors import BusError, InputError
 
 WINDOW: Final = 0.8
-"""Share of the period after SYNC in which the TPDOs must arrive; the rest is for sending the RPDOs."""
+"""Share of the period after SYNC within which the TPDOs must arrive; the rest is for sending the RPDOs."""
 LATE: Final = 0.5
-"""Share of the period by which a cycle may begin late before it is skipped."""
+"""Maximum lateness of a cycle that is not skipped, as a share of the period."""
 SPARE: Final = 0.1
-"""Share of the period, before the next SYNC, in which no frames of ``outgoing`` are sent."""
+"""Share of the period before the next SYNC in which no frames of ``outgoing`` are sent."""
 DRAIN_MAXIMUM: Final = 256
 """Maximum number of frames read before SYNC; a full bus at 1 Mbit/s delivers at most 220 in 10 ms."""
 FLUSH_MAXIMUM: Final = 10_000
-"""Maximum number of queued frames discarded when the cycle begins."""
+"""Maximum number of queued frames that are discarded at the start of the cycle."""
 _CLOCK_STEP_S: Final = 1e-6
-"""Tolerance for the rounding of times that are sums of periods."""
+"""Tolerance for rounding of times that are sums of periods."""
 _HEARTBEAT_DATA: Final = bytes([NmtState.OPERATIONAL])
 
 
@@ -60,9 +60,9 @@ class BusCycle:
     """Runs the axes of one bus over a link, one `exchange` per period.
 
     ``on_frame`` receives every frame that is not a PDO of the cycle: SDO answers, heartbeats, emergencies.
-    ``outgoing`` is called once per turn, after all frames of the cycle are sent, and returns one more frame
-    to send, or None. Both may be set at any time. They run within the cycle, so they must be quick and must
-    not raise.
+    ``outgoing`` is called once per turn, after all frames of the cycle are sent, and returns an additional
+    frame to send, or None. Both may be set at any time. They run within the cycle, so they must be fast and
+    must not raise.
     """
 
     __slots__ = (
@@ -87,18 +87,18 @@ class BusCycle:
         self.on_frame: Callable[[Frame], None] | None = None
         self.outgoing: Callable[[], tuple[int, bytes] | None] | None = None
         self.axes: tuple[AxisCycle, ...] = ()
-        """Axes in the order in which they are answered."""
+        """Axes in the order of their replies."""
         self.histogram = Histogram()
         """Lateness of the start of each period."""
         self.overruns = 0
-        """Number of cycles that were skipped because they began too late."""
+        """Number of cycles skipped because they began too late."""
         self.skipped = 0
         """Number of whole periods without a SYNC."""
         self.refused = 0
-        """Number of frames of ``outgoing`` that were dropped because the transmit buffer was full."""
+        """Number of frames of ``outgoing`` dropped because the transmit buffer was full."""
 
         self.count = -1
-        """Number of the last period; skipped periods are counted."""
+        """Number of the last period, including skipped periods."""
         self.woke_s = clock.now()
         """Clock time at which the last turn began."""
         self.due_s = self.woke_s
@@ -108,9 +108,9 @@ class BusCycle:
         self.busy_s = 0.0
         """Duration of the last turn."""
         self.faults: list[tuple[Fault, str]] = []
-        """Faults of the bus itself in the last turn; each speaking axis has judged them as well."""
+        """Faults of the bus itself in the last turn, which each speaking axis has judged as well."""
         self.down: str | None = None
-        """Failure of the interface in the last turn, in words; None if there was none."""
+        """Failure of the interface in the last turn, in words; None without a failure."""
 
         self._window_s = WINDOW * period_s
         self._late_s = LATE * period_s
@@ -132,7 +132,7 @@ class BusCycle:
 
     @property
     def bus_load(self) -> float:
-        """Worst-case share of the period that the last turn's frames took; NaN if the bit rate is not known.
+        """Worst-case share of the period occupied by the last turn's frames; NaN if the bit rate is unknown.
 
         An awaited frame counts even if it did not arrive.
         """
@@ -141,7 +141,8 @@ class BusCycle:
     def join(self, axis: AxisCycle) -> None:
         """Adds an axis, which stays silent until its ``begin``. Must not be called within a turn.
 
-        InputError if another axis uses one of its identifiers, or if it needs another cycle or master.
+        InputError if another axis uses one of its identifiers, or if it requires another cycle time or
+        master.
         """
         config = axis.image.axis
         if config.drive.cycle_s != self.period_s:
@@ -179,9 +180,9 @@ class BusCycle:
         self.restart()
 
     def exchange(self) -> None:
-        """Runs one period for all axes; results are in each axis and in this object.
+        """Runs one period for all axes; the results are in each axis and in this object.
 
-        Errors of the bus or the axes are not raised but latched in the axes that they affect.
+        Errors of the bus or the axes are not raised but latched in the affected axes.
         """
         now = self._wait()
         count = self.count
@@ -224,7 +225,7 @@ class BusCycle:
     # ---------------------------------------------------------------- the parts of a turn
 
     def _wait(self) -> float:
-        """Sleeps until the next deadline, skipping periods that are past; returns the clock time."""
+        """Sleeps until the next deadline, skipping missed periods; returns the clock time."""
         clock, deadline, period_s = self.clock, self._deadline, self.period_s
         self.count += 1
         if self.faults:
@@ -255,7 +256,7 @@ class BusCycle:
         self._everybody(Fault.OVERRUN, f"by {1e3 * late_s:.1f} ms, periods skipped: {missed}")
 
     def _stop_before_sync(self) -> None:
-        """Replaces set-points that must not come into force with the next SYNC."""
+        """Replaces set-points that must not take effect with the next SYNC."""
         send, now = self._send, self.clock.now()
         for axis in self._speaking:
             if now - axis.spoke_s >= axis.patience_s - _CLOCK_STEP_S and axis.powered:
@@ -275,7 +276,7 @@ class BusCycle:
                         send(*frame)
 
     def _note_hang(self, axis: AxisCycle, silence_s: float) -> None:
-        """Notes that this process was silent for longer than the time-out of a powered drive."""
+        """Notes that this process was silent beyond the time-out of a powered drive."""
         hang = (Fault.HANG, f"{1e3 * silence_s:.0f} ms; the drive waits {1e3 * axis.patience_s:.0f} ms")
         axis.pending.insert(0, hang)
         if all(fault is not Fault.HANG for fault, _ in self.faults):
@@ -313,7 +314,7 @@ class BusCycle:
         return True
 
     def _before_sync(self, frame: Frame, slot: Slot) -> None:
-        """Handles a TPDO before SYNC: stale if it is awaited, else accepted."""
+        """Handles a TPDO before SYNC: stale if awaited, else accepted."""
         bit, accept, axis = slot
         if axis.awaited:
             if not axis.rested:
@@ -363,7 +364,7 @@ class BusCycle:
         return got
 
     def _note_missing(self, got: int, spoilt: dict[int, int]) -> None:
-        """Notes missing TPDOs and those of the wrong length as faults of the axis that awaits them."""
+        """Notes missing TPDOs and TPDOs of wrong length as faults of the axis that awaits them."""
         for can_id, length in spoilt.items():
             bit, _, axis = self._slots[can_id]
             if axis.awaited:
@@ -383,7 +384,7 @@ class BusCycle:
                     axis.pending.append((Fault.LOST_TPDO, ", ".join(lost)))
 
     def _other(self, frame: Frame) -> None:
-        """Passes a frame that is not awaited to its axis and to ``on_frame``, and notes bus faults."""
+        """Passes an unawaited frame to its axis and to ``on_frame``, and notes bus faults."""
         self._bits_of_turn += FRAME_BITS[len(frame.data)]
         axis = self._listeners.get(frame.can_id)
         if axis is not None:
@@ -396,7 +397,7 @@ class BusCycle:
             self.on_frame(frame)
 
     def _heartbeat(self, now: float) -> None:
-        """Sends the master's heartbeat when it is due; a missed one is not made up for."""
+        """Sends the master's heartbeat when due; a missed heartbeat is not made up for."""
         self._heartbeat_s += self._heartbeat_period_s
         if self._heartbeat_s <= now:
             self._heartbeat_s = now + self._heartbeat_period_s
@@ -429,7 +430,7 @@ class BusCycle:
                 axis.pending.append((fault, detail))
 
     def _no_room(self, detail: str) -> None:
-        """Notes an unsent frame of the cycle; axes that were already answered stop with the next turn."""
+        """Notes an unsent frame of the cycle; axes that already have their reply stop with the next turn."""
         self.faults.append((Fault.TRANSMIT_FULL, detail))
         for axis in self._speaking:
             if axis.feedback.cycle == self.count:
@@ -476,4 +477,4 @@ class BusCycle:
 
 
 def _nobody() -> None:
-    """Does nothing: the axis is on no bus."""
+    """Does nothing, because the axis is not on a bus."""

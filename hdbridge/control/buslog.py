@@ -1,8 +1,8 @@
-"""Records from bus logs, for `fit` and `diagnose`: CAN frames logged by any tool.
+"""Records from bus logs of any tool, for `fit` and `diagnose`.
 
-Reads the formats of python-can. The PDO mapping comes from the SDO traffic in the log, else from the axis
-file. The master may be any. A sample consists of the data sent for one SYNC, at the time of that SYNC;
-without SYNC it is one frame that carries both encoders. Nothing is interpolated.
+Reads the formats of python-can. The PDO mapping is taken from the SDO traffic in the log, else from the axis
+file. Any master is supported. A sample consists of the data sent for one SYNC, at the time of that SYNC;
+without SYNC, of one frame with both encoders. Nothing is interpolated.
 """
 
 from __future__ import annotations
@@ -43,10 +43,11 @@ READERS: Final[dict[str, Any]] = {
     ".trc": can.TRCReader,
     ".mf4": can.MF4Reader,
 }
-"""Readers by file name suffix; .gz may follow it."""
+"""Readers by file name suffix, which .gz may follow."""
 _BINARY: Final = {".blf", ".mf4"}
 FOLLOWED_SHARE: Final = 0.5
-"""Minimum share of moving samples in which the target changes, if it is the command of each cycle."""
+"""Minimum share of moving samples with a changing target, for the target to count as the command of each
+cycle."""
 _SINCE_1970_S: Final = 1e9
 """Smallest time stamp that is absolute; smaller ones are relative."""
 _RESETS: Final = (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION)
@@ -55,7 +56,8 @@ _RESETS: Final = (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION)
 def import_log(
     path: Path, axis: AxisConfig, *, channel: str | None = None, all_states: bool = False
 ) -> Recording:
-    """Returns the recording of one axis from a bus log; ``channel`` is needed if it is on several buses.
+    """Returns the recording of one axis from a bus log; ``channel`` is required if the axis is on several
+    buses.
 
     Samples with the drive not enabled are left out unless ``all_states``. A new part begins at a gap and when
     the drive boots. The notes state the origin of the mapping.
@@ -89,7 +91,7 @@ def import_log(
 
 
 def messages(path: Path, cut_off: list[str]) -> Iterator[can.Message]:
-    """Yields the data frames with 11-bit identifiers; ``cut_off`` receives the damage that ends it early."""
+    """Yields the data frames with 11-bit identifiers; ``cut_off`` receives damage that ends the log early."""
     packed = path.suffix.lower() == ".gz"
     suffix = (path.with_suffix("") if packed else path).suffix.lower()
     if suffix not in READERS:
@@ -158,7 +160,7 @@ class _Bus:
         self._missing: list[str] = []
         """Encoders that no PDO carries."""
         self._is_free = False
-        """True if an encoder's PDO does not come with SYNC."""
+        """True if the PDO of an encoder does not come with SYNC."""
         self._targets: dict[int, tuple[PdoCodec, int]] = {}
         self._fresh: set[int] = set()
         self._sync_s: float | None = None
@@ -195,13 +197,12 @@ class _Bus:
             self._take_pdo(can_id, data, time_s)
 
     def end(self) -> None:
-        """Ends the log."""
         self._end_window()
 
     # -- SDO ----------------------------------------------------------------------------------------------
 
     def _take_sdo(self, can_id: int, data: bytes) -> None:
-        """Takes an SDO frame of an expedited transfer (up to 4 bytes). A write counts once confirmed."""
+        """Takes an SDO frame of an expedited transfer (up to 4 bytes). A write counts only once confirmed."""
         command, index, sub = data[0], int.from_bytes(data[1:3], "little"), data[3]
         size = 4 - (command >> 2 & 3) if command & 1 else 4
         value = int.from_bytes(data[4 : 4 + size], "little")
@@ -356,7 +357,7 @@ class _Bus:
             image.follow_target(self._target)
 
     def _begin(self, *, unseated: bool = False) -> None:
-        """Begins a new part: the path of the axis up to it is not known."""
+        """Begins a new part, before which the path of the axis is unknown."""
         self._reseated |= unseated and self._seated
         self._target, self._targets_heard = None, 0
         self._fresh.clear()
@@ -366,7 +367,7 @@ class _Bus:
     # -- the result ---------------------------------------------------------------------------------------
 
     def why_empty(self) -> str:
-        """Returns the message for a channel that has PDOs of the axis, but no sample."""
+        """Returns the message for a channel with PDOs of the axis but without a sample."""
         image = self._mapped_image()
         pdos = "; ".join(map(str, image.tpdos))
         boot = (
@@ -453,7 +454,7 @@ def _unbroken(samples: list[Sample]) -> list[list[Sample]]:
 
 
 def _from_first_target(samples: list[Sample]) -> list[Sample]:
-    """Drops the samples before the first target, if there is one."""
+    """Drops the samples before the first target, if any."""
     first = next((row for row, each in enumerate(samples) if not math.isnan(each.motor_target_deg)), 0)
     return samples[first:]
 

@@ -1,7 +1,7 @@
 """Routing of identifiers to the axes of a bus, and the check that axes can share a bus. Pure.
 
 All axes have one cycle and one master, and no identifier is used twice. The routes are computed whenever an
-axis begins, falls silent or is stopped, so that a turn only looks them up.
+axis begins, falls silent or is stopped, so a turn only looks them up.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Routes(NamedTuple):
     listening: tuple[AxisCycle, ...]
     """Silent axes."""
     slots: dict[int, Slot]
-    """TPDOs that may come with every SYNC, by identifier."""
+    """TPDOs that may come with each SYNC, by identifier."""
     listeners: dict[int, AxisCycle]
     """Axes that receive all other frames, by identifier."""
     awaited: int
@@ -40,7 +40,7 @@ class Routes(NamedTuple):
 
 
 def routes(axes: Sequence[AxisCycle]) -> Routes:
-    """Returns the routes for the present states of the axes; also sets ``needed`` of each axis."""
+    """Returns the routes for the present states of the axes; also sets each axis's ``needed``."""
     slots: dict[int, Slot] = {}
     listeners: dict[int, AxisCycle] = {}
     awaited, bits = 0, FRAME_BITS[0]

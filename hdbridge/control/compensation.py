@@ -1,22 +1,22 @@
-"""Inverse of the transmission model: the motor target that puts the load at its target.
+"""Inverse of the transmission model: computes the motor target that brings the load to its target.
 
 The compensated motor angle solves ``theta_M / N + w TE(theta_M) = theta_L``, where TE is the model's error
 from its present state and w the ramp's weight. Three choices matter:
 
-* The command drives it, never a measured angle: near a reversal the slope of the elastic law is infinite,
-  and one count of encoder chatter would become several arcseconds.
+* It is driven by the command, never by a measured angle. Near a reversal the slope of the elastic law is
+  infinite, and one count of encoder chatter would become several arcseconds.
 * The root is bracketed. The left side rises with theta_M if the repeating part cannot fall faster than the
-  gear rises (otherwise the model is refused; play is crossed more gently), so there is exactly one root. A
+  gear rises (otherwise the model is refused; play is crossed more gently), so the root is unique. A
   plain fixed-point iteration does not converge near a reversal.
 * The model's state changes only when a command is issued (`Compensation.command`), with the angle issued,
   after caps and ramps.
 
 An effect may need a channel that can be lost (`LOSABLE`). `Compensation.know` sets the available ones; the
-part of the correction that needs a lost one is faded out, as `disengage` does with the whole, and later in.
+part of the correction that needs a lost channel is faded out, as by `disengage`, and later back in.
 
 In motion the servo filters the correction. If the model has the measured response of the axis, the correction
-passes through its filter (`prefilter`). The model's state follows the unfiltered path, which is the path that
-the motor is meant to take.
+passes through its filter (`prefilter`). The model's state follows the unfiltered path, which is the intended
+path of the motor.
 
 Pure: no clock, no bus.
 """
@@ -38,12 +38,12 @@ from hdbridge.units import ARCSEC_PER_DEG
 _TOLERANCE_ARCSEC = 5e-7
 _STEEPEST_FALL = 0.9
 _SAFE = 0.9
-"""Share of the steepest allowed fall that gentle play uses, as a margin."""
+"""Share of the steepest allowed fall up to which gentle play is used, as a margin."""
 _NOWHERE = Moment()
 _TURNS = 32
 """Number of reversals of the issued path that are kept for a model that takes over."""
 LOSABLE = frozenset(each for each in MEASURED if each.axis_key)
-"""Channels with their own sensors."""
+"""Channels with sensors of their own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class CompensationLimits:
 
 
 class _Faded(Tracker):
-    """An effect's tracker with a weight on its error; it follows the motion at any weight."""
+    """Tracker of an effect with a weight on its error; it follows the motion at any weight."""
 
     __slots__ = ("_tracker", "needs", "weight")
 
@@ -76,7 +76,7 @@ class _Faded(Tracker):
 
 
 class Inverse:
-    """Inverse of the model, from the state that `advance` has left."""
+    """Inverse of the model, from the state after the last `advance`."""
 
     __slots__ = (
         "_before_deg", "_error", "_fall", "_forward", "_known", "_moment", "_motor_deg", "_offset",
@@ -85,7 +85,7 @@ class Inverse:
     )  # fmt: skip
 
     def __init__(self, model: TransmissionModel, start: Start = Start.VIRGIN) -> None:
-        """Leaves out effects that cannot or must not be compensated, such as the load encoder's errors.
+        """Omits effects that cannot or must not be compensated, such as the load encoder's errors.
 
         InputError if the repeating part of the model is too steep for a unique inverse.
         """
@@ -94,7 +94,7 @@ class Inverse:
         trackers, self._fall = _gentle(model.effects, start, _STEEPEST_FALL * self._slope)
         stateful = [not isinstance(each, Memoryless) for each in trackers]
         self.faded: list[_Faded] = []
-        """Effects that need a channel that can be lost."""
+        """Effects that depend on a channel that can be lost."""
         for place, each in enumerate(model.effects):
             if sensed := each.needs() & LOSABLE:
                 trackers[place] = faded = _Faded(trackers[place], sensed)
@@ -129,9 +129,9 @@ class Inverse:
         self._forward: bool | None = None
         """Direction of the last motion."""
         self._known = not self.memory_deg
-        """True if an earlier run in one direction was longer than the memory."""
+        """True if an earlier path in one direction was longer than the memory."""
         self._turns = deque([0.0], _TURNS)
-        """Motor angles at which the issued path began and reversed."""
+        """Motor angles of the start and the reversals of the issued path."""
 
     @property
     def error_arcsec(self) -> float:
@@ -140,12 +140,12 @@ class Inverse:
 
     @property
     def path_deg(self) -> list[float]:
-        """Motor angles at which the issued path began and reversed, and its present end, degrees."""
+        """Motor angles of the start, the reversals and the present end of the issued path, degrees."""
         return [*self._turns, self._motor_deg]
 
     @property
     def memory_known(self) -> bool:
-        """True if that path has run farther in one direction than the model remembers."""
+        """True if that path has run further in one direction than the model remembers."""
         return self._known or abs(self._motor_deg - self._turns[-1]) >= self.memory_deg
 
     def error_at(self, motor_deg: float, moment: Moment = _NOWHERE) -> float:
@@ -155,7 +155,7 @@ class Inverse:
         )
 
     def _level(self, moment: Moment) -> float:
-        """Returns the part of the error that is the same at every motor angle, arcsec."""
+        """Returns the part of the error that does not depend on the motor angle, arcsec."""
         total = 0.0
         for each in self._offsets:
             total += each.peek(0.0, moment)
@@ -209,10 +209,11 @@ class Inverse:
         self._forward = forward
 
     def solve(self, load_deg: float, moment: Moment = _NOWHERE, weight: float = 1.0) -> float:
-        """Returns the motor angle in degrees that puts the load at ``load_deg``; the state does not change.
+        """Returns the motor angle in degrees that brings the load to ``load_deg``; the state does not
+        change.
 
-        ``weight`` scales the error (0: uncompensated). Exact to 1e-6 arcsec at the load, or to the last bit
-        of the motor angle if the law is so steep that this is coarser.
+        ``weight`` scales the error (0: uncompensated). Accurate to 1e-6 arcsec at the load, or to the last
+        bit of the motor angle where a steep law makes this coarser.
         """
         peek, slope, last = self._tracker.peek, self._slope, self._motor_deg
         self._peeked = None
@@ -272,11 +273,12 @@ class Inverse:
 
 
 def _gentle(effects: tuple[Effect, ...], start: Start, steepest: float) -> tuple[list[Tracker], float]:
-    """Returns trackers of the effects, and a bound on how steeply their sum falls, arcsec per motor degree.
+    """Returns trackers of the effects, and a bound on the steepest fall of their sum, arcsec per motor
+    degree.
 
     The load rests while the motor crosses play, so play falls as steeply as the gear rises, or more steeply
-    if noise made the fitted play too narrow. If the sum would fall more steeply than ``steepest``, the play
-    in it is crossed only as steeply as the other effects allow.
+    if noise made the fitted play too narrow. If the sum would fall more steeply than ``steepest``, play is
+    crossed only as steeply as the other effects allow.
     """
     trackers = [each.tracker(start) for each in effects]
     fall = fall_bound(effects)
@@ -295,8 +297,8 @@ def _gentle(effects: tuple[Effect, ...], start: Start, steepest: float) -> tuple
 class Compensation:
     """Inverse with caps and ramps, called once per control cycle.
 
-    It begins disengaged: the motor target is N times the load target. `engage` and `disengage` fade the
-    correction in and out, so switching never makes the axis jump.
+    It begins disengaged, with a motor target of N times the load target. `engage` and `disengage` fade the
+    correction in and out, so switching never causes a jump.
     """
 
     __slots__ = (
@@ -311,7 +313,7 @@ class Compensation:
         InputError if the model's response was measured at another cycle.
         """
         self.model = model
-        """Model that is inverted; `Bench` refuses one of another axis, gear or drive."""
+        """Model that is inverted; `Bench` rejects a model of another axis, gear or drive."""
         self._inverse = Inverse(model)
         self._ratio = model.ratio
         self.maximum_arcsec = limits.maximum_arcsec
@@ -337,7 +339,7 @@ class Compensation:
         self._known = LOSABLE
         self._fading = False
         self.needs = self._inverse.needs
-        """Channels that a `Moment` must contain; it may be omitted if there are none."""
+        """Channels required in a `Moment`, which may be omitted if this is empty."""
         self.limited = 0
         """Number of cycles in which a cap or the slew limit acted."""
 
@@ -348,13 +350,13 @@ class Compensation:
 
     @property
     def memory_known(self) -> bool:
-        """True if the state depends only on the issued path, which since `reset` has run farther in one
+        """True if the state depends only on the issued path, which since `reset` has run further in one
         direction than the model remembers. Always True for a model without memory.
         """
         return self._inverse.memory_known
 
     def know(self, channels: frozenset[Channel]) -> None:
-        """Sets the available channels of `LOSABLE`; effects that need others fade out."""
+        """Sets the available channels of `LOSABLE`; effects that need other channels fade out."""
         self._known = channels
         self._fading = bool(self._inverse.faded)
 
@@ -417,7 +419,7 @@ class Compensation:
     def wanted(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
         """Returns the correction that `command` would approach, arcsec, within the cap; advances the ramps.
 
-        For two compensations that share one motor (`switchover.Correction`), followed by a call of `issued`.
+        For two compensations that share one motor (`switchover.Correction`); must be followed by `issued`.
         """
         most = self.maximum_arcsec
         wanted = ARCSEC_PER_DEG * (load_deg - self._solved(load_deg, moment) / self._ratio)
@@ -437,9 +439,9 @@ class Compensation:
         self._inverse.advance(motor_deg, moment)
 
     def take_over(self, other: Compensation, moment: Moment = _NOWHERE) -> None:
-        """Continues from another compensation, on the path that it has issued; for a new object.
+        """Continues a new object from another compensation, on the path that the other has issued.
 
-        Effects with memory get the state that this path leaves, as far back as the path is kept.
+        Effects with memory receive the state that results from this path, as far back as the path is kept.
         """
         self._known, self._fading = other._known, bool(self._inverse.faded)
         begin, *rest = other._inverse.path_deg
@@ -461,7 +463,7 @@ class Compensation:
         self._fading = not settled
 
     def hold(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
-        """Returns the motor target in degrees, with the correction frozen, for a cycle without feedback."""
+        """Returns the motor target in degrees with a frozen correction, for a cycle without feedback."""
         if self._prefilter is not None:
             self._prefilter.follow(load_deg, self._static, moment, self._predicted)
         self._inverse.advance(self._ratio * (load_deg - self._static / ARCSEC_PER_DEG), moment)

@@ -21,8 +21,8 @@ __all__ = ["LATE", "WINDOW", "Command", "Cycle", "Feedback", "Target"]
 class Cycle:
     """Runs the process image over a link, one `tick` per period.
 
-    ``image`` gives the controlword (``image.power.go``) and the scaling; ``supervision`` holds the latch and
-    the list of faults; ``monitor`` may be shared with the boot-up.
+    ``image`` provides the controlword (``image.power.go``) and the scaling; ``supervision`` holds the latch
+    and the list of faults; ``monitor`` may be shared with the boot-up.
     """
 
     __slots__ = (
@@ -56,19 +56,16 @@ class Cycle:
         self._bus.join(self._axis)
         self._exchange = self._bus.exchange
         self.histogram = self._bus.histogram
-        """Lateness of the start of each period."""
         self.stopping: list[Feedback] = []
         """Feedback of the cycles that `tick` ran to complete the last quick stop."""
         self.restart()
 
     @property
     def overruns(self) -> int:
-        """Number of cycles that were skipped because they began too late."""
         return self._bus.overruns
 
     @property
     def skipped(self) -> int:
-        """Number of whole periods without a SYNC."""
         return self._bus.skipped
 
     def restart(self) -> None:
@@ -82,14 +79,14 @@ class Cycle:
     def tick(self, command: Command = None) -> Feedback:
         """Runs one period and returns its feedback.
 
-        ``command`` is the target in motor counts, or None to hold the last one, or a function of this
-        cycle's feedback that returns either. It is used while the drive is enabled; before that the target
+        ``command`` is the target in motor counts, None to repeat the last target, or a function of this
+        cycle's feedback that returns either. It is used while the drive is enabled; before that, the target
         is the actual position, so that enabling causes no motion.
 
         Raises `SafetyStop` if the fault table requires it, and again at each call until
-        ``supervision.reset()``. By then the drive has reported the quick stop and the motor stands still, or
-        that has timed out, or no RPDO is sent any more (`Reaction.LATCH`). Errors of ``command`` other than
-        `InputError` pass through; the caller must then stop the axis.
+        ``supervision.reset()``. By then, the drive has reported the quick stop and the motor stands still,
+        the quick stop has timed out, or no RPDO is sent any more (`Reaction.LATCH`). Errors of ``command``
+        other than `InputError` propagate; the caller must then stop the axis.
         """
         supervision, axis = self.supervision, self._axis
         if supervision.stop is not None:

@@ -49,7 +49,7 @@ class Histogram:
         self.total = 0
         """Number of recorded values."""
         self.maximum_us = 0
-        """Greatest value, exact."""
+        """Exact maximum."""
 
     def record(self, late_s: float) -> None:
         """Counts one lateness in seconds; an early wake-up counts as zero."""
@@ -63,9 +63,9 @@ class Histogram:
         self.total += 1
 
     def percentile_us(self, percent: float) -> int:
-        """Returns the lateness that ``percent`` of all values do not exceed, us; 0 if there are none.
+        """Returns the lateness that ``percent`` of all values do not exceed, us; 0 without values.
 
-        It is a bin's upper end, so it is never too small and at most 3 % too large.
+        It is the upper end of a bin, so it is never too small and at most 3 % too large.
         """
         if not 0.0 <= percent <= 100.0:
             raise ValueError(f"a percentile lies in 0 .. 100, not at {percent}")
@@ -111,22 +111,22 @@ class Histogram:
 
 
 CANDIDATES_S: Final = (0.001, 0.002, 0.004, 0.008, 0.010)
-"""Cycle times that are measured by default."""
+"""Cycle times measured by default."""
 RULE_PERCENT: Final = 99.99
 RULE_SHARE: Final = 0.2
 RULE_MAXIMUM_SHARE: Final = 0.5
 RULE: Final = (
-    f"a machine carries a cycle when {RULE_PERCENT:g} % of the wake-ups are late by less than "
+    f"a computer sustains a cycle if {RULE_PERCENT:g} % of the wake-ups are late by less than "
     f"{100 * RULE_SHARE:g} % of it and none by more than {100 * RULE_MAXIMUM_SHARE:g} %"
 )
 ENOUGH: Final = 10_000
-"""Minimum number of wake-ups that determines the worst ten-thousandth."""
+"""Minimum number of wake-ups for determining the worst ten-thousandth."""
 
 
 def carries(histogram: Histogram, period_s: float) -> bool:
     """Returns True if the rule (`RULE`) holds for a cycle of ``period_s``; False for an empty histogram.
 
-    At half a cycle of lateness the control cycle skips a period and counts an overrun.
+    With a lateness of half a cycle, the control cycle skips a period and counts an overrun.
     """
     return (
         histogram.total > 0
@@ -142,7 +142,7 @@ class Measurement:
     period_s: float
     histogram: Histogram = field(repr=False)
     skipped: int
-    """Number of whole periods that were missed."""
+    """Number of whole periods missed."""
 
     @property
     def carried(self) -> bool:
@@ -160,7 +160,7 @@ class LatencyReport:
 
     @property
     def carried_s(self) -> float | None:
-        """Shortest period from which on all measured ones are sustained; None if there is none."""
+        """Shortest period above which the computer sustains all measured periods; None without one."""
         best = None
         for each in reversed(self.measurements):
             if not each.carried:
@@ -173,12 +173,12 @@ class LatencyReport:
         """Result in one line."""
         if self.carried_s is None:
             return (
-                f"this machine carries none of these cycle times ({RULE}); "
+                f"this computer sustains none of these cycle times ({RULE}); "
                 "close other programs, allow real-time priority, or use a kernel with PREEMPT_RT"
             )
         few = min(each.histogram.total for each in self.measurements)
         more = f"; only {few} wake-ups were measured, take {ENOUGH} or more" if few < ENOUGH else ""
-        return f"this machine carries a cycle of {1e3 * self.carried_s:g} ms ({RULE}){more}"
+        return f"this computer sustains a cycle of {1e3 * self.carried_s:g} ms ({RULE}){more}"
 
     def table(self) -> str:
         """Returns the measurements and their combined histogram as plain text."""
@@ -228,7 +228,7 @@ def wake_ups(
 ) -> Measurement:
     """Wakes up every ``period_s`` for ``duration_s`` on absolute deadlines and records the lateness of each.
 
-    ``work`` is called at each wake-up (an exchange on a bus, for example); if it takes longer than a period,
+    ``work`` is called at each wake-up (for example an exchange on a bus); if it takes longer than a period,
     whole periods are skipped and counted.
     """
     histogram, skipped = Histogram(), 0

@@ -2,8 +2,8 @@
 
 The compensation is feed-forward, so an aged model leaves an unseen error. This loop integrates the error
 (load target minus load encoder) at rest and adds the result to the load target. In motion the error is mostly
-delay, and the value is held. The value is bounded and its slew is limited. It fades out, for a reason that
-`LoadLoop.doubt` states, in three cases:
+delay, and the value is held. The value is bounded and its slew is limited. It fades out in three cases, with
+the reason in `LoadLoop.doubt`:
 
     the error is too large             more than twice the bound; ends when it is smaller
     the load encoder moved at rest     without the motor; ends when it has moved back
@@ -36,7 +36,7 @@ _NOISE_S: Final = 1.0
 _DRIFT_S: Final = 600.0
 """Time constant for tracking a drift of the load against the motor at rest."""
 _AGREED_S: Final = 1.0
-"""Time at rest for which an encoder that has moved back is observed; each further doubt doubles it."""
+"""Time at rest for which an encoder that has moved back is observed, doubled by each further doubt."""
 _AGREED_MAX_S: Final = 600.0
 _SIGMAS: Final = 8.0
 """Maximum deviation that counts as noise, in standard deviations."""
@@ -47,7 +47,7 @@ _LEAST_SHARE: Final = 0.5
 _OUTLIERS: Final = 2
 """Number of consecutive unexplained readings that count as a move of the load encoder."""
 _AGREEMENT: Final = 1.0 / 3.0
-"""Share of the greatest disagreement below which the encoders agree again."""
+"""Share of the greatest disagreement below which the encoders count as agreeing again."""
 _MODEL_ERROR: Final = 0.25
 """Possible relative error of a model's hysteresis."""
 _PLACES: Final = 24
@@ -56,10 +56,7 @@ _BOTH: Final = frozenset({-1, 1})
 
 
 def loop_width_arcsec(model: TransmissionModel) -> float:
-    """Returns the greatest width of a model's hysteresis loop, arcsec at the load.
-
-    0 for a model without memory.
-    """
+    """Returns the greatest width of a model's hysteresis loop, arcsec at the load; 0 without memory."""
     tracker, moment = model.tracker(Start.VIRGIN), Moment()
     span_deg = 2.0 * tracker.memory_deg
     if not 0.0 < span_deg < math.inf:
@@ -94,7 +91,7 @@ class LoadLoop:
         """``gain_1_s`` is the share of the error removed per second; ``maximum_arcsec`` bounds the value.
 
         ``counts_arcsec`` is one count of the motor encoder plus one of the load encoder, both at the load.
-        InputError for numbers that are not finite and above 0, and for a gain that would make the loop
+        InputError for numbers that are not finite and positive, and for a gain at which the loop would
         oscillate.
         """
         for name, number in (
@@ -124,20 +121,21 @@ class LoadLoop:
         self._patience_max = math.ceil(_AGREED_MAX_S / period_s)
         self._settled = max(math.ceil(SETTLED_S / period_s), 1)
         self._slack = maximum_arcsec
-        """Amount by which the load may lag the motor beyond the model's hysteresis."""
+        """Possible lag of the load behind the motor beyond the model's hysteresis."""
         self._value = 0.0
         self._standing = self._outliers = 0
         """Number of periods at rest, and of consecutive readings outside the explained range."""
         self._difference = self._motor = self._error = 0.0
-        """Averages at rest: load encoder minus load angle by motor encoder, the latter, and the error."""
+        """Averages at rest: load encoder minus load angle by motor encoder, that load angle, and the
+        error."""
         self._noise = 0.0
         """Mean absolute deviation of the difference from its average at rest, minus that of the motor."""
         self._noise_readings = 0
         self._reference = self._rest_motor = 0.0
-        """Averages when the axis came to rest; during a doubt about the encoder, those before it."""
+        """Averages when the axis came to rest; during a doubt about the encoder, those before the doubt."""
         self._doubt = ""
         self._beyond = False
-        """True if the doubt is about the size of the error and not about the encoder."""
+        """True if the doubt is about the size of the error rather than the encoder."""
         self._jumped = self._jumped_most = self._off = 0.0
         """During a doubt about the encoder: sum of its moves at rest, the greatest such sum, and the
         greatest disagreement."""
@@ -153,14 +151,15 @@ class LoadLoop:
 
     @property
     def doubt(self) -> str:
-        """Reason why the loop does not act, in words; empty while it does."""
+        """Reason why the loop does not act, in words; empty while it acts."""
         return self._doubt
 
     def use_models(self, whole: TransmissionModel, predicting: TransmissionModel) -> None:
-        """Sets the models: ``whole`` has the full hysteresis, ``predicting`` gives ``motor`` of `step`.
+        """Sets the models: ``whole`` has the full hysteresis, ``predicting`` predicts the ``motor`` argument
+        of `step`.
 
-        The load may lag the motor by the part of the hysteresis that is not predicted, and by a share of the
-        predicted part. If the hysteresis is not known, only the loop's own bound limits the lag.
+        The load may lag the motor by the unpredicted part of the hysteresis, and by a share of the predicted
+        part. Without a known hysteresis, only the loop's own bound limits the lag.
         """
         width = loop_width_arcsec(whole)
         known = (1.0 - _MODEL_ERROR) * loop_width_arcsec(predicting)
@@ -168,7 +167,7 @@ class LoadLoop:
         self._standing = 0
 
     def reset(self, value_arcsec: float = 0.0) -> None:
-        """Restarts without a doubt, at this value, which the load target already contains."""
+        """Restarts without a doubt at this value, which the load target already contains."""
         if not math.isfinite(value_arcsec):
             raise InputError(f"load loop: a value of {value_arcsec!r} arcsec; expected a finite number")
         self._value = min(max(value_arcsec, -self._maximum), self._maximum)
@@ -179,8 +178,8 @@ class LoadLoop:
     def step(self, target: float, load: float | None, motor: float, moving: bool) -> float:
         """Runs one period; returns the slew-limited addition to the load target, arcsec.
 
-        ``target`` is the load target without this addition, ``load`` the load encoder (None if there is no
-        fresh reading), ``motor`` the load angle by the motor encoder and the model.
+        ``target`` is the load target without this addition, ``load`` the load encoder (None without a fresh
+        reading), ``motor`` the load angle by the motor encoder and the model.
         """
         if load is None or not math.isfinite(load) or not math.isfinite(motor):
             self._standing = 0
@@ -205,7 +204,7 @@ class LoadLoop:
     # ---------------------------------------------------------------- at rest
 
     def _settle(self, error: float, difference: float, motor: float) -> None:
-        """Takes a reading while the load settles, into an average that forgets the first ones."""
+        """Adds a reading while the load settles to an average that forgets the first readings."""
         self._outliers = 0
         self._average(error, difference, motor, max(self._share, 1.0 / self._standing))
         if self._standing < self._settled:
@@ -218,7 +217,7 @@ class LoadLoop:
             self._end()
 
     def _observe(self, error: float, difference: float, motor: float) -> None:
-        """Takes a reading at rest, after the load has settled."""
+        """Adds a reading at rest, after the load has settled."""
         deviation = difference - self._difference
         explained = self._explained() + 2.0 * abs(motor - self._motor)
         if abs(deviation) > explained:
@@ -264,7 +263,7 @@ class LoadLoop:
             self._noise += noise_share * (max(abs(deviation) - abs(moved), 0.0) - self._noise)
 
     def _explained(self) -> float:
-        """Returns the difference of the encoders at rest that is explained without motion of the load."""
+        """Returns the difference of the encoders at rest that is explicable without motion of the load."""
         return self._counts + _SIGMAS * _SIGMA_OF_MEAN_DEVIATION * self._noise
 
     # ---------------------------------------------------------------- doubt about the encoder
@@ -307,7 +306,7 @@ class LoadLoop:
                     self._end()
 
     def _end(self) -> None:
-        """Ends the doubt; the loop continues from the value that it has faded to."""
+        """Ends the doubt; the loop continues from its faded value."""
         self._doubt, self._beyond = "", False
         self._reference, self._rest_motor = self._difference, self._motor
 

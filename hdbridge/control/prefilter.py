@@ -35,11 +35,11 @@ class Prefilter:
         self._output = self._before = 0.0
         """Outputs of the last two cycles, arcsec."""
         self._predicted = deque(repeat(0.0, len(lead.weights)), len(lead.weights))
-        """Predicted corrections, arcsec, the farthest ahead first."""
+        """Predicted corrections, arcsec, furthest ahead first."""
         first, per_cycle = lead.lead_cycles, lead.per_cycle
         ahead = [first - j / per_cycle for j in range(per_cycle - 1, -1, -1)]
         self._reaches = tuple((s, 0.5 * s * (s + 1.0)) for s in ahead)
-        """Factors of the last step and of its change that give the distance of each new prediction."""
+        """Factors of the last step and of its change for the distance of each new prediction."""
         self._full_step = lead.full_speed_deg_s * period_s
         self._last: float | None = None
         self._step = 0.0

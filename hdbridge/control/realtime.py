@@ -1,7 +1,7 @@
 """Process settings for a punctual loop: no garbage collection, real-time priority, locked memory.
 
-Everything is restored on exit. Settings that the system refuses are reported, not required: the loop then
-runs with those it got, and its lateness histogram shows the result.
+All settings are restored on exit. Settings that the system refuses are reported but not required. The loop
+then runs with the granted settings, and its lateness histogram shows the result.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ _MCL_CURRENT, _MCL_FUTURE = 1, 2
 PRIORITY: Final = 50
 """SCHED_FIFO priority: above all ordinary work, and equal to the kernel's interrupt threads.
 
-Linux runs threaded interrupts (nearly all under PREEMPT_RT) at SCHED_FIFO 50 too; see sched_set_fifo. Threads
-of equal priority on one processor do not preempt each other, so the loop may wait for an interrupt thread,
-and the one that delivers frames can run to its end."""
+Linux also runs threaded interrupts (nearly all under PREEMPT_RT) at SCHED_FIFO 50; see sched_set_fifo.
+Threads of equal priority on one processor do not preempt each other, so the loop may wait for an interrupt
+thread, and an interrupt thread that delivers frames can run to completion."""
 
 SWITCH_INTERVAL_S: Final = 0.0002
 
 
 @dataclass(frozen=True, slots=True)
 class Realtime:
-    """Settings obtained, with the reason for each that was refused."""
+    """Granted settings, with the reason for each refused setting."""
 
     scheduling: str | None
     """None if the thread has SCHED_FIFO, else the reason."""
@@ -69,10 +69,10 @@ def _lock_memory(flags: int) -> str | None:
 def prepare_realtime(priority: int = PRIORITY, cpus: Collection[int] = ()) -> Iterator[Realtime]:
     """Makes the calling thread and its process punctual within the block.
 
-    ``priority`` is the SCHED_FIFO priority, 1 to 99, or 0 to leave the scheduling alone; ``cpus`` are the
-    numbers of the processors that the thread may run on, empty for any.
+    ``priority`` is the SCHED_FIFO priority, 1 to 99, or 0 to leave the scheduling unchanged; ``cpus`` are the
+    numbers of the permitted processors, empty for any.
 
-    Do not use it around a loop that does not sleep, such as a bench on a virtual clock: with SCHED_FIFO it
+    Not for use around a loop that does not sleep, such as a bench on a virtual clock: with SCHED_FIFO it
     would monopolise a processor.
     """
     held = _Held(priority, cpus)
@@ -87,11 +87,11 @@ def prepare_realtime(priority: int = PRIORITY, cpus: Collection[int] = ()) -> It
 
 @contextmanager
 def left_realtime() -> Iterator[None]:
-    """Suspends `prepare_realtime` within the block, for a fit between two motions, for example.
+    """Suspends `prepare_realtime` within the block, for example for a fit between two motions.
 
-    A long computation with SCHED_FIFO would block other processes for minutes, and without the garbage
-    collector, in locked memory, could exhaust it. `resumed_realtime` within the block resumes it for a
-    motion.
+    A long computation with SCHED_FIFO would block other processes for minutes. Without the garbage collector,
+    in locked memory, it could exhaust the memory. `resumed_realtime` within the block resumes the settings
+    for a motion.
     """
     held = _held[-1] if _held else None
     if held is None or held.left:
@@ -136,7 +136,7 @@ class _Held:
 
 
 _held: Final[list[_Held]] = []
-"""Blocks that are active; module-level because the settings apply to the whole process."""
+"""Active blocks; module-level because the settings apply to the whole process."""
 
 
 @contextmanager

@@ -1,7 +1,7 @@
-"""Benches for procedures, on a drive that this process masters or on an axis that another process holds.
+"""Benches for procedures, on a drive mastered by this process or on an axis held by another process.
 
-Calibration, improvement and the comparison of schemes need only this: the axis file, the identity of the
-drive, and benches to run procedures on.
+Calibration, improvement and the comparison of schemes require only this: the axis file, the identity of the
+drive, and benches for procedures.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hdbridge.drive.drive import Drive
 
 
 class Rig(Protocol):
-    """Axis that another process holds, with a booted drive."""
+    """Axis with a booted drive that another process holds."""
 
     @property
     def axis(self) -> AxisConfig: ...
@@ -39,7 +39,7 @@ def bench_on(
     *,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Bench:
-    """Returns a bench for a booted drive, or for an axis that another process holds."""
+    """Returns a bench for a booted drive, or for an axis held by another process."""
     if isinstance(place, Drive):
         return Bench(place, compensation, interrupted=interrupted)
     return place.bench(compensation, interrupted=interrupted)

@@ -28,7 +28,7 @@ class Sensed:
     def reset(self) -> None:
         """Forgets all readings."""
         self.known: frozenset[Channel] = frozenset()
-        """Channels with sensors of their own that have a reading now."""
+        """Channels with sensors of their own that have a current reading."""
         self._present: tuple[bool, ...] = (False,) * len(self._channels)
         self._values = list(AT_REST)
 

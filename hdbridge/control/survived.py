@@ -1,4 +1,4 @@
-"""Tolerated faults of a run: counts of the faults that the supervision let pass. Pure."""
+"""Tolerated faults of a run, with counts. Pure."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ class Survived(BaseModel):
 
 
 class Watch:
-    """Counts faults and skipped periods from its creation on."""
+    """Counts faults and skipped periods from its creation."""
 
     __slots__ = ("_before", "_skipped", "_supervision")
 
     def __init__(self, supervision: Supervision, skipped: int) -> None:
-        """``skipped`` is the number of periods skipped before."""
+        """``skipped`` is the number of periods skipped before its creation."""
         self._supervision = supervision
         self._before = dict(supervision.counts)
         self._skipped = skipped
 
     def survived(self, skipped: int) -> tuple[Survived, ...]:
-        """Returns the faults since then, in the order of the fault table, and last the skipped periods."""
+        """Returns the faults since creation in fault-table order, followed by the skipped periods."""
         counts = {
             fault: count - self._before[fault]
             for fault, count in self._supervision.counts.items()
@@ -59,7 +59,7 @@ class Watch:
 
 
 def lines(runs: Iterable[tuple[str, Sequence[Survived]]]) -> Iterator[str]:
-    """Yields one line for each run that tolerated faults, with the run's name first."""
+    """Yields one line for each run with tolerated faults, beginning with the run's name."""
     for name, survived in runs:
         if survived:
             yield f"{name} continued despite: {'; '.join(map(str, survived))}"

@@ -1,10 +1,11 @@
-"""Change of the model in motion, without a step: takes the place of one `Compensation` in the control cycle.
+"""Change of the model in motion without a step: replaces a single `Compensation` in the control cycle.
 
 During a change both models follow the issued angle, and the correction passes from that of the old model to
-that of the new one: by a weight that rises over the ramp's time, within the slew limit and the caps. The new
-one begins on the path that was issued last, which also determines the state of its hysteresis.
+that of the new model, by a weight that rises over the ramp time, within the slew limit and the caps. The new
+model begins on the last issued path, which also determines the state of its hysteresis.
 
-A scheme (none, synchronous, hysteresis, both) is a model with other effects and is switched in the same way.
+A scheme (none, synchronous, hysteresis, both) is a model with other effects, so schemes are switched in the
+same way.
 """
 
 from __future__ import annotations
@@ -24,38 +25,37 @@ _NOWHERE = Moment()
 class Correction:
     """Compensation that can be exchanged for another; it has the same interface.
 
-    ``command`` and ``hold`` are those of the compensation itself while nothing changes, so they add no cost.
-    They are different functions during a change: look them up in each cycle.
+    Without a change, ``command`` and ``hold`` are those of the compensation itself, at no additional cost.
+    During a change they are other functions, so they must be looked up in each cycle.
     """
 
     __slots__ = ("_limited", "_new", "_now", "_weight", "command", "hold")
 
     command: Callable[[float, Moment], float]
-    """Motor target in degrees for this cycle's load target (`Compensation.command`)."""
+    """Returns the motor target in degrees for this cycle's load target (`Compensation.command`)."""
     hold: Callable[[float, Moment], float]
-    """Same with the correction frozen (`Compensation.hold`); a change pauses."""
+    """Returns the same with the correction frozen (`Compensation.hold`); a change pauses."""
 
     def __init__(self, first: Compensation) -> None:
         self._now = first
         self._new: Compensation | None = None
         self._weight = 0.0
-        """Weight of the new one during a change."""
+        """Weight of the new compensation during a change."""
         self._limited = 0
         self.command, self.hold = first.command, first.hold
 
     @property
     def model(self) -> TransmissionModel:
-        """Model that is in force, or will be after the change."""
+        """Model in force, or in force after the change."""
         return (self._new or self._now).model
 
     @property
     def changing(self) -> bool:
-        """True during a change."""
         return self._new is not None
 
     @property
     def needs(self) -> frozenset[Channel]:
-        """Channels that a `Moment` must contain; those of both models during a change."""
+        """Channels required in a `Moment`; those of both models during a change."""
         return self._now.needs if self._new is None else self._now.needs | self._new.needs
 
     @property
@@ -67,24 +67,21 @@ class Correction:
     def predicted_arcsec(self) -> float:
         """Model's error at the last motor target, arcsec, regardless of the weight.
 
-        During a change it passes from that of the old model to that of the new one.
+        During a change it passes from the error of the old model to that of the new model.
         """
         now = self._now.predicted_arcsec
         return now if self._new is None else now + self._weight * (self._new.predicted_arcsec - now)
 
     @property
     def memory_known(self) -> bool:
-        """True if the state depends on the issued path alone (`Compensation.memory_known`)."""
         return self._now.memory_known and (self._new is None or self._new.memory_known)
 
     @property
     def weight(self) -> float:
-        """Weight of the ramp: 0 off, 1 fully on."""
         return self._now.weight
 
     @property
     def limited(self) -> int:
-        """Number of cycles in which a cap or the slew limit acted."""
         return self._limited + self._now.limited
 
     def change(self, new: Compensation) -> None:
@@ -104,17 +101,14 @@ class Correction:
         self.command = self._first_blended
 
     def know(self, channels: frozenset[Channel]) -> None:
-        """Sets the available channels (`Compensation.know`)."""
         for each in self._all():
             each.know(channels)
 
     def engage(self) -> None:
-        """Fades the correction in from the next command on."""
         for each in self._all():
             each.engage()
 
     def disengage(self) -> None:
-        """Fades the correction out from the next command on."""
         for each in self._all():
             each.disengage()
 

@@ -1,1 +1,1 @@
-"""The daemon, which controls the drives of one bus permanently. See docs/architecture.md."""
+"""Daemon that permanently controls the drives of one bus. See docs/architecture.md."""

@@ -28,7 +28,7 @@ def hold(
     ``page`` is a loopback port for the live page (0: any free one). Its address is printed to standard error,
     with a token for this run; a machine with ``api.tcp`` has its page there instead. ``force`` starts even if
     another process controls the interface or another master is active on the bus. Raises InputError, BusError
-    or DaemonError if it cannot start; then nothing was sent.
+    or DaemonError if it cannot start, before anything was sent.
     """
     log = log or LogSettings()
     begin_log(log)
@@ -48,7 +48,7 @@ def hold(
             token = secrets.token_urlsafe(32)
             listeners.append(stack.enter_context(tcp_socket(page, "--port")))
         if page is not None:
-            _tell_page(listeners[-1], token)
+            _print_page(listeners[-1], token)
         memory = stack.enter_context(Memory.create(len(machine.axes), machine.cycle_s))
         start = Start(
             machine, memory.fd, os.getpid(), simulation=simulation, force=force, socket=path,
@@ -58,7 +58,7 @@ def hold(
         return Keeper(start, memory, listeners, Notifier.of_environment(), times=times, lock=lock).run()
 
 
-def _tell_page(listener: socket.socket, token: str | None) -> None:
-    """Prints the address of the page for the user; a token does not belong in a log."""
+def _print_page(listener: socket.socket, token: str | None) -> None:
+    """Prints the address of the page for the user, because a token must not be logged."""
     host, port = listener.getsockname()
     print(f"page: http://{host}:{port}/{f'#token={token}' if token else ''}", file=sys.stderr, flush=True)

@@ -48,12 +48,12 @@ _ERRORS: Final = range(2, 16)
 it."""
 _FIRST_ATTEMPTS: Final = 3
 PATIENCE_S: Final = 1.0
-"""Maximum wait for a manager whose queue is full, for messages that it must not miss."""
+"""Maximum wait for a manager with a full queue, for messages that it must not miss."""
 
 
 @dataclass(frozen=True, slots=True)
 class Programs:
-    """Programs of the children; tests substitute others."""
+    """Programs of the children; replaced in tests."""
 
     control: Sequence[str] = ("-m", "hdbridge.daemon.loop.process")
     service: Sequence[str] = ("-m", "hdbridge.daemon.serve")
@@ -65,13 +65,13 @@ class Times:
     """Time-outs of the keeper, seconds."""
 
     begin_s: float = 60.0
-    """Start of a child."""
+    """Start-up of a child."""
     hung_s: float = 5.0
-    """A turn of the control process; the drives' own watchdogs act long before."""
+    """Duration of a turn of the control process; the drives' own watchdogs act long before."""
     service_hung_s: float = 30.0
-    """A sign of life of the service."""
+    """Interval without a sign of life of the service."""
     gateway_hung_s: float = 5.0
-    """A sign of life of the gateway."""
+    """Interval without a sign of life of the gateway."""
     stop_s: float = 30.0
     """Braking of all axes by the control process."""
     service_stop_s: float = 10.0
@@ -88,7 +88,7 @@ class Child:
     def __init__(self, program: Sequence[str], start_fd: int, handed: Sequence[int], now_s: float) -> None:
         """Runs ``program`` in this interpreter, with the number of ``start_fd`` as its argument.
 
-        It also inherits the descriptors in ``handed``. It has its own session, so that signals of the
+        The child also inherits the descriptors in ``handed``. It has its own session, so signals of the
         terminal reach only the keeper.
         """
         self.started_s = now_s
@@ -120,7 +120,7 @@ class Child:
         return f"ended by signal {-status}"
 
     def send(self, number: signal.Signals) -> None:
-        """Sends a signal, unless the process has ended; its id cannot be reused before `ended` is called."""
+        """Sends a signal unless the process has ended; its id cannot be reused before `ended` is called."""
         self._process.send_signal(number)
 
     def close(self) -> None:
@@ -139,7 +139,7 @@ class Budget:
         self._times: deque[float] = deque()
 
     def spend(self, now_s: float) -> bool:
-        """Counts an event; returns False if the window's budget is used up."""
+        """Counts an event; returns False if the window's budget is exhausted."""
         while self._times and now_s - self._times[0] >= self._window_s:
             self._times.popleft()
         if len(self._times) >= self._most:
@@ -166,13 +166,13 @@ class BackOff:
 class Heartbeat:
     """Hang detection by a counter, measured in looks without an advance.
 
-    It does not use time, so a monitor that was itself suspended blames nobody else.
+    It does not use time, so a monitor that was itself suspended does not blame others.
     """
 
     def __init__(self) -> None:
         self._last = 0
         self.misses = 0
-        """Consecutive looks without an advance."""
+        """Number of consecutive looks without an advance."""
         self.begun = False
         """True if the counter has advanced since the restart."""
 
@@ -185,15 +185,15 @@ class Heartbeat:
         return advanced
 
     def restart(self, value: int) -> None:
-        """Starts again with a restarted process, whose counter has this value."""
+        """Restarts with a restarted process, whose counter has this value."""
         self._last, self.misses, self.begun = value, 0, False
 
 
 class Notifier:
-    """Notifies the service manager, if there is one. It never fails."""
+    """Notifies the service manager, if any. It never fails."""
 
     def __init__(self, address: str | None = None, watchdog_s: float | None = None) -> None:
-        """``address`` is the manager's socket; one that begins with @ is abstract."""
+        """``address`` is the manager's socket; an address that begins with @ is abstract."""
         self.watchdog_s = watchdog_s
         """Watchdog time-out of the manager; None without a watchdog."""
         self._address = "\0" + address[1:] if address and address.startswith("@") else address
@@ -209,24 +209,24 @@ class Notifier:
 
     def ready(self) -> None:
         """Reports that the daemon is ready."""
-        self._tell("READY=1", PATIENCE_S)
+        self._send("READY=1", PATIENCE_S)
 
     def alive(self) -> None:
-        """Reports a sign of life to the watchdog."""
+        """Sends a sign of life to the watchdog."""
         if self.watchdog_s is not None:
-            self._tell("WATCHDOG=1")
+            self._send("WATCHDOG=1")
 
     def stopping(self) -> None:
         """Reports that the daemon is stopping."""
-        self._tell("STOPPING=1", PATIENCE_S)
+        self._send("STOPPING=1", PATIENCE_S)
 
     def status(self, words: str) -> None:
         """Sets the line in ``systemctl status``, if it has changed."""
-        if words != self._status and self._tell(f"STATUS={words}"):
+        if words != self._status and self._send(f"STATUS={words}"):
             self._status = words
 
-    def _tell(self, line: str, patience_s: float = 0.0) -> bool:
-        """Returns True if the manager took the message; waits at most ``patience_s`` for it."""
+    def _send(self, line: str, patience_s: float = 0.0) -> bool:
+        """Returns True if the manager accepted the message; waits at most ``patience_s`` for it."""
         if self._address is None:
             return True
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
@@ -238,7 +238,7 @@ class Notifier:
 
 @dataclass(slots=True)
 class _Helper:
-    """A process in addition to the control process; restarted after increasing delays, whatever ended it."""
+    """Process in addition to the control process, restarted after increasing delays, whatever ended it."""
 
     name: str
     program: Sequence[str]
@@ -246,7 +246,7 @@ class _Helper:
     alive: Cell
     """Cell with the time of its last sign of life."""
     begun: Cell
-    """Cell with its process id."""
+    """Cell with the process id."""
     hung_s: float
     child: Child | None = None
     due_s: float | None = None
@@ -255,7 +255,7 @@ class _Helper:
 
 
 class Loan:
-    """A loan of the bus to another program: asked for, then begun, and over when the lock is free again."""
+    """Loan of the bus to another program: requested, then begun, and over when the lock is free again."""
 
     COLLECTED_S: Final = 10.0
     """Time for the borrower to acquire the lock."""
@@ -272,7 +272,7 @@ class Loan:
         self._lock.release()
 
     def is_over(self, now_s: float) -> bool:
-        """Acquires the lock if the borrower is done, or has not come; returns True if it is acquired."""
+        """Acquires the lock once the borrower has finished or has not come; returns True on success."""
         if self._lock.holder:
             self._collected = True
             return False
@@ -439,7 +439,7 @@ class Keeper:
             self._memory.forget_gateway()
 
     def _lend(self, loan: Loan, now_s: float) -> None:
-        """Ends the control process if the bus is wanted; starts another one when the bus is free again."""
+        """Ends the control process if the bus is wanted; starts a new one when the bus is free again."""
         status = self._memory.status
         if loan.asked_s is None:
             if status[Cell.BUS_WANTED] and self._control is not None:

@@ -1,7 +1,7 @@
-"""The daemon's log: one line per event, as JSON, or as text on a terminal, with a rate limit per event.
+"""Log of the daemon: one line per event, as JSON, or as text on a terminal, with a rate limit per event.
 
 Each process logs to standard error, which under systemd is the journal, and with ``--log`` to a file. The
-control process logs how it starts, and nothing while the loop turns.
+control process logs its start, and nothing while the loop runs.
 """
 
 import logging
@@ -16,7 +16,7 @@ from hdbridge.files.logformat import ForMachines, ForPeople, LogFile
 
 _ROOT = logging.getLogger("hdbridge")
 BURST: Final = 20
-"""Maximum number of records of one event per `WINDOW_S`; the number of omitted ones is reported."""
+"""Maximum number of records of one event per `WINDOW_S`; the number of omitted records is reported."""
 WINDOW_S: Final = 10.0
 _LEVELS: Final = {
     logging.DEBUG: 7,
@@ -33,13 +33,13 @@ class LogSettings:
     """Log settings of the daemon's processes."""
 
     verbose: int = 0
-    """If 1 or more, SDO transfers are logged as well."""
+    """SDO transfers are logged as well from 1 on."""
     file: Path | None = None
     """File to which all records are appended, one JSON object per line."""
 
 
 class RateLimit(logging.Filter):
-    """Passes `BURST` records of an event per window, and reports the number omitted after it."""
+    """Passes `BURST` records of an event per window, and then reports the number omitted."""
 
     def __init__(self, burst: int = BURST, window_s: float = WINDOW_S) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ class RateLimit(logging.Filter):
 
 
 class _Journal(ForMachines):
-    """JSON preceded by the priority, for the journal."""
+    """Formatter for the journal: JSON preceded by the priority."""
 
     def format(self, record: logging.LogRecord) -> str:
         return f"<{_LEVELS.get(record.levelno, 6)}>{super().format(record)}"

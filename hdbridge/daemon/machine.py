@@ -1,7 +1,7 @@
 """Machine of a daemon: axes on one bus, validated together before anything is opened.
 
-`Machine` is made from a machine file and the profiles that it names, or from one profile. The keeper reads it
-once and passes it to the other processes, so edits of a file take effect at the next start.
+A `Machine` is created from a machine file and its profiles, or from one profile. The keeper reads it once and
+passes it to the other processes, so edits of a file take effect at the next start.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ T = TypeVar("T")
 
 
 def machine_file(text: str) -> Path | None:
-    """Returns the machine file given by its path, its folder or a bundled name; None if it is a profile."""
+    """Returns the machine file given by its path, its folder or a bundled name; None for a profile."""
     path = Path(text)
     if not path.exists() and path.name == text and text:
         path = bundled_folder("profiles") / text
@@ -73,7 +73,7 @@ class Axis:
         return self.config.name
 
     def model(self) -> TransmissionModel:
-        """Returns the active model on disk; one without effects if there is none yet.
+        """Returns the active model on disk; a model without effects if there is no active model yet.
 
         Raises InputError if it cannot be read, or belongs to another axis, drive or gear.
         """
@@ -90,7 +90,7 @@ class Machine:
 
     name: str
     path: Path
-    """Path of the machine file, or of the axis file if there is none."""
+    """Path of the machine file, or of the axis file without one."""
     axes: tuple[Axis, ...]
     bus: BusConfig
     realtime: RealtimeConfig
@@ -123,7 +123,7 @@ class Machine:
         return (self.folder / "recordings" / "daemon").absolute()
 
     def axis_folder(self, axis: Axis, name: str, environment: Mapping[str, str] = os.environ) -> Path:
-        """Returns a folder for data of an axis: in its profile's if writable, else in the state folder."""
+        """Returns a folder for data of an axis: in its profile if writable, else in the state folder."""
         if _writable(axis.profile.folder):
             return axis.profile.folder / name
         return self.state_folder(environment) / axis.name / name
@@ -148,7 +148,7 @@ class Machine:
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Loads a machine file, or the one in a folder; InputError has file:line:column."""
+        """Loads a machine file, or that of a folder; InputError has file:line:column."""
         path = Path(path)
         document = read_yaml(path / "machine.yaml" if path.is_dir() else path)
         file = document.validate(MachineFile)
@@ -231,7 +231,7 @@ def _writable(folder: Path) -> bool:
 
 
 def _absolute(profile: Profile) -> Profile:
-    """Returns the profile with absolute paths, as the daemon's processes may have other working folders."""
+    """Returns the profile with absolute paths, because the processes may have other working folders."""
     return Profile(profile.axis.absolute(), profile.model.absolute(), profile.truth.absolute())
 
 
@@ -269,7 +269,7 @@ def _agreed(axes: Sequence[Axis], ask: Callable[[AxisConfig], T], places: _Place
 
 
 def _check_together(axes: Sequence[Axis], bus: BusConfig, places: _Places) -> None:
-    """Checks that the names are unique, and that the axes can share a bus, whose cycle takes their frames."""
+    """Checks that names are unique, and that the axes can share a bus and its cycle has time for them."""
     names: dict[str, int] = {}
     for number, axis in enumerate(axes):
         if (other := names.setdefault(axis.name, number)) != number:
@@ -288,7 +288,7 @@ def _check_together(axes: Sequence[Axis], bus: BusConfig, places: _Places) -> No
 
 
 def _check_gateway(file: MachineFile, axes: Sequence[Axis], bus: BusConfig, places: _Places) -> None:
-    """Known axes, one node id each, a bus of its own, and positions that fit into an int32."""
+    """Checks for known axes, one node id each, a separate bus, and positions that fit into an int32."""
     gateway = file.gateway
     if gateway is None:
         return

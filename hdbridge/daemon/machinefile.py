@@ -1,7 +1,7 @@
 """Schema of the machine file: axes, bus, access, recorder, adaptation.
 
 A user writes ``machine.yaml``; the program never changes it. `hdbridge.daemon.machine` reads it together with
-the profiles that it names.
+its profiles.
 """
 
 import re
@@ -23,7 +23,7 @@ Parameter = Annotated[str, Field(pattern=r"^[a-z_]+\.[a-z_]+$")]
 
 
 class RecorderSettings(Strict):
-    """Settings of the ring on disk and of the recordings kept aside."""
+    """Settings of the ring on disk and of the recordings kept."""
 
     folder: str | None = Field(
         None,
@@ -91,7 +91,7 @@ class AdaptationSettings(Strict):
 
 
 class _Part(Strict):
-    """A mapping of the file: frozen, no unknown keys, finite numbers."""
+    """Mapping of the file: frozen, no unknown keys, finite numbers."""
 
 
 class LoadLoopSettings(_Part):
@@ -121,7 +121,7 @@ class AxisEntry(_Part):
 
 
 class TcpSettings(_Part):
-    """The API over TCP, for this machine: for the page, local tools and a reverse proxy."""
+    """API over TCP on this machine, for the page, local tools and a reverse proxy."""
 
     port: int = Field(8402, ge=1, le=65_535, description="port of 127.0.0.1")
     names: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]+$")], ...] = Field(
@@ -143,7 +143,7 @@ class ApiSettings(_Part):
 
 
 class GatewaySettings(_Part):
-    """The machine as CiA-402 drives on another bus, for a master there. Positions are those of the load."""
+    """The machine as CiA-402 drives on another bus, for its master. Positions are those of the load."""
 
     bus: BusConfig = Field(description="the bus of the other master")
     nodes: dict[str, Annotated[int, Field(ge=1, le=127)]] = Field(
@@ -170,10 +170,10 @@ class LimitSettings(_Part):
 
 
 class MachineFile(_Part):
-    """The content of a machine file."""
+    """Content of a machine file."""
 
     schema_: Literal["hdbridge.machine/1"] = Field(
-        alias="schema", description="kind and version of this file"
+        alias="schema", description="schema and version of this file"
     )
     name: str = Field(pattern=NAME, description="name: letters, digits, '.', '_', '-'")
     axes: tuple[AxisEntry, ...] = Field(
@@ -200,7 +200,7 @@ class MachineFile(_Part):
 
 
 def token_complaint(path: Path) -> str | None:
-    """Returns what is wrong with a token file; None if it is valid."""
+    """Returns the error of a token file; None if it is valid."""
     try:
         content, mode = path.read_text(encoding="ascii").strip(), path.stat().st_mode
     except (OSError, UnicodeDecodeError) as problem:

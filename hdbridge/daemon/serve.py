@@ -1,7 +1,7 @@
-"""The service process: ``python -m hdbridge.daemon.serve FD``, started by the keeper.
+"""Service process: ``python -m hdbridge.daemon.serve FD``, started by the keeper.
 
 It assembles bridge, API, recorder, watch, adaptation and log, and ends them in order. It has one event loop;
-blocking work runs in threads. If it dies, the axes complete the commands they have.
+blocking work runs in threads. If it dies, the axes complete their present commands.
 """
 
 import asyncio
@@ -33,7 +33,7 @@ from hdbridge.daemon.start import Start, run_child, runtime_folder
 from hdbridge.errors import HdbridgeError
 
 THREADS_PER_AXIS: Final = 2
-"""Threads per axis; its drive may be verified while another of its requests blocks."""
+"""Threads per axis, because its drive may be verified while another of its requests blocks."""
 SPARE_THREADS: Final = 4
 LOOK_S: Final = 1.0
 """Interval between checks for the socket file."""
@@ -53,8 +53,8 @@ def run(start: Start) -> None:
 async def serve(start: Start, memory: Memory) -> None:
     """Runs the service until SIGTERM and the end of the control process."""
     machine = start.machine
-    told = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
+    terminated = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, terminated.set)
     async with AsyncExitStack() as stack:
         simulated = start.simulation is not None
         clock = SimulatedClock(lambda: memory.status.loop_count, machine.cycle_s) if simulated else None
@@ -68,7 +68,7 @@ async def serve(start: Start, memory: Memory) -> None:
                 machine.name, tuple(AxisAbout.of(each.config) for each in machine.axes), machine.cycle_s
             ),
             machine.recorder,
-            tell=bridge.core.log.note,
+            notify=bridge.core.log.note,
             in_use=lambda: {name: axis.models.in_use for name, axis in bridge.axes.items()},
         )
         bridge.recorder = recorder.state
@@ -87,7 +87,7 @@ async def serve(start: Start, memory: Memory) -> None:
                 group.create_task(_apply(following)),
                 group.create_task(_keep_socket(start, server, bridge.core.log.note)),
             ]
-            await told.wait()
+            await terminated.wait()
             await _last_words(bridge, memory)
             for task in beside:
                 task.cancel()
@@ -135,7 +135,7 @@ def listeners(machine: Machine, descriptors: Sequence[int], page_token: str | No
 
 
 async def _keep_socket(start: Start, server: ApiServer, note: Callable[[str], None]) -> None:
-    """Binds the Unix socket again whenever its file is gone; open connections stay."""
+    """Binds the Unix socket again whenever its file has disappeared; open connections stay."""
     path, bound, noted = start.socket, start.socket_file, ""
     while True:
         found = (0, 0)
@@ -167,7 +167,7 @@ async def _say_when_served(server: ApiServer, memory: Memory) -> None:
 
 
 async def _last_words(bridge: ServiceBridge, memory: Memory) -> None:
-    """Continues while the axes are brought to rest, so that clients see it and it is recorded."""
+    """Continues while the axes are brought to rest, so that clients see this and it is recorded."""
     end_s = asyncio.get_running_loop().time() + LAST_WORDS_S
     status = memory.status
     while bridge.core.observer.alive and status.loop_pid and asyncio.get_running_loop().time() < end_s:

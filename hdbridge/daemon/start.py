@@ -1,8 +1,8 @@
 """Start data that the keeper passes to its children, the first steps of each child, the runtime folder.
 
-A child is a fresh interpreter, not a fork: it inherits only descriptors. One of them contains the pickled
-start data, in memory that no other process can open. So all processes, including restarted ones, use the same
-machine file.
+A child is a fresh interpreter, not a fork, and inherits only descriptors. One of them contains the pickled
+start data, in memory that no other process can open. All processes, including restarted ones, therefore use
+the same machine file.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Start:
     memory_fd: int
     """Descriptor of the shared memory."""
     keeper: int
-    """Process id of the keeper; a child with another parent has lost it already."""
+    """Process id of the keeper; a child with another parent has already lost the keeper."""
     simulation: Simulation | None = None
     force: bool = False
     """If True, communicate even if another master is active. The keeper holds the interface's lock anyway."""
@@ -66,11 +66,11 @@ class Start:
     log: LogSettings = LogSettings()
 
     def hand_over(self, **changes: object) -> int:
-        """Returns a descriptor with the data for a child; close it once the child runs."""
-        told = replace(self, **changes)  # type: ignore[arg-type]
+        """Returns a descriptor with the data for a child, to be closed once the child runs."""
+        start = replace(self, **changes)  # type: ignore[arg-type]
         fd = os.memfd_create("hdbridge-start", os.MFD_CLOEXEC)
         with os.fdopen(os.dup(fd), "wb") as file:
-            pickle.dump(told, file)
+            pickle.dump(start, file)
         os.lseek(fd, 0, os.SEEK_SET)
         return fd
 
@@ -80,12 +80,12 @@ class Start:
         try:
             (number,) = arguments
             with os.fdopen(int(number), "rb") as file:
-                told = pickle.load(file)
+                start = pickle.load(file)
         except (ValueError, OSError, pickle.UnpicklingError, EOFError):
-            told = None
-        if not isinstance(told, cls):
+            start = None
+        if not isinstance(start, cls):
             raise InputError("this is a process of the daemon and not started by hand: use 'hdbridge run'")
-        return told
+        return start
 
 
 def run_child(arguments: list[str], name: str, run: Callable[[Start], None]) -> int:
@@ -121,8 +121,8 @@ def begin_child(start: Start, name: str) -> None:
 def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
     """Returns the folder of the socket, created if necessary; raises InputError if others can access it.
 
-    It is the service manager's, else the session's (``$XDG_RUNTIME_DIR/hdbridge``), else one of this user
-    under ``/tmp``.
+    It is the service manager's folder, else the session's (``$XDG_RUNTIME_DIR/hdbridge``), else a folder of
+    this user under ``/tmp``.
     """
     given = environment.get("RUNTIME_DIRECTORY", "").split(":")[0]
     if given:

@@ -1,1 +1,1 @@
-"""A CiA-402 drive on a CAN bus, seen from the drive: CANopen node, firmware, modes. It knows no plant."""
+"""A CiA-402 drive on a CAN bus, seen from the drive: CANopen node, firmware, modes, without a plant."""

@@ -1,4 +1,4 @@
-"""Choices that CiA 301 and CiA 402 leave to a drive's firmware, and that real drives make differently."""
+"""Choices that CiA 301 and CiA 402 leave to a drive's firmware, and in which real drives differ."""
 
 from enum import Enum
 
@@ -13,11 +13,11 @@ class Controlword(Enum):
     EDGE = "edge"
     """Ignored."""
     LEVEL = "level"
-    """Evaluated again: a repeated 000Fh in *quick stop active* is transition 16."""
+    """Evaluated again, so a repeated 000Fh in *quick stop active* is transition 16."""
 
 
 class HeartbeatConsumer(Enum):
-    """Supervision of the master's heartbeat (1016h) after one was lost."""
+    """Supervision of the master's heartbeat (1016h) after a loss."""
 
     RESTARTS = "restarts"
     """Starts again with the next heartbeat."""
@@ -26,7 +26,7 @@ class HeartbeatConsumer(Enum):
 
 
 class Behaviour(Strict):
-    """Firmware behaviour of the simulated drive. The defaults are the friendliest drive."""
+    """Firmware behaviour of the simulated drive. The defaults are those of the most tolerant drive."""
 
     controlword: Controlword = Field(
         Controlword.EDGE, description="`edge`: a repeated controlword is ignored; `level`: it acts again"

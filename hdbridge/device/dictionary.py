@@ -1,8 +1,8 @@
 """The object dictionary of the simulated drive: the objects that its EDS declares, and their values.
 
 An entry holds a stored value, or is bound to a function that returns the drive's present value. A write is
-checked for access, length and range as CiA 301 demands, and then by the entry's guard, which may refuse it.
-PDO mappings are compiled from entries once (``pdo.py``), so the cyclic path only reads stored values and
+checked for access, length and range as required by CiA 301, and then by the entry's guard, which may refuse
+it. PDO mappings are compiled from entries once (``pdo.py``), so the cyclic path only reads stored values and
 calls bound functions.
 """
 
@@ -19,7 +19,7 @@ from hdbridge.files.edsfile import shared_eds
 from hdbridge.files.profile import bundled_folder
 
 BUNDLED: Final = bundled_folder("eds") / "hdbridge-402.eds"
-"""EDS of the objects that the firmware works with."""
+"""EDS of the objects used by the firmware."""
 NUMBERS: Final = {
     datatypes.BOOLEAN: "B",
     datatypes.INTEGER8: "b",
@@ -33,10 +33,10 @@ NUMBERS: Final = {
     datatypes.REAL32: "f",
     datatypes.REAL64: "d",
 }
-"""Data types of numbers, as ``struct`` format characters; an object of any other type holds bytes."""
+"""Data types of numbers, with their ``struct`` format characters; objects of other types hold bytes."""
 _VENDORS: Final = (0x2000, 0x5FFF)
 _PDOS: Final = (0x1400, 0x1BFF)
-"""Indices of the PDO parameters. A PDO that the EDS does not list does not exist."""
+"""Indices of the PDO parameters. A PDO that is not in the EDS does not exist."""
 
 MAX_STRING: Final = 64
 """Longest string, in bytes, that can be written to a writable string object."""
@@ -75,7 +75,7 @@ class SdoAbortError(Exception):
 
 
 def only(*allowed: int) -> Callable[[int], None]:
-    """Returns a guard that refuses every other value."""
+    """Returns a guard that refuses all other values."""
 
     def check(value: int) -> None:
         if value not in allowed:
@@ -87,14 +87,14 @@ def only(*allowed: int) -> Callable[[int], None]:
 class Entry:
     """One (index, sub-index).
 
-    ``value`` is what is stored; ``bind`` makes reads call a function instead; ``guard`` is asked with a new
-    value before it is stored and refuses by raising ``SdoAbortError``; ``follower`` is called after it was
-    stored. The firmware uses a ``hidden`` entry, but the bus does not see it. The firmware uses only entries
-    that are ``is_known``. The default of an ``is_relative`` one contains the node id.
+    ``value`` is the stored value. After ``bind``, reads call a function instead. ``guard`` checks a new value
+    before it is stored, and refuses by raising ``SdoAbortError``; ``follower`` is called after it was stored.
+    A ``hidden`` entry is used by the firmware but invisible on the bus. The firmware uses only entries that
+    are ``is_known``. The default of an ``is_relative`` entry contains the node id.
     """
 
     def __init__(self, variable: ODVariable, own: ODVariable | None = None) -> None:
-        """``own`` is the same object in the bundled EDS: its default serves if the drive's EDS gives none."""
+        """``own`` is the same object in the bundled EDS; its default is used if the drive's EDS has none."""
         self.index: Final[int] = variable.index
         self.sub: Final[int] = variable.subindex
         self.name: Final[str] = variable.name
@@ -132,7 +132,7 @@ class Entry:
         return 8 * self.codec.size if self.codec else 0
 
     def bind(self, read: Callable[[], int]) -> None:
-        """Makes reads, by SDO and by PDO, call ``read``."""
+        """Makes reads by SDO and PDO call ``read``."""
         self.bound = (lambda: self._wrapped(read())) if self._bits else read
 
     def _wrapped(self, value: int) -> int:
@@ -161,7 +161,7 @@ class Entry:
         return self.codec.pack(self.number())
 
     def check_length(self, size: int) -> None:
-        """Refuses a read-only entry, and a length that does not match the data type."""
+        """Refuses writes to a read-only entry and of a wrong length for the data type."""
         if not self.writable:
             raise SdoAbortError(Abort.READ_ONLY)
         longest = self.codec.size if self.codec else MAX_STRING
@@ -191,7 +191,7 @@ class Entry:
             self.follower(value)
 
     def accepts(self, value: object) -> bool:
-        """Returns True for a number of its type within its limits; asks no guard."""
+        """Returns True for a number of its type within its limits, without asking the guard."""
         if self.codec is None or not isinstance(value, int | float):
             return False
         try:
@@ -213,8 +213,8 @@ class Dictionary:
     """All entries of one node, by (index, sub-index).
 
     The firmware works with every object of the bundled EDS, except those whose indices the vendor uses for
-    other objects in ``eds_path``. Objects that ``eds_path`` does not list are hidden: no SDO or PDO reaches
-    them, and they keep the bundled default.
+    other objects in ``eds_path``. Objects that ``eds_path`` does not list are hidden: they are not accessible
+    by SDO or PDO, and keep the bundled default.
     """
 
     def __init__(self, eds_path: Path, node_id: int) -> None:
@@ -257,7 +257,7 @@ class Dictionary:
         return self._entries[key]
 
     def open(self, index: int, sub: int) -> Entry:
-        """Returns an entry to the bus; refuses missing and hidden ones."""
+        """Returns an entry to the bus; refuses missing and hidden entries."""
         entry = self._entries.get((index, sub))
         if entry is None or entry.hidden:
             code = Abort.NO_SUBINDEX if index in self._indices else Abort.NO_OBJECT
@@ -272,7 +272,7 @@ class Dictionary:
         return (entry for entry in self._entries.values() if not entry.hidden)
 
     def remove(self, index: int, sub: int) -> None:
-        """Hides an object, as on a drive that does not have it."""
+        """Hides an object, as on a drive that lacks it."""
         self._entries[index, sub].hidden = True
         self._note_indices()
 
@@ -294,7 +294,7 @@ class Dictionary:
 
 
 def _is_vendors(variable: ODVariable, own: ODVariable) -> bool:
-    """Returns True for a manufacturer-specific object of another type: the index is equal by chance."""
+    """Returns True for a manufacturer-specific object of another type, with the same index by chance."""
     return _VENDORS[0] <= variable.index <= _VENDORS[1] and variable.data_type != own.data_type
 
 

@@ -33,7 +33,7 @@ class Emergency:
         self._dictionary = dictionary
         self._send = send
         self.active: list[int] = []
-        """Codes of the errors that have not ended, oldest first."""
+        """Codes of the errors that are still active, oldest first."""
         dictionary[0x1001, 0].bind(self._register)
         dictionary[0x1014, 0].guard = self._check_can_id
         dictionary[0x1003, 0].guard = only(0)
@@ -61,7 +61,7 @@ class Emergency:
         self._transmit(code, additional)
 
     def clear(self, code: int) -> None:
-        """Ends one error and sends the latest one still active, or 'error reset' after the last."""
+        """Ends one error and sends the latest error still active, or 'error reset' after the last."""
         if code in self.active:
             self.active.remove(code)
             self._transmit(self.active[-1] if self.active else ErrorCode.NONE, b"")

@@ -1,7 +1,7 @@
 """Fault injection in the simulated drive, for tests of a master.
 
 ``node.faults`` is the only access. Counted faults end automatically; the caller switches the others off.
-Without a pending fault, the cyclic path pays for one attribute look-up.
+Without a pending fault, the cost to the cyclic path is one attribute look-up.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ class Faults:
     drop_tpdos: int = 0
     """The next n TPDOs are lost."""
     shorten_tpdos: int = 0
-    """The next n come without their last byte."""
+    """The next n TPDOs lose their last byte."""
     duplicate_tpdos: int = 0
-    """The next n come twice."""
+    """The next n TPDOs are sent twice."""
     hold_tpdos: int = 0
-    """The next n come delayed by one SYNC, after the fresh ones."""
+    """The next n TPDOs are delayed by one SYNC and sent after the fresh ones."""
     reverse_tpdos: int = 0
-    """The TPDOs of the next n SYNCs come in reverse order."""
+    """The TPDOs of the next n SYNCs are sent in reverse order."""
     mute_heartbeat: bool = False
     """The heartbeat stops; everything else continues."""
     silent: bool = False
@@ -54,9 +54,9 @@ class Faults:
     ignore_missing_set_points: bool = False
     """The drive does not notice that RPDOs are missing."""
     deceleration_counts_s2: float | None = None
-    """Deceleration of every ramp, in place of the one that the objects demand; counts/s2."""
+    """Deceleration of every ramp, overriding the objects; counts/s2."""
     pending: list[Callable[[DriveNode], None]] = field(default_factory=list)
-    """For the node: what happens to it at the next poll."""
+    """For the node: events due at the next poll."""
     _held: list[Outgoing] = field(default_factory=list)
 
     def raise_error(self, code: int, additional: bytes = b"") -> None:
@@ -64,24 +64,24 @@ class Faults:
         self.pending.append(lambda node: node.firmware.fault(code, additional))
 
     def lose_master(self, code: int) -> None:
-        """At the next poll: react as 6007h says to the loss of the master, without an EMCY."""
+        """At the next poll: loss of the master without an EMCY, with the reaction of 6007h."""
         self.pending.append(lambda node: node.firmware.connection_lost(code))
 
     def miss_master(self, code: int) -> None:
-        """At the next poll: as ``lose_master``, with the EMCY ``code`` (8130h or 8250h)."""
+        """At the next poll: like ``lose_master``, with the EMCY ``code`` (8130h or 8250h)."""
         self.pending.append(lambda node: node.emergency.occur(code))
         self.lose_master(code)
 
     def boot_up(self) -> None:
-        """At the next poll: reset as after a brown-out, with a boot-up message, whatever the axis does."""
+        """At the next poll: reset with a boot-up message, as after a brown-out, in any state of the axis."""
         self.pending.append(lambda node: node.reset())
 
     def leave_operational(self) -> None:
-        """At the next poll: enter PRE-OPERATIONAL, whatever the axis does, and report it by heartbeat."""
+        """At the next poll: change to PRE-OPERATIONAL with a heartbeat, in any state of the axis."""
         self.pending.append(lambda node: node.drop_out())
 
     def open_enable_input(self) -> None:
-        """At the next poll: switch the power stage off without an EMCY, as a hardware enable input does."""
+        """At the next poll: power stage off without an EMCY, as by a hardware enable input."""
         self.pending.append(lambda node: node.firmware.power_cut())
 
     @property

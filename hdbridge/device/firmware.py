@@ -1,7 +1,7 @@
 """The CiA-402 firmware of the simulated drive: power states, stopping, supervision, and the objects of 6000h.
 
 The node calls ``advance`` once per period, and ``control`` through the controlword object; everything else
-goes through the dictionary. The firmware reads no clock: it adds up the periods.
+goes through the dictionary. The firmware does not read a clock but adds up the periods.
 """
 
 from typing import Final
@@ -41,7 +41,7 @@ _REFERENCED: Final = int(Status.REFERENCED)
 
 
 class _Braking:
-    """A stop in progress: its ramp, and the state (None: unchanged) or mode that follows it."""
+    """Stop in progress: its ramp, and the state (None: unchanged) or mode that follows."""
 
     def __init__(self, ramp: Profile, then: State | None) -> None:
         self.ramp = ramp
@@ -97,7 +97,8 @@ class Firmware:
         self._awaits_power = False
         self._resetting = False
         self._stopped_itself = False
-        """In QUICK STOP ACTIVE without a command; a repeated controlword ends it only if levels are read."""
+        """True in QUICK STOP ACTIVE without a command. A repeated controlword then ends it only if levels
+        are read."""
         self._beyond_window_s = 0.0
         self._following_error = False
         self._error_code = 0
@@ -170,7 +171,7 @@ class Firmware:
         return word
 
     def _delay_status(self) -> None:
-        """Keeps 6041h and 6061h at their present values for the delay that follows a command."""
+        """Keeps 6041h and 6061h at their present values for the delay after a command."""
         if self._status_delay_s:
             if self._old_status_s <= 0.0:
                 self._old_statusword, self._old_mode = self._statusword(), self._mode.number
@@ -209,7 +210,7 @@ class Firmware:
         self._state_bits = state.value | _ALWAYS
 
     def control(self, word: int) -> None:
-        """Evaluates a controlword. A repeated one is ignored, unless the drive reads levels."""
+        """Evaluates a controlword; a repeated controlword is ignored unless the drive reads levels."""
         if word == self._word and not self._waits_for_rest and not self._by_level:
             return
         if word != self._word:
@@ -312,7 +313,7 @@ class Firmware:
             self._mode.resume()
 
     def _brake(self, option: int, then: State | None) -> None:
-        """Stops on the ramp that an option code of 605Ah to 605Eh selects, then enters ``then``."""
+        """Stops on the ramp selected by an option code of 605Ah to 605Eh, then enters ``then``."""
         value = self._dictionary.value
         deceleration: float = value(0x60C6)  # 'current limit' and 'voltage limit' brake with maximum torque
         if option in SLOW_DOWN_RAMP:
@@ -338,7 +339,7 @@ class Firmware:
     # ---------------------------------------------------------------- errors
 
     def fault(self, code: int, additional: bytes = b"") -> None:
-        """Reports a malfunction, stops the axis as 605Eh says and ends in FAULT."""
+        """Reports a malfunction, stops the axis as selected by 605Eh, and ends in FAULT."""
         self._emergency.occur(code, additional)
         self._error_code = code
         if self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
@@ -352,12 +353,12 @@ class Firmware:
         self._brake(option, State.FAULT)
 
     def power_cut(self) -> None:
-        """Switches the power stage off, as an opening enable input does. An active fault stays active."""
+        """Switches the power stage off, as by an opening enable input. An active fault stays active."""
         in_fault = self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
         self._power_off(State.FAULT if in_fault else State.SWITCH_ON_DISABLED)
 
     def connection_lost(self, code: int) -> None:
-        """Reacts to the loss of the master as 6007h says; ``code`` is the EMCY code of the loss."""
+        """Reacts to the loss of the master as selected by 6007h; ``code`` is the EMCY code of the loss."""
         option = self._dictionary.value(0x6007)
         is_powered = self.state in POWERED or self._awaits_power
         if option == 1 and is_powered:

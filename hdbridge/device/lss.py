@@ -11,9 +11,9 @@ from typing import Final
 REQUEST: Final = 0x7E5
 ANSWER: Final = 0x7E4
 UNCONFIGURED: Final = 255
-"""Node id of a node without one: it answers only to LSS."""
+"""Node id of an unconfigured node, which answers only to LSS."""
 BIT_RATES_BPS: Final = (1_000_000, 800_000, 500_000, 250_000, 125_000, 100_000, 50_000, 20_000, 10_000)
-"""Table 0 of bit timings, by index."""
+"""Bit rates of table 0, by index."""
 _NUMBER: Final = struct.Struct("<BI3x")
 _FAST_SCAN: Final = struct.Struct("<BIBBB")
 _RESTART_SCAN: Final = 0x80
@@ -28,19 +28,18 @@ class LssSlave:
     def __init__(
         self, identity: Callable[[int], int], node_id: int, *, stores: bool, bit_rate_bps: int | None = None
     ) -> None:
-        """``identity`` returns a sub-index of 1018h; ``stores``: a node id can be stored.
+        """``identity`` returns a sub-index of 1018h; ``stores`` states that a node id can be stored.
 
-        ``bit_rate_bps`` is the only one that the interface has; None if it is not known.
+        ``bit_rate_bps`` is the only bit rate of the interface; None if unknown.
         """
         self.node_id = node_id
-        """In use."""
         self.pending = self.stored = node_id
-        """In use after the next reset of the communication, and after the next reset of the node."""
+        """Node id after the next reset of the communication, and after the next reset of the node."""
         self.configuring = False
         """True in LSS configuration state, False in LSS waiting state."""
         self._identity, self._stores, self._bit_rate_bps = identity, stores, bit_rate_bps
         self._next = self._scanned = 0
-        """Next request of an identity that agreed so far; part of the identity that is scanned."""
+        """Number of the next identity request after those that agreed, or of the identity part under scan."""
 
     def respond(self, request: bytes) -> bytes | None:
         """Returns the answer to a request; None for a request that is not answered."""
@@ -70,14 +69,14 @@ class LssSlave:
         return self._identity(place + 1)
 
     def _in_range(self, command: int, number: int) -> bool:
-        """Vendor and product, then lower and upper end of revision and serial number."""
+        """Returns True for the same vendor and product, and a revision and serial number within the range."""
         if command <= 0x47:
             return number == self._part(command - 0x46)
         own = self._part(2 + (command - 0x48) // 2)
         return number <= own if command % 2 == 0 else own <= number
 
     def _agrees(self, command: int, span: tuple[int, int], part_agrees: bool) -> bool:
-        """Takes one of the requests that together select an identity; True once all have matched in order."""
+        """Takes one of the requests that select an identity; returns True once all matched in order."""
         agrees = part_agrees and command in (span[0], self._next)
         self._next = command + 1 if agrees else 0
         return agrees and command == span[1]

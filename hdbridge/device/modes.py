@@ -27,7 +27,7 @@ _BIT_13: Final = int(Status.MODE_13)
 
 
 class Mode:
-    """An operating mode in OPERATION ENABLED. The base class is mode 0, 'no mode', and holds the position."""
+    """Operating mode in OPERATION ENABLED. The base class is mode 0, 'no mode', and holds the position."""
 
     number: ClassVar[int] = 0
 
@@ -115,7 +115,7 @@ class InterpolatedPosition(CyclicSynchronousPosition):
 
 
 class _Planned(Mode):
-    """Base class of modes whose moves the drive plans itself."""
+    """Base class of modes with moves planned by the drive."""
 
     _profile: Profile | None
     _elapsed_s: float
@@ -131,11 +131,11 @@ class _Planned(Mode):
         return demand, velocity
 
     def _arrive(self, demand_counts: float) -> None:
-        """Called at the end of a move."""
+        """Handles the end of a move."""
 
 
 class ProfilePosition(_Planned):
-    """PP: trapezoidal moves to set-points; one more set-point may be queued during a move."""
+    """PP: trapezoidal moves to set-points; one set-point may be queued during a move."""
 
     number = 1
 
@@ -219,9 +219,9 @@ class ProfilePosition(_Planned):
 
 
 class Homing(_Planned):
-    """HM: methods 33 and 34 move to the next index pulse, 35 and 37 take the present position.
+    """HM: methods 33 and 34 move to the next index pulse, 35 and 37 use the present position.
 
-    The position found is set to 607Ch. There is one index pulse per motor turn.
+    The position found becomes 607Ch. There is one index pulse per motor turn.
     """
 
     number = 6

@@ -1,7 +1,7 @@
 """Actual and demanded position of the simulated axis, in the plant's counts and in the user's.
 
-The plant counts without bound and knows no home; the user has int32 positions with polarity and home offset.
-All motion is computed in the plant's counts; int32 appears only when objects are read or written.
+The plant counts without bound and without a home. The user has int32 positions with polarity and home offset.
+All motion is computed in the plant's counts; int32 occurs only in objects that are read or written.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ class Machine(Protocol):
         ...
 
     def coast(self, substeps: int, braked: bool) -> None:
-        """Power stage off, holding brake open or closed."""
+        """Power stage off, with the holding brake open or closed."""
         ...
 
 
@@ -45,8 +45,8 @@ class Motion:
     """Demand and actual position of the axis, shared by the firmware and its operating modes.
 
     ``demand_counts`` and ``velocity_counts_s`` are position and velocity of the demand, in the plant's
-    coordinates; ``motor_counts`` and ``load_counts`` are the latest encoder samples. ``limited`` becomes true
-    when a limit cuts a target.
+    coordinates; ``motor_counts`` and ``load_counts`` are the latest encoder samples. ``limited`` becomes True
+    when a limit reduces a target.
     """
 
     def __init__(self, dictionary: Dictionary, machine: Machine) -> None:
@@ -86,9 +86,8 @@ class Motion:
     def goal(self, target: int) -> float:
         """Converts a user's int32 target to a plant position within the limits.
 
-        Without limits positions wrap around, and the one nearest to the demand is meant.
-        An axis that already is beyond a software limit may stay where it is and come back; it is not
-        dragged inside.
+        Without limits, positions wrap around, and the target is the one nearest to the demand. An axis that
+        is already beyond a software limit may stay there and return; it is not forced inside.
         """
         sign = self.sign
         here = sign * round(self.demand_counts) + self.home_counts
@@ -105,7 +104,7 @@ class Motion:
         return sign * (here + distance - self.home_counts)
 
     def unlimited(self, target: int) -> float:
-        """Converts a user's int32 target to the plant position nearest to the demand, whatever the limits."""
+        """Converts a user's int32 target to the plant position nearest to the demand, ignoring the limits."""
         distance = target - self.demand_position()
         return self.demand_counts + self.sign * (distance if self._has_limits else wrap_int32(distance))
 

@@ -7,7 +7,7 @@ from hdbridge.device.dictionary import Dictionary
 
 LOAD_OBJECT: Final = (0x60E4, 1)
 MOTOR_POSITION: Final = (0x6064, 0)
-"""Position actual value, always that of the motor: an axis file that names it has no load encoder."""
+"""Position actual value, always of the motor; an axis file that uses it has no load encoder."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Nameplate:
     gear_load_turns: int = 1
     rated_torque_mnm: int = 320
     load_object: tuple[int, int] = LOAD_OBJECT
-    """Index and sub-index of the object that the load encoder is read from."""
+    """Index and sub-index of the load encoder's object."""
 
     def engrave(self, dictionary: Dictionary) -> None:
         """Writes these values to the dictionary, as present values and as defaults."""

@@ -1,10 +1,10 @@
-"""The simulated drive as a CANopen node: NMT, heartbeats, SYNC, PDOs, SDO and EMCY around the firmware.
+"""Simulated drive as a CANopen node: NMT, heartbeats, SYNC, PDOs, SDO and EMCY around the firmware.
 
-Upon SYNC the node first sends its synchronous TPDOs with the values of that moment, then applies the
-synchronous RPDOs that came since the last one, then runs its axis for exactly one period of object 60C2h.
-(Some drives apply RPDOs first: `Behaviour` has this and other choices of a firmware.)
-Before the first SYNC, and when SYNC is missing for one and a half periods, the clock drives the axis instead,
-so a drive without a master can still stop. Single-threaded: everything happens inside ``poll``.
+Upon SYNC, the node first sends its synchronous TPDOs with the present values, then applies the synchronous
+RPDOs received since the last SYNC, then runs its axis for exactly one period of object 60C2h. (Some drives
+apply RPDOs first; `Behaviour` has this and other choices.) Before the first SYNC, and when SYNC is missing
+for one and a half periods, the clock drives the axis instead, so a drive without a master can still stop.
+Single-threaded: everything happens inside ``poll``.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ from hdbridge.device.syncclock import SyncClock
 
 PDO_COUNT: Final = 512
 LONGEST_CATCH_UP_S: Final = 1.0
-"""Maximum time that a late poll makes up for."""
+"""Maximum delay that a late poll makes up for."""
 
 FRAMES_PER_POLL: Final = 64
 
@@ -45,7 +45,7 @@ _INITIALISING = NmtState.INITIALISING
 # For the cyclic path: to look a member up in its class takes five times as long as a name of the module.
 
 _AFTER_ERROR: Final = {0: NmtState.PRE_OPERATIONAL, 2: NmtState.STOPPED}
-"""Object 1029h:01: the NMT state after a communication error; 1 changes nothing."""
+"""NMT state after a communication error, by the value of 1029h:01; 1 changes nothing."""
 
 
 class DriveNode:
@@ -53,9 +53,9 @@ class DriveNode:
 
     ``bus`` is any python-can bus, and is read only here; ``eds_path`` declares the objects; ``clock`` gives
     the time of start; ``nameplate`` distinguishes drives, ``behaviour`` their firmware. ``stage`` is a power
-    stage that takes time or fails, ``store`` the file of the stored parameters, ``bit_rate_bps`` the one that
-    LSS may configure, which is that of the interface.
-    ``poll`` must be called when frames may have come and at ``next_event_s``.
+    stage with delays or failures, ``store`` the file of the stored parameters, and ``bit_rate_bps`` the bit
+    rate of the interface, the only one that LSS can configure. ``poll`` must be called when frames may have
+    arrived and at ``next_event_s``.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class DriveNode:
 
     @property
     def node_id(self) -> int:
-        """The node id in use; 255 if LSS took it away."""
+        """Node id in use; 255 if LSS removed it."""
         return self._lss.node_id
 
     def _boot(self) -> None:
@@ -167,7 +167,7 @@ class DriveNode:
 
     @property
     def now_s(self) -> float:
-        """Reception of the frame, or time of the event, that is being processed; on the node's clock."""
+        """Time of reception of the frame, or of the event, that is being processed; on the node's clock."""
         return self._now_s
 
     @property
@@ -176,13 +176,13 @@ class DriveNode:
         return self._sync_due_s < _NEVER
 
     def sync_is_late(self, now_s: float) -> bool:
-        """Returns True while SYNC is late by so much that the node runs on its own clock."""
+        """Returns True if SYNC is so late that the node runs on its own clock."""
         left = self.behaviour.sync_timeout_periods - 0.5
         return self._sync_due_s - left * self._period_s <= now_s
 
     @property
     def period_s(self) -> float:
-        """The period of 60C2h, or of SYNC if the drive measures it."""
+        """Period of 60C2h, or of SYNC if the drive measures it."""
         return self._period_s
 
     @property
@@ -224,7 +224,7 @@ class DriveNode:
         self._due_s = self._now_s
 
     def _route(self) -> None:
-        """Assigns frames and SYNC to the PDOs that are active now."""
+        """Assigns frames and SYNC to the active PDOs."""
         running = self.nmt is NmtState.OPERATIONAL
         tpdos = [pdo for pdo in self._tpdos if running and pdo.valid]
         rpdos = [pdo for pdo in self._rpdos if running and pdo.valid]
@@ -398,7 +398,7 @@ class DriveNode:
         self._route()
 
     def _leave_operational(self, state: NmtState) -> None:
-        """Stops the PDOs; an axis that depends on them has lost its master (6007h)."""
+        """Stops the PDOs. An axis that depends on them has lost its master (6007h)."""
         lost = state is NmtState.STOPPED or (
             self.nmt is NmtState.OPERATIONAL and self.firmware.follows_the_bus
         )
@@ -432,7 +432,7 @@ class DriveNode:
         self._boot()
 
     def reset(self) -> None:
-        """Starts again as after power-on, with a boot-up message (NMT reset node)."""
+        """Restarts as after power-on, with a boot-up message (NMT reset node)."""
         self._lss.pending = self._lss.stored
         self._lss.configuring = False
         self._take_node_id()
@@ -512,7 +512,7 @@ class DriveNode:
     def _lose_sync(self) -> None:
         """Discards pending set-points when SYNC is overdue, and stops an axis that follows the bus.
 
-        The period is reset to 60C2h, because the measured period of sparse SYNCs is too long for an axis on
+        The period returns to 60C2h, because the measured period of sparse SYNCs is too long for an axis on
         its own clock.
         """
         self._sync_due_s = _NEVER
@@ -524,7 +524,7 @@ class DriveNode:
             self.firmware.connection_lost(ErrorCode.SYNC_LOST)
 
     def bus_failed(self) -> None:
-        """Reacts to an interface that is down or bus-off as to a lost master (6007h), in any mode."""
+        """Reacts to an interface that is down or bus-off like to a lost master (6007h), in any mode."""
         for rpdo in self._rpdos:
             rpdo.pending = None
         self.firmware.connection_lost(ErrorCode.COMMUNICATION)

@@ -1,4 +1,4 @@
-"""Stored parameters (1010h, 1011h): a master's configuration survives a reset, and with a file power-off."""
+"""Stored parameters (1010h, 1011h): a master's configuration survives a reset and, with a file, power-off."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -41,7 +41,7 @@ class StoredParameters:
             entry.guard = check
 
     def restore(self, first: int = 0x0000, last: int = 0xFFFF) -> None:
-        """Restores the stored values, or else the defaults, in this range of indices."""
+        """Restores the stored values, else the defaults, in this range of indices."""
         self._dictionary.restore(first, last)
         for (index, sub), value in self._stored.items():
             if first <= index <= last and (index, sub) in self._dictionary:

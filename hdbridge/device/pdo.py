@@ -1,7 +1,7 @@
-"""The PDOs of the simulated drive: configured over SDO as in CiA 301, and compiled once for speed.
+"""PDOs of the simulated drive, configured by SDO as in CiA 301 and compiled once for speed.
 
 Each PDO guards its communication and mapping parameters in the dictionary. Whenever they change, the mapping
-is compiled to one ``struct`` and the bound readers or writers; a cycle only calls those.
+is compiled to one ``struct`` and the bound readers or writers; a cycle only calls these.
 """
 
 import struct
@@ -114,7 +114,7 @@ class Pdo:
         raise NotImplementedError
 
     def _mapped(self, word: int) -> Entry:
-        """Returns the entry that a mapping word names; refuses one that cannot be mapped to this PDO."""
+        """Returns the entry of a mapping word; refuses an entry that cannot be mapped to this PDO."""
         index, sub = word >> 16, word >> 8 & 0xFF
         entry = _gap(index) if index in DUMMIES and sub == 0 else self._dictionary.open(index, sub)
         if not entry.mappable or not self._may_map(entry) or entry.bits != word & 0xFF:
@@ -131,7 +131,7 @@ class Pdo:
         return self._dictionary.value(self._communication, 1) & ~INVALID
 
     def _check_fixed(self, sub: int, value: int) -> None:
-        """Refuses another value while the PDO exists; some masters write the one that is there."""
+        """Refuses a different value while the PDO exists, because some masters write the present value."""
         if self.valid and value != self._parameter(sub):
             raise SdoAbortError(Abort.STATE)
 
@@ -150,11 +150,11 @@ class Pdo:
 
 
 class TransmitPdo(Pdo):
-    """A TPDO."""
+    """Transmit PDO."""
 
     def __init__(self, dictionary: Dictionary, number: int, changed: Callable[[], None]) -> None:
         self.pack: Callable[[], bytes] = bytes
-        """Returns the mapped values now."""
+        """Returns the present mapped values."""
         self.sent: bytes | None = None
         self.sent_s = -float("inf")
         self.syncs_to_go = 1
@@ -181,7 +181,7 @@ class TransmitPdo(Pdo):
         self.sync_start = self._parameter(6)
 
     def has_started(self, sync: bytearray) -> bool:
-        """Returns True from the SYNC with the start value on, or from any without a counter (CiA 301)."""
+        """Returns True from the SYNC with the start value on, or without a counter (CiA 301)."""
         if sync and sync[0] != self.sync_start:
             return False
         self.sync_start, self.syncs_to_go = 0, 1
@@ -213,22 +213,22 @@ class TransmitPdo(Pdo):
         return data
 
     def due_s(self, now_s: float) -> float:
-        """Returns the next time after ``now_s`` at which it may be due: event timer or end of inhibit."""
+        """Returns the next time after ``now_s`` at which the PDO may be due: event timer, end of inhibit."""
         due_s = self.sent_s + self.event_timer_s if self.event_timer_s > 0.0 else float("inf")
         inhibited_until_s = self.sent_s + self.inhibit_s
         return min(due_s, inhibited_until_s) if inhibited_until_s > now_s else due_s
 
 
 class ReceivePdo(Pdo):
-    """An RPDO: synchronous data waits in ``pending`` for the next SYNC.
+    """Receive PDO; synchronous data waits in ``pending`` for the next SYNC.
 
-    ``deadline_s`` is the time by which the next one must arrive (event timer), armed by the first one.
+    ``deadline_s`` is the time by which the next RPDO must arrive (event timer), armed by the first one.
     """
 
     def __init__(
         self, dictionary: Dictionary, number: int, changed: Callable[[], None], *, holds: bool = False
     ) -> None:
-        """``holds``: data waiting for SYNC survive a change of the NMT state."""
+        """``holds`` states that data waiting for SYNC survive a change of the NMT state."""
         self._holds = holds
         self._writers: tuple[Callable[[int], None], ...] = ()
         self.length = 0
@@ -247,7 +247,7 @@ class ReceivePdo(Pdo):
         self.restart()
 
     def restart(self) -> None:
-        """Disarms the deadline and, unless the drive holds them, discards data that wait for SYNC."""
+        """Disarms the deadline and, unless the drive holds it, discards the data waiting for SYNC."""
         if not self._holds:
             self.pending = None
         self.deadline_s = float("inf")

@@ -1,6 +1,6 @@
-"""The CiA-402 power state machine of the simulated drive, as tables.
+"""CiA-402 power state machine of the simulated drive, as tables.
 
-Written from the profile, independently of the master's table, so that one checks the other.
+Written from the profile, independently of the master's table, so that each verifies the other.
 """
 
 from enum import Enum, IntEnum
@@ -57,11 +57,11 @@ class Status(IntEnum):
 
 
 class PowerStage:
-    """The power stage as the firmware sees it. This one switches immediately and never fails.
+    """Power stage as seen by the firmware. This class switches immediately and never fails.
 
-    The firmware asks for power with ``switch`` and operates the axis only while ``is_on``. ``error_code`` is
-    the emergency error code of a failure (0: none) and stays until a ``reset`` has removed it. The firmware
-    remains in FAULT while ``is_resetting``.
+    The firmware requests power with ``switch`` and operates the axis only while ``is_on``. ``error_code`` is
+    the emergency error code of a failure (0 for none) and stays until a ``reset`` has removed it. The
+    firmware remains in FAULT while ``is_resetting``.
     """
 
     is_on = True
@@ -74,7 +74,7 @@ class PowerStage:
         """Requests power, or switches it off."""
 
     def reset(self) -> None:
-        """Requests the end of a failure."""
+        """Requests the removal of a failure."""
 
 
 POWERED: Final = frozenset({State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE})
@@ -119,6 +119,6 @@ def command_of(controlword: int) -> Command | None:
 
 
 def next_state(state: State, controlword: int) -> State:
-    """Returns the state that ``controlword`` requests in ``state``, or ``state`` if it requests none."""
+    """Returns the state that ``controlword`` requests in ``state``, or ``state`` without a request."""
     command = command_of(controlword)
     return state if command is None else TRANSITIONS.get((state, command), state)

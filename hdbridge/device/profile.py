@@ -84,7 +84,8 @@ def move(
 ) -> Profile:
     """Returns the fastest profile within the limits from any state of motion to rest at ``target``.
 
-    If the start is too fast, in the wrong direction or too near, the profile brakes first and then returns.
+    If the initial velocity is too high or in the wrong direction, or the target too near, the profile brakes
+    first and then returns.
     """
     builder = _Builder(position, velocity)
     overshoots = (target - stop(position, velocity, deceleration).end) * velocity < 0.0

@@ -13,7 +13,7 @@ LONGEST_WAIT_S: Final = 0.1
 """Default maximum interval between calls of ``should_stop``."""
 
 PATIENCE_S: Final = 5.0
-"""Maximum time of continuous read failures: an interface that is down may come up again."""
+"""Maximum duration of read failures, because an interface that is down may come up again."""
 
 
 class Served(Protocol):
@@ -34,10 +34,11 @@ class Server:
         self._failing_since_s: float | None = None
 
     def poll(self, wait_s: float | None = None) -> bool:
-        """Waits for a frame for at most ``wait_s``, then handles all that is due; False if reading failed.
+        """Waits for a frame for at most ``wait_s``, then handles everything that is due; False if reading
+        failed.
 
-        A failure of the interface stops the axis as 6007h says, and the node continues on its own clock.
-        Raises BusError when reading has failed for ``PATIENCE_S``.
+        A failure of the interface stops the axis as selected by 6007h, and the node continues on its own
+        clock. Raises BusError when reading has failed for ``PATIENCE_S``.
         """
         node, now = self._node, self._clock.now
         try:
@@ -69,8 +70,8 @@ def run(
 ) -> None:
     """Serves ``node``, whose bus is ``bus``, until ``should_stop`` returns True.
 
-    ``longest_wait_s`` is the maximum delay until a new event of the node is noticed. Raises BusError as
-    `Server.poll` does.
+    ``longest_wait_s`` is the maximum delay until a new event of the node is noticed. Raises BusError like
+    `Server.poll`.
     """
     server = Server(bus, node, clock)
     while not should_stop():
@@ -80,9 +81,9 @@ def run(
 
 
 def _age_s(message: can.Message) -> float:
-    """Returns how long a frame waited for this process, by its SocketCAN time stamp; else 0.
+    """Returns the time for which a frame waited for this process, by its SocketCAN time stamp; else 0.
 
-    The stamp is wall-clock time. A difference that is negative or longer than ``LONGEST_WAIT_S`` comes from a
+    The stamp is wall-clock time. A negative difference, or one longer than ``LONGEST_WAIT_S``, comes from a
     step of that clock and is ignored.
     """
     age_s = time.time() - message.timestamp

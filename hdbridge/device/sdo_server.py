@@ -1,6 +1,6 @@
-"""The SDO server of a device (CiA 301): expedited, segmented and block transfers in both directions.
+"""SDO server of a device (CiA 301): expedited, segmented and block transfers in both directions.
 
-It does no I/O: the node passes eight data bytes and sends the answers that are returned.
+It does no I/O: the node passes eight data bytes and sends the returned answers.
 """
 
 import struct
@@ -16,7 +16,7 @@ _TOGGLE: Final = 0x10
 
 
 class _Client(IntEnum):
-    """Client command specifiers: the upper three bits of a request."""
+    """Client command specifiers, the upper three bits of a request."""
 
     DOWNLOAD_SEGMENT = 0
     DOWNLOAD = 1
@@ -28,7 +28,7 @@ class _Client(IntEnum):
 
 
 class _Block(Enum):
-    """The step of a block transfer that is due."""
+    """Next step of a block transfer."""
 
     NONE = "none"
     SEGMENTS_IN = "segments of a download"
@@ -42,7 +42,7 @@ _MOST_SEGMENTS: Final = 127
 
 
 class SdoServer:
-    """SDO server for one client: one transfer at a time."""
+    """SDO server for one client, with one transfer at a time."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
@@ -99,7 +99,7 @@ class SdoServer:
             return [_ABORT.pack(0x80, *self._object, abort.code)]
 
     def _open(self, request: bytes) -> Entry:
-        """Opens the entry for a new transfer; an unfinished one is discarded, as the client abandoned it."""
+        """Opens the entry for a new transfer; discards an unfinished one, which the client has abandoned."""
         self._entry = None
         _, *self._object = _HEAD.unpack_from(request)
         return self._dictionary.open(self._object[0], self._object[1])

@@ -7,14 +7,14 @@ SHORTEST_PERIOD_S: Final = 0.000_5
 _GAIN: Final = 0.05
 """Final gain of the time correction; the gain of the period is half its square."""
 _ASTRAY: Final = 0.5
-"""Deviation beyond which the tracking restarts at the present SYNC; periods."""
+"""Deviation above which tracking restarts at the present SYNC; periods."""
 _ANOTHER: Final = 0.1
 _AGREEING: Final = 3
 """Number of successive intervals, equal within `_ANOTHER`, that replace a different period."""
 
 
 class SyncClock:
-    """A second-order tracking filter, so a constant drift between two clocks leaves no error.
+    """Second-order tracking filter, in which a constant drift between two clocks leaves no error.
 
     It begins with a least-squares line through all SYNCs and ends with fixed gains.
     """

@@ -1,4 +1,4 @@
-"""Fits the boot-up's writes to a drive: objects that its EDS lacks or fixes are left to the drive. Pure."""
+"""Adapts the boot-up's writes to a drive: leaves objects that its EDS lacks or fixes to the drive. Pure."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -35,17 +35,17 @@ class Left:
 def plan(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[PlannedWrite]:
     """Returns all writes of a boot-up in order, for the drive and for a load encoder with its own node id.
 
-    ``od`` is the drive's object dictionary, by default that of the axis's EDS. Objects that are left to the
-    drive are omitted, and unused PDOs are disabled. Raises `InputError` with the line of the axis file if a
-    value cannot be expressed in its object, or if the EDS forbids it, lacks an object that the control cycle
-    or the axis file needs, or excludes the mode.
+    ``od`` is the drive's object dictionary, by default that of the axis's EDS. Objects left to the drive are
+    omitted, and unused PDOs are disabled. Raises `InputError` with the line of the axis file if a value
+    cannot be expressed in its object, or if the EDS forbids it, lacks an object that the control cycle or the
+    axis file needs, or excludes the mode.
     """
     return _sorted(axis, od)[0]
 
 
 def left_to_drive(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[Left]:
-    """Returns the objects that `plan` leaves to the drive, and missing ones that the control cycle can do
-    without.
+    """Returns the objects that `plan` leaves to the drive, and missing objects that the control cycle does
+    not need.
     """
     od = dictionary_of(axis) if od is None else od
     if od is None:
@@ -68,7 +68,7 @@ def sent_along(axis: AxisConfig) -> list[str]:
 
 
 def _sorted(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[list[PlannedWrite], list[Left]]:
-    """Splits all rows into those that the boot-up writes and the objects that are left to the drive."""
+    """Splits all rows into the writes of the boot-up and the objects left to the drive."""
     od = dictionary_of(axis) if od is None else od
     if od is not None:
         _check_mode(axis, od)
@@ -90,7 +90,7 @@ def _sorted(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[list[Planned
 
 
 def _left_because(axis: AxisConfig, od: ObjectDictionary, row: PlannedWrite) -> str | None:
-    """Returns the reason to leave an object to the drive, or None if the boot-up sets it.
+    """Returns the reason for leaving an object to the drive; None if the boot-up sets it.
 
     Raises `InputError` if the drive must not keep its own value.
     """
@@ -142,7 +142,7 @@ def _check_mode(axis: AxisConfig, od: ObjectDictionary) -> None:
 
 
 def _value_of_6502h(od: ObjectDictionary) -> int:
-    """Returns the supported drive modes (6502h) given by the EDS; 0 if it gives none."""
+    """Returns the supported drive modes (6502h) from the EDS; 0 if missing there."""
     variable = find(od, objects.SUPPORTED_MODES.index, objects.SUPPORTED_MODES.sub)
     return (held(variable) if variable is not None else None) or 0
 

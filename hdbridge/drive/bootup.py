@@ -1,7 +1,7 @@
 """Boot-up: takes an unknown node to a verified, configured drive in OPERATIONAL, with power off.
 
-Nothing is assumed. Identity and scaling are compared with the axis file; every object is read before it is
-written and read back afterwards. The first mismatch ends the boot-up with an error that names the object,
+Nothing is assumed. Identity and scaling are compared with the axis file. Every object is read before it is
+written, and read back afterwards. The first mismatch ends the boot-up with an error that names the object,
 unless the object may be left to the drive.
 """
 
@@ -39,7 +39,7 @@ _log = logging.getLogger(__name__)
 BOOT_UP_TIMEOUT_S: Final = 2.0
 """Time from a reset to the boot-up message, after which the node is queried directly; s."""
 SDO_AFTER_BOOT_UP_S: Final = 3.5
-"""Time from the boot-up message to the first SDO answer that a node is allowed; s."""
+"""Maximum time from the boot-up message to the first SDO answer of a node; s."""
 STATE_TIMEOUT_S: Final = 1.0
 _POLL_S: Final = 0.02
 _WRITE_ONLY: Final = 0x0601_0001
@@ -50,7 +50,7 @@ _MAPPINGS_PER_KIND: Final = 0x200
 
 @dataclass(frozen=True, slots=True)
 class BootReport:
-    """Result of a boot-up: what was found and written."""
+    """Result of a boot-up: values found and written."""
 
     node_id: int
     identity: dict[str, int]
@@ -64,16 +64,16 @@ class BootReport:
     written: tuple[PlannedWrite, ...] = ()
     """The subset of ``held`` that had to be written."""
     left: frozenset[tuple[int, int]] = frozenset()
-    """Index and sub-index of the objects whose value the drive refused and was allowed to keep."""
+    """Index and sub-index of the objects whose value the drive refused and could keep."""
     notes: tuple[str, ...] = field(default=())
-    """Remarks for the user that are no reason to refuse the drive."""
+    """Remarks for the user that do not justify refusing the drive."""
 
 
 class BootUp:
     """One boot-up.
 
     ``clients`` maps node ids to SDO clients: the drive's, and that of a separate load encoder.
-    ``others_heard`` are other nodes that have been heard before.
+    ``others_heard`` are other nodes heard before.
     """
 
     def __init__(
@@ -120,9 +120,9 @@ class BootUp:
         return self._report(identity, modes)
 
     def look(self) -> BootReport:
-        """Compares a running drive with its axis file; writes nothing and changes no state.
+        """Compares a running drive with its axis file, without writing or changing a state.
 
-        Raises as `run` does.
+        Raises like `run`.
         """
         self._check_device_type()
         identity = self._check_identity()
@@ -196,7 +196,7 @@ class BootUp:
             raise IdentityError(first)
 
     def _readings(self, addresses: Iterable[Address]) -> dict[Address, int]:
-        """Reads those objects that the EDS lists."""
+        """Reads those of the objects that the EDS lists."""
         return {each: self._sdo.fetch(each) for each in addresses if self._sdo.has(each.index, each.sub)}
 
     def _check_device_type(self) -> None:
@@ -237,7 +237,7 @@ class BootUp:
     # -- configuration ------------------------------------------------------------------------------------
 
     def _power_off(self) -> None:
-        """Switches off a drive that an earlier master left with power on, before anything is changed."""
+        """Switches off a drive that an earlier master left powered, before any change."""
         off = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
         state = decode(self._sdo.fetch(objects.STATUSWORD))
         if state in off:
@@ -259,8 +259,8 @@ class BootUp:
             pass
 
     def _configure(self, rows: list[PlannedWrite]) -> None:
-        """Configures one PDO unless it already is as planned; its configuration may be correct
-        and read-only.
+        """Configures a PDO unless it is already as planned, because a correct configuration may be
+        read-only.
         """
         lasting = [row for row in rows if not row.passing]
         wrong = [row for row in lasting if not self._is_held(row)]
@@ -277,7 +277,7 @@ class BootUp:
             self._settle(row)
 
     def _is_held(self, row: PlannedWrite) -> bool:
-        """Returns True if the drive already holds the value; False if the object is write-only."""
+        """Returns True if the drive already holds the value; False for a write-only object."""
         try:
             found = self._read(row)
         except SdoError as error:
@@ -298,7 +298,7 @@ class BootUp:
             raise
 
     def _settle(self, row: PlannedWrite) -> None:
-        """Makes an object hold its value: reads it, writes it if it differs, reads it back."""
+        """Makes an object hold its value: reads it, writes it if different, reads it back."""
         if not self._is_held(row):
             try:
                 self._write(row)
@@ -314,7 +314,7 @@ class BootUp:
             self._held.append(row)
 
     def _may_keep(self, row: PlannedWrite, error: DriveError) -> bool:
-        """Returns True if the drive may keep its own value: a default the user did not set, or a read-only
+        """Returns True if the drive may keep its own value: a default not set by the user, or a read-only
         object.
         """
         if not row.without or row.exact:
@@ -339,7 +339,7 @@ class BootUp:
         if found is not None and not row.holds(found):
             raise DriveError(
                 f"{sdo.describe(row.index, row.sub)}: was written {value} ({row.why}), but reads back "
-                f"{found}; the drive does not take this value{self._decides(row)}"
+                f"{found}; the drive does not accept this value{self._decides(row)}"
             )
 
     def _refused(self, row: PlannedWrite, error: SdoError) -> SdoError:
@@ -368,7 +368,7 @@ def await_sdo(
     """Waits for the first SDO answer of a node and returns its device type (1000h).
 
     A node may answer only seconds after its boot-up message. Raises `DriveError` if it does not answer; the
-    message reports what was heard of the node since its status had the counts ``since``. ``where`` is the key
+    message reports the messages of the node since its status had the counts ``since``. ``where`` is the key
     of the axis file that defines the node. An abort counts as an answer (`SdoAbortError`).
     """
     status = monitor.watch(client.node_id)

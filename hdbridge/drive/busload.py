@@ -19,7 +19,7 @@ from hdbridge.drive.layout import layouts
 from hdbridge.errors import InputError
 
 MAXIMUM_LOAD: Final = 0.8
-"""Maximum share of the cycle taken by its frames. The rest is for retransmissions and other nodes."""
+"""Maximum share of the cycle occupied by its frames. The rest is for retransmissions and other nodes."""
 _STUFFED: Final = 34
 _UNSTUFFED: Final = 13
 _LARGEST: Final = 8
@@ -62,10 +62,10 @@ def cycle_bits(axes: Sequence[AxisConfig]) -> float:
 
 
 def bus_load(axes: Sequence[AxisConfig], bitrate_bps: int | None = None) -> float | None:
-    """Returns the worst-case share of each cycle that its frames take; None if no bit rate is known.
+    """Returns the worst-case share of each cycle occupied by its frames; None without a known bit rate.
 
-    ``bitrate_bps`` is by default that of the axis files. Raises `InputError` if these disagree on the bit
-    rate or on the cycle time.
+    ``bitrate_bps`` is by default that of the axis files. Raises `InputError` if they disagree on the bit rate
+    or the cycle time.
     """
     rate = bitrate_bps if bitrate_bps is not None else _common_bitrate(axes)
     if rate is None or not axes:
@@ -115,7 +115,7 @@ def _common_bitrate(axes: Sequence[AxisConfig]) -> int | None:
 
 
 def _common(values: Iterable[tuple[AxisConfig, float]], field: str) -> float:
-    """Returns the value of a field that all axes share; raises `InputError` if two differ."""
+    """Returns the value of a field that all axes share; raises `InputError` if two values differ."""
     pairs = list(values)
     first, value = pairs[0]
     for axis, other in pairs[1:]:

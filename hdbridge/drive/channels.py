@@ -1,9 +1,9 @@
 """Optional channels of a running axis (load torque, temperature): scaling, range check, hold and loss. Pure.
 
-A channel matters less than the encoders. Without it the axis still holds its position, except for the part of
-the compensation that depends on it, so it does not stop for a missing or implausible reading. The last good
-reading is held for the time given in the axis file. After that the channel is lost and has no value until
-readings return.
+A channel is less important than the encoders. Without it, the axis still holds its position, except for the
+part of the compensation that depends on the channel. The axis therefore does not stop for a missing or
+implausible reading. The last good reading is held for the time given in the axis file. After that, the
+channel is lost and has no value until readings return.
 """
 
 from hdbridge.axis.channels import BY_KEY, MeasuredChannel
@@ -36,15 +36,14 @@ class ChannelFollower:
         is lost.
         """
         self.lost = False
-        """True if no good reading has come for longer than the hold time, so that none is
-        awaited any more.
-        """
+        """True if no good reading has come for longer than the hold time, so that readings are no longer
+        awaited."""
         self.why = "none came"
-        """Reason why there is no new value, for messages."""
+        """Reason for the lack of a new value, for messages."""
         self._age = 0
 
     def accept(self, counts: int) -> None:
-        """Takes a reading; one outside the plausible range is rejected."""
+        """Takes a reading; a reading outside the plausible range is rejected."""
         value = self._of(counts)
         if self._least <= value <= self._greatest:
             self.value = value

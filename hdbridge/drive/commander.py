@@ -1,6 +1,6 @@
 """Commands the drive by SDO, outside the control cycle: walks its states and waits for its statusword.
 
-While it waits it keeps up the master's duties: it processes heartbeats and emergencies and sends the master's
+While waiting, it fulfils the master's duties: it processes heartbeats and emergencies, and sends the master's
 own heartbeat, without which the drive stops.
 """
 
@@ -45,7 +45,6 @@ class Commander:
         return f"node {self.sdo.node_id} on {self.link.name}"
 
     def statusword(self) -> int:
-        """Reads the statusword."""
         self._beat()
         return self.sdo.fetch(objects.STATUSWORD)
 
@@ -56,12 +55,11 @@ class Commander:
         return self.image.power.observe(statusword)
 
     def control(self, controlword: int) -> None:
-        """Writes the controlword."""
         self._beat()
         self.sdo.store(objects.CONTROLWORD, controlword)
 
     def pause(self, duration_s: float) -> None:
-        """Waits; receives frames and sends the master's heartbeat when it is due."""
+        """Waits, receiving frames and sending the master's heartbeat when due."""
         end_s = self.link.now() + duration_s
         while True:
             self._beat()
@@ -80,7 +78,7 @@ class Commander:
     def wait_for(
         self, what: str, done: Callable[[int], bool], timeout_s: float, *, allow_fault: bool = False
     ) -> int:
-        """Polls the statusword until ``done(statusword)`` is true and returns it.
+        """Polls the statusword until ``done(statusword)`` is true, and returns it.
 
         Raises `DriveError` on a fault unless ``allow_fault``, and `TransitionError` on time-out.
         """
@@ -93,7 +91,7 @@ class Commander:
                 raise self.fault(f"while waiting for {what}")
             if self.link.now() >= deadline_s:
                 raise TransitionError(
-                    f"{self.name}: {what} did not come about within {timeout_s:g} s; the drive is in "
+                    f"{self.name}: {what} did not occur within {timeout_s:g} s; the drive is in "
                     f"'{decode(statusword).value}' (statusword {statusword:04X}h); check its enable input, "
                     "supply and error display"
                 )
@@ -110,7 +108,7 @@ class Commander:
         return ", ".join(filter(None, details)) or "no error code is known"
 
     def fault(self, when: str) -> DriveError:
-        """Returns the error to raise for a drive in fault."""
+        """Returns the error for a drive in fault."""
         return DriveError(
             f"{self.name}: fault {when} ({self.fault_words()}); remove the cause (the drive's manual "
             f"explains the code), then reset the fault: {RESET}"

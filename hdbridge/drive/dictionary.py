@@ -22,7 +22,7 @@ def load_eds(path: Path | str, node_id: int) -> ObjectDictionary:
 
 
 def dictionary_of(axis: AxisConfig) -> ObjectDictionary | None:
-    """Returns the dictionary of the axis's drive (shared, read only); None if the axis was not read from a
+    """Returns the read-only, shared dictionary of the axis's drive; None if the axis was not read from a
     file.
     """
     return shared_eds(axis.eds_path, axis.drive.node_id).dictionary if axis.is_from_file else None
@@ -31,7 +31,7 @@ def dictionary_of(axis: AxisConfig) -> ObjectDictionary | None:
 def find(od: ObjectDictionary, index: int, sub: int) -> ODVariable | None:
     """Returns an object that the EDS lists, or None.
 
-    canopen's own look-up would invent missing array members from the first one.
+    canopen's own look-up would derive missing array members from the first member.
     """
     entry = od.get(index)
     if isinstance(entry, ODVariable):
@@ -45,6 +45,6 @@ def integer_type(variable: ODVariable) -> IntegerType | None:
 
 
 def held(variable: ODVariable) -> int | None:
-    """Returns the object's value according to the EDS: its value in a DCF, else its default, else None."""
+    """Returns the object's value in the EDS: its value in a DCF, else its default, else None."""
     value = variable.value if variable.value is not None else variable.default
     return value if isinstance(value, int) else None

@@ -5,7 +5,7 @@
         drive.enable(Mode.PP)
         drive.move_to(90.0)
 
-For the control cycle, `enable()` prepares everything and hands over to ``image.power``: the cycle then walks
+For the control cycle, `enable()` prepares everything and hands over to ``image.power``. The cycle then walks
 the states by PDO, while SYNC and set-points are already running.
 """
 
@@ -87,11 +87,11 @@ class Drive:
         """Result of the last boot-up."""
 
     def listen(self) -> None:
-        """Listens, once, for another master on the bus; raises `BusInUseError` if there is one. Sends
-        nothing.
+        """Listens once for another master on the bus, without sending; raises `BusInUseError` if there is
+        one.
 
-        Takes two heartbeat periods, and at least the 0.51 s in which the slowest other master sends two
-        SYNCs. `boot` calls it; call it before reading objects of a drive that is not booted.
+        Takes two heartbeat periods, and at least the 0.51 s in which the slowest master sends two SYNCs.
+        Called by `boot`; must be called before reading objects of a drive that is not booted.
         """
         if self._may_speak:
             return
@@ -124,7 +124,7 @@ class Drive:
     def take_over(self) -> BootReport:
         """Takes over a drive that another process on this computer has booted, whatever its state.
 
-        Compares it with the axis file and raises as `boot` does; writes nothing.
+        Compares it with the axis file and raises like `boot`; writes nothing.
         """
         self.listen()
         self.report = BootUp(self.link, self.monitor, self.axis, self._clients).look()
@@ -132,7 +132,7 @@ class Drive:
 
     @property
     def identity(self) -> Identity:
-        """Identity of the drive: as read in the boot-up, else as the axis file expects it."""
+        """Identity of the drive, as read in the boot-up, else as expected by the axis file."""
         answered = self.report.identity if self.report else {}
         return Identity.model_validate({**self.axis.drive.identity.model_dump(exclude_none=True), **answered})
 
@@ -140,11 +140,11 @@ class Drive:
         """Prepares for power in ``mode``: sets target = actual position and the mode, checks 6061h, then
         enables.
 
-        The default is the mode of the control cycle (``drive.mode``). In PP and HM the states are walked
-        here, by SDO. A cyclic mode needs SYNC and set-points while the drive is enabled, so only
-        ``image.power`` is aimed and the cycle walks the states. Raises `DriveError` for a fault (call
-        `fault_reset` first) or a position outside the limits, `TransitionError`, and `InputError` for the
-        other cyclic mode.
+        The default is the mode of the control cycle (``drive.mode``). In PP and HM, this method walks the
+        states by SDO. A cyclic mode requires SYNC and set-points while the drive is enabled, so this method
+        only sets the aim of ``image.power``, and the cycle walks the states. Raises `DriveError` for a fault
+        (call `fault_reset` first) or a position outside the limits, `TransitionError`, and `InputError` for
+        the other cyclic mode.
         """
         cyclic = self.image.cyclic.mode
         mode = cyclic if mode is None else mode
@@ -173,7 +173,7 @@ class Drive:
         return self._make_ready(self.image.cyclic.mode)
 
     def _make_ready(self, mode: Mode) -> Positions:
-        """Does everything that precedes power except the target: checks, heartbeat monitoring, mode."""
+        """Does all preparations for power except the target: checks, heartbeat monitoring, mode."""
         modes_of_drive = self._booted().modes
         if mode not in modes_of_drive:
             raise DriveError(
@@ -198,7 +198,7 @@ class Drive:
         return positions
 
     def disable(self) -> None:
-        """Brakes, then switches power off, by SDO. Allowed in every state except an active fault reaction."""
+        """Brakes, then switches power off, by SDO. Permitted in all states but an active fault reaction."""
         state = self._commander.state()
         if state is State.OPERATION_ENABLED:
             self._commander.walk(State.SWITCHED_ON)
@@ -211,7 +211,7 @@ class Drive:
         _log.info("disabled", {"node": self.axis.drive.node_id, "state": state.value})
 
     def fault_reset(self) -> str:
-        """Resets a fault by a rising edge on bit 7; returns its error code and last emergency as text.
+        """Resets a fault by a rising edge on bit 7; returns the error code and last emergency as text.
 
         Raises `TransitionError` if the drive is not in fault, `DriveError` if the fault persists.
         """
@@ -235,18 +235,18 @@ class Drive:
         return words
 
     def quick_stop(self) -> State:
-        """Stops at once as object 605Ah selects; returns the resulting state."""
+        """Stops at once, as selected by object 605Ah; returns the resulting state."""
         return self._commander.quick_stop()
 
     def halt(self) -> bool:
-        """Halts in 'operation enabled' as object 605Dh selects; returns True if the axis came to rest."""
+        """Halts in 'operation enabled', as selected by 605Dh; returns True if the axis came to rest."""
         return modes.halt(self._commander)
 
     def wait(self, duration_s: float) -> None:
         """Waits while the drive is enabled outside the control cycle.
 
-        A drive that hears no heartbeat of the master for ``drive.heartbeat_ms`` stops on its own. This call
-        keeps sending it; a plain sleep does not.
+        A drive that hears no heartbeat of the master for ``drive.heartbeat_ms`` stops on its own. Unlike a
+        plain sleep, this method keeps sending the heartbeat.
         """
         self._commander.pause(duration_s)
 
@@ -279,7 +279,7 @@ class Drive:
     ) -> Positions:
         """Homes by a method of 6098h, enabling the drive if necessary; returns the positions afterwards.
 
-        Speeds, acceleration and offset (607Ch) are at the load. Raises as `move_to` does.
+        Speeds, acceleration and offset (607Ch) are at the load. Raises like `move_to`.
         """
         homing = modes.Homing.checked(
             self.axis,
@@ -307,8 +307,8 @@ class Drive:
         return Positions(motor, load, self.image.motor_deg(motor), self.image.load_deg(load))
 
     def can_set(self, address: Address) -> bool:
-        """Returns True if an object can be written, by the EDS and by what the drive accepted
-        in the boot-up.
+        """Returns True if an object can be written, according to the EDS and to the writes accepted in the
+        boot-up.
         """
         variable = find(self.sdo.od, address.index, address.sub)
         left = self.report.left if self.report is not None else ()
@@ -317,7 +317,7 @@ class Drive:
     def close(self) -> list[str]:
         """Stops and disables the drive and takes it out of OPERATIONAL; returns the problems as text.
 
-        Tries every step and raises nothing of its own, because it also runs when the bus is broken.
+        Tries every step and raises no errors of its own, because it also runs when the bus is broken.
         """
         if not self._touched:
             return []
@@ -341,7 +341,7 @@ class Drive:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Closes the drive; a failure to disable it is raised, or added as a note to the error in flight."""
+        """Closes the drive; a failure to disable it is raised, or added as a note to the present error."""
         problems = self.close()
         if not problems:
             return
@@ -354,10 +354,10 @@ class Drive:
         error.add_note(warning)
 
     def _expect_master(self, expected: bool) -> None:
-        """Makes the drive monitor the master's heartbeat while power may be on, and only then.
+        """Makes the drive monitor the master's heartbeat only while power may be on.
 
-        Without power nothing can move, and the master may be busy with files. A drive starts to monitor at
-        the first heartbeat that it hears after this object was written.
+        Without power nothing can move, and the master may be busy with files. The drive starts monitoring
+        with the first heartbeat after this object was written.
         """
         if self.can_set(objects.HEARTBEAT_CONSUMER):
             self.sdo.store(objects.HEARTBEAT_CONSUMER, master_heartbeat(self.axis) if expected else 0)
@@ -383,7 +383,7 @@ class Drive:
                 quick.store(objects.HEARTBEAT_CONSUMER, 0)
 
     def _power_off_blindly(self) -> None:
-        """Powers off without waiting for answers, with frames that a drive which can only receive still
+        """Powers off without waiting for answers, with frames that even a drive that can only receive
         obeys.
         """
         request = objects.COB_SDO_REQUEST + self.axis.drive.node_id

@@ -1,7 +1,6 @@
 """Names of the error codes in EMCY messages and object 603Fh (CiA 301 table 26, CiA 402-2 annex).
 
-A table and one look-up: the name of the code if the profiles define it, else the class given by its leading
-digits.
+The name of a code is that of the profiles, else the class given by its leading digits.
 """
 
 from typing import Final
@@ -112,7 +111,7 @@ _GATEWAY: Final[dict[int, str]] = {
     0xFF02: "power was refused, did not come, or was lost",
     0xFF03: "quick stop by a client",
 }
-"""Causes for which the gateway sends these codes."""
+"""Causes for these codes from the gateway."""
 
 
 def gateway_error(code: int) -> str:

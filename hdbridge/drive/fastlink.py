@@ -1,8 +1,8 @@
-"""Fast link for the control cycle: the same frames and errors as `Link`, for less CPU time.
+"""Fast link for the control cycle: the same frames and errors as `Link`, with less CPU time.
 
-Half the cost of a cycle would be python-can's copying and building of messages. Two shortcuts avoid it and
-change nothing else. On SocketCAN, frames go straight through the bus's own socket. On other interfaces, sent
-messages are copied by their constructor instead of the general deep copy that python-can's virtual bus makes
+python-can's copying and building of messages would be half the cost of a cycle. Two shortcuts avoid it
+without other changes. On SocketCAN, frames are read and written on the bus's own socket. On other interfaces,
+sent messages are copied by their constructor rather than by the deep copy that python-can's virtual bus makes
 for each receiver.
 """
 
@@ -42,7 +42,7 @@ def fast_link(link: Link) -> Link:
 
 
 class _MessageLink(Link):
-    """Link that sends messages that are cheap to copy."""
+    """Link that sends messages whose copying is cheap."""
 
     def send(self, can_id: int, data: bytes) -> None:
         if self._down is not None:

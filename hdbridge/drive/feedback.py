@@ -12,7 +12,7 @@ class Feedback(NamedTuple):
     """Measurements of one cycle. Positions are encoder counts, unwrapped, multi-turn."""
 
     cycle: int
-    """Number of periods since `Cycle.restart`, skipped ones included."""
+    """Number of periods since `Cycle.restart`, including skipped periods."""
     time_s: float
     """``cycle`` times the period."""
     statusword: int
@@ -22,9 +22,9 @@ class Feedback(NamedTuple):
     torque_permille: float
     """NaN if the drive does not send it (6077h)."""
     fresh: bool
-    """False if a TPDO was missing or implausible; the values are then the last good ones."""
+    """False if a TPDO was missing or implausible; the values are then the last good values."""
     readings: tuple[float | None, ...]
-    """Last good reading of each channel of the axis file; None if there is none."""
+    """Last good reading of each channel of the axis file; None without one."""
 
 
 ENABLE_TIMEOUT_S: Final = 2.0
@@ -33,9 +33,7 @@ STANDING: Final = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, State.READ
 
 
 def until_enabled(tick: Callable[[], Feedback], power: PowerWalk, period_s: float) -> Feedback:
-    """Cycles until operation is enabled and returns that cycle's feedback; raises `TransitionError` on
-    time-out.
-    """
+    """Cycles until operation is enabled; returns that cycle's feedback. `TransitionError` on time-out."""
     for _ in range(math.ceil(ENABLE_TIMEOUT_S / period_s)):
         feedback = tick()
         if power.state is State.OPERATION_ENABLED:

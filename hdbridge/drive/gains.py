@@ -14,7 +14,7 @@ GAIN_OBJECTS: Final = (0x60F6, 0x60F9, 0x60FB)
 
 
 def read_gains(sdo: SdoClient) -> dict[str, int]:
-    """Reads the integers of `GAIN_OBJECTS` that the EDS lists and the drive answers, by ``60FBh:01``."""
+    """Reads the integers of `GAIN_OBJECTS` that are in the EDS and readable, by ``60FBh:01``."""
     found = {}
     for index in GAIN_OBJECTS:
         entry = sdo.od.get(index)

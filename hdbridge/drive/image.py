@@ -31,13 +31,12 @@ _ENABLED: Final = State.OPERATION_ENABLED
 _ENABLE_OPERATION: Final = Command.ENABLE_OPERATION.word
 HALT_BIT: Final = 0x0100
 HEARTBEATS_PER_TIMEOUT: Final = 2
-"""Heartbeats that the master sends within the drive's time-out, and periods of the drive's heartbeat that it
-waits.
-"""
+"""Heartbeats of the master within the drive's time-out, and periods of the drive's heartbeat for which the
+master waits."""
 
 
 def drive_heartbeat_ms(axis: AxisConfig, od: ObjectDictionary | None = None) -> int:
-    """Returns the period of the drive's heartbeat, ms; 0 if its EDS has none (1017h)."""
+    """Returns the period of the drive's heartbeat, ms; 0 if its EDS lacks 1017h."""
     od = dictionary_of(axis) if od is None else od
     address = objects.HEARTBEAT_PRODUCER
     there = od is None or find(od, address.index, address.sub) is not None
@@ -48,8 +47,8 @@ def position_limits_counts(axis: AxisConfig) -> tuple[int, int]:
     """Returns the least and the greatest target of the drive in motor counts, ordered for either direction.
 
     The limits of the axis file apply to the commanded position. The compensation may add up to its own
-    maximum, so the drive's limits are wider by that. `AxisConfig` ensures that both fit the 32 bits of a
-    target.
+    maximum, so the drive's limits are wider by that amount. `AxisConfig` ensures that both fit the 32 bits of
+    a target.
     """
     margin_deg = axis.compensation.maximum_arcsec / ARCSEC_PER_DEG
     ends = [
@@ -83,7 +82,7 @@ class ProcessImage:
         """Period of the master's heartbeat; s."""
         beat_ms = drive_heartbeat_ms(axis, od)
         self.heartbeat_timeout_s: float = beat_ms / 1000.0 * HEARTBEATS_PER_TIMEOUT if beat_ms else math.inf
-        """Maximum age of the drive's heartbeat, s; infinite if it sends none."""
+        """Maximum age of the drive's heartbeat, s; infinite if the drive sends none."""
         self.limits_counts = position_limits_counts(axis)
         self.power = PowerWalk()
         self.halt = False
@@ -99,7 +98,7 @@ class ProcessImage:
             for channel, follower in zip(axis.channels.values(), self.channels, strict=True)
         }
         self.readings: tuple[float | None, ...] = (None,) * len(self.channels)
-        """Last good reading of each of ``channels``; None if there is none, or none any more."""
+        """Last good reading of each of ``channels``; None before the first reading and for a lost channel."""
         position = self._entry_of(objects.POSITION_ACTUAL)
         demand = self._entry_of(objects.POSITION_DEMAND)
         self._unwrap_motor = Unwrap(1 << position.type.bits if position else INT32_RANGE)
@@ -116,9 +115,8 @@ class ProcessImage:
         self.motor_counts = 0
         self.load_counts = 0
         self.demand_counts = 0
-        """Position demand. If the drive does not send it: the target before the last, which it
-        has reached.
-        """
+        """Position demand. For a drive that does not send it, the target before the last, which has been
+        reached."""
         self.torque_permille: float = math.nan if objects.TORQUE_ACTUAL in absent else 0
         """Torque in per mille of the rated torque; NaN if the drive does not send it."""
         self.target_counts = 0
@@ -134,7 +132,7 @@ class ProcessImage:
         )
 
     def _handlers_of(self, tpdos: Iterable[Layout]) -> dict[int, Callable[[bytes], None]]:
-        """Returns the handler of each TPDO's data. An object in several TPDOs is taken from the first."""
+        """Returns the handler of each TPDO's data. An object in several TPDOs is read from the first."""
         source = self.axis.load_encoder.source
         takers: dict[tuple[int, int, int], Callable[[int], None]] = {
             (self.node_id, address.index, address.sub): take
@@ -172,9 +170,7 @@ class ProcessImage:
         return True
 
     def handler(self, can_id: int) -> Callable[[bytes], None]:
-        """Returns the handler of one of the image's TPDOs, for callers that look it up once instead of using
-        `accept`.
-        """
+        """Returns the handler of one of the image's TPDOs, for repeated use in place of `accept`."""
         return self._handlers[can_id]
 
     def length_of(self, can_id: int) -> int:
@@ -183,7 +179,7 @@ class ProcessImage:
         return next(each.codec.length for each in layouts if each.can_id == can_id)
 
     def statusword_in(self, can_id: int, data: bytes) -> int | None:
-        """Returns the statusword that a TPDO carries, or None. Does not change the image."""
+        """Returns the statusword in a TPDO, or None, without changing the image."""
         for layout in self.tpdos:
             place = layout.codec.positions.get((objects.STATUSWORD.index, objects.STATUSWORD.sub))
             if layout.can_id == can_id and place is not None and len(data) == layout.codec.length:
@@ -243,11 +239,11 @@ class ProcessImage:
     # -- sent frames --------------------------------------------------------------------------------------
 
     def _packer(self, layout: Layout, od: ObjectDictionary | None) -> Callable[[int, int], tuple[int, bytes]]:
-        """Returns a function that builds an RPDO frame from controlword and target, either of which may be in
-        another RPDO.
+        """Returns a function that builds an RPDO frame from controlword and target, either of which may be
+        elsewhere.
 
-        A read-only mapping may contain other objects. The mode of operation is then that of the cycle; any
-        other object gets its value from the EDS, else 0.
+        A read-only mapping may contain other objects. The mode of operation is then that of the cycle; all
+        other objects are set to their value in the EDS, else to 0.
         """
         entries, can_id, pack = layout.codec.entries, layout.can_id, layout.codec.pack
         values = [0 if entry.is_gap or od is None else _held(od, entry) for entry in entries]
@@ -284,8 +280,8 @@ class ProcessImage:
     def pack_rpdo(self, target_counts: int) -> Frames:
         """Returns the RPDOs with the controlword of ``power`` and the target.
 
-        Raises `InputError` if the target is outside the limits. Before power is enabled use `pack_rpdo_idle`,
-        because the axis may then stand anywhere.
+        Raises `InputError` if the target is outside the limits. Before power is enabled, `pack_rpdo_idle`
+        must be used, because the axis may stand anywhere.
         """
         self.check_target(target_counts)
         return self._pack(target_counts)
@@ -319,7 +315,7 @@ class ProcessImage:
         return frames
 
     def follow_target(self, target_counts: int) -> None:
-        """Records a sent target. If the drive sends no demand, the previous target becomes the demand."""
+        """Records a sent target. Without a demand from the drive, the previous target becomes the demand."""
         if not self.has_demand:
             self.demand_counts = self._under_way
             self._under_way = self.motor_counts + wrap_int32(target_counts - self.motor_counts)

@@ -19,14 +19,14 @@ except ImportError:  # a system without flock has no lock and no holder to repor
 
 _SHARED_BY_ALL_USERS: Final = Path("/run/lock")
 _IN_ONE_PROCESS: Final = frozenset({"virtual"})
-"""python-can interfaces that do not reach beyond their process."""
+"""python-can interfaces within one process."""
 
 
 class InterfaceLock:
-    """Lock of a CAN interface on this computer. Entered or acquired by one holder, until it is released.
+    """Lock of a CAN interface on this computer, held by one holder until released.
 
-    The lock file is never removed, because the next two processes could then each get a lock. ``folder`` is
-    its location, by default one that all users of the computer share.
+    The lock file is never removed, because the next two processes could then each obtain a lock. ``folder``
+    is its location, by default one shared by all users of the computer.
     """
 
     def __init__(self, interface: str, channel: object, folder: Path | None = None) -> None:
@@ -38,7 +38,7 @@ class InterfaceLock:
 
     @property
     def holder(self) -> int:
-        """Process id of the holder; 0 if the lock is free, or if the system does not show its holder."""
+        """Process id of the holder; 0 if the lock is free or the system hides its holder."""
         return _holder(self._path) if self._path is not None and self._path.exists() else 0
 
     def acquire(self) -> None:
@@ -95,7 +95,7 @@ def process_words(number: int) -> str:
 
 
 def command_line(number: int) -> str:
-    """Returns the command line of a process; empty if there is no such process."""
+    """Returns the command line of a process; empty if the process does not exist."""
     words: list[bytes] = []
     with suppress(OSError):
         words = Path(f"/proc/{number}/cmdline").read_bytes().split(b"\0")
@@ -103,7 +103,7 @@ def command_line(number: int) -> str:
 
 
 def user_name(uid: int) -> str:
-    """Returns the name of a user of this computer; ``user`` and the number if there is none."""
+    """Returns the name of a user of this computer; ``user`` and the number if unknown."""
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:
@@ -111,9 +111,7 @@ def user_name(uid: int) -> str:
 
 
 def _holder(path: Path) -> int:
-    """Returns the id of the process that has locked a file; 0 if there is none or the system does not show
-    it.
-    """
+    """Returns the id of the process that has locked a file; 0 if unlocked or hidden by the system."""
     inode = path.stat().st_ino
     with suppress(OSError, ValueError):
         for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
@@ -128,7 +126,7 @@ def _folder() -> Path:
 
 
 def _open(path: Path) -> int:
-    """Opens for reading, which suffices for locking: the file may belong to another user."""
+    """Opens for reading, which suffices for locking, because the file may belong to another user."""
     flags = os.O_RDONLY | os.O_NOFOLLOW
     try:
         try:

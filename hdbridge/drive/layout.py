@@ -1,4 +1,4 @@
-"""Contents of each PDO, chosen from what the axis needs and what its drive offers. Pure.
+"""Contents of each PDO, from the needs of the axis and the offers of its drive. Pure.
 
 A drive with free mappings gets
 
@@ -8,7 +8,7 @@ A drive with free mappings gets
     TPDO4 480h+id  temperature                         if it comes less often than the load torque
     RPDO1 200h+id  controlword, target                 6 bytes
 
-A read-only mapping is used as it is if it carries a needed object; the remaining objects go into the other
+A read-only mapping is used unchanged if it contains a needed object; the remaining objects go into the other
 PDOs. Position demand and torque are left out if the drive cannot send them. A load encoder with its own node
 id sends its TPDO1.
 """
@@ -35,7 +35,7 @@ _STANDARD_ENTRIES: Final = 8
 _LAST_SYNCHRONOUS: Final = 240
 _EXTENDED: Final = 0x2000_0000
 OPTIONAL: Final = (objects.TORQUE_ACTUAL, objects.POSITION_DEMAND)
-"""Objects that the control cycle uses if the drive can send them, the more important first."""
+"""Objects that the control cycle uses if the drive can send them, most important first."""
 
 
 class Layout(NamedTuple):
@@ -65,7 +65,7 @@ class Layouts(NamedTuple):
     rpdos: tuple[Layout, ...]
     """PDOs that the master sends."""
     absent: tuple[Address, ...]
-    """Objects of `OPTIONAL` that no TPDO carries."""
+    """Objects of `OPTIONAL` that are in no TPDO."""
 
 
 class _Offer(NamedTuple):
@@ -77,9 +77,9 @@ class _Offer(NamedTuple):
     fixed: tuple[PdoEntry, ...] | None
     """Entries of a read-only mapping; None if the mapping can be written."""
     can_id: int | None
-    """Identifier of the PDO, if the drive does not let it be changed."""
+    """Identifier of the PDO, if fixed by the drive."""
     every: int | None
-    """Transmission type, if the drive does not let it be changed."""
+    """Transmission type, if fixed by the drive."""
 
 
 def cyclic_mode(axis: AxisConfig) -> CyclicMode:
@@ -251,8 +251,8 @@ _Choice = list[tuple[_Offer, tuple[PdoEntry, ...]]]
 def _assign(needs: list[PdoEntry], offers: Sequence[_Offer], slowest: int | None) -> _Choice | None:
     """Assigns objects to PDOs; returns the chosen PDOs with their entries, or None if not all fit.
 
-    Read-only mappings are used first, because a free one can take what they do not carry. With ``slowest``,
-    only PDOs sent at least every ``slowest`` SYNCs are used.
+    Read-only mappings are used first, because a free mapping can take the remaining objects. With
+    ``slowest``, only PDOs sent at least every ``slowest`` SYNCs are used.
     """
     usable = [each for each in offers if each.every is None or slowest is None or each.every <= slowest]
     chosen: _Choice = []
@@ -375,7 +375,7 @@ def _source_complaints(axis: AxisConfig, od: ObjectDictionary, offers: Sequence[
 
 
 def _instead(od: ObjectDictionary, index: int) -> str:
-    """Lists the sub-indices that the EDS has at an index, for a message."""
+    """Lists the sub-indices of an index in the EDS, for a message."""
     entry = od.get(index)
     if entry is None:
         return ""

@@ -1,8 +1,8 @@
 """Raw CAN frames in and out: the only module of the master that uses python-can.
 
 It runs in the control cycle, so it adds little to the back end's own call. Every failure of the interface
-becomes a `BusError` that names it, frames that CANopen does not use are dropped and counted, and every
-deadline is on the monotonic clock that was passed in.
+becomes a `BusError` with its name. Frames that CANopen does not use are dropped and counted. Every deadline
+refers to the monotonic clock that was passed in.
 """
 
 import errno
@@ -31,7 +31,7 @@ _GONE: Final = frozenset(
 )
 _DRAIN_AT_MOST: Final = 4096
 _ECHOING: Final = frozenset({"UdpMulticastBus"})
-"""python-can back ends that echo a bus's own frames and cannot be configured not to."""
+"""python-can back ends that always echo a bus's own frames."""
 _PACKAGES: Final = {
     "udp_multicast": ("msgpack", "msgpack"),
     **dict.fromkeys(("slcan", "serial", "robotell", "seeedstudio"), ("serial", "pyserial")),
@@ -59,7 +59,7 @@ class Frame(NamedTuple):
 
 
 new_tuple: Final = tuple.__new__
-"""Builds a named tuple from its values in half the time of its own constructor."""
+"""Builds a named tuple from its values in half the time of the tuple's own constructor."""
 
 
 @dataclass(slots=True)
@@ -82,7 +82,7 @@ class Link:
 
     Once the interface is lost (ENETDOWN, ENODEV, bus-off), every call raises the same `BusError`. A SocketCAN
     socket reports the loss only *once* and then stays silent, which would look like a quiet bus. To continue,
-    open the bus again and make a new link.
+    open the bus again and create a new link.
     """
 
     def __init__(self, bus: can.BusABC, clock: Clock) -> None:
@@ -107,11 +107,11 @@ class Link:
 
     @property
     def down(self) -> str | None:
-        """Reason for which the interface is lost for good, or None."""
+        """Reason for the permanent loss of the interface, or None."""
         return self._down
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Sends a data frame with an 11-bit identifier; returns when the interface has taken it.
+        """Sends a data frame with an 11-bit identifier; returns when the interface has accepted it.
 
         Raises `TransmitBufferFull` if the frame was dropped because the queue is full, `BusError` if the
         interface failed.
@@ -124,7 +124,7 @@ class Link:
             raise self._failure("send", error) from error
 
     def recv(self, deadline_s: float) -> Frame | None:
-        """Returns the next data frame, or None if none came by ``deadline_s`` (a past deadline polls once).
+        """Returns the next data frame; None if none came by ``deadline_s`` (a past deadline polls once).
 
         Raises `BusError` if the interface failed.
         """
@@ -199,9 +199,8 @@ class Link:
 def _mark(bus: can.BusABC) -> str | None:
     """Returns the channel name that marks this bus's own frames on a back end that echoes them, else None.
 
-    Such a back end transports the channel with the frame, so an echo is identified reliably: a frame of
-    another master with the same identifier and data has another mark, or none. All links of a bus share one
-    mark.
+    Such a back end transports the channel with the frame, so echoes are identified reliably: an equal frame
+    of another master has another mark, or none. All links of a bus share one mark.
     """
     if type(bus).__name__ not in _ECHOING:
         return None
@@ -251,16 +250,16 @@ def absent_interface(settings: BusConfig) -> str | None:
 
 
 def _lacking(interface: str) -> str | None:
-    """Returns the package to install for a python-can interface; None if it is installed or none is known."""
+    """Returns the package required by a python-can interface; None if installed or unknown."""
     module, package = _PACKAGES.get(interface, ("", ""))
     return package if module and find_spec(module) is None else None
 
 
 @contextmanager
 def open_bus(settings: BusConfig, *, shared: bool = False) -> Iterator[can.BusABC]:
-    """Opens the bus of an axis file; raises a one-line `BusError` if that fails.
+    """Opens the bus of an axis file; raises a one-line `BusError` on failure.
 
-    Only one process of a computer may open an interface; the next is refused with `BusInUseError`, because
+    Only one process of a computer may open an interface. The next is refused with `BusInUseError`, because
     two masters on one bus stop each other's axes. ``shared`` skips this check, for programs that are not a
     master and for an explicit override. python-can's configuration files in the home folder are ignored.
     """

@@ -1,9 +1,9 @@
 """Detection of another master on the bus, by listening before the first frame is sent.
 
 A reset, and on some drives even an SDO request, stops an axis that another master is moving. A master
-therefore listens first, for as long as the slowest other master may be silent. The frames that count are
-those that would stop the axis while this master runs: SYNC, NMT commands, the heartbeat of a master, and
-set-points.
+therefore listens first, for as long as the slowest other master may be silent. The relevant frames are those
+that would stop the axis while this master runs: SYNC, NMT commands, the heartbeat of a master, and set-
+points.
 """
 
 from collections import Counter
@@ -17,7 +17,8 @@ from hdbridge.errors import BusInUseError
 LONGEST_CYCLE_S: Final = 0.255
 """Longest SYNC period that a drive accepts: 255 ms in 60C2h; s."""
 PERIODS: Final = 2
-"""Periods to listen, of the slowest cycle and of the heartbeat, because a frame may just have been sent."""
+"""Listening time in periods of the slowest cycle and of the heartbeat: two, because a frame may just have
+been sent."""
 USUAL_MASTER: Final = 127
 """Default node id of a master's heartbeat (77Fh), unless its axis file sets another."""
 _RPDOS: Final = (objects.COB_RPDO1, 0x300, 0x400, 0x500)
@@ -31,7 +32,7 @@ def listening_s(heartbeat_ms: float = 0.0) -> float:
 
 
 def heartbeat_of(frame: Frame) -> int | None:
-    """Returns the node whose heartbeat or boot-up message this is, or None."""
+    """Returns the node of a heartbeat or boot-up message, or None."""
     node_id = frame.can_id - objects.COB_HEARTBEAT
     return node_id if 0 < node_id <= _NODE else None
 
@@ -40,7 +41,7 @@ class Ear:
     """Counts the frames that only another master sends.
 
     ``drives`` are the nodes whose set-points count, ``masters`` the node ids whose heartbeat is a master's,
-    ``asked`` the nodes whose SDO channel no one else may use.
+    ``asked`` the nodes whose SDO channel is reserved.
     """
 
     def __init__(
@@ -61,9 +62,9 @@ class Ear:
         return True
 
     def listen(self, link: Link, duration_s: float, then: Callable[[Frame], object] = lambda _: None) -> None:
-        """Listens for a duration; ``then`` receives every frame as well.
+        """Listens for a duration; ``then`` also receives every frame.
 
-        Frames that were waiting before do not count, because their master may be gone.
+        Frames that were already waiting do not count, because their master may be gone.
         """
         for old in link.drain():
             self._note(old)

@@ -1,4 +1,4 @@
-"""Profile position (PP) and homing (HM): moves that the drive plans itself, outside the control cycle.
+"""Profile position (PP) and homing (HM): moves planned by the drive, outside the control cycle.
 
 Each is a handshake of controlword and statusword bits defined in CiA 402-2. A move that fails or takes too
 long ends with a quick stop.
@@ -31,7 +31,8 @@ FAILED: Final = 0x2000
 """PP: following error; HM: homing error."""
 HOMED: Final = ACKNOWLEDGED | TARGET_REACHED
 STALE_READINGS: Final = 50
-"""Statusword readings, at least `POLL_S` apart, after which bits from before a command have been cleared."""
+"""Number of statusword readings, at least `POLL_S` apart, after which bits from before a command have been
+cleared."""
 TOWARDS_SWITCH: Final = 0.1
 """Default speed of a homing run towards the switch, as a share of the axis's velocity limit."""
 TOWARDS_ZERO: Final = 0.02
@@ -53,7 +54,7 @@ def _stopping_on_failure(commander: Commander) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class ProfileMove:
-    """A checked PP move: target in motor counts, limits at the load, and time-out."""
+    """A validated PP move: target in motor counts, limits at the load, and time-out."""
 
     load_deg: float
     target_counts: int
@@ -92,7 +93,7 @@ class ProfileMove:
         )
 
     def time_allowed_s(self, axis: AxisConfig, start_counts: int) -> float:
-        """Returns the time-out: the given one, else 1.5 times the duration of the move plus 2 s."""
+        """Returns the given time-out, else 1.5 times the duration of the move plus 2 s."""
         if self.timeout_s is not None:
             return self.timeout_s
         way_deg = abs(axis.motor_encoder.degrees(self.target_counts - start_counts)) / axis.gear.ratio
@@ -102,7 +103,7 @@ class ProfileMove:
 
 @dataclass(frozen=True, slots=True)
 class Homing:
-    """A checked homing run: method (6098h), speeds, acceleration and offset at the load."""
+    """A validated homing run: method (6098h), speeds, acceleration and offset at the load."""
 
     method: int
     switch_velocity_deg_s: float
@@ -148,8 +149,8 @@ class Homing:
 def run_move(commander: Commander, move: ProfileMove) -> None:
     """Moves in PP; the drive must be enabled in that mode.
 
-    Raises `DriveError` if the drive fails on the way, `TransitionError` on time-out; the axis is stopped
-    then.
+    Raises `DriveError` if the drive fails on the way, `TransitionError` on time-out; the axis is then
+    stopped.
     """
     axis, sdo = commander.axis, commander.sdo
     with _stopping_on_failure(commander):
@@ -177,8 +178,8 @@ def run_move(commander: Commander, move: ProfileMove) -> None:
 def run_homing(commander: Commander, homing: Homing) -> None:
     """Homes in HM; the drive must be enabled in that mode.
 
-    Raises `DriveError` if the drive reports a homing error, `TransitionError` on time-out; the axis is
-    stopped then.
+    Raises `DriveError` if the drive reports a homing error, `TransitionError` on time-out; the axis is then
+    stopped.
     """
     axis, sdo = commander.axis, commander.sdo
     offset = round(axis.motor_encoder.counts(homing.offset_deg * axis.gear.ratio))
@@ -238,8 +239,8 @@ def _end(commander: Commander, doing: str, what: str, before: int, bits: int, ti
     """Waits for the end of an action: all of ``bits`` set, or `FAILED`.
 
     ``before`` is the statusword before the action was started. If it shows the end of an earlier action, the
-    drive has to clear those bits first. Some drives take 50 ms for that, and an action that ends at once
-    never shows them cleared. After `STALE_READINGS` readings the bits therefore count as the answer.
+    drive must clear those bits first. Some drives take 50 ms for this, and an action that ends at once never
+    shows cleared bits. After `STALE_READINGS` readings, the bits therefore count as the answer.
     """
 
     def over(word: int) -> bool:

@@ -1,7 +1,7 @@
 """Unsolicited messages of the nodes: heartbeats, boot-up messages and emergencies.
 
-Bookkeeping only; nothing is decided here. Every receiver passes its frames on to the monitor, so that a
-heartbeat that arrives during an SDO transfer is not lost.
+This module only records and makes no decisions. Every receiver passes its frames on to the monitor, so that a
+heartbeat during an SDO transfer is not lost.
 """
 
 from collections import deque
@@ -17,7 +17,7 @@ EMERGENCIES_KEPT: Final = 64
 
 
 class Emergency(NamedTuple):
-    """One EMCY message; a short one is kept with the bytes it has."""
+    """One EMCY message; a short message is kept with its actual bytes."""
 
     time_s: float
     code: int
@@ -54,7 +54,7 @@ class NodeStatus:
         return self.boot_ups, self.heartbeats, self.emergency_count
 
     def heard_since(self, counts: tuple[int, int, int]) -> str:
-        """Describes the messages of the node since these counts; empty if there were none."""
+        """Describes the messages of the node since these counts; empty without any."""
         boot_ups, heartbeats, emergencies = counts
         said = []
         if self.boot_ups > boot_ups:

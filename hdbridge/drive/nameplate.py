@@ -1,7 +1,7 @@
-"""Comparison of a drive's identification and scaling with the axis file. Pure: it judges readings.
+"""Comparison of a drive's identification and scaling with the axis file. Pure function of readings.
 
-Every difference is a line of text: the key of the axis file, its value, and the drive's value. The boot-up
-refuses the drive with the first one; the bring-up shows them all.
+Every difference is a line of text with the key of the axis file, its value, and the drive's value. The
+boot-up refuses the drive with the first line; the bring-up shows them all.
 """
 
 from collections.abc import Iterator, Mapping
@@ -14,7 +14,7 @@ from hdbridge.drive.layout import cyclic_mode
 from hdbridge.drive.objects import Address
 
 Readings = Mapping[Address, int]
-"""Values read from the drive; objects that it lacks are missing."""
+"""Values read from the drive, without the objects that it lacks."""
 
 IDENTITY: Final[tuple[tuple[Address, str], ...]] = (
     (objects.VENDOR_ID, "vendor_id"),
@@ -27,7 +27,7 @@ _RATED_TORQUE_TOLERANCE: Final = 0.01
 
 
 def scaling_addresses(axis: AxisConfig) -> tuple[Address, ...]:
-    """Returns the objects that define the drive's position scaling; a drive need not have them."""
+    """Returns the objects that define the drive's position scaling, all of which are optional."""
     source = axis.load_encoder.source
     additional = source.node is None and source.index == objects.ADDITIONAL_POSITIONS
     return (
@@ -151,7 +151,7 @@ def _polarity(axis: AxisConfig, readings: Readings) -> Iterator[str]:
 
 
 def _load_counts(axis: AxisConfig, readings: Readings) -> Iterator[str]:
-    """Compares 60E6h and 60EBh, for an encoder at 60E4h, with the axis file; per turn of load or motor."""
+    """Compares 60E6h and 60EBh, for an encoder at 60E4h, with the axis file, per turn of load or motor."""
     source, counts = axis.load_encoder.source, axis.load_encoder.counts_per_turn
     if source.node is not None or source.index != objects.ADDITIONAL_POSITIONS:
         return

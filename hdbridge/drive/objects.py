@@ -1,7 +1,7 @@
-"""The objects of CiA 301 and CiA 402 that the master uses: address, type, name. Data only.
+"""Objects of CiA 301 and CiA 402 that the master uses: address, type, name. Data only.
 
-Everything is keyed by (index, sub-index). If the EDS of a drive gives an object another type than the profile
-does, the EDS wins, because the drive answers according to it.
+The key is (index, sub-index). If the EDS of a drive states another type than the profile, the EDS takes
+precedence, because the drive answers according to it.
 """
 
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class IntegerType(Enum):
         return (1 << (self.bits - self.signed)) - 1
 
     def encode(self, value: int) -> bytes:
-        """Returns the little-endian bytes of ``value``; the caller has checked the range."""
+        """Returns the little-endian bytes of ``value``, whose range the caller has checked."""
         return value.to_bytes(self.bits // 8, "little", signed=self.signed)
 
     def decode(self, data: bytes) -> int:
@@ -55,7 +55,7 @@ class IntegerType(Enum):
 
     @classmethod
     def named(cls, name: object) -> Self:
-        """Returns the type with a name ("int32") or an equivalent member of another string enum.
+        """Returns the type of a name ("int32") or of an equivalent member of another string enum.
 
         Raises `InputError` for an unknown name.
         """
@@ -105,7 +105,7 @@ COB_SDO_ANSWER: Final = 0x580
 COB_SDO_REQUEST: Final = 0x600
 COB_HEARTBEAT: Final = 0x700
 PDO_INVALID: Final = 0x8000_0000
-"""Bit 31 of a PDO's COB-ID: the PDO does not exist."""
+"""Bit 31 of a PDO's COB-ID, set if the PDO does not exist."""
 
 DEVICE_PROFILE_402: Final = 402
 
@@ -187,7 +187,7 @@ REQUIRED: Final = (CONTROLWORD, STATUSWORD, MODE, MODE_DISPLAY, POSITION_ACTUAL)
 
 
 class CyclicMode(NamedTuple):
-    """Mode of operation that takes a position target in every cycle."""
+    """Mode of operation with a position target in every cycle."""
 
     mode: Mode
     target: Address

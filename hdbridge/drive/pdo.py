@@ -1,7 +1,7 @@
 """PDO codec: mapped objects, and conversion between frame data and integers. No I/O.
 
 The layout is compiled once into a `struct`, because it is used in every control cycle. A frame of the wrong
-length is rejected as a whole, and only integers within the range of their type are packed: NaN, infinity and
+length is rejected as a whole. Only integers within the range of their type are packed, so NaN, infinity and
 an out-of-range target never reach the bus.
 """
 
@@ -14,13 +14,13 @@ from hdbridge.drive.objects import Address, IntegerType
 from hdbridge.errors import DriveError, InputError
 
 _CODES = {8: "b", 16: "h", 24: "3s", 32: "i", 64: "q"}
-"""Format of `struct` by the width of a signed integer; it has no 24-bit one."""
+"""`struct` format by the width of a signed integer; `struct` has no 24-bit format."""
 MAX_BYTES = 8
 _FIRST_OBJECT = 0x1000
 
 
 class PdoLengthError(DriveError):
-    """A PDO does not have the length of its mapping; treat it as lost."""
+    """A PDO does not have the length of its mapping and counts as lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class PdoEntry:
 
     @property
     def is_gap(self) -> bool:
-        """True for a data type in place of an object, which a drive's own mapping may use as padding."""
+        """True for a data type in place of an object, which a drive's own mapping may contain as padding."""
         return self.index < _FIRST_OBJECT
 
     @property
@@ -80,8 +80,8 @@ class PdoCodec:
             raise InputError(f"a PDO maps an object once, but got {names}")
 
     def unpack(self, data: bytes | bytearray) -> tuple[int, ...]:
-        """Returns the mapped values in order; raises `PdoLengthError` unless ``data`` has the
-        mapped length.
+        """Returns the mapped values in order; raises `PdoLengthError` unless ``data`` has the mapped
+        length.
         """
         try:
             values = self._unpack(data)

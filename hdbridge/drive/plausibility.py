@@ -1,6 +1,6 @@
 """Plausibility of a cycle's positions, and the following error. Pure.
 
-If an encoder moves farther in a cycle than the axis can, its reading is rejected and the last good one is
+If an encoder moves further in a cycle than the axis can, its reading is rejected and the last good reading is
 kept, so that one glitch costs one cycle. The drive's following error is checked here as well as by the drive
 itself (6065h and 6066h).
 """
@@ -14,7 +14,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 OVERSPEED: Final = 1.5
 """Factor by which a quick stop, an overshoot or a resonance may exceed the axis's velocity limit."""
 FLOOR_ARCSEC: Final = 180.0
-"""Load movement per cycle that vibration and noise may cause, however slow the axis's limit is."""
+"""Load movement per cycle that vibration and noise may cause, whatever the axis's limit."""
 
 
 @dataclass(frozen=True, slots=True)

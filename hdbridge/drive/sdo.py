@@ -1,10 +1,10 @@
 """SDO client that reads and writes a node's objects in the caller's thread.
 
-The SDO protocol is that of `canopen`; only its way of waiting is replaced. canopen's client needs a notifier
-thread that feeds a queue, and that thread dies for good when the interface goes down. Here the caller's
+The SDO protocol is that of `canopen`; only its method of waiting is replaced. canopen's client needs a
+notifier thread that feeds a queue and terminates for good when the interface goes down. Here, the caller's
 thread receives until the answer arrives or a deadline on the given clock passes, and hands every other frame
-to the network monitor. It also adds retries of the whole transfer, a limit on the size of an answer, a check
-of every answer's length, and errors with advice.
+to the network monitor. The client also retries whole transfers, limits the size of an answer, checks every
+answer's length, and raises errors with advice.
 
 Never used inside the control cycle.
 """
@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 DEFAULT_TIMEOUT_S: Final = 0.5
 DEFAULT_ATTEMPTS: Final = 3
 SIZE_CAP: Final = 4096
-"""Maximum length of an object that is read, bytes; names and versions are the longest ones needed."""
+"""Maximum length of an object, bytes; the longest objects read are names and versions."""
 _TIMEOUTS_PER_TRANSFER: Final = 20
 _FRAME_BYTES: Final = 8
 _ABORT: Final = 0x80
@@ -51,7 +51,7 @@ _ADVICE: Final = {
 
 
 ABSENT: Final = frozenset({0x0602_0000, 0x0609_0011})
-"""Abort codes of a drive that lacks the object."""
+"""Abort codes of a missing object."""
 
 
 class SdoAbortError(SdoError):
@@ -75,7 +75,7 @@ class _Channel(CanopenSdoClient):
         self.monitor = monitor
         self.timeout_s = DEFAULT_TIMEOUT_S
         self.transfer_ends_s = 0.0
-        """Deadline of the whole transfer, because a node could answer every segment in time and never end."""
+        """Deadline of the whole transfer, because a node could answer every segment in time but never end."""
         self.strays = 0
 
     def send_request(self, request: bytes | bytearray) -> None:
@@ -140,7 +140,7 @@ class _Channel(CanopenSdoClient):
 class SdoClient:
     """Reads and writes the objects of one node. Not thread-safe; not for the control cycle.
 
-    ``od`` is the node's object dictionary, or None if the types of CiA 301 and CiA 402 suffice.
+    ``od`` is the node's object dictionary; None if the types of CiA 301 and CiA 402 suffice.
     """
 
     def __init__(
@@ -168,15 +168,15 @@ class SdoClient:
         return find(self.od, index, sub) is not None
 
     def type_of(self, index: int, sub: int) -> IntegerType:
-        """Returns an object's integer type by the EDS, else by the profile; raises `SdoError` if neither has
-        it.
+        """Returns an object's integer type by the EDS, else by the profile; `SdoError` if it is in
+        neither.
         """
         variable = find(self.od, index, sub)
         if variable is not None:
             kind = integer_type(variable)
             if kind is None:
                 raise SdoError(
-                    f"{self.describe(index, sub)}: is not an integer by the EDS (type {variable.data_type}h)"
+                    f"{self.describe(index, sub)}: is not an integer in the EDS (type {variable.data_type}h)"
                 )
             return kind
         known = STANDARD.get((index, sub))
@@ -223,11 +223,9 @@ class SdoClient:
         self.write_bytes(index, sub, kind.encode(value))
 
     def fetch(self, address: Address) -> int:
-        """Reads a known object, as `read` does."""
         return self.read(address.index, address.sub)
 
     def store(self, address: Address, value: int) -> None:
-        """Writes a known object, as `write` does."""
         self.write(address.index, address.sub, value)
 
     def read_text(self, index: int) -> str:
@@ -241,7 +239,7 @@ class SdoClient:
         return self._transfer("read", index, sub, None)
 
     def write_bytes(self, index: int, sub: int, data: bytes) -> None:
-        """Writes raw bytes: expedited up to four, segmented beyond."""
+        """Writes raw bytes: up to four expedited, more segmented."""
         self._transfer("write", index, sub, data)
 
     def _transfer(self, doing: str, index: int, sub: int, data: bytes | None) -> bytes:
@@ -253,12 +251,12 @@ class SdoClient:
             try:
                 if data is None:
                     answer = self._channel.fetch(index, sub, SIZE_CAP)
-                    self._tell("sdo read", index, sub, data=answer.hex(" "))
+                    self._log("sdo read", index, sub, data=answer.hex(" "))
                     return answer
                 self._channel.download(index, sub, data)
-                self._tell("sdo write", index, sub, data=data.hex(" "))
+                self._log("sdo write", index, sub, data=data.hex(" "))
             except SdoAbortedError as error:
-                self._tell(f"sdo {doing} refused", index, sub, abort=f"{error.code:08X}h")
+                self._log(f"sdo {doing} refused", index, sub, abort=f"{error.code:08X}h")
                 advice = _ADVICE.get(error.code, "see the drive's manual for this code")
                 text = SdoAbortedError.CODES.get(error.code, "vendor-specific")
                 raise SdoAbortError(
@@ -268,16 +266,16 @@ class SdoClient:
                 ) from error
             except _NoAnswerError as error:
                 problem = f"{error}; check that the node is powered and its node id and bit rate are right"
-                self._tell(f"sdo {doing} failed", index, sub, problem=str(error))
+                self._log(f"sdo {doing} failed", index, sub, problem=str(error))
             except SdoCommunicationError as error:
                 problem = f"{error}; check that no second SDO client is active"
-                self._tell(f"sdo {doing} failed", index, sub, problem=str(error))
+                self._log(f"sdo {doing} failed", index, sub, problem=str(error))
             else:
                 return b""
         times = f"{self.attempts} attempts" if self.attempts != 1 else "one attempt"
         raise SdoError(f"{self.describe(index, sub)}: {doing} failed after {times}: {problem}")
 
-    def _tell(self, event: str, index: int, sub: int, **facts: object) -> None:
+    def _log(self, event: str, index: int, sub: int, **facts: object) -> None:
         _log.debug(event, {"node": self.node_id, "object": f"{index:04X}h:{sub:02X}", **facts})
 
     @staticmethod

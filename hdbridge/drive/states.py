@@ -1,13 +1,13 @@
-"""The power state machine of CiA 402, as tables.
+"""Power state machine of CiA 402, as tables.
 
-This module holds the states, the rows of the decoding table, the rows of the transition table, and what
-follows from those rows alone: decoding, the commands allowed in each state, the path between two states, the
-diagram. It has no bus, clock, objects or modes of operation, and no policy about *when* to move: those belong
-to `drive.py` and to the cycle. A drive that behaves differently gets another row, not an `if`.
+This module contains the states, the rows of the decoding and transition tables, and the functions that follow
+from these rows alone: decoding, the commands permitted in each state, the path between two states, the
+diagram. It has no bus, clock, objects or modes of operation, and no policy of *when* to move, which belongs
+to `drive.py` and to the cycle. A drive that behaves differently requires another row, not an `if`.
 
 The rows are those of CiA 402-2, with its transition numbers. Three transitions are never part of an automatic
-path, because each must be requested explicitly: leaving a fault (15), resuming from a quick stop (16), and of
-course a fault (13).
+path: leaving a fault (15) and resuming from a quick stop (16), which must be requested explicitly, and a
+fault (13).
 """
 
 from collections import deque
@@ -73,8 +73,8 @@ class Command(Enum):
 
 
 class Transition(NamedTuple):
-    """One row: in ``source``, ``command`` leads to ``target``. Without a command the drive changes on its
-    own.
+    """Row of the table: in ``source``, ``command`` leads to ``target``. Without a command, the drive changes
+    on its own.
     """
 
     number: int
@@ -118,7 +118,7 @@ HOLD: Final[dict[State, int]] = {
     State.OPERATION_ENABLED: Command.ENABLE_OPERATION.word,
     State.QUICK_STOP_ACTIVE: Command.QUICK_STOP.word,
 }
-"""Controlword that keeps the drive in a state; in every other state it is 0, disable voltage."""
+"""Controlword that keeps the drive in a state; 0 (disable voltage) in all other states."""
 
 
 def _decoded(bits: int) -> State:
@@ -139,7 +139,7 @@ def decode(statusword: int | None) -> State:
 
 
 def row_for(state: State, command: Command) -> Transition:
-    """Returns the row that ``command`` takes in ``state``; raises `TransitionError` if there is none."""
+    """Returns the row of ``command`` in ``state``; raises `TransitionError` without one."""
     for row in TRANSITIONS:
         if row.source is state and row.command is command:
             return row
@@ -153,8 +153,8 @@ def row_for(state: State, command: Command) -> Transition:
 def _first_row(state: State, target: State) -> Transition | None:
     """Returns the first row of the shortest path (breadth-first search), or None.
 
-    The path avoids the transitions of `NEVER_IMPLIED` and never passes *through* 'operation enabled': no
-    drive is to be powered merely to reach another state.
+    The path avoids the transitions of `NEVER_IMPLIED` and never passes *through* 'operation enabled', because
+    a drive must not be powered merely to reach another state.
     """
     ways: deque[tuple[State, Transition | None]] = deque([(state, None)])
     seen = {state}
@@ -175,11 +175,11 @@ _FIRST_ROWS: Final = {(a, b): _first_row(a, b) for a in State for b in State}
 
 
 def controlword_for(state: State, target: State) -> int:
-    """Returns the controlword for the next step from ``state`` to ``target``, or the one that holds the
-    target.
+    """Returns the controlword for the next step from ``state`` to ``target``, or the controlword that holds
+    the target.
 
-    It is 0 (disable voltage) if the drive must first change state on its own. Raises `TransitionError` if
-    there is no path, which includes every exit from a fault (use `PowerWalk.reset_fault`) and the direct exit
+    It is 0 (disable voltage) if the drive must first change state on its own. Raises `TransitionError`
+    without a path, which includes every exit from a fault (use `PowerWalk.reset_fault`) and the direct exit
     from a quick stop (only through 'switch on disabled').
     """
     if state is target and state is not State.UNKNOWN:
@@ -211,8 +211,8 @@ _WORDS: Final = {state: {aim: _word(state, aim) for aim in State} for state in S
 class PowerWalk:
     """Walks a drive through its states, taking one statusword and returning one controlword at a time.
 
-    It only pursues the aim it was given: a drive that leaves 'operation enabled' on its own is not enabled
-    again, and a fault is reset only on request. A call that raises changes nothing.
+    It only pursues its aim. A drive that leaves 'operation enabled' on its own is not enabled again, and a
+    fault is reset only on request. A call that raises changes nothing.
     """
 
     def __init__(self) -> None:
@@ -221,10 +221,9 @@ class PowerWalk:
         self._reset = _NO_RESET
         self._was_enabled = False
         self.dropped: State | None = None
-        """First state seen after the drive left 'operation enabled' without a command.
+        """First state after the drive left 'operation enabled' without a command.
 
-        Kept until the next `go`, whatever the drive reports meanwhile.
-        """
+        Kept until the next `go`, whatever the drive reports meanwhile."""
 
     @property
     def state(self) -> State:
@@ -281,7 +280,7 @@ class PowerWalk:
         self._aim = State.SWITCH_ON_DISABLED
 
     def controlword(self) -> int:
-        """Returns the word to send now. Bits 4-6 and 8-15 are zero: the mode of operation adds its own."""
+        """Returns the word to send now. Bits 4-6 and 8-15 are zero; the mode of operation sets them."""
         if self._reset == _RESET_LOW:
             # Bit 7 acts on its rising edge, so it is sent low once before high.
             self._reset = _RESET_HIGH
@@ -295,9 +294,7 @@ class PowerWalk:
 
 
 def states_on_the_way(state: State, target: State) -> Iterator[State]:
-    """Yields the states from ``state`` to ``target``, both included; raises `TransitionError` if there is no
-    path.
-    """
+    """Yields the states from ``state`` to ``target``, both included; `TransitionError` without a path."""
     yield state
     while state is not target:
         controlword_for(state, target)

@@ -1,8 +1,8 @@
-"""The fault table: the reaction to each fault in a control cycle. Pure: no bus, no clock.
+"""Fault table: the reaction to each fault in a control cycle. Pure: no bus, no clock.
 
-The cycle reports the faults it saw, and the table gives the reaction. A stop is latched: only
-`Supervision.reset` releases it, and after a `Reaction.LATCH` only when the drive has been fully verified
-again. The table is data. A fault with another reaction is another row, not an `if`.
+The cycle reports its faults, and the table returns the reaction. A stop is latched. Only `Supervision.reset`
+releases it, and after a `Reaction.LATCH` only when the drive has been fully verified again. The table is
+data: a fault with another reaction is another row, not an `if`.
 """
 
 from collections import deque
@@ -20,9 +20,8 @@ class Reaction(IntEnum):
     GO = 0
     """Continue; the fault is counted."""
     FREEZE = 1
-    """Continue with the compensation's correction held, because this cycle's feedback is the
-    last good one.
-    """
+    """Continue with the compensation's correction frozen, because this cycle's feedback is the last good
+    one."""
     QUICK_STOP = 2
     """Command a quick stop until the drive reports it; latched."""
     LATCH = 3
@@ -30,7 +29,7 @@ class Reaction(IntEnum):
 
 
 class Fault(Enum):
-    """Faults that a cycle can have."""
+    """Faults of a cycle."""
 
     LOST_TPDO = "a TPDO is missing"
     OVERRUN = "the cycle started too late"
@@ -72,8 +71,10 @@ _GO, _FREEZE, _STOP, _LATCH = Reaction.GO, Reaction.FREEZE, Reaction.QUICK_STOP,
 
 TABLE: Final[tuple[Row, ...]] = (
     Row(Fault.LOST_TPDO, _FREEZE, 2, _STOP, "check the cable, the bus load and the drive's PDOs"),
-    Row(Fault.OVERRUN, _GO, 2, _STOP, "see 'hdbridge latency' for the cycle time that this machine carries"),
-    Row(Fault.HANG, _STOP, 1, _STOP, "see 'hdbridge latency' for what this machine carries; keep it awake"),
+    Row(
+        Fault.OVERRUN, _GO, 2, _STOP, "see 'hdbridge latency' for the cycle time that this computer sustains"
+    ),
+    Row(Fault.HANG, _STOP, 1, _STOP, "see 'hdbridge latency' for what this computer sustains; keep it awake"),
     Row(Fault.DUPLICATE_TPDO, _GO, 1, _GO, "look for a second node with the drive's node id"),
     Row(Fault.WRONG_LENGTH, _FREEZE, 2, _STOP, "boot the drive again: its PDO mapping (1A00h) was changed"),
     Row(Fault.DISCARDED_FRAME, _GO, 1, _GO, "look for a node that is not CANopen, or restart the drive"),
@@ -106,7 +107,7 @@ ROWS: Final[dict[Fault, Row]] = {row.fault: row for row in TABLE}
 EVENTS_KEPT: Final = 1000
 EMERGENCIES_TOLD: Final = 3
 _BY_THE_DRIVE: Final = frozenset({Fault.DRIVE_FAULT, Fault.DROPPED_OUT, Fault.NMT_CHANGE})
-"""Faults that the drive raises on its own; its emergency messages give the reason."""
+"""Faults that the drive raises on its own, with the reason in its emergency messages."""
 _EMERGENCIES: Final = frozenset({Fault.EMERGENCY, Fault.MASTER_LOST})
 EXPLAINED_HINT: Final = f"remove that cause, then reset the fault: {RESET}"
 """Advice for a stop that an emergency message of the drive explains."""
@@ -140,29 +141,29 @@ class Supervision:
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         """Newest events, oldest first."""
         self.noted = 0
-        """Number of all events, including those no longer kept."""
+        """Number of all events, including those dropped."""
         self.counts: dict[Fault, int] = dict.fromkeys(Fault, 0)
         """Number of cycles in which each fault was seen."""
         self.stop: Event | None = None
         """Event that stopped the axis first; None while it may run."""
         self.gravest: Event | None = None
-        """Event that decides how the axis is stopped: the first cause, or a graver consequence of it."""
+        """Event that decides how the axis is stopped: the first cause, or a more severe consequence."""
 
     @property
     def quiet(self) -> bool:
-        """True if a cycle without faults changes nothing, so that `judge` need not be called for it."""
+        """True if a cycle without faults changes nothing, so that `judge` need not be called."""
         return not self._runs and self.stop is None
 
     @property
     def reaction(self) -> Reaction:
-        """The latched reaction; GO if nothing is latched."""
+        """Latched reaction; GO without a latch."""
         return self.gravest.reaction if self.gravest is not None else Reaction.GO
 
     def judge(self, cycle: int, faults: Iterable[tuple[Fault, str]]) -> Reaction:
-        """Returns the reaction to one cycle's faults, each given with its detail; no faults is a good cycle.
+        """Returns the reaction to one cycle's faults, each with its detail; a good cycle has none.
 
-        Returns the latched reaction once there is one, however good the cycle was. Two consecutive cycles
-        without usable feedback cause a stop, whichever faults spoilt them.
+        Once latched, the reaction stays the same, however good the cycle. Two consecutive cycles without
+        usable feedback cause a stop, whichever faults caused the loss.
         """
         previous, self._runs = self._runs, {}
         frozen, self._frozen = self._frozen, False
@@ -173,7 +174,7 @@ class Supervision:
         return max(worst, self.reaction)
 
     def also(self, cycle: int, fault: Fault, detail: str) -> Reaction:
-        """Adds a fault to the cycle that `judge` has judged, one that arose from the reaction to it."""
+        """Adds a fault that arose from the reaction to the cycle that `judge` has judged."""
         self._note(cycle, fault, detail, self._runs.get(fault, 0) + 1, frozen=False)
         return self.reaction
 
@@ -196,12 +197,12 @@ class Supervision:
         return reaction
 
     def since(self, noted: int) -> list[Event]:
-        """Returns the events after the first ``noted`` ones, oldest first, as far as they are kept."""
+        """Returns the events after the first ``noted`` events, oldest first, as far as kept."""
         new = min(self.noted - noted, len(self.events))
         return list(islice(self.events, len(self.events) - new, None)) if new > 0 else []
 
     def error(self) -> SafetyStop:
-        """Returns the latched stop as the error to raise."""
+        """Returns the latched stop as an error."""
         stop, gravest = self.stop, self.gravest
         assert stop is not None, "there is no stop to report"
         assert gravest is not None
@@ -211,14 +212,14 @@ class Supervision:
         done = "quick stop" if self.reaction is Reaction.QUICK_STOP else "set-points stopped"
         then = "" if gravest.fault is stop.fault else f"; then {gravest.fault.value}"
         said = self._emergencies(stop.cycle - 1)
-        told = f"; the drive sent {', '.join(said)}" if said else ""
+        sent = f"; the drive sent {', '.join(said)}" if said else ""
         hint = EXPLAINED_HINT if said and stop.fault in _BY_THE_DRIVE else row.hint
         return SafetyStop(
-            f"cycle {stop.cycle}: {stop.fault.value}{again}{detail}{then}{told}: {done}, latched", hint
+            f"cycle {stop.cycle}: {stop.fault.value}{again}{detail}{then}{sent}: {done}, latched", hint
         )
 
     def _emergencies(self, since_cycle: int) -> list[str]:
-        """Returns the first emergencies that came with the stop: the drive's own explanation of it."""
+        """Returns the first emergencies that came with the stop, which are the drive's own explanation."""
         said = [
             event.detail
             for event in self.events

@@ -13,7 +13,7 @@ from hdbridge.drive.supervision import Fault
 
 _NODE_MASK: Final = 0x7F
 _MASTER_LOST: Final = (HEARTBEAT_LOST, RPDO_TIMEOUT)
-"""Emergency codes of a drive that stopped because it missed its master."""
+"""Emergency codes of a drive that stopped for lack of its master."""
 _STATES: Final[dict[int, str]] = {
     NmtState.STOPPED: " (stopped)",
     NmtState.PRE_OPERATIONAL: " (pre-operational)",
@@ -23,7 +23,7 @@ _STATES: Final[dict[int, str]] = {
 def bus_faults(heartbeat_id: int) -> dict[int, tuple[Fault, str]]:
     """Returns the fault for each frame that only the single master of a bus sends.
 
-    ``heartbeat_id`` is the identifier of its heartbeat.
+    ``heartbeat_id`` is the identifier of the master's heartbeat.
     """
     return {
         COB_SYNC: (Fault.FOREIGN_SYNC, ""),
@@ -55,7 +55,7 @@ class Traffic:
     def faults(self, frame: Frame, *, commanded: bool) -> Iterator[tuple[Fault, str]]:
         """Yields the faults that a frame reports, each with its detail for a message.
 
-        ``commanded``: the drive is enabled by this master and is to follow set-points.
+        ``commanded`` states that this master has enabled the drive and sends it set-points.
         """
         can_id, data, time_s = frame
         if self._monitor.dispatch(frame):

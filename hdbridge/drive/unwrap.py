@@ -7,8 +7,8 @@ class Unwrap:
     """Follows a wrapping counter and returns an unbounded multi-turn count.
 
     Only differences modulo ``modulus`` are used, so a wrap has no effect as long as the counter moves by less
-    than half the modulus between two readings. The first reading is taken as it is. ``modulus`` is 2**bits of
-    the object, or an encoder's total range if it restarts earlier.
+    than half the modulus between two readings. The first reading is not changed. ``modulus`` is 2**bits of
+    the object, or the encoder's total range if it is smaller.
     """
 
     def __init__(self, modulus: int = INT32_RANGE) -> None:

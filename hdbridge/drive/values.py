@@ -26,7 +26,7 @@ class Object:
     sub: int
     name: str
     data_type: int
-    """Number of the type in the EDS; 0 if only the profile knows the object."""
+    """Number of the type in the EDS; 0 if the object is only in the profile."""
     integer: IntegerType | None
     readable: bool = True
     writable: bool = True
@@ -48,8 +48,8 @@ class Object:
         return f"{self.index:04X}h:{self.sub:02X}" + (f" '{self.name}'" if self.name else "")
 
     def decode(self, data: bytes) -> Value:
-        """Decodes a value; unknown types become hexadecimal text. Raises `InputError` if the bytes do not fit
-        the type.
+        """Decodes a value; unknown types become hexadecimal text. `InputError` if the bytes do not fit the
+        type.
         """
         try:
             if self.integer is not None:
@@ -61,7 +61,8 @@ class Object:
                 return float(struct.unpack(form, _fitting(data, struct.calcsize(form)))[0])
         except ValueError as problem:
             raise InputError(
-                f"{self}: answered {problem}, which is no {self.type_name}; check that drive.eds is the EDS "
+                f"{self}: answered {problem}, which is not of the type {self.type_name}; check that "
+                f"drive.eds is the EDS "
                 "of this drive"
             ) from None
         if self.data_type == datatypes.UNICODE_STRING:
@@ -71,7 +72,7 @@ class Object:
         return data.hex(" ")
 
     def encode(self, text: str) -> bytes:
-        """Encodes a value written as text; raises `InputError` if it is not of the type or out of range."""
+        """Encodes a value written as text; `InputError` if it is of another type or out of range."""
         if self.integer is not None:
             return self.integer.encode(self._integer(text, self.integer))
         if self.data_type == datatypes.BOOLEAN:
@@ -115,7 +116,7 @@ class Object:
 def find_object(text: str, od: ObjectDictionary) -> Object:
     """Returns an object by its number (6064h, 0x1018:4, 60C2h:01) or its name in the EDS.
 
-    A sub-index is hexadecimal, as in manuals. Raises `InputError` if there is no such object.
+    A sub-index is hexadecimal, as in manuals. Raises `InputError` for an unknown object.
     """
     number = re.fullmatch(r"(?:0[xX])?([0-9a-fA-F]{4})[hH]?(?:[:.](?:0[xX])?([0-9a-fA-F]{1,2})[hH]?)?", text)
     known = {_name(each): each for each in _variables(od)}
@@ -167,7 +168,7 @@ def _name(variable: ODVariable) -> str:
 
 
 def _fitting(data: bytes, size: int) -> bytes:
-    """Cuts an expedited answer to ``size`` bytes; extra bytes must only repeat the sign."""
+    """Truncates an expedited answer to ``size`` bytes; extra bytes may only repeat the sign."""
     if len(data) < size or any(each not in {0, 0xFF} for each in data[size:]):
         raise ValueError(f"{len(data)} bytes ({data.hex(' ')})")
     return data[:size]

@@ -1,8 +1,8 @@
-"""Writes of the boot-up, as a list that can be reviewed before it is carried out. Pure.
+"""Writes of the boot-up, as a list for review before execution. Pure.
 
-Every row gives the object, its value, the reason, and the field of the axis file that it comes from. The
-boot-up reads each object first, writes those that hold another value, in this order, and reads them back.
-`hdbridge.drive.bootplan` leaves objects that are optional in CiA 402 to a drive that lacks them.
+Every row contains the object, its value, the reason, and the field of the axis file from which it comes. The
+boot-up reads each object first, writes those with another value, in this order, and reads them back.
+`hdbridge.drive.bootplan` leaves missing objects that are optional in CiA 402 to the drive.
 """
 
 import math
@@ -23,9 +23,9 @@ from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG
 
 SYNCHRONOUS: Final = 1
-"""Transmission type: sent, or put into force, at every SYNC."""
+"""Transmission type: sent, or applied, at every SYNC."""
 RPDO_TIMEOUT_CYCLES: Final = 4
-"""Cycles without a set-point after which the drive stops (but not before 10 ms)."""
+"""Number of cycles without a set-point after which the drive stops (but not before 10 ms)."""
 _COB_COMPARED: Final = PDO_INVALID | 0x7FF
 _EVERYTHING: Final = -1
 _EXPONENTS: Final = (-3, -4, -2, -5, -6, -1, 0)
@@ -35,7 +35,7 @@ _LARGEST_MANTISSA: Final = 255
 
 @dataclass(frozen=True, slots=True)
 class PlannedWrite:
-    """Value that one object is to hold."""
+    """Required value of one object."""
 
     node_id: int
     index: int
@@ -43,19 +43,20 @@ class PlannedWrite:
     value: int
     why: str
     field: str = ""
-    """Field of the axis file that decides the value; empty if none does."""
+    """Field of the axis file that determines the value; empty without one."""
     type: IntegerType | None = None
-    """Integer type; None if the EDS or the profile gives it."""
+    """Integer type; None for that of the EDS or the profile."""
     compared: int = _EVERYTHING
     """Mask of the bits that must read back as written."""
     kept: int = 0
     """Mask of the bits that keep the drive's value."""
     composed: bool = False
-    """Several numbers in one object. The EDS limits are ignored, because vendors give those of one number."""
+    """True for several numbers in one object. The limits of the EDS are ignored, because vendors state them
+    for one number."""
     without: str = ""
     """Consequence if the drive keeps its own value; empty if hdbridge requires this value."""
     exact: bool = False
-    """True if a drive that has the object must hold exactly this value."""
+    """True if a drive with this object must hold exactly this value."""
     pdo: int = 0
     """Communication parameter of the PDO that the row configures; the rows of a PDO are consecutive."""
     passing: bool = False
@@ -108,14 +109,12 @@ def master_heartbeat(axis: AxisConfig) -> int:
 
 
 def set_point_timeout_ms(axis: AxisConfig) -> int:
-    """Returns the value of 1400h:05: the time without set-points after which the drive stops, ms."""
+    """Returns the value of 1400h:05: time without set-points after which the drive stops, ms."""
     return max(math.ceil(RPDO_TIMEOUT_CYCLES * axis.drive.cycle_ms), 10)
 
 
 def drives_patience_s(axis: AxisConfig) -> float:
-    """Returns the time after which a drive with all its watchdogs stops on its own if the master is silent;
-    s.
-    """
+    """Returns the time after which a drive with all its watchdogs stops without its master; s."""
     return min(axis.drive.heartbeat_ms, set_point_timeout_ms(axis)) / 1000.0
 
 
@@ -173,7 +172,7 @@ def _pdos(axis: AxisConfig, od: ObjectDictionary | None, pdos: Layouts) -> Itera
 
 
 def _carried(axis: AxisConfig, layout: Layout) -> list[str]:
-    """Returns the key of the axis file that chose each entry of a PDO; empty if none did."""
+    """Returns the key of the axis file that chose each entry of a PDO; empty without one."""
     encoder = axis.load_encoder.source
     keys = {(encoder.index, encoder.subindex): "load_encoder.source"}
     for key, channel in axis.channels.items():
@@ -203,7 +202,7 @@ def _invalid(
 def _pdo(layout: Layout, communication: int, mapping: int, fields: list[str]) -> Iterator[PlannedWrite]:
     """Yields the rows of one PDO in the order of CiA 301: invalid, empty, entries, count, valid.
 
-    ``fields`` are the keys of the axis file that chose the entries, empty if none did.
+    ``fields`` are the keys of the axis file that chose the entries; empty without one.
     """
     node_id, number, can_id, codec, every, _ = layout
     field = next(filter(None, fields), "")
@@ -258,7 +257,7 @@ def _cycle(axis: AxisConfig, od: ObjectDictionary | None) -> Iterator[PlannedWri
 
 
 def _period(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[int, int]:
-    """Returns mantissa and exponent of the cycle that the drive accepts; some have a fixed exponent or
+    """Returns mantissa and exponent of the cycle in a form that the drive accepts; some fix exponent or
     period.
     """
     seconds = Decimal(repr(axis.drive.cycle_ms)) / 1000
@@ -283,7 +282,7 @@ def _period(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[int, int]:
 
 
 def permitted(variable: ODVariable, kind: IntegerType) -> tuple[int, int]:
-    """Returns the least and greatest value of an object by its type and its limits in the EDS."""
+    """Returns the least and the greatest value of an object, by its type and its limits in the EDS."""
     low = kind.minimum if variable.min is None else max(kind.minimum, variable.min)
     high = kind.maximum if variable.max is None else min(kind.maximum, variable.max)
     return low, high

@@ -1,1 +1,1 @@
-"""Files: strict YAML and CSV, atomic writing, bundled files, and the error messages about wrong ones."""
+"""Files: strict YAML and CSV, atomic writing, bundled files, and error messages about invalid files."""

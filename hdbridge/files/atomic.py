@@ -1,7 +1,7 @@
 """Atomic file writing: a file has either its old or its new content, whatever interrupts the write.
 
-Pipes and character devices hold nothing that could be kept: they are written directly, and never replaced by
-a file.
+Pipes and character devices have no content to preserve, so they are written directly, and never replaced by a
+file.
 """
 
 import errno
@@ -27,7 +27,7 @@ def write_atomically(path: Path | str, content: str | bytes) -> None:
     """Replaces a file's content (text as UTF-8) by a temporary file, fsync, rename, and fsync of the folder.
 
     A reader, or a power cut, finds the old content or the new one. Pipes and character devices are written
-    directly. Raises `OutputError` if the location cannot be written; the old file then remains.
+    directly. Raises `OutputError`, preserving the old file, if the location cannot be written.
     """
     data = content.encode() if isinstance(content, str) else content
     try:
@@ -56,9 +56,9 @@ def write_atomically(path: Path | str, content: str | bytes) -> None:
 
 
 def check_writable(path: Path | str) -> None:
-    """Raises `InputError` unless a file can be written here; call it before a long measurement.
+    """Raises `InputError` unless a file can be written here; to be called before a long measurement.
 
-    It tries the write, so that a read-only file system or a name that is too long is detected too.
+    It attempts a write, so that a read-only file system or a name that is too long is detected as well.
     """
     try:
         if is_stream(path):
@@ -94,7 +94,7 @@ def _try_out(target: Path) -> None:
 
 
 def descriptor_of(path: Path | str) -> int | None:
-    """Returns the descriptor that a path like ``/dev/stdout`` or ``/dev/fd/3`` names; None for others."""
+    """Returns the descriptor in a path like ``/dev/stdout`` or ``/dev/fd/3``; else None."""
     if str(path) in _STANDARD:
         return _STANDARD.index(str(path))
     found = _DESCRIPTOR.fullmatch(str(path))
@@ -102,7 +102,7 @@ def descriptor_of(path: Path | str) -> int | None:
 
 
 def is_stream(path: Path | str) -> bool:
-    """Returns True for what is written directly: a pipe, a character device, an open file of this process."""
+    """Returns True for direct writing: a pipe, a character device, an open file of this process."""
     if descriptor_of(path) is not None:
         return True
     try:
@@ -155,8 +155,7 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
     """Writes a new folder with these files, all or none of them; returns their paths.
 
     Raises `InputError` if the folder is not empty or cannot be created, `OutputError` if the files cannot be
-    written, as on a full disk. After an error nothing is left, not even parents that were created for the
-    folder.
+    written, as on a full disk. An error leaves nothing behind, not even new parent folders.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: already exists; expected a new folder, nothing was written")
@@ -179,9 +178,9 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
 
 
 def new_folder(path: Path) -> Path:
-    """Creates a folder that did not exist: this one, else the name with the next free number.
+    """Creates a new folder: this one, else the name with the next free number.
 
-    Two concurrent processes get two folders.
+    Two concurrent processes receive two folders.
     """
     make_folder(path.parent)
     for number in itertools.count(1):
@@ -204,8 +203,8 @@ def _temporary_name(target: Path) -> Path:
 def _temporary(target: Path) -> Iterator[int]:
     """Yields the descriptor of the single temporary file of a target, locked.
 
-    Its name is fixed, so that a killed writer leaves only a file that the next one overwrites. A second
-    writer waits for the lock; by then the first has renamed the file, so it opens the file again.
+    Its name is fixed, so a killed writer leaves only a file that the next writer overwrites. A second writer
+    waits for the lock. The first has then renamed the file, so the second opens the file again.
     """
     name = _temporary_name(target)
     while True:

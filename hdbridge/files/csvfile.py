@@ -1,8 +1,8 @@
-"""Columns of numbers in a CSV file of any program; what is written reads back the same.
+"""Columns of numbers in a CSV file of any program; written numbers read back identically.
 
 A header line names the columns, followed by one row per sample. Separators, decimal commas, comments, lines
 before the header, a row of units under it, the encoding and gzip are recognised and reported as remarks. A
-file that numpy's parser accepts costs about two microseconds per row; any other is read row by row, to locate
+file that numpy's parser accepts takes about two microseconds per row; any other is read row by row, to locate
 its error or to keep a column of text.
 """
 
@@ -42,7 +42,7 @@ _OTHER_FILES: Final = {
     b"MDF ": "an MDF file",
     b"\x89MCAP": "an MCAP file",
 }
-"""Kinds of binary files by their first bytes, as the magic files of file(1) list them."""
+"""Kinds of binary files by their first bytes, as in the magic files of file(1)."""
 _GZIP_LEVEL = 4  # beyond it time grows several-fold and the size hardly falls
 _ROWS_AT_ONCE = 50_000
 _PIECE_BYTES = 1 << 20
@@ -50,9 +50,9 @@ _PIECE_BYTES = 1 << 20
 _SEPARATORS: Final = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 _HEAD_BYTES = 1 << 16
 _HEAD_ROWS = 100
-"""Number of rows that are searched for the header."""
+"""Number of rows searched for the header."""
 _SAMPLED = 20
-"""Number of data rows that are examined for decimal commas."""
+"""Number of data rows examined for decimal commas."""
 _COMMENT = re.compile(rb"(?:^|(?<=[\r\n]))([ \t]*(?:#|%|//)[ \t]*)([^\r\n]*)")
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*$")
 _CLOCK = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})(?:[.,](\d+))?$")
@@ -66,7 +66,7 @@ class _Layout:
     """Positions of the columns in a file, and the format of its rows."""
 
     names: tuple[str, ...]
-    """Names of the columns in order; one without a name has its number, counted from 1."""
+    """Names of the columns in order; a column without a name has its number, counted from 1."""
     header_line: int
     """Line of the header; 0 if the file has none."""
     first_line: int
@@ -81,8 +81,8 @@ class _Layout:
 class CsvFile:
     """CSV file with a known layout; `read` returns its columns.
 
-    ``wanted`` are names of columns that the caller needs, or numbers (1 is the first): the header is the line
-    that contains them. Raises `InputError` with the file and, if there is one, the line.
+    ``wanted`` are names of columns that the caller needs, or numbers (1 is the first); the header is the line
+    that contains them. Raises `InputError` with the file and, if known, the line.
     """
 
     def __init__(self, path: Path, wanted: Collection[str] = ()) -> None:
@@ -110,7 +110,7 @@ class CsvFile:
         return dict(zip(self.names, self._layout.units, strict=False))
 
     def find(self, column: str) -> str | None:
-        """Returns the name of a column given by name or by number; None without this column.
+        """Returns the name of a column given by name or number; None if it does not exist.
 
         Raises `InputError` if two columns have the name.
         """
@@ -129,8 +129,8 @@ class CsvFile:
         """Returns the columns by name, in the order of the file.
 
         Columns of ``finite`` must hold only finite numbers; those of ``times`` may hold ISO times or times of
-        day, which become seconds since the first. Others are kept: as numbers if possible (an empty cell is
-        NaN), else as text. Of columns with the same name the first is kept.
+        day, which become seconds since the first. Other columns are kept, as numbers if possible (an empty
+        cell is NaN), else as text. The first of several columns with the same name is kept.
         """
         content = self._text()
         self._held = None
@@ -195,7 +195,7 @@ class CsvFile:
         return self._named([np.ascontiguousarray(column) for column in table])
 
     def _slow(self, content: bytes, finite: Collection[str], times: Collection[str]) -> dict[str, Column]:
-        """Reads all columns row by row; raises `InputError` at the first wrong row."""
+        """Reads all columns row by row; raises `InputError` at the first invalid row."""
         rows: list[list[str]] = []
         lines: list[int] = []
         for row, line in self._rows(content):
@@ -244,7 +244,7 @@ class CsvFile:
 
 
 def csv_text(columns: Mapping[str, Column]) -> Iterator[str]:
-    """Yields the file's text in pieces; a number has as many digits as it needs to read back the same."""
+    """Yields the file's text in pieces; a number has as many digits as it needs to read back identically."""
     yield ",".join(map(_cell, columns)) + "\n"
     rows = len(next(iter(columns.values()), ()))
     for first in range(0, rows, _ROWS_AT_ONCE):
@@ -256,7 +256,7 @@ def csv_text(columns: Mapping[str, Column]) -> Iterator[str]:
 
 
 def write_columns(path: Path, columns: Mapping[str, Column]) -> None:
-    """Writes the file atomically, compressed if its name ends in ``.gz``; same columns, same bytes."""
+    """Writes the file atomically, compressed if its name ends in ``.gz``; deterministic."""
     content = io.BytesIO()
     if path.suffix == ".gz":
         with gzip.GzipFile("", "wb", _GZIP_LEVEL, content, mtime=0) as file:
@@ -276,7 +276,7 @@ def _wrong(text: str) -> InputError:
 
 
 def text_of(path: Path) -> tuple[bytes, str]:
-    """Returns the file's text, decompressed, as UTF-8 without a mark, and its encoding if it was another."""
+    """Returns the file's text, decompressed, as UTF-8 without a mark, and its encoding if different."""
     try:
         with open_regular(path) as plain:
             content = _bounded(plain)
@@ -317,7 +317,7 @@ def text_of(path: Path) -> tuple[bytes, str]:
 
 
 def _bounded(file: BinaryIO | gzip.GzipFile) -> bytes:
-    """Reads at most one piece more than is allowed; a single `read` could take far more memory."""
+    """Reads at most one piece more than permitted, because a single `read` could take far more memory."""
     content = io.BytesIO()
     while content.tell() <= MAXIMUM_BYTES and (piece := file.read(_PIECE_BYTES)):
         content.write(piece)
@@ -366,7 +366,7 @@ def _head(content: bytes) -> list[_Line]:
 
 
 def _layout(path: Path, content: bytes, wanted: Collection[str]) -> _Layout:
-    """Finds separator and header: the line with most ``wanted`` names, else the one above the numbers."""
+    """Finds separator and header: the line with most ``wanted`` names, else the line above the numbers."""
     head = _head(content)
     rows = [line for line in head if not line.comment]
     if not rows:
@@ -427,7 +427,7 @@ def _named_header(head: Sequence[_Line], wanted: Collection[str]) -> tuple[str, 
 
 
 def _guessed_header(head: Sequence[_Line]) -> tuple[str, _Line | None]:
-    """Returns the separator that gives most number cells, and the line of names above them, if any."""
+    """Returns the separator with most number cells, and the line of names above them, if any."""
     best: tuple[int, str, _Line | None] | None = None
     for separator in _SEPARATORS:
         rows = [line for line in head if not line.comment]
@@ -462,7 +462,7 @@ def _numbers(line: _Line, separator: str) -> int:
 
 
 def _is_row_of_units(first: Sequence[str], second: Sequence[str], needed: Sequence[int]) -> bool:
-    """Returns True for words in each needed column with numbers or times in the row below."""
+    """Returns True for words in each needed column above a row of numbers or times."""
     if max(needed) >= min(len(first), len(second)):
         return False
 
@@ -514,7 +514,7 @@ def _is_number(cell: str, comma: bool = False) -> bool:
 
 
 def _seconds(cells: Sequence[str]) -> FloatArray | None:
-    """Returns seconds since the first of ISO times or times of day; None if a cell is neither.
+    """Returns the seconds since the first of ISO times or times of day; None for any other cell.
 
     Times of day without a date continue past midnight.
     """
@@ -530,14 +530,14 @@ def _seconds(cells: Sequence[str]) -> FloatArray | None:
 
 
 class _Moment(NamedTuple):
-    """A time: whole seconds, and the fraction."""
+    """Time as whole seconds and a fraction."""
 
     whole: int
     part: float
 
 
 def _moment(cell: str) -> _Moment | None:
-    """Parses an ISO time or a time of day; None if the text is neither."""
+    """Parses an ISO time or a time of day; None for any other text."""
     text = cell.strip()
     if clock := _CLOCK.match(text):
         hours, minutes, seconds = (int(each) for each in clock.groups()[:3])

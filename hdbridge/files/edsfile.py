@@ -1,8 +1,8 @@
 """EDS and DCF files (CiA 306) as vendors ship them: a front end for canopen's reader.
 
-canopen reads a well-formed file in UTF-8. Here any file is decoded, and its names, numbers and compact
-descriptions are brought into the form that canopen accepts. A value that cannot be read is reported with
-line, section and key: as an `InputError` if an object cannot be described without it, else in `Eds.unread`.
+canopen reads a well-formed file in UTF-8. This front end decodes any file and converts its names, numbers and
+compact descriptions to the form that canopen accepts. An unreadable value is reported with line, section and
+key: as an `InputError` if an object cannot be described without it, else in `Eds.unread`.
 """
 
 import io
@@ -35,7 +35,7 @@ _BITS: Final = {
     datatypes.INTEGER8: 8, datatypes.INTEGER16: 16, datatypes.INTEGER24: 24, datatypes.INTEGER32: 32,
     datatypes.INTEGER40: 40, datatypes.INTEGER48: 48, datatypes.INTEGER56: 56, datatypes.INTEGER64: 64,
 }  # fmt: skip
-"""Signed types, whose values a file may give in two's complement."""
+"""Signed types, whose values a file may state in two's complement."""
 _VALUES: Final = ("LowLimit", "HighLimit", "DefaultValue", "ParameterValue")
 _LARGEST_COMPACT: Final = 254
 _PDOS: Final = 512
@@ -52,7 +52,7 @@ class Eds(NamedTuple):
 
     dictionary: ObjectDictionary
     unread: tuple[str, ...]
-    """Values that could not be read and count as missing: one line each, with line, section and key."""
+    """Unreadable values, which count as missing: one line each, with line, section and key."""
 
 
 def read_eds(path: Path | str, node_id: int) -> Eds:
@@ -118,7 +118,7 @@ class _Section:
         self.keys: dict[str, _Key] = {}
 
     def get(self, key: str) -> str:
-        """Returns the value of a key; empty if there is none."""
+        """Returns the value of a key; empty if missing."""
         found = self.keys.get(key.upper())
         return found.value if found is not None else ""
 
@@ -155,7 +155,7 @@ class _Reader:
     # -- lines --------------------------------------------------------------------------------------------
 
     def _split(self, text: str) -> None:
-        """Splits the text into sections and keys. Of two equal keys the first counts, as in Windows."""
+        """Splits the text into sections and keys. The first of two equal keys counts, as in Windows."""
         section = None
         end = text.find(_DOS_END)
         for number, raw in enumerate(re.split(r"\r\n|\n|\r", text[:end] if end >= 0 else text), start=1):
@@ -185,7 +185,7 @@ class _Reader:
     # -- values -------------------------------------------------------------------------------------------
 
     def _number(self, section: _Section, key: str, default: int | None = None) -> int:
-        """Returns a number that an object requires; ``default`` if the key is absent or empty."""
+        """Returns a number required by an object; ``default`` if the key is missing or empty."""
         text, line = section.keys.get(key.upper(), _Key("", section.line))
         value = _integer(text)
         if value is None and text == "" and default is not None:
@@ -195,7 +195,7 @@ class _Reader:
         return value
 
     def _value(self, section: _Section, key: str, data_type: int) -> str | None:
-        """Returns a value as canopen reads it; None without a readable one."""
+        """Returns a value as read by canopen; None if unreadable."""
         text = section.get(key)
         if text == "" or data_type not in _INTEGERS:
             return text or None
@@ -220,7 +220,7 @@ class _Reader:
     # -- objects ------------------------------------------------------------------------------------------
 
     def _objects(self) -> dict[int, dict[int | None, _Section]]:
-        """Returns the sections of each object: None is the object itself, the others are its sub-indices."""
+        """Returns the sections of each object: None is the object itself, all others are its sub-indices."""
         objects: dict[int, dict[int | None, _Section]] = {}
         for name, section in self._sections.items():
             match = _OBJECT.fullmatch(name)
@@ -308,7 +308,7 @@ class _Reader:
         return int(value != 0)
 
     def _own_type(self, number: int) -> int:
-        """Returns the base type of a custom type, as CANFestival writes them; bytes if there is none."""
+        """Returns the base type of a custom type, as written by CANFestival; bytes if unknown."""
         section = self._sections.get(f"{number:X}SUB1")
         value = _integer(section.get("DefaultValue")) if section is not None else None
         return value if value is not None and 0 < value <= _LAST_STANDARD_TYPE else datatypes.DOMAIN
@@ -386,7 +386,7 @@ def _compact_mapping(device: _Section) -> Iterator[tuple[int, _Section]]:
 
 
 def _made(name: str, of: _Section, keys: Mapping[str, str]) -> _Section:
-    """Creates a section that the file describes within another one."""
+    """Creates a section that the file describes within another section."""
     section = _Section(of.name, of.line)
     section.keys = {
         key.upper(): _Key(value, of.line) for key, value in (("ParameterName", name), *keys.items())
@@ -395,7 +395,7 @@ def _made(name: str, of: _Section, keys: Mapping[str, str]) -> _Section:
 
 
 def _integer(text: str) -> int | None:
-    """Parses a decimal number (leading zeros allowed) or a hexadecimal one; None if it is neither."""
+    """Parses a decimal number (leading zeros allowed) or a hexadecimal number; None for any other text."""
     match = _NUMBER.fullmatch(text)
     if match is None:
         return None
@@ -404,7 +404,7 @@ def _integer(text: str) -> int | None:
 
 
 def _bounds(low: str | None, high: str | None) -> bool:
-    """Returns False for limits that leave no choice, such as 0 and 0, which mean that there are none."""
+    """Returns False for limits that leave no choice, such as 0 and 0, which denote their absence."""
     least, greatest = _integer(low or ""), _integer(high or "")
     return least is None or greatest is None or least < greatest
 

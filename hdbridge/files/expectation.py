@@ -28,7 +28,7 @@ class Field:
                 yield member
 
     def values(self) -> list[Any]:
-        """Returns the values that it accepts, if the set is closed."""
+        """Returns the accepted values if the set is closed."""
         found: list[Any] = []
         for member in self.types():
             if get_origin(member) is Literal:
@@ -43,7 +43,7 @@ class Field:
 
 
 def nearest(word: str, choices: Sequence[str]) -> str | None:
-    """Returns the choice that ``word`` probably means, or None."""
+    """Returns the most probable intended choice for ``word``, or None."""
     close = difflib.get_close_matches(word.lower(), [each.lower() for each in choices], n=1, cutoff=0.6)
     return next((each for each in choices if close and each.lower() == close[0]), None)
 
@@ -59,7 +59,7 @@ def key_of(name: str, field: FieldInfo) -> str:
 
 
 def field_names(model: type[BaseModel], at: Sequence[str | int]) -> list[str]:
-    """Returns the keys that a mapping at a location may have."""
+    """Returns the permitted keys of a mapping at a location."""
     place = field_at(model, at)
     models = [each for each in place.types() if _is_model(each)] if place else []
     return [key_of(name, field) for each in models for name, field in each.model_fields.items()]
@@ -76,7 +76,7 @@ def field_at(model: type[BaseModel], at: Sequence[str | int]) -> Field | None:
 
 
 def expected_words(field: Field | None) -> str:
-    """For example "an integer from 1 to 127 (node id of the drive)"."""
+    """Describes a field, for example "an integer from 1 to 127 (node id of the drive)"."""
     if field is None:
         return "a value"
     words = type_words(field)
@@ -84,7 +84,7 @@ def expected_words(field: Field | None) -> str:
 
 
 def type_words(field: Field) -> str:
-    """For example "a number above 0, at most 3600"."""
+    """Describes a field's type, for example "a number above 0, at most 3600"."""
     words = " or ".join(dict.fromkeys(_words(each) for each in field.types())) or "nothing"
     metadata = list(field.metadata)
     for member in _unioned(field.annotation):

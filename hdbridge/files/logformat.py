@@ -1,7 +1,7 @@
 """Log line of an event: text for people, a JSON object for programs.
 
-The library reports events through `logging`: the message is the event's name, its argument a dictionary of
-facts.
+The library reports events through `logging`, with the event's name as the message and a dictionary of facts
+as its argument.
 """
 
 import json
@@ -32,7 +32,7 @@ class ForMachines(logging.Formatter):
 
 
 class LogFile(logging.FileHandler):
-    """Log file that stops with one message on a full disk, because the axis matters more than its log."""
+    """Log file that stops with one message on a full disk, because the axis takes precedence over its log."""
 
     failed = False
 

@@ -1,8 +1,8 @@
 """Permitted locations of results, so that no output overwrites anything of value.
 
-A result may replace a result of its own kind and nothing else: no input of the command, no other output, no
-file that makes a folder a profile or a recording. Pipes and character devices are written directly
-(`write_atomically`); sockets, disks and folders are refused. Everything is checked before anything moves.
+A result may replace only a result of the same kind: not an input of the command, another output, or a file
+that makes a folder a profile or a recording. Pipes and character devices are written directly
+(`write_atomically`); sockets, disks and folders are refused. Everything is checked before any motion.
 """
 
 import os
@@ -23,7 +23,7 @@ _HEAD_BYTES: Final = 4096
 
 
 class Kind(Enum):
-    """Kind of an output, with the pattern that the beginning of such a file matches."""
+    """Kind of an output, with the pattern for the beginning of such a file."""
 
     JSON = r'\s*\{\s*"schema": "hdbridge\.'
     PAGE = r"(?s).*<!doctype html>"
@@ -44,7 +44,7 @@ class Kind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """One location that a command writes to."""
+    """Location written by a command."""
 
     option: str
     """Option that names it, for messages: ``--json``."""
@@ -77,8 +77,8 @@ def check_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = ()) -> Non
         for other in outputs[:number]:
             if not _endless(output.path) and _same(output.path, other.path):
                 raise InputError(
-                    f"{output.path}: {other.option} and {output.option} both write there; expected different "
-                    f"places"
+                    f"{output.path}: {other.option} and {output.option} both write to this path; expected "
+                    f"different paths"
                 )
 
 
@@ -162,7 +162,7 @@ def _check_folder(output: Output, inputs: Sequence[Path]) -> None:
             )
     for each in inputs:
         if _same(folder, each):
-            raise InputError(f"{folder}: {output.option} is what this command reads; expected a new folder")
+            raise InputError(f"{folder}: {output.option} is an input of this command; expected a new folder")
     existing = place
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
@@ -183,9 +183,9 @@ def _redirected() -> list[tuple[str, os.stat_result]]:
 
 
 def _same(one: Path, other: Path) -> bool:
-    """Returns True if two paths name one file: by links of either kind, or by another spelling or case.
+    """Returns True if two paths name one file, also through links, or in another spelling or case.
 
-    For files that do not exist yet, case is ignored, because some file systems ignore it.
+    The case of files that do not exist yet is ignored, because some file systems ignore it.
     """
     mine, its = descriptor_of(one), descriptor_of(other)
     if mine is not None or its is not None:
@@ -237,7 +237,7 @@ _failures: ContextVar[list[OutputError] | None] = ContextVar("failures", default
 def failures_deferred() -> Iterator[list[OutputError]]:
     """Defers write failures of results within the block; yields the list of errors.
 
-    After a measurement the figures are printed first, so that a full disk does not lose them.
+    After a measurement, the figures are printed first, so that a full disk does not lose them.
     """
     failed: list[OutputError] = []
     token = _failures.set(failed)
@@ -249,7 +249,7 @@ def failures_deferred() -> Iterator[list[OutputError]]:
 
 @contextmanager
 def writing() -> Iterator[None]:
-    """Context of writing a result: its `OutputError` is deferred if an outer block defers failures."""
+    """Defers an `OutputError` while a result is written, if an outer block defers failures."""
     try:
         yield
     except OutputError as error:

@@ -1,4 +1,4 @@
-"""Files of one axis, found from user input or a machine file, and the location of bundled ones."""
+"""Files of one axis, found from user input or a machine file, and the location of bundled files."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ def bundled_folder(kind: Literal["eds", "profiles"], package: Path = _PACKAGE) -
 
 
 def bundled_profile(name: str) -> Path:
-    """Returns the folder of a bundled profile; raises `InputError` with the existing ones and the nearest."""
+    """Returns the folder of a bundled profile; InputError with the existing profiles and the nearest name."""
     folder = bundled_folder("profiles")
     if name and (folder / name / "axis.yaml").is_file():
         return folder / name
@@ -55,14 +55,14 @@ class Profile:
 
     @property
     def simulated(self) -> Path:
-        """File that describes the simulated drive: the axis's twin if there is one, else its truth file."""
+        """File that describes the simulated drive: the axis's twin if it exists, else its truth file."""
         return self.twin if self.twin.is_file() else self.truth
 
     @classmethod
     def find(cls, text: str, base: Path = Path()) -> Self:
-        """Finds a profile by folder, axis file or bundled name; raises `InputError` if there is none.
+        """Finds a profile by folder, axis file or bundled name; raises `InputError` if it does not exist.
 
-        ``base`` is the folder that a relative path starts from.
+        ``base`` is the folder from which a relative path starts.
         """
         path = base / text
         if not path.exists():

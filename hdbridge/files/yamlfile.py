@@ -1,4 +1,4 @@
-"""Strict YAML: a file is read exactly, or refused in one line that gives the place and the reason.
+"""Strict YAML: a file is read exactly, or refused in one line with the location and the reason.
 
 The dialect is the core schema of YAML 1.2 (so `off` and `2025-01-31` are text, `1e-3` is a number and `0x402`
 an integer), one document of plain mappings, lists and scalars: no tags, anchors or aliases, no duplicate
@@ -46,7 +46,7 @@ _CONVERSIONS: tuple[tuple[re.Pattern[str], Callable[[str], int | float]], ...] =
 
 
 class FileError(InputError):
-    """A file is wrong. The text is the first error; `details` has all of them, one line each."""
+    """A file is invalid. The text is the first error; `details` has all errors, one line each."""
 
     def __init__(self, *texts: str) -> None:
         lines = tuple(map(one_line, texts))
@@ -64,14 +64,9 @@ class Node:
     value: Any
     """Plain Python: dict, list, str, int, float, bool or None."""
     found: str
-    """The value as text, for error messages."""
+    """Value as text, for error messages."""
     children: dict[str, tuple[Node, Node]] | list[Node] | None = None
-    """Children; for a mapping: key -> (key's node, value's node)."""
-
-
-def compose(text: str, path: Path) -> Node:
-    """Returns the root node of a YAML text; ``path`` only names it in messages (`FileError`)."""
-    return _Composer(text, path).document()
+    """Children; for a mapping, key -> (key's node, value's node)."""
 
 
 class _Composer:
@@ -103,7 +98,7 @@ class _Composer:
             raise self._not_yaml(self._in_better_words() or problem) from None
 
     def _in_better_words(self) -> yaml.YAMLError | None:
-        """Returns the error of the pure-Python parser, which is clearer and the same on every computer."""
+        """Returns the error of the pure-Python parser, which is clearer and equal on every computer."""
         try:
             for _ in yaml.parse(self._text, Loader=yaml.SafeLoader):
                 pass
@@ -240,19 +235,19 @@ def read_yaml(path: Path | str) -> Document:
 def document_from_text(text: str, path: Path | str) -> Document:
     """Parses YAML text as a document; ``path`` only names it in messages."""
     path = Path(path)
-    return Document(path, compose(text, path))
+    return Document(path, _Composer(text, path).document())
 
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """One YAML document: its data, and the position of each value."""
+    """YAML document: its data, and the position of each value."""
 
     path: Path
     root: Node
 
     @property
     def data(self) -> Any:
-        """The content as plain dicts, lists and scalars."""
+        """Content as plain dicts, lists and scalars."""
         return self.root.value
 
     def validate(self, model: type[M], at: Location = ()) -> M:
@@ -271,7 +266,7 @@ class Document:
         return FileError(self._line(at, message, key=key))
 
     def position(self, at: Location) -> tuple[int, int]:
-        """Returns line and column of the key at a location, or of the innermost existing one around it."""
+        """Returns line and column of the key at a location, or of the innermost existing key around it."""
         node = self._node(at, key=True)
         return node.line, node.column
 
@@ -299,7 +294,7 @@ class Document:
     def _complaint(
         self, model: type[BaseModel], at: Location, error: ErrorDetails
     ) -> tuple[Location, str, bool]:
-        """Returns location, message, and True if the key is meant rather than its value."""
+        """Returns location, message, and True if the error is in the key rather than its value."""
         place, kind = error["loc"], error["type"]
         if kind == "extra_forbidden":
             names = field_names(model, place[:-1])
@@ -334,7 +329,7 @@ class Document:
     def _walk(self, at: Location) -> tuple[Location, list[Node]]:
         """Returns the steps that exist in the file, and the values along them, the root first.
 
-        Other steps are left out: pydantic includes the names of a union's members in its locations.
+        Other steps are omitted, because pydantic includes the names of a union's members in its locations.
         """
         kept: Location = ()
         values = [self.root]
@@ -356,7 +351,7 @@ def wrong(message: str, *at: str | int) -> PydanticCustomError:
 
 
 def dotted(at: Location) -> str:
-    """Formats a location the way a person writes it: ``effects[0].parameters.width_deg``."""
+    """Formats a location in the usual notation: ``effects[0].parameters.width_deg``."""
     text = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in at)
     return text.removeprefix(".")
 
@@ -367,15 +362,15 @@ def _hint(word: str, choices: Sequence[str]) -> str:
 
 
 class Hex(int):
-    """Integer that is written in hexadecimal: object indices, vendor and product numbers."""
+    """Integer written in hexadecimal: object indices, vendor and product numbers."""
 
 
 class Line(list[Any]):
-    """List that is written in one line: a row of a table, an interval."""
+    """List written on one line: a row of a table, an interval."""
 
 
 class _Dumper(yaml.SafeDumper):
-    """YAML dumper that quotes any text that either dialect, 1.1 or 1.2, would read as something else."""
+    """YAML dumper that quotes any text that either dialect, 1.1 or 1.2, would read as another type."""
 
     def ignore_aliases(self, data: Any) -> bool:
         """Disables aliases, which are refused on reading."""
@@ -401,7 +396,7 @@ _Dumper.add_representer(
 
 
 def _text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
-    """Uses double quotes if other styles would fold or lose line breaks and Unicode marks."""
+    """Uses double quotes if other styles would fold the text or lose line breaks and Unicode marks."""
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"' if _BREAKS.search(text) else None)
 
 

@@ -1,9 +1,9 @@
-"""The rows of a fleet as Parquet: written in increments during a run, and compacted at its end.
+"""Rows of a fleet as Parquet: written in increments during a run, and compacted at its end.
 
-`OUT/recordings` and `OUT/findings` hold the result, sorted and partitioned by the first digit of the key, so
-the same recordings always give the same bytes. `OUT/increments` holds rows that are not compacted yet; a
-killed run leaves them behind, and the next run includes them. docs/files.md describes the columns, which are
-a contract.
+`OUT/recordings` and `OUT/findings` contain the result, sorted and partitioned by the first digit of the key,
+so the same recordings always result in the same bytes. `OUT/increments` contains rows that are not compacted
+yet; a killed run leaves them behind, and the next run includes them. docs/files.md describes the columns,
+which are a contract.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ STORED: Final = [
     *("key", "path", "joint", "axis", "date", "ratio"),
     *("model_sha256", "version", "reason", "stamp", "axes"),
 ]
-"""Columns from which a run sees whether it has to read a recording."""
+"""Columns from which a run decides whether to read a recording."""
 
 
 def schema(name: str) -> pa.Schema:
@@ -128,7 +128,7 @@ class Dataset:
         self.folder = folder
 
     def create(self) -> None:
-        """Creates the folder; InputError if that fails or the folder holds something else."""
+        """Creates the folder; InputError on failure or if the folder has other contents."""
         if self.folder.is_dir() and any(self.folder.iterdir()) and not self._is_one():
             raise InputError(
                 f"{self.folder}: was not written by hdbridge fleet; expected a new folder, or one "
@@ -167,7 +167,7 @@ class Dataset:
         return Stored(self._rows(RECORDINGS, STORED))
 
     def renew(self, changes: Mapping[tuple[str, str], Mapping[str, Any]]) -> None:
-        """Replaces columns of rows, by key and path, and keeps their findings."""
+        """Replaces columns of rows, by key and path, without changing their findings."""
         if changes:
             self.add(
                 [
@@ -178,7 +178,7 @@ class Dataset:
             )
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Writes rows of recordings, each with its ``findings``; after a crash all of them or none exist."""
+        """Writes rows of recordings, each with its ``findings``; after a crash, either all or none exist."""
         if not rows:
             return
         folder = self.folder / INCREMENTS
@@ -197,8 +197,8 @@ class Dataset:
     def compact(self, present: Collection[tuple[str, str]] = ()) -> None:
         """Merges the increments into the parts, marks duplicates and sorts the rows.
 
-        ``present`` holds key and path of each recording of the last run. Other rows of the same paths belong
-        to an older file, model or version and are dropped.
+        ``present`` contains key and path of each recording of the last run. Other rows of the same paths
+        belong to an older file, model or version, and are dropped.
         """
         current: dict[str, set[str]] = defaultdict(set)
         for key, path in present:
@@ -228,7 +228,7 @@ class Dataset:
             done.unlink()
 
     def recordings(self) -> list[dict[str, Any]]:
-        """Returns the rows of all recordings, each with its ``findings`` in the order of their rank."""
+        """Returns the rows of all recordings, each with its ``findings`` by rank."""
         rows = {(row["key"], row["path"]): {**row, "findings": []} for row in self._rows(RECORDINGS)}
         for each in sorted(self._rows(FINDINGS), key=lambda row: row["rank"]):
             if (each["key"], each["path"]) in rows:

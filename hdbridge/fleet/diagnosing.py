@@ -1,7 +1,7 @@
-"""The task of a worker: turns one recording of the fleet into plain rows. Errors go into the row.
+"""Task of a worker: converts one recording of the fleet to plain rows, including errors.
 
 The key of a row is a hash of its samples, model and version. The motor orders are estimated from the samples
-alone, so that joints can be distinguished without trusting their models.
+alone, so that joints can be distinguished without relying on their models.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 ORDERS: Final = (1, 2, 3, 4, 5, 6, 7, 8)
 """Motor orders that identify a joint."""
 SETTLED_DEG: Final = 90.0
-"""Motor travel after a reversal that is excluded from the orders, because the loop is not yet crossed."""
+"""Motor travel after a reversal that is excluded from the orders, because the loop has not been crossed
+yet."""
 TURNS: Final = 2.0
 """Minimum travel for estimating orders; motor turns."""
 NO_MEMORY: Final = "more memory was needed than a worker has; raise --memory"
@@ -40,7 +41,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Model:
-    """Model of a joint as text, or the reason why there is none."""
+    """Model of a joint as text, or the reason for its absence."""
 
     text: str = ""
     where: str = ""
@@ -51,7 +52,7 @@ class Model:
 
 @cache
 def model_in(text: str, where: str) -> Model:
-    """Checks the text of a model file; an invalid one returns a `Model` with the reason."""
+    """Checks the text of a model file; the `Model` of an invalid file contains the reason."""
     from hdbridge.axis.model import TransmissionModel
 
     try:
@@ -65,7 +66,7 @@ def model_in(text: str, where: str) -> Model:
 def fitted(sources: Sequence[Source], where: str) -> Model:
     """Fits the model of a joint to the first usable one of its recordings.
 
-    The reason for a failure is that of a recording which could be read, if there is one.
+    The reason for a failure is preferably that of a readable recording.
     """
     from hdbridge.commissioning.calibration import fit
 
@@ -94,7 +95,7 @@ def axes_of(path: str) -> list[str] | str:
 
 
 def read(source: Source) -> Recording:
-    """Reads the recording of a source. InputError if anything is wrong with it."""
+    """Reads the recording of a source; InputError for any error in it."""
     with fetched(source.path) as path:
         try:
             if source.is_flight:
@@ -118,7 +119,7 @@ def read(source: Source) -> Recording:
 
 
 def diagnosed(source: Source, model: Model, known: str = "") -> Row:
-    """Diagnoses a recording and returns its row; without ``findings`` if its key is the ``known`` one."""
+    """Diagnoses a recording and returns its row, without ``findings`` if its key is the ``known`` key."""
     row = _described(source) | {"model": model.where or None, "model_sha256": model.sha256}
     try:
         recording = read(source)
@@ -190,7 +191,7 @@ def _of_samples(recording: Recording) -> Row:
 
 
 def _key(row: Mapping[str, Any]) -> str:
-    """Hashes samples, model and version, or samples, joint, reason and version if there is no diagnosis."""
+    """Hashes samples, model and version; without a diagnosis, samples, joint, reason and version."""
     if row.get("reason"):
         parts = [row.get("samples_sha256", ""), row["joint"], row["reason"], row["version"]]
     else:
@@ -283,7 +284,7 @@ def _clear(motor_deg: FloatArray) -> np.ndarray[Any, np.dtype[np.bool_]]:
 
 
 def local_model(path: str) -> Model:
-    """Reads the model file at a local path or URL; errors become the reason of the `Model`."""
+    """Reads the model file at a local path or URL; an error becomes the reason of the `Model`."""
     try:
         with fetched(path) as file:
             return model_in(Path(file).read_text(encoding="utf-8"), path)

@@ -1,7 +1,7 @@
-"""A run over a fleet: one Dask task for each recording, on a local or an existing cluster.
+"""Run over a fleet: one Dask task per recording, on a local or an existing cluster.
 
 Dask schedules the tasks, restarts workers and repeats the tasks of a dead worker. A recording that repeatedly
-kills its worker is diagnosed once more at the end, alone; if that fails too, its row reports it.
+kills its worker is diagnosed once more at the end, alone. If this fails too, its row reports it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 INCREMENT_S: Final = 1.0
-"""Minimum time between two increments: `kill -9` loses at most the recordings finished in that time."""
+"""Minimum time between two increments; `kill -9` loses at most the recordings finished in this time."""
 POLL_S: Final = 0.25
 AHEAD: Final = 2000
 """Maximum number of tasks submitted to the scheduler at a time."""
@@ -37,19 +37,19 @@ KILLED: Final = (
     "it kills its worker each time, most likely for memory; raise --memory, or shorten the recording"
 )
 RETRIED: Final = (KILLED, NO_MEMORY)
-"""Reasons for which a recording is diagnosed again although nothing has changed: --memory may have."""
+"""Reasons for diagnosing an unchanged recording again, because --memory may have changed."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a run; numbers of recordings."""
+    """Progress of a run, in numbers of recordings."""
 
     done: int
     total: int
     failed: int
     known: int
     memory_mb: float
-    """Largest memory of a worker seen so far."""
+    """Highest memory use of a worker so far."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def run(
 ) -> Progress:
     """Diagnoses the recordings that are not in the data set yet, and adds them.
 
-    A recording whose files, manifest row and model are as they were is not read. One that failed for a reason
+    A recording with unchanged files, manifest row and model is not read. A recording that failed for a reason
     in ``retried`` is tried again.
 
     ``model`` is the model of every joint, ``models`` a folder of JOINT.yaml; a joint without one gets a model
@@ -132,8 +132,8 @@ def watch(
 ) -> None:
     """Passes sources and ``retried`` to ``diagnose`` whenever some are new, until interrupted; or ``once``.
 
-    A recording is ready when two listings, ``interval_s`` apart, agree on it, so one that is still being
-    written waits for a later round. The first call gets all recordings that are ready, because models may
+    A recording is ready once two listings, ``interval_s`` apart, agree on it, so a recording that is still
+    being written waits for a later round. The first call receives all ready recordings, because models may
     have changed. An error of a later listing is reported, and the next round tries again.
     """
     before: dict[tuple[str, str | None], str | None] | None = None
@@ -174,7 +174,7 @@ def _name(source: Source) -> tuple[str, str | None]:
 
 
 def _is_new(file: Sequence[Source], stored: Stored) -> bool:
-    """Returns True for a file that has to be read; not for one that is missing, as it was before."""
+    """Returns True for a file that must be read, except a file that is missing as before."""
     if any(each.stamp is None for each in file):
         return any(stored.row(each) is None for each in file)
     return not stored.unchanged(file)
@@ -190,10 +190,10 @@ class _Run:
         retried: Collection[str],
     ) -> None:
         self._clients = clients
-        """Returns the client of the cluster; the first call starts it."""
+        """Returns the client of the cluster; the first call starts the cluster."""
         self._dataset = dataset
         self._stored = dataset.stored()
-        self._tell = progress
+        self._notify = progress
         self._interrupted = interrupted
         self._retried = retried
         self._renewed: dict[tuple[str, str], Row] = {}
@@ -204,7 +204,7 @@ class _Run:
         self._memory = 0.0
 
     def of(self, sources: Sequence[Source], model: Path | None, models: Path | None) -> Progress:
-        """Performs the run. However it ends, the rows made until then are kept."""
+        """Performs the run. However it ends, the rows so far are kept."""
         try:
             sources = self._split_flights(sources)
             self._total = len(sources) + len(self._present)
@@ -311,7 +311,7 @@ class _Run:
     def _results(
         self, tasks: Iterable[tuple[Callable[..., Any], tuple[Any, ...]]]
     ) -> Iterator[tuple[int, Any]]:
-        """Yields number and result of each task as it completes; None for one that kills its workers."""
+        """Yields number and result of each task on completion; None for a task that kills its workers."""
         from distributed import KilledWorker, as_completed
 
         tasks = list(tasks)
@@ -360,7 +360,7 @@ class _Run:
         self._measure(client)
 
     def _measure(self, client: Client) -> None:
-        """Updates the largest memory of a worker."""
+        """Updates the highest memory use of a worker."""
         with suppress(OSError):
             workers: Collection[Mapping[str, Any]] = client.scheduler_info(n_workers=-1)["workers"].values()
             self._memory = max(
@@ -388,4 +388,4 @@ class _Run:
         return Progress(len(self._present), self._total, self._failed, self._known, self._memory)
 
     def _report(self) -> None:
-        self._tell(self._state())
+        self._notify(self._state())

@@ -1,7 +1,7 @@
-"""The fleet as the prior of a single joint's diagnosis: `fleet.parquet` next to the page of a run.
+"""Fleet as the prior for the diagnosis of a single joint: `fleet.parquet` next to the page of a run.
 
-It holds, for each cause, how often joints of each group have it, how often the diagnosis names it in joints
-with and without it, and how its parameters vary between joints. All of it is estimated from the fleet.
+It contains, for each cause, its frequency in joints of each group, the rates of findings in joints with and
+without it, and the distribution of its parameters between joints. All of these are estimated from the fleet.
 """
 
 import math
@@ -29,7 +29,7 @@ GROUPS: Final = ("gear", "batch", "cell", "lubricant")
 def prior_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Estimates the prior from the recordings of a data set (`Dataset.recordings`).
 
-    One row for each cause and group; the group of all joints has no attribute.
+    One row per cause and group; the group of all joints has no attribute.
     """
     joints = own_recordings(rows)[0]
     result: list[dict[str, Any]] = []
@@ -89,7 +89,7 @@ def write_prior(path: Path, rows: Sequence[Row]) -> None:
 
 
 def read_prior(path: Path, of: Mapping[str, str]) -> Prior:
-    """Reads the prior of a joint ``of`` these groups, by attribute. InputError for a wrong file or group."""
+    """Reads the prior of a joint ``of`` these groups, by attribute. InputError for a bad file or group."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

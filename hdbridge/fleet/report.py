@@ -25,14 +25,14 @@ ROWS: Final = 200
 NOT_KNOWN: Final = "not known yet"
 NO_PAGES: Final[Mapping[str, str]] = MappingProxyType({})
 Joint = Callable[[str], Cell]
-"""Returns the name of a joint, with a link to its page if there is one."""
+"""Returns the name of a joint, with a link to its page if it exists."""
 _FAILURES: Final = 40
-"""Length of the prefix by which failure reasons are grouped; characters."""
+"""Length of the prefix by which failure reasons are grouped, characters."""
 _KINDS: Final = {"swapped": "another joint", "turned": "another encoder or zero", "changed": "changed orders"}
 
 
 def hours_words(remaining: Interval | None) -> str:
-    """Formats the hours to a limit with their interval, or reports that they are not known yet."""
+    """Formats the hours to a limit with their interval, or reports that they are unknown."""
     if remaining is None:
         return NOT_KNOWN
     if remaining.high == 0.0:
@@ -43,7 +43,7 @@ def hours_words(remaining: Interval | None) -> str:
 def fleet_page(summary: Summary, folder: Path, pages: Mapping[str, str] = NO_PAGES) -> Page:
     """Returns the page of a summary.
 
-    ``folder`` holds the data set, ``pages`` the addresses of the joints' pages that exist.
+    ``folder`` contains the data set, ``pages`` the addresses of the existing joint pages.
     """
 
     def joint(name: str) -> Cell:
@@ -53,7 +53,7 @@ def fleet_page(summary: Summary, folder: Path, pages: Mapping[str, str] = NO_PAG
     commands = []
     if without is not None:
         line = shlex.join(["hdbridge", "fleet", "report", str(folder), "--joint", without])
-        about = f"writes the page of {without}; with --pages, those of all joints of the list"
+        about = f"writes the page of {without}; with --pages, those of all listed joints"
         commands.append(Command(line, about))
     return Page(
         title=f"Fleet of {summary.joints:,} joints",
@@ -75,7 +75,7 @@ def _verdict(summary: Summary) -> str:
             text += f", {summary.limit_arcsec:g} arcsec in {hours_words(soonest.remaining)} h"
         text += "."
     elif summary.recordings > len(summary.failed):
-        text = f"No joint of {summary.joints:,} stands out by a cause that repeats and is not common to all."
+        text = f"None of {summary.joints:,} joints has a cause that repeats and is not common to all."
     else:
         text = "No joint can be judged."
     if wrong := len(summary.failed):
@@ -85,20 +85,20 @@ def _verdict(summary: Summary) -> str:
 
 
 def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
-    """Yields the sections that have rows; the list of joints always."""
+    """Yields the sections that have rows, and always the list of joints."""
     text = (
         "Joints with a cause that appeared after the first recording and repeats, or that grows: more often "
         "than the fleet's rate of wrong names explains. No more than 1 in 100 of these lines is expected to "
         f"be wrong. Limit: a peak of {summary.limit_arcsec:g} arcsec."
     )
     yield from _table(
-        "Look at first",
+        "Inspect first",
         text,
         ["joint", "cause", Heading("to the limit", "h"), Heading("peak"),
          Heading("growth", "arcsec per 1000 h"), Heading("probability", ""), "named in", "data",
          "also changed"],
         [_candidate(each, joint) for each in summary.first],
-    ) if summary.first else [Section("Look at first", f"{text}\n\nThere is none.")]  # fmt: skip
+    ) if summary.first else [Section("Inspect first", f"{text}\n\nNone.")]  # fmt: skip
     for attribute, causes in summary.prevalence.items():
         yield from _table(
             f"Causes by {attribute}",
@@ -117,8 +117,8 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
     mistaken = sorted(summary.mistaken, key=lambda each: ([*_KINDS].index(each.kind), each.joint, each.path))
     yield from _table(
         "Exchanged joints, other encoders, duplicates",
-        "Recordings that are not of their joint as it was. Those of another joint, of another encoder, and "
-        "second copies count nowhere else on this page.",
+        "Recordings that do not match their joint. Recordings of another joint or encoder, and duplicates, "
+        "are excluded from the rest of this page.",
         ["joint", "what", "why", "recording"],
         [
             *([joint(each.joint), _KINDS[each.kind], each.text, each.path] for each in mistaken),
@@ -138,7 +138,7 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
     )
     yield from _table(
         "Silent joints",
-        "Joints of which nothing is known now.",
+        "Joints without current information.",
         ["joint", "why"],
         [[joint(name), why] for name, why in summary.silent],
     )
@@ -151,9 +151,10 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
     )
     rates = sorted(summary.rates.items(), key=lambda each: -each[1][0])
     yield from _table(
-        "How often which cause is named",
-        "Estimated from the fleet: the share of joints with the cause, and how often a recording names it in "
-        "a joint with it and in one without. What is named as often without it is not worth a line.",
+        "Findings by cause",
+        "Estimated from the fleet: the share of joints with the cause, and the rates of findings in "
+        "recordings of joints with and without it. A finding that is as frequent without the cause is not "
+        "informative.",
         ["cause", Heading("share", "of joints"), Heading("named with it", "of recordings"),
          Heading("without", "of recordings")],
         [[_words(cause), *(f"{100.0 * each:.1f} %" for each in own)] for cause, own in rates],
@@ -163,7 +164,7 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
 def _table(
     title: str, text: str, header: Sequence[str | Heading], rows: Sequence[Sequence[Cell]]
 ) -> Iterator[Section]:
-    """Yields a section with the first rows; nothing without rows."""
+    """Yields a section with the first rows, if any."""
     more = f"the first {ROWS} of {len(rows):,}; fleet report --json has all" if len(rows) > ROWS else ""
     if rows:
         yield Section(title, text, [Table(header, rows[:ROWS], more)])
@@ -212,7 +213,7 @@ KEY_DIGITS = 12
 
 
 def shown(rows: Sequence[Row]) -> dict[str, Row]:
-    """Returns the recording that the page of each joint shows: the last that is its own.
+    """Returns the recording for the page of each joint: the last that is the joint's own.
 
     Its ``mistaken`` are the joint's recordings of another joint or encoder, or with other orders.
     """
@@ -224,7 +225,7 @@ def shown(rows: Sequence[Row]) -> dict[str, Row]:
 
 
 def links(folder: Path, latest: Mapping[str, Row]) -> dict[str, str]:
-    """Returns the relative address of each joint's page that is there and up to date.
+    """Returns the relative address of each existing, up-to-date joint page.
 
     ``latest`` is from `shown`.
     """
@@ -234,9 +235,9 @@ def links(folder: Path, latest: Mapping[str, Row]) -> dict[str, str]:
 
 
 def write_page(folder: Path, row: Row) -> None:
-    """Diagnoses the recording to show again and writes the page; removes the joint's older pages.
+    """Diagnoses the displayed recording again and writes the page; removes the joint's older pages.
 
-    InputError if recording or model are not there any more.
+    InputError if recording or model no longer exist.
     """
     from hdbridge.analysis.diagnosis import diagnose
     from hdbridge.axis.model import TransmissionModel

@@ -1,7 +1,8 @@
-"""A simulated fleet: random joints that age over a year, and recordings with typical file faults.
+"""Simulated fleet: random joints that age over a year, and recordings with typical file faults.
 
 Each joint is the bundled demo axis with a gear of its own. Its recordings come from the simulated axis
-(`hdbridge.sim`), which shares no code with the diagnosis. `answers.json` holds the hidden causes and faults.
+(`hdbridge.sim`), which shares no code with the diagnosis. `answers.json` contains the hidden causes and
+faults.
 """
 
 import gzip
@@ -30,13 +31,13 @@ LUBRICANTS: Final = ("grease A", "grease B")
 CELLS: Final = ("cell 1", "cell 2", "cell 3")
 BATCHES: Final = ("2025-07", "2025-08", "2025-09")
 SICK: Final = 0.2
-"""Share of joints with a growing cause; three times as large in the last batch."""
+"""Share of joints with a growing cause, three times as large in the last batch."""
 ODD: Final = 0.1
-"""Share of joints whose orders are unusually large from the beginning."""
+"""Share of joints with unusually large orders from the beginning."""
 EVERYDAY: Final = 0.015
 """Relative standard deviation of orders and loop between recordings of a healthy joint."""
 FRICTION_NM: Final = 0.3
-"""Friction of the load of a joint with backlash."""
+"""Load friction of a joint with backlash."""
 STIFFNESS_NM_PER_RAD: Final = 45_000.0
 
 
@@ -91,10 +92,10 @@ def _loop(data: dict[str, Any], size: float) -> None:
 
 
 def peak_at_0_hours_arcsec(cause: str, arcsec_per_1000_hours: float, first_hours: float) -> float:
-    """Returns the peak at 0 hours of the straight line that a diagnosis sees.
+    """Returns the peak at 0 hours of the straight line seen by a diagnosis.
 
-    A model that is fitted to the first recording contains that recording's motor orders and loop: they count
-    from there. The friction of a load with backlash winds the gear up, which looks the same as the gap.
+    A model fitted to the first recording contains that recording's motor orders and loop, so they count from
+    there. The friction of a load with backlash winds the gear up, which looks like the gap.
     """
     if cause in {"motor_order", "hysteresis_parameters"}:
         return -arcsec_per_1000_hours * first_hours / 1000.0
@@ -108,7 +109,7 @@ CAUSES: Final[Mapping[str, Callable[[dict[str, Any], float], None]]] = {
     "motor_order": _motor_order,
     "hysteresis_parameters": _loop,
 }
-"""Causes of ageing: functions that add a peak of a given size, in arcsec, to the data of a truth."""
+"""Causes of ageing, as functions that add a peak of a given size, in arcsec, to the data of a truth."""
 
 
 def simulate(
@@ -117,7 +118,7 @@ def simulate(
     """Writes recordings, `manifest.csv` and `answers.json` to a new folder.
 
     One file in a hundred is damaged, and one in fifty is duplicated. In a hundred joints, two are exchanged
-    for each other, and one has its motor encoder replaced. There is at least one of each. InputError for
+    for each other, and one has its motor encoder replaced. Each fault occurs at least once. InputError for
     fewer than 4 joints or 3 recordings, and for a folder that is not empty.
     """
     if joints < 4 or recordings < 3:
@@ -189,7 +190,7 @@ def _drawn(number: int, recordings: int, base: Mapping[str, Any], rng: Random) -
 
 
 def _truth(joint: Joint, number: int, base: Mapping[str, Any], rng: Random) -> Truth:
-    """Returns the parameters of the axis at one of its recordings."""
+    """Returns the parameters of the axis during one of its recordings."""
     data = json.loads(json.dumps(base))
     data["substep_ms"] = 1.0
     data["motor"]["encoder"].update(counts_per_turn=65536, interpolation=16)

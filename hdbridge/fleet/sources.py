@@ -1,7 +1,7 @@
-"""The recordings of a fleet: folders, globs, fsspec URLs, and the manifest that describes them.
+"""Recordings of a fleet: folders, globs, fsspec URLs, and the manifest that describes them.
 
 A source is one recording of one joint that has not been read yet. Errors in a single recording are found
-later, by the worker that reads it; a wrong manifest or a place without recordings is an InputError.
+later, by the worker that reads it; an invalid manifest or a place without recordings is an InputError.
 """
 
 import csv
@@ -48,18 +48,18 @@ MANIFEST: Final[Mapping[str, str]] = {
 """Columns of a manifest. Only ``path`` is required."""
 NUMBERS: Final = ("ratio", "hours")
 MANIFEST_NAMES: Final = ("manifest.csv", "manifest.parquet")
-"""File names that are not taken for a recording."""
+"""File names that are not recordings."""
 MARKS: Final = ("size", "ETag", "mtime", "LastModified", "created")
-"""Attributes of a remote file that change with its content, as fsspec's file systems name them."""
+"""Attributes of a remote file that change with its content, by their names in fsspec's file systems."""
 
 
 TIMEOUT_S: Final = 20.0
-"""Default of the longest wait for the first answer of a server."""
+"""Default time-out of the first answer of a server."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """One recording of one joint, with the data known before it is read."""
+    """One recording of one joint, with the data known before reading it."""
 
     path: str
     joint: str | None = None
@@ -92,7 +92,7 @@ class Source:
 
 
 class Stored:
-    """Rows of a data set without their figures, to find the recordings that need not be read again."""
+    """Rows of a data set without their figures, for finding the recordings that need not be read again."""
 
     def __init__(self, rows: Iterable[Mapping[str, Any]] = ()) -> None:
         self._rows: dict[str, dict[str | None, Mapping[str, Any]]] = defaultdict(dict)
@@ -100,7 +100,7 @@ class Stored:
             self._rows[row["path"]][row["axis"]] = row
 
     def row(self, source: Source) -> Mapping[str, Any] | None:
-        """Returns the row of a source, whatever has changed since."""
+        """Returns the row of a source, regardless of changes."""
         return self._rows[source.path].get(source.axis) if source.path in self._rows else None
 
     def unchanged(self, sources: Sequence[Source]) -> list[Mapping[str, Any]]:
@@ -132,10 +132,10 @@ def find_sources(
 ) -> list[Source]:
     """Returns all recordings at the given places and in the manifest, each once, sorted by path.
 
-    InputError for a place that does not exist or holds no recording (unless it ``may_be_empty``), for a wrong
-    manifest, and for a manifest at a place that is not named as one. A recording that is ``stored`` unchanged
-    is not opened. ``timeout_s`` is the longest wait for the first answer of a server. Ignored parts of the
-    manifest are passed to ``report``.
+    InputError for a place that does not exist or has no recording (unless it ``may_be_empty``), for an
+    invalid manifest, and for a manifest that is given as a place. A recording that is ``stored`` unchanged is
+    not opened. ``timeout_s`` is the time-out of the first answer of a server. Ignored parts of the manifest
+    are passed to ``report``.
     """
     found = read_manifest(manifest, report) if manifest else {}
     if not found and not given and not may_be_empty:
@@ -172,7 +172,7 @@ def find_sources(
 
 
 def _advice(manifest: str) -> str:
-    """Returns how to pass a manifest that was found among recordings; ``--manifest`` is a local file."""
+    """Returns the option for a manifest that was found among recordings; ``--manifest`` is a local file."""
     if "://" not in manifest:
         return f"pass it as well: --manifest {manifest}"
     name = posixpath.basename(manifest)
@@ -187,7 +187,7 @@ def _recordings(files: Mapping[str, str], described: Collection[str]) -> dict[st
 
 
 def _marks_of(paths: Collection[str], timeout_s: float) -> dict[str, str]:
-    """Returns the marks of the recordings that a manifest names; a missing one has none."""
+    """Returns the marks of the recordings in a manifest; a missing recording has none."""
     files: dict[str, str] = {}
     for place in {posixpath.dirname(path) if "://" in path else path for path in paths}:
         with suppress(InputError):  # the worker that reads the recording reports the error
@@ -198,7 +198,7 @@ def _marks_of(paths: Collection[str], timeout_s: float) -> dict[str, str]:
 def _listing(place: str, timeout_s: float) -> dict[str, str]:
     """Returns all files at or below a place (folder, glob, file or URL), each with its mark: size and times.
 
-    InputError if there is nothing.
+    InputError if there are none.
     """
     if "://" not in place:
         place = os.path.abspath(place)  # noqa: PTH100 - workers run in another folder
@@ -245,7 +245,7 @@ def _local(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _stamp(source: Source, mark: str | None) -> str | None:
-    """Hashes the mark of a recording and its row in the manifest; None for a recording that is not there."""
+    """Hashes the mark of a recording and its row in the manifest; None for a missing recording."""
     if mark is None:
         return None
     if source.axis and source.path.endswith(BUS_LOGS):
@@ -282,7 +282,7 @@ def _with_about(source: Source, stored: Stored) -> Source:
 def read_manifest(
     path: Path, report: Callable[[str], None] = lambda _: None
 ) -> dict[tuple[str, str | None], Source]:
-    """Reads a manifest, CSV or Parquet; sources by path and axis. InputError names the wrong row.
+    """Reads a manifest, CSV or Parquet; returns sources by path and axis. InputError names the invalid row.
 
     Other columns and repeated rows are ignored and passed to ``report``.
     """

@@ -1,4 +1,4 @@
-"""Statistics over many joints: pure functions of arrays, without files and without randomness.
+"""Statistics over many joints: pure functions of arrays, without files or randomness.
 
 Every rate, scatter and prior is estimated from the fleet itself, so a joint is compared with the same
 diagnosis of the other joints on everyday records. If the data do not decide, the answer is None.
@@ -21,7 +21,7 @@ from hdbridge.axis.effects import FloatArray, IntArray
 
 Complexes = NDArray[np.complex128]
 OUTLIERS_FROM: Final = 8
-"""Minimum number of values for a range: below it, the median absolute deviation is uncertain by half."""
+"""Minimum number of values for a range; below it, the median absolute deviation is uncertain by half."""
 DRAWS: Final = 4001
 GOLDEN: Final = 0.6180339887498949
 INTERVAL: Final = (0.05, 0.95)
@@ -40,7 +40,7 @@ DISAGREE: Final = 1e-12
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A value with its 90 % interval; an infinite bound is open."""
+    """Value with its 90 % interval; an infinite bound is open."""
 
     low: float
     value: float
@@ -54,7 +54,7 @@ def prevalence(cases: Mapping[str, tuple[int, int]]) -> dict[str, Interval]:
     """Estimates the share of joints with a cause in each group from (cases, joints), partially pooled.
 
     The model is beta-binomial with mean and concentration integrated out over a grid, so a group of three
-    joints is drawn towards the others and a group of three hundred is not.
+    joints is drawn towards the others, unlike a group of three hundred.
     """
     if not cases:
         return {}
@@ -86,22 +86,23 @@ def prevalence(cases: Mapping[str, tuple[int, int]]) -> dict[str, Interval]:
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """Prevalence of one cause, and the rates at which recordings name it."""
+    """Prevalence of one cause, and the rates of its findings."""
 
     probability: FloatArray
     """Probability that each joint has the cause, shape (joints,)."""
     share: float
     """Share of joints that have the cause."""
     named: float
-    """Rate at which a recording of a joint that has it names it."""
+    """Rate of findings in recordings of a joint with the cause."""
     wrongly: float
-    """Rate at which a recording of a joint that does not have it names it."""
+    """Rate of findings in recordings of a joint without the cause."""
 
 
 def repeats(named: Sequence[Sequence[bool]]) -> Repeats:
-    """Estimates which joints have a cause; ``named`` holds, by joint, if each recording in time names it.
+    """Estimates which joints have a cause; ``named`` contains its findings by joint and recording, in time
+    order.
 
-    Recordings of a joint without the cause name it at a constant rate; those of a joint with it name it at a
+    Recordings of a joint without the cause have findings at a constant rate; those of a joint with it, at a
     higher rate from an unknown onset on. Shares and rates are estimated from the fleet by expectation
     maximisation with weak priors.
     """
@@ -138,7 +139,7 @@ def repeats(named: Sequence[Sequence[bool]]) -> Repeats:
 
 
 def within_false_discoveries(probability: FloatArray, rate: float) -> FloatArray:
-    """Selects the largest set of claims of which an expected share of at most ``rate`` is wrong."""
+    """Selects the largest set of claims with an expected share of wrong claims of at most ``rate``."""
     order = np.argsort(-probability, kind="stable")
     wrong = np.cumsum(1.0 - probability[order]) / np.arange(1, len(order) + 1)
     chosen = np.zeros(len(probability), dtype=bool)
@@ -159,7 +160,7 @@ def normal_range(values: FloatArray) -> Interval:
 def outliers(values: FloatArray, rate: float = 0.05) -> NDArray[np.bool_]:
     """Selects outliers at a false discovery rate (Benjamini and Hochberg 1995); mask of shape (n,).
 
-    There are none among fewer than eight values, or if more than half of the values are equal.
+    Selects none among fewer than eight values, or if more than half of the values are equal.
     """
     scale = median_deviation(values - np.median(values)) if len(values) else 0.0
     if len(values) < OUTLIERS_FROM or scale == 0.0:
@@ -199,11 +200,11 @@ class Trend:
     change: tuple[float, float]
     """Mean and standard deviation of the slopes of joints that change."""
     changing: float
-    """Probability that the joint is one of those that change."""
+    """Probability that the joint changes."""
 
     @cached_property
     def _slopes(self) -> list[tuple[float, float, float]]:
-        """Weight, mean and standard deviation of the slope if the joint stays, and if it changes."""
+        """Weight, mean and standard deviation of the slope if the joint does not change, and if it does."""
         slope, own = float(self.line[1]), float(self.covariance[1, 1])
         result = []
         for weight, centre, deviation in (
@@ -244,7 +245,7 @@ class Trend:
     def hours_to(self, limit: float) -> Interval | None:
         """Returns the hours from the last recording until the line reaches a limit, or None if unknown.
 
-        It is unknown if the line may never reach the limit (upper bound of the interval infinite).
+        They are unknown if the line may never reach the limit (upper bound of the interval infinite).
         """
         level, slope = self._draws
         hours = np.full(DRAWS, np.inf)
@@ -261,7 +262,7 @@ def trends(series: Sequence[Series]) -> list[Trend | None]:
 
     The trends are straight lines; errors are the figure's own plus a scatter between recordings that is
     common to all joints. The prior of the slopes is a normal mixture of joints that change and joints that do
-    not, fitted to the fleet, so the slope of three noisy recordings is drawn to zero and a steep one is not.
+    not, fitted to the fleet, so the slope of three noisy recordings is drawn to zero, unlike a steep slope.
     """
     usable = [place for place, each in enumerate(series) if len(np.unique(each.hours)) > 1]
     if not usable:
@@ -295,7 +296,7 @@ def _design(each: Series) -> FloatArray:
 
 
 def _line(each: Series, scatter: float) -> tuple[FloatArray, FloatArray]:
-    """Fits a line. If the values do not lie on one, as after a step, its covariance grows with the misfit."""
+    """Fits a line. If the values do not follow it, as after a step, its covariance grows with the misfit."""
     design = _design(each)
     weight = 1.0 / (each.sd**2 + scatter**2)
     cov = np.linalg.pinv(design.T @ (weight[:, np.newaxis] * design))
@@ -309,7 +310,7 @@ def _line(each: Series, scatter: float) -> tuple[FloatArray, FloatArray]:
 def _scatter(series: Sequence[Series]) -> float:
     """Estimates the common scatter between recordings by restricted maximum likelihood (REML).
 
-    A share `OWN_SCATTER` of the series has a scatter of its own, so one step does not blur all the others.
+    A share `OWN_SCATTER` of the series has a scatter of its own, so one step does not blur all other series.
     """
     chosen = [each for each in series if len(each.hours) > _design(each).shape[1]]
     chosen = chosen[:: max(1, math.ceil(len(chosen) / SCATTER_SERIES))]
@@ -370,20 +371,19 @@ class Identity:
     """Reason why the orders of a recording differ from its joint's first recording."""
 
     kind: str
-    """``swapped``: they are another joint's; ``turned``: the motor encoder was exchanged or its zero set;
-    ``changed``: they match no joint.
-    """
+    """``swapped``: the orders are another joint's; ``turned``: the motor encoder was exchanged or its zero
+    set; ``changed``: the orders match no joint."""
     other: int | None = None
-    """For ``swapped``: the joint that the orders match."""
+    """Joint that the orders match, if ``swapped``."""
     angle_deg: float | None = None
-    """For ``turned``: the offset of the motor angle."""
+    """Offset of the motor angle, if ``turned``."""
 
 
 def identities(orders: Complexes, joint: Sequence[int], time: Sequence[Any]) -> list[Identity | None]:
     """Checks by the motor orders that each recording belongs to its joint; None if it does.
 
     ``orders``, shape (recordings, orders), are amplitude times exp(i phase) of the orders 1, 2, ...; rows
-    with NaN have none. Each recording is compared with the first one of its joint.
+    with NaN are missing. Each recording is compared with the first recording of its joint.
     """
     numbers = np.asarray(joint)
     known = np.all(np.isfinite(orders), axis=1) & (orders.shape[1] > 0)

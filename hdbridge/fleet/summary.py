@@ -1,8 +1,8 @@
 """Summary of a fleet: joints to inspect first, prevalence of causes, and faults of the data.
 
-On everyday records, the diagnosis of one recording names too many causes for a list that people act on. A
-joint is listed only if a cause repeats over its recordings more often than the fleet's own rate of wrong
-names explains, and if it appeared after the first recording or grows.
+On everyday records, the diagnosis of one recording reports too many causes for a list that people act on. A
+joint is listed only if a cause repeats over its recordings more often than the fleet's own rate of false
+findings explains, and if it appeared after the first recording or grows.
 """
 
 from collections import Counter, defaultdict
@@ -34,7 +34,7 @@ COMMON: Final = 0.4
 """Share of a gear type's joints above which a cause belongs to the type and counts only if it grows."""
 SURE: Final = 0.95
 REPEATED: Final = 2
-"""Minimum number of recordings that name a cause."""
+"""Minimum number of recordings with a finding of the cause."""
 PEAK_ERROR: Final = 0.25
 """Standard deviation of a small peak, in detection limits."""
 SILENT: Final = 3.0
@@ -53,24 +53,24 @@ class Candidate:
     """Probability that the joint has the cause, from all its recordings and the fleet's rates."""
     aliases: tuple[str, ...]
     peak_arcsec: float
-    """Peak of the cause in the latest recording that names it."""
+    """Peak of the cause in the latest recording with a finding."""
     named: int
     recordings: int
     growth: Interval | None
-    """Arcsec per 1000 hours; None if the hours are not known."""
+    """Arcsec per 1000 hours; None without hours."""
     growing: bool
     remaining: Interval | None
-    """Hours until the peak reaches the limit; None if that is not known yet."""
+    """Hours until the peak reaches the limit; None if unknown."""
     what_changed: tuple[str, ...]
     remarks: tuple[str, ...]
     path: str
-    """Path of its last recording."""
+    """Path of the joint's last recording."""
     gear: str
 
 
 @dataclass(frozen=True)
 class Odd:
-    """A figure of a joint outside the normal range of its gear type."""
+    """Figure of a joint outside the normal range of its gear type."""
 
     joint: str
     gear: str
@@ -81,7 +81,7 @@ class Odd:
 
 @dataclass(frozen=True)
 class Mistaken:
-    """A recording whose orders differ from its joint's first recording."""
+    """Recording whose orders differ from its joint's first recording."""
 
     joint: str
     path: str
@@ -91,7 +91,7 @@ class Mistaken:
 
 @dataclass(frozen=True)
 class Summary:
-    """Contents of the page of a fleet."""
+    """Content of a fleet page."""
 
     recordings: int
     joints: int
@@ -100,7 +100,7 @@ class Summary:
     prevalence: Mapping[str, Mapping[str, Mapping[str, tuple[int, int, Interval]]]]
     """Joints with the cause, joints, and share, by attribute, cause and group."""
     rates: Mapping[str, tuple[float, float, float]]
-    """Share of joints, and rates at which recordings name it in joints with and without it, by cause."""
+    """Share of joints, and rates of findings in joints with and without the cause, by cause."""
     odd: tuple[Odd, ...]
     mistaken: tuple[Mistaken, ...]
     duplicates: tuple[tuple[str, str, str], ...]
@@ -165,7 +165,7 @@ def summarise(rows: Sequence[Row], limit_arcsec: float) -> Summary:
 
 
 def own_recordings(rows: Sequence[Row]) -> tuple[dict[str, list[Row]], tuple[Mistaken, ...]]:
-    """Returns the diagnosed recordings of each joint in time, without copies and mistaken ones; and these."""
+    """Returns the diagnosed recordings of each joint in time, without copies; and the mistaken ones."""
     good = [row for row in rows if row["reason"] is None and row["duplicate_of"] is None]
     good.sort(key=_when)
     mistaken, foreign = _mistaken(good)
@@ -232,7 +232,7 @@ def _causes(
 
 
 def named_by(row: Row, cause: str) -> Mapping[str, Any] | None:
-    """Returns the finding of a recording that names a cause, or None."""
+    """Returns a recording's finding of a cause, or None."""
     return next((each for each in row["findings"] if each["cause"] == cause), None)
 
 
@@ -242,13 +242,13 @@ def _peak(row: Row, cause: str) -> float | None:
 
 
 def _floor(row: Row, cause: str) -> float:
-    """Returns the smallest peak from which a recording would name a cause, arcsec."""
+    """Returns the smallest peak that a recording would report, arcsec."""
     limit = next((each["arcsec"] for each in row["limits"] or () if each["cause"] == cause), None)
     return limit if limit is not None else max(row["rms_arcsec"] or 0.0, 1.0)
 
 
 def _size(rows: Sequence[Row], cause: str) -> Series:
-    """Returns the peak of a cause over the hours; if not named, it lies between 0 and the detection limit."""
+    """Returns the peak of a cause over the hours; without a finding, between 0 and the detection limit."""
     points = []
     for row in rows:
         peak, floor = _peak(row, cause), _floor(row, cause)
@@ -390,7 +390,7 @@ def _prevalence(
 
 
 def _odd(joints: Mapping[str, Sequence[Row]]) -> tuple[Odd, ...]:
-    """Returns figures outside the normal range of their gear type, from each joint's median."""
+    """Returns the figures outside the normal range of their gear type, from each joint's median."""
     table: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for name, rows in joints.items():
         for row in rows:
@@ -416,7 +416,7 @@ def _odd(joints: Mapping[str, Sequence[Row]]) -> tuple[Odd, ...]:
 
 
 def _silent(rows: Sequence[Row]) -> tuple[tuple[str, str], ...]:
-    """Returns joints without a usable recording, or without one for a long time."""
+    """Returns the joints without a usable recording, or without one for a long time."""
     usable: dict[str, list[datetime]] = {row["joint"]: [] for row in rows if row["joint"]}
     diagnosed = {row["joint"] for row in rows if row["reason"] is None}
     for row in rows:

@@ -1,12 +1,11 @@
 """Synchronised moves of several axes: common start, common arrival, straight path in between.
 
-The result is knots at the control period for each axis, which a stream (`SetPoint.stream`) follows exactly.
-Compute them outside the loop, because it takes milliseconds.
+The result is a set of knots for each axis at the control period, which a stream (`SetPoint.stream`) follows
+exactly. The plan must be computed outside the loop, because it takes milliseconds.
 
-Ruckig's free version plans no path through intermediate points (it would call a server on the internet). A
-path through way points therefore rests at each point at which its direction changes; points on a straight
-line are passed in motion. Rounding a corner without a rest means leaving the points: the caller decides this
-by choosing other points.
+Ruckig's free version does not plan paths through intermediate points (it would call a server on the
+internet). A path through way points therefore rests at each change of direction; points on a straight line
+are passed in motion. To round a corner without a rest, the caller must choose other points.
 """
 
 import math
@@ -26,22 +25,21 @@ from hdbridge.motion.procedures.moves import MotionLimits
 from hdbridge.motion.stream import ACCELERATION_MARGIN
 
 _STRAIGHT = 1e-9
-"""Maximum difference of two unit direction vectors that count as equal."""
+"""Maximum difference of two unit direction vectors of the same direction."""
 MOST_S = 3600.0
 """Maximum duration of a plan, whose knots are kept in memory; s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoordinatedPlan:
-    """Knots of several axes for common times."""
+    """Knots of several axes at common times."""
 
     duration_s: float
     knots: dict[str, FloatArray]
     """Knots per axis, shape (n, 3): time in s (from 0, at each control period), load angle in degrees,
     velocity in deg/s.
 
-    The first is the initial position, the last the target; both at rest.
-    """
+    The first knot is the initial position, the last the target; both at rest."""
 
 
 def coordinated(
@@ -51,12 +49,12 @@ def coordinated(
     period_s: float,
     share: float = 1.0,
 ) -> CoordinatedPlan:
-    """Plans a synchronised move from rest, through points, to rest at the last of them.
+    """Plans a synchronised move from rest, through points, to rest at the last point.
 
-    ``starts_deg`` holds the position of each axis. Each point gives load angles of some or all axes; the
+    ``starts_deg`` holds the position of each axis. Each point contains load angles of some or all axes; the
     others stay. ``share``, above 0 and up to 1, scales all velocity and acceleration limits. Raises
-    `InputError` for an unknown axis, an angle outside its limits or not finite, and a plan longer than an
-    hour.
+    `InputError` for an unknown axis, an angle that is not finite or outside its limits, and a plan longer
+    than an hour.
     """
     if not points_deg:
         raise InputError("a coordinated move without a point; expected at least one")
@@ -71,7 +69,7 @@ def coordinated(
                 )
             _check_inside(name, point[name], limits[name])
     if not names:
-        raise InputError("a coordinated move of no axis; expected a target for at least one")
+        raise InputError("a coordinated move without an axis; expected a target for at least one")
     here = np.array([starts_deg[each] for each in names])
     if not np.isfinite(here).all():
         raise InputError(f"the coordinated move begins at {here.tolist()} deg; expected finite angles")
@@ -102,7 +100,7 @@ def _check_inside(name: str, angle_deg: float, limits: MotionLimits) -> None:
 
 
 class _Eased(NamedTuple):
-    """Limits that keep the cubics between the knots within the limits of the axis."""
+    """Reduced limits for the knots, so that the cubics between them stay within the limits of the axis."""
 
     velocity_deg_s: float
     acceleration_deg_s2: float
@@ -125,8 +123,8 @@ def _eased(limits: MotionLimits, period_s: float, share: float) -> _Eased:
 
 
 def _straight(corners: Sequence[FloatArray]) -> list[tuple[FloatArray, FloatArray]]:
-    """Returns the legs from corner to corner, without points passed straight on and without legs of zero
-    length.
+    """Returns the legs from corner to corner, without points passed in a straight line and without empty
+    legs.
     """
     legs: list[tuple[FloatArray, FloatArray]] = []
     for begin, end in pairwise(corners):

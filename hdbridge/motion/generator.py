@@ -1,8 +1,8 @@
 """Jerk-limited plans of one axis from any present state, by ruckig on line.
 
 A plan is checked before it is returned: it ends at its target, in finite time, and stays within the bounds
-and the axis's velocity. The result is None if ruckig finds no solution, or only one outside the bounds; the
-caller then decides what is safe.
+and the axis's velocity. The result is None if ruckig finds no solution within the bounds; the caller then
+decides on a safe reaction.
 """
 
 import math
@@ -15,14 +15,15 @@ from hdbridge.motion.procedures.moves import MotionLimits
 
 SOLVED = frozenset({Result.Working, Result.Finished})
 SHARES = (1.0, 1.0 - 1e-6)
-"""Ruckig fails if limits and distance coincide exactly; slightly slower it succeeds."""
+"""Shares of the limits for successive attempts, because ruckig fails if limits and distance coincide
+exactly."""
 _MISS_DEG = 1e-6
-"""Maximum distance of a plan's end from its target; beyond it ruckig has failed numerically."""
+"""Maximum distance of a plan's end from its target; above it, ruckig has failed numerically."""
 _ROUNDING_DEG = 1e-9
 
 
 _NEAR_END = 0.999
-"""Share of a path's duration at which it still moves in its final direction."""
+"""Share of a path's duration at which the motion still has its final direction."""
 _HALVINGS = 30
 _At = Callable[[float], tuple[list[float], list[float], list[float]]]
 
@@ -43,7 +44,7 @@ class Bounds(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A path to rest, over the time since it was made."""
+    """Path to rest, over the time since its creation."""
 
     begin_deg: float
     end_deg: float
@@ -52,7 +53,7 @@ class Plan(NamedTuple):
     """Position (relative to ``begin_deg``), velocity and acceleration of one degree of freedom."""
 
     def state(self, time_s: float) -> Kinematics:
-        """Returns the state after this time; at rest, exactly at its end, after its duration."""
+        """Returns the state after this time; after its duration, at rest exactly at its end."""
         if time_s >= self.duration_s:
             return Kinematics(self.end_deg, 0.0, 0.0)
         position, velocity, acceleration = self.at(time_s)
@@ -60,9 +61,10 @@ class Plan(NamedTuple):
 
 
 def _turn(velocity_deg_s: float, at: _At, duration_s: float) -> float:
-    """Returns where a path with this initial velocity turns back, relative to its start; 0 if it does not.
+    """Returns the position at which a path with this initial velocity turns back, relative to its start;
+    else 0.
 
-    Ruckig's own extremes miss it if the initial acceleration exceeds the plan's limit.
+    Ruckig's own extremes omit it if the initial acceleration exceeds the plan's limit.
     """
     later = _NEAR_END * duration_s
     if not velocity_deg_s or velocity_deg_s * at(later)[1][0] >= 0.0:
@@ -78,7 +80,7 @@ def _turn(velocity_deg_s: float, at: _At, duration_s: float) -> float:
 
 
 class Generator:
-    """Computes plans within the limits of one axis, or slower ones."""
+    """Computes plans within the limits of one axis, or slower."""
 
     def __init__(self, limits: MotionLimits) -> None:
         self._limits = limits
@@ -96,7 +98,7 @@ class Generator:
     ) -> Plan | None:
         """Returns the fastest path to rest at a position; never faster than the axis, whatever is requested.
 
-        The present velocity and acceleration may exceed the requested ones; they are then reduced first.
+        Present velocity and acceleration above the requested values are reduced first.
         """
         self._demand.control_interface = ControlInterface.Position
         # Relative to the present position, so that the plan does not depend on the distance from zero.
@@ -107,7 +109,7 @@ class Generator:
         return plan._replace(end_deg=target_deg)
 
     def to_rest(self, now: Kinematics, bounds: Bounds) -> Plan | None:
-        """Returns the fastest path to rest, wherever it ends."""
+        """Returns the fastest path to rest, at any position within the bounds."""
         self._demand.control_interface = ControlInterface.Velocity
         return self._plan(now, math.inf, math.inf, bounds)
 

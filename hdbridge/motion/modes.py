@@ -4,19 +4,19 @@ from enum import IntEnum
 
 
 class MotionMode(IntEnum):
-    """Source of the present motion. The numbers are part of the daemon's shared memory: add,
-    never renumber.
+    """Source of the present motion. The numbers are part of the daemon's shared memory, so they may be added
+    but not changed.
     """
 
     HOLD = 0
-    """At rest where the last motion ended."""
+    """At rest at the end of the last motion."""
     GOTO = 1
     """Moving to a target."""
     JOG = 2
-    """Moving at a velocity for as long as a client requests it."""
+    """Moving at a velocity while a client requests it."""
     STREAM = 3
-    """Following knots that a client has planned."""
+    """Following knots planned by a client."""
     STOP = 4
     """Braking to rest within the limits."""
     FOLLOW = 5
-    """After a position that somebody else gives in each period."""
+    """Following a position supplied by another source in each period."""

@@ -1,4 +1,4 @@
-"""Pursuit of a position that somebody else gives in each period, within the limits of the axis."""
+"""Pursuit of a position supplied by another source in each period, within the limits of the axis."""
 
 import math
 
@@ -9,12 +9,12 @@ _ROUNDING = 1e-6
 
 
 class Pursuit:
-    """Reaches each goal exactly if the limits allow it; otherwise approaches it at the limit of acceleration.
+    """Reaches each goal exactly if the limits permit it; otherwise approaches it at the acceleration limit.
 
-    Goals that lie on straight lines between set-points change their velocity in steps, also on a path within
-    the limits. Therefore a goal is reached exactly if its velocity changes by no more than the limit allows
-    from one set-point to the next. A goal outside the bounds is pursued to the bound. Jerk is not limited, as
-    for the knots of a stream.
+    Goals on straight lines between set-points change their velocity in steps, even on a path within the
+    limits. A goal is therefore reached exactly if its velocity changes by no more than the limit permits from
+    one set-point to the next. A goal outside the bounds is pursued to the bound. Jerk is not limited, as for
+    the knots of a stream.
     """
 
     def __init__(self, begin_deg: float, limits: MotionLimits, bounds: Bounds, period_s: float) -> None:
@@ -27,11 +27,14 @@ class Pursuit:
 
     @property
     def at_rest(self) -> bool:
-        """True if it stands at its goal."""
+        """True if the set-point stands at its goal."""
         return self.state.velocity_deg_s == 0.0 and self.state.position_deg == self._goal_deg
 
     def step(self, goal_deg: float, spacing_s: float = 0.0) -> Kinematics:
-        """One period towards ``goal_deg`` (finite): the new state. ``spacing_s``: time between set-points."""
+        """Moves towards ``goal_deg`` (finite) for one period; returns the new state.
+
+        ``spacing_s`` is the time between set-points.
+        """
         lower, upper, acceleration, period_s = self._lower, self._upper, self._acceleration, self._period_s
         before_deg = self._goal_deg
         self._goal_deg = goal_deg = lower if goal_deg < lower else upper if goal_deg > upper else goal_deg
@@ -56,7 +59,7 @@ class Pursuit:
         return state
 
     def _speed(self, distance_deg: float) -> float:
-        """The highest speed of the next period from which it can still brake within a distance."""
+        """Returns the highest speed of the next period that still permits braking within a distance."""
         if distance_deg <= 0.0:
             return 0.0
         change = self._acceleration * self._period_s

@@ -1,6 +1,6 @@
 """Set-point of one axis, period by period, for commands at any time.
 
-Every motion continues from the present position, velocity and acceleration: a new target does not require
+Every motion continues from the present position, velocity and acceleration, so a new target does not require
 rest. An impossible command is refused (`InputError`) before anything has changed, and the motion under way
 continues.
 
@@ -51,7 +51,7 @@ class SetPoint:
         self._path: Plan | Cubic | None = None
         """Path in progress; None at rest and in a stream."""
         self._steps = 0
-        """Periods since ``_path`` was set, at which time it had run for ``_since_s``."""
+        """Periods since ``_path`` was set; the path had then run for ``_since_s``."""
         self._since_s = 0.0
         self._left = self._stream_timeout = 0
         """Remaining periods of a jog, or of a stream at rest."""
@@ -67,22 +67,19 @@ class SetPoint:
 
     @property
     def velocity_deg_s(self) -> float:
-        """Velocity of the load target."""
         return self._velocity_deg_s
 
     @property
     def acceleration_deg_s2(self) -> float:
-        """Acceleration of the load target."""
         return self._acceleration_deg_s2
 
     @property
     def mode(self) -> MotionMode:
-        """Mode of the present motion."""
         return self._mode
 
     @property
     def at_rest(self) -> bool:
-        """True if it stands still and would remain so without further input."""
+        """True if the set-point stands still and would remain so without further input."""
         if self._stream is not None:
             return self._stream.waiting
         if self._pursuit is not None:
@@ -96,7 +93,7 @@ class SetPoint:
 
     @property
     def room(self) -> int:
-        """Number of knots that would be accepted now; 0 outside a stream."""
+        """Number of knots that would now be accepted; 0 outside a stream."""
         return 0 if self._stream is None else self._stream.room
 
     def reset(self, load_deg: float) -> None:
@@ -117,8 +114,8 @@ class SetPoint:
         """Moves to a load angle and rests there; from rest or from any motion.
 
         Velocity and acceleration limit this move; the axis's limits apply in any case. Raises `InputError`
-        for a target outside the position limits or an invalid number, and in motion if the axis would have to
-        leave the position limits on its way (stop it first).
+        for a target outside the position limits or an invalid number, and in motion if the path would leave
+        the position limits (stop first).
         """
         limits = self._limits
         _check_finite("target", target_deg)
@@ -132,10 +129,11 @@ class SetPoint:
         self._take(self._planned(target_deg, speed, acceleration), MotionMode.GOTO)
 
     def jog(self, velocity_deg_s: float, timeout_s: float) -> None:
-        """Moves at a velocity (no faster than the axis may) until the time-out; zero brakes.
+        """Moves at a velocity (up to the axis's limit) until the time-out; zero brakes.
 
-        Call it again before the time-out. It brakes before a position limit and waits there. Raises
-        `InputError` for invalid numbers, and for a time-out that is not above 0 and up to `MOST_TIMEOUT_S`.
+        Must be called again before the time-out. The axis brakes before a position limit and waits there.
+        Raises `InputError` for invalid numbers, and for a time-out that is not above 0 and up to
+        `MOST_TIMEOUT_S`.
         """
         _check_finite("velocity", velocity_deg_s)
         timeout = self._timeout(timeout_s)
@@ -157,7 +155,7 @@ class SetPoint:
         self._left = timeout
 
     def stop(self) -> None:
-        """Brakes to rest within the limits. Never refused; at rest it ends a stream or a jog."""
+        """Brakes to rest within the limits. Never refused; at rest, ends a stream or a jog."""
         if self.at_rest:
             self._rest_at(self._position_deg)
         elif self._mode is not MotionMode.STOP:
@@ -166,7 +164,7 @@ class SetPoint:
     def stream(self, timeout_s: float) -> None:
         """Follows knots from here (`knot`); their time starts with the first `step` after `begin_stream`.
 
-        It becomes a hold after resting without a knot for the time-out. Raises `InputError` in motion, and
+        A rest without knots for the time-out ends the stream with a hold. Raises `InputError` in motion, and
         for a time-out that is not above 0 and up to `MOST_TIMEOUT_S`.
         """
         timeout = self._timeout(timeout_s)
@@ -180,7 +178,7 @@ class SetPoint:
         self._mode = MotionMode.STREAM
 
     def follow(self) -> None:
-        """Pursue what `aim` gives, until another motion or `stop`. InputError: in motion."""
+        """Pursues the positions passed to `aim` until another motion. Raises `InputError` in motion."""
         if not self.at_rest:
             raise InputError("an axis begins to follow another master at rest: stop the axis first")
         self._rest_at(self._position_deg)
@@ -189,9 +187,10 @@ class SetPoint:
         self._mode = MotionMode.FOLLOW
 
     def aim(self, position_deg: float, spacing_s: float = 0.0) -> None:
-        """Pursue this position with the next `step`, as far as the limits allow. InputError: not finite.
+        """Pursues a position with the next `step`, within the limits. Raises `InputError` if it is not
+        finite.
 
-        ``spacing_s`` is the time between the set-points that it was interpolated from.
+        ``spacing_s`` is the time between the set-points from which it was interpolated.
         """
         _check_finite("load angle", position_deg)
         self._aim = (position_deg, spacing_s)
@@ -206,7 +205,7 @@ class SetPoint:
         Between two knots the set-point follows the cubic with their velocities. Raises `InputError`, leaving
         the stream unchanged, if the knot is not later than the last one; if position, speed or (by more than
         5 %) acceleration would exceed the limits, anywhere on the way to it or when braking from it; if the
-        first knot is not at rest at the position of the axis; and if there is no space for it (`room`).
+        first knot is not at rest at the position of the axis; and if the buffer is full (`room`).
         """
         self._streaming().add(time_s, position_deg, velocity_deg_s)
 
@@ -280,7 +279,7 @@ class SetPoint:
         self._underrun = False
 
     def _planned(self, target_deg: float, velocity_deg_s: float, acceleration_deg_s2: float) -> Plan:
-        """Returns the plan to a target; raises `InputError` if there is none."""
+        """Returns the plan to a target; raises `InputError` if no plan exists."""
         now, bounds = self._state(), self._bounds_here()
         for acceleration in (acceleration_deg_s2, math.inf):
             # In motion a gentle move may have to brake as hard as the axis can, to stay within its limits.
@@ -298,10 +297,10 @@ class SetPoint:
     def _brake(self, since_s: float) -> None:
         """Brakes to rest in the first of three ways that stays within the position limits.
 
-        First, as fast as jerk permits. Second, if that would overshoot a limit, back to the present position,
-        which brakes as hard and releases later. Third, with constant acceleration, which needs no more travel
-        than any path within the limits and is always possible. The third is needed only out of a stream whose
-        knots brake against a limit with more jerk than the axis may have.
+        The first is as fast as the jerk limit permits. The second, if the first would overshoot a limit,
+        returns to the present position, which brakes as hard and releases later. The third has constant
+        acceleration, needs no more travel than any path within the limits, and is always possible. It is
+        needed only in a stream whose knots brake against a limit with more than the axis's jerk.
         """
         now, bounds = self._state(), self._bounds_here()
         if self._stream is not None or self._pursuit is not None:
@@ -317,7 +316,7 @@ class SetPoint:
         self._take(path, MotionMode.STOP, since_s)
 
     def _steady_stop(self, now: Kinematics, bounds: Bounds) -> Cubic:
-        """Returns a stop with constant deceleration: the limit, or what the remaining travel requires."""
+        """Returns a stop with constant deceleration: at the limit, or as the remaining travel requires."""
         place, speed = now.position_deg, abs(now.velocity_deg_s)
         left_deg = bounds.upper_deg - place if now.velocity_deg_s > 0.0 else place - bounds.lower_deg
         travel_deg = min(speed * speed / (2.0 * self._limits.acceleration_deg_s2), left_deg)
@@ -352,7 +351,7 @@ def _check_finite(name: str, value: float) -> None:
 
 
 def _positive(name: str, value: float | None) -> float:
-    """Returns a limit of a move; infinite if none is given."""
+    """Returns a limit of a move; infinite if not given."""
     if value is None:
         return math.inf
     if not (math.isfinite(value) and value > 0.0):

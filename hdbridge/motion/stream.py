@@ -14,11 +14,9 @@ from hdbridge.motion.generator import Bounds, Kinematics
 from hdbridge.motion.procedures.moves import MotionLimits
 
 MOST_KNOTS = 8192
-"""Maximum number of waiting knots; a further one is refused."""
+"""Maximum number of waiting knots; more are refused."""
 ACCELERATION_MARGIN = 1.05
-"""Ratio to the acceleration limit that a cubic may reach, as one through knots of a path at the
-limit does.
-"""
+"""Permitted ratio of a cubic's acceleration to the limit, as reached through knots of a path at the limit."""
 BEGIN_DEG = 1e-6
 """Maximum distance of a stream's first knot from the set-point."""
 _ROUNDING = 1e-6
@@ -62,7 +60,7 @@ class Cubic(NamedTuple):
         return self.end_s - self.begin_s
 
     def state(self, time_s: float) -> Kinematics:
-        """Returns the state at this time; before and after its ends, the state at them."""
+        """Returns the state at this time; before and after the cubic, the state at its ends."""
         period_s = self.end_s - self.begin_s
         s = 1.0 if time_s >= self.end_s else max(time_s - self.begin_s, 0.0) / period_s
         return Kinematics(
@@ -98,18 +96,18 @@ class Cubic(NamedTuple):
 
 
 class Stream:
-    """The knots of one stream, in its own time.
+    """Knots of one stream, in the stream's own time.
 
-    At a knot with zero velocity it rests until there is another. Its time stops meanwhile, so that late knots
-    delay the path instead of making it jump. If it runs out of knots in motion, ``overrun_s`` gives the time
-    since.
+    At a knot with zero velocity, the stream rests until the next knot. Its time stops meanwhile, so late
+    knots delay the path instead of causing a jump. If the stream runs out of knots in motion, ``overrun_s``
+    is the time since then.
     """
 
     def __init__(self, begin_deg: float, limits: MotionLimits, bounds: Bounds, period_s: float) -> None:
         self._limits, self._bounds = limits, bounds
         self._period_s = period_s
         self._grid_s = 1e-7 * period_s
-        """Resolution of time: times closer than this are equal."""
+        """Time resolution; closer times count as equal."""
         self._cubics: deque[Cubic] = deque()
         self._begin_deg = begin_deg
         self._last: tuple[float, float, float] | None = None
@@ -120,7 +118,7 @@ class Stream:
         """Periods since the last rest."""
         self._released = self._begun = False
         self.overrun_s: float | None = None
-        """Time since it ran out of knots in motion; the state is that of the last knot."""
+        """Time since the stream ran out of knots in motion; the state is that of the last knot."""
         self._state = Kinematics(begin_deg, 0.0, 0.0)
 
     @property
@@ -130,12 +128,11 @@ class Stream:
 
     @property
     def waiting(self) -> bool:
-        """True if it rests because there are no knots."""
+        """True if the stream rests for lack of knots."""
         return not self._cubics and self._state.velocity_deg_s == 0.0
 
     @property
     def state(self) -> Kinematics:
-        """Present state."""
         return self._state
 
     def add(self, time_s: float, position_deg: float, velocity_deg_s: float) -> None:
@@ -206,7 +203,7 @@ class Stream:
             )
 
     def begin(self) -> None:
-        """Starts time with the next step, or with the first one that has a knot."""
+        """Starts time with the next step, or with the first step that has a knot."""
         self._released = True
 
     def step(self) -> Kinematics:
@@ -230,7 +227,7 @@ class Stream:
         self._state = cubic.state(time_s)
 
     def _end(self, cubic: Cubic, time_s: float) -> None:
-        """Handles the last knot: at rest, on time for another, or overrun."""
+        """Handles the last knot: at rest, on time for the next, or overrun."""
         if self._last is not None and self._last[2] == 0.0:
             self._cubics.clear()
             self._state = Kinematics(cubic.end_deg, 0.0, 0.0)

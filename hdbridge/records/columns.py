@@ -1,6 +1,6 @@
 """Assignment of CSV columns to channels of a record, with units and wrapping counters.
 
-A record's own columns are in the units that their names state. A file of another program is read with
+A record's own columns are in the units stated in their names. A file of another program is read with
 `CsvColumns`: the options ``--columns``, ``--units`` and ``--unwrap`` of the command line.
 """
 
@@ -40,7 +40,7 @@ CHANNELS: Final[Mapping[str, str]] = MappingProxyType(
         **{without_unit(each.value).removesuffix("_c"): each.value for each in MEASURED},
     }
 )
-"""Column of a record for each channel that the options name."""
+"""Column of a record for each channel named in the options."""
 Said = str | Sequence[str] | Mapping[str, object] | None
 """``channel=value,channel=value``, a sequence of such texts, or a mapping."""
 ROW: Final = "row"
@@ -53,7 +53,7 @@ class _Scale(NamedTuple):
     factor: float
     at_zero: float = 0.0
     per: str = ""
-    """Quantity that must follow a colon: it divides the factor, or for a torque multiplies it."""
+    """Quantity that must follow a colon. It divides the factor or, for a torque, multiplies it."""
 
 
 _RAD: Final = math.degrees(1.0)
@@ -116,7 +116,7 @@ _CLOCK_PERIODS: Final = sorted(
     for step in range(4)
     for period in (2**16, 2**24, 2**31, 2**32, 60, 3600, 86400, 1e9)
 )
-"""Values at which clocks wrap, in the units in which they count."""
+"""Values at which clocks wrap, in their own units."""
 _UNIT = re.compile(r"(-?)(\d*\.?\d*(?:[eE][+-]?\d+)?)\s*([^\d\s:.+-][^:]*?)(?::(.+))?$")
 _IN_NAME = re.compile(r"[\[(]([^\])]+)[\])]\s*$|(?:[_ ./-]|\bin )([^\W\d_]+|[°%\"'‰µμ]\w*)\s*$")
 _HINTS: Final[Mapping[str, frozenset[str]]] = {
@@ -141,7 +141,7 @@ class Unit:
     per: float | None = None
     """Counts per turn, or the rated torque in Nm."""
     times: float = 1.0
-    """Number of units per value of the column; negative if it counts the other way."""
+    """Number of units per value of the column; negative for the opposite direction."""
 
     @classmethod
     def parse(cls, text: str, channel: str, where: str = "--units") -> Self:
@@ -171,7 +171,7 @@ class Unit:
 
     @property
     def factor(self) -> float:
-        """Value of one column unit in the record's unit; for a temperature, of a difference of one."""
+        """Value of one column unit in the record's unit; for a temperature, of a difference of one unit."""
         factor = self.scale.factor * self.times
         if self.per is None:
             return factor
@@ -190,7 +190,7 @@ class Unit:
         return replace(self, name=name, scale=_units_of(channel)[name])
 
     def scaled(self, by: float) -> Self:
-        """Returns the unit of a column whose values are ``by`` times as large as this one states."""
+        """Returns the unit of a column whose values are ``by`` times as large as stated here."""
         return replace(self, times=self.times * by)
 
     def __str__(self) -> str:
@@ -201,7 +201,7 @@ class Unit:
 
 @dataclass(frozen=True, slots=True)
 class CsvColumns:
-    """User's statement of where the channels are in CSV files, by the names of `CHANNELS`."""
+    """User's assignment of the channels in CSV files, by the names of `CHANNELS`."""
 
     columns: Mapping[str, str] = field(default_factory=dict)
     """Column name, or its number (1 is the first), or `ROW`; other channels use the record's own column."""
@@ -213,8 +213,7 @@ class CsvColumns:
     def of(cls, columns: Said = None, units: Said = None, unwrap: Said = None) -> Self:
         """Parses ``motor=theta_m,time=t``, ``motor=counts:65536,time=ms`` and ``motor=65536``, or mappings.
 
-        Of several texts the later ones take precedence. Raises `InputError` for an impossible channel, unit
-        or period.
+        Later texts take precedence. Raises `InputError` for an impossible channel, unit or period.
         """
         periods: dict[str, float] = {}
         for channel, text in _pairs(unwrap, "--unwrap", "PERIOD").items():
@@ -235,7 +234,7 @@ class CsvColumns:
         )
 
     def __bool__(self) -> bool:
-        """True if anything was stated."""
+        """True if anything was assigned."""
         return bool(self.columns or self.units or self.unwrap)
 
     def column(self, channel: str) -> str:
@@ -245,22 +244,22 @@ class CsvColumns:
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """CSV file that a record was read from, and how, for messages that name lines and options."""
+    """CSV file of a record and its interpretation, for messages that name lines and options."""
 
     file: CsvFile
     columns: Mapping[str, str]
-    """Column of the file for each channel that the record has."""
+    """Column of the file for each channel of the record."""
     units: Mapping[str, Unit]
     """Unit in which each column was read."""
     stated: frozenset[str]
-    """Channels whose unit the user has stated."""
+    """Channels with a unit stated by the user."""
     unwrapped: frozenset[str]
     remarks: tuple[str, ...]
     """Assumptions, as text."""
 
     @property
     def remark(self) -> str:
-        """One line with the assumptions; empty if there were none."""
+        """One line with the assumptions; empty without any."""
         return one_line(f"{self.file.path}: assumed {'; '.join(self.remarks)}") if self.remarks else ""
 
     def place(self, row: int) -> str:
@@ -268,7 +267,7 @@ class Origin:
         return f"{self.file.path}:{self.file.line_of_row(row)}"
 
     def clock_cure(self, time_s: FloatArray) -> str:
-        """Returns the option for a clock that wraps at a common period; empty if it does not."""
+        """Returns the option for a clock that wraps at a common period, else empty."""
         raw = time_s / self.units["time"].factor
         steps = np.diff(raw)
         ahead = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 0.0
@@ -295,7 +294,7 @@ def option(name: str, values: Mapping[str, str]) -> str:
 def read(file: CsvFile, said: CsvColumns) -> tuple[dict[str, Column], Origin]:
     """Reads the columns of a record from a CSV file, converted and unwrapped, with their origin.
 
-    The record's own names come first; all other columns of the file are kept as they are.
+    The record's own names come first; all other columns of the file are kept unchanged.
     """
     found = _located(file, said)
     units, remarks = _units(file, said, found)
@@ -321,7 +320,7 @@ def read(file: CsvFile, said: CsvColumns) -> tuple[dict[str, Column], Origin]:
 
 
 def _located(file: CsvFile, said: CsvColumns) -> dict[str, str]:
-    """Finds the column of each channel; raises `InputError` for missing ones, with the options to pass."""
+    """Finds the column of each channel; raises `InputError` for missing columns, with the options to pass."""
     found: dict[str, str] = {}
     missing: list[str] = []
     for channel, own in CHANNELS.items():
@@ -349,7 +348,7 @@ def _located(file: CsvFile, said: CsvColumns) -> dict[str, str]:
 
 
 def _missing(file: CsvFile, said: CsvColumns, missing: Sequence[str], found: Mapping[str, str]) -> InputError:
-    """Returns the error for missing columns: which exist, and which options to pass."""
+    """Returns the error for missing columns, with the existing columns and the options to pass."""
     names = [f"'{said.column(each)}'" for each in missing]
     what = f"column{'s' * (len(names) > 1)} {', '.join(names)} {'are' if len(names) > 1 else 'is'} missing"
     if not file.header_line:

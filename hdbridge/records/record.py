@@ -1,7 +1,7 @@
-"""A record: the motion of one axis, sample by sample, as named columns with units.
+"""Record: the motion of one axis, sample by sample, as named columns with units.
 
-A record comes from hdbridge's own bench or from another program's CSV file; both look alike. Sampling may be
-uneven. Angles are multi-turn degrees.
+A record comes from hdbridge's own bench or from another program's CSV file; both have the same form. Sampling
+may be uneven. Angles are multi-turn degrees.
 """
 
 import math
@@ -31,7 +31,7 @@ from hdbridge.records.columns import (
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 UNIT_SHARE: Final = 0.006
-"""Maximum relative deviation of a slope from another unit's: the distance of the nearest common ratio."""
+"""Maximum relative deviation of a slope from that of another unit: the spacing of common ratios."""
 LEAST_COUNTS: Final = 1000.0
 """Minimum counts per turn of an encoder."""
 STANDSTILL: Final = 0.01
@@ -154,7 +154,7 @@ class Record:
     starts: tuple[int, ...] = field(default=(0,))
     """First row of each joined record; the motion of the axis between two records is unknown."""
     origin: Origin | None = None
-    """CSV file that it was read from, and how; None for any other record."""
+    """CSV file from which it was read and its interpretation; None for any other record."""
 
     def __post_init__(self) -> None:
         missing = [name for name in REQUIRED if name not in self.columns]
@@ -194,7 +194,7 @@ class Record:
 
     @classmethod
     def of_csv(cls, path: Path, said: CsvColumns, minimum_samples: int = MINIMUM_SAMPLES) -> Self:
-        """Does the same as `read_csv`, with parsed options."""
+        """Reads a CSV file like `read_csv`, with parsed options."""
         file = CsvFile(path, [said.column(channel) for channel in CHANNELS])
         found, origin = read(file, said)
         record = cls(found, str(path), origin=origin)
@@ -207,14 +207,14 @@ class Record:
             cure = origin.clock_cure(record.time_s)
             raise InputError(
                 f"{origin.place(row)}: time_s: {record.time_s[row]:g} after {record.time_s[row - 1]:g}; "
-                f"expected time that does not run backwards{f': {cure}' if cure else ''}"
+                f"expected times that do not decrease{f': {cure}' if cure else ''}"
             )
         return record
 
     def write_csv(self, path: Path | str) -> None:
         """Writes the record atomically, gzip if the name ends in ``.gz``.
 
-        Every number reads back exactly, and the same record gives the same bytes.
+        Every number reads back exactly, and equal records result in equal bytes.
         """
         write_columns(Path(path), self.columns)
 
@@ -266,7 +266,7 @@ class Record:
         return error
 
     def motion(self) -> Motion:
-        """Returns the motion for a model, with the commanded motor angle if there is one."""
+        """Returns the motion for a model, with the commanded motor angle if recorded."""
         target = self.motor_target_deg
         return Motion(
             motor_deg=self.motor_position_deg if target is None else target,
@@ -283,8 +283,8 @@ class Record:
     def check_ratio(self, ratio: float) -> None:
         """Raises `InputError` if the record's own angles contradict a ratio.
 
-        A small deviation is left to diagnosis, and so is any deviation if the axis moved too little to
-        distinguish it from the gear's own error.
+        A small deviation is left to the diagnosis, and so is any deviation that is not distinguishable from
+        the gear's own error because the axis moved too little.
         """
         slope = self.load_turns_per_motor_turn() if len(self) else None
         if slope is None:
@@ -310,22 +310,22 @@ class Record:
         return type(self)(columns, self.source, (0, *inside), self.origin)
 
     def between(self, start_s: float, end_s: float) -> Self:
-        """Returns the samples of a time span, both ends included."""
+        """Returns the samples of a time span, including both ends."""
         first = int(np.searchsorted(self.time_s, start_s, side="left"))
         end = int(np.searchsorted(self.time_s, end_s, side="right"))
         return self.rows(first, end)
 
     def parts(self) -> tuple[Self, ...]:
-        """Returns the records that it was concatenated from."""
+        """Returns the records from which it was concatenated."""
         ends = (*self.starts[1:], len(self))
         return tuple(self.rows(start, end) for start, end in zip(self.starts, ends, strict=True))
 
 
 def concatenate(records: Sequence[Record]) -> Record:
-    """Concatenates records in the order given, with one absolute zero.
+    """Concatenates records in the given order, with one absolute zero.
 
-    A record whose time starts again is shifted to follow the one before. Columns that some records lack are
-    left out.
+    A record whose time starts again is shifted to follow the record before. Columns missing from some records
+    are left out.
     """
     if not records:
         raise ValueError("nothing to concatenate")
@@ -347,7 +347,7 @@ def concatenate(records: Sequence[Record]) -> Record:
 
 
 def time_shifts_s(records: Sequence[Record]) -> tuple[float, ...]:
-    """Returns the offsets that make the records' times follow each other, s; zero if they already do."""
+    """Returns the offsets that make the records' times consecutive, s; zero if they already are."""
     shifts: list[float] = []
     end_s = -np.inf
     for record in records:

@@ -1,8 +1,8 @@
-"""A recording: a record, its segments and its provenance; one folder, or CSV files of another program.
+"""Recording: a record, its segments and its provenance, as one folder or as CSV files of another program.
 
-The folder holds ``record.csv.gz`` (several files if the record has several parts) and ``recording.yaml``. The
-latter is written last and contains the former's checksum: a folder without it is not a recording, and
-modified raw data are detected.
+The folder contains ``record.csv.gz`` (several files if the record has several parts) and ``recording.yaml``.
+The latter is written last and contains the checksums, so a folder without it is not a recording, and modified
+raw data are detected.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ PART_SAMPLES: Final = 50
 RECORD_NAME = "record.csv.gz"
 ABOUT_NAME = "recording.yaml"
 CSV_NAMES: Final = (".csv", ".csv.gz")
-"""Endings of the names of CSV files."""
+"""Endings of CSV file names."""
 HEADER = "# What was recorded next to this file, by hdbridge. docs/files.md describes its keys.\n"
 """First line of ``recording.yaml``."""
 
@@ -63,15 +63,15 @@ class RecordedFile(Strict):
 
     @classmethod
     def of(cls, path: Path, samples: int) -> Self:
-        """Describes a file that has been written."""
+        """Describes a written file."""
         return cls(name=path.name, sha256=sha256_of(path), samples=samples)
 
 
 class RecordingFile(Strict):
-    """The content of ``recording.yaml``."""
+    """Content of ``recording.yaml``."""
 
     schema_: Literal["hdbridge.recording/1"] = Field(
-        alias="schema", description="kind and version of this file"
+        alias="schema", description="schema and version of this file"
     )
     axis: str | None = Field(None, description="name of the axis")
     ratio: float | None = Field(None, gt=0, le=1000, description="N: motor turns per load turn")
@@ -98,7 +98,7 @@ class RecordingFile(Strict):
 
 @dataclass(frozen=True)
 class Recording:
-    """A record with what is known about it; for a bare CSV file, only the record."""
+    """Record with its segments and provenance; for a bare CSV file, only the record."""
 
     record: Record
     segments: tuple[Segment, ...] = ()
@@ -111,9 +111,9 @@ class Recording:
 
     @classmethod
     def load(cls, *paths: Path | str, columns: Said = None, units: Said = None, unwrap: Said = None) -> Self:
-        """Loads recording folders and CSV files as one recording in the order given.
+        """Loads recording folders and CSV files as one recording in the given order.
 
-        ``columns``, ``units`` and ``unwrap`` are for CSV files of other programs, as for `Record.read_csv`.
+        ``columns``, ``units`` and ``unwrap`` are for CSV files of other programs; see `Record.read_csv`.
         Raises `InputError` for any error in them, and for files that have changed since they were recorded.
         """
         said = CsvColumns.of(columns, units, unwrap)
@@ -158,7 +158,7 @@ class Recording:
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Joins recordings in the order given; attributes on which they differ are left open."""
+        """Joins recordings in the given order; attributes on which they differ are left open."""
         if len(parts) == 1:
             return parts[0]
         records = [each.record for each in parts]
@@ -176,9 +176,9 @@ class Recording:
         return cls(concatenate(records), tuple(segments), **common)
 
     def save(self, folder: Path | str) -> None:
-        """Writes the folder, a file for each part of the record.
+        """Writes the folder, with one file per part of the record.
 
-        Raises `InputError` if there already is a recording, because raw data are never replaced.
+        Raises `InputError` if it already contains a recording, because raw data are never replaced.
         """
         folder = Path(folder)
         if (folder / ABOUT_NAME).exists():
@@ -199,7 +199,7 @@ class Recording:
         RecordingFile.made(files=tuple(files), segments=self.segments, **common).write(folder)
 
     def pieces(self, *kinds: str) -> Iterator[tuple[Segment, Record]]:
-        """Yields the segments of these kinds (all if none is given), each with its samples."""
+        """Yields the segments of these kinds (all by default), each with its samples."""
         for segment in self.segments:
             if not kinds or segment.kind in kinds:
                 yield segment, self.record.between(segment.start_s, segment.end_s)
@@ -209,7 +209,7 @@ def recordings_among(files: Iterable[str]) -> dict[str, list[str]]:
     """Returns the recordings that `Recording.load` reads among files (paths or URLs), each with its files.
 
     A folder with ``recording.yaml`` is one recording, and each CSV file elsewhere is another. A folder with
-    the raw data of a recording but without ``recording.yaml``, which is written last, is not complete yet.
+    raw data but without ``recording.yaml``, which is written last, is not complete yet.
     """
     folders: dict[str, list[str]] = {}
     for each in files:
@@ -231,7 +231,7 @@ def _is_raw(path: str) -> bool:
 
 
 def versions_here() -> dict[str, str]:
-    """Returns the versions of the software that makes a recording or a model in this process."""
+    """Returns the software versions for a recording or a model made in this process."""
     return dict(_versions())
 
 
@@ -278,13 +278,13 @@ def by_name(given: Given) -> dict[Path, Recording]:
 def agreed_ratio(recordings: Mapping[Path, Recording], said: Iterable[tuple[str, float | None]]) -> float:
     """Returns the gear ratio on which ``said`` (source and value) and the recordings agree.
 
-    Raises `InputError` if they disagree, or if none states it.
+    Raises `InputError` if they disagree, or if none of them states a ratio.
     """
     said = [*said, *((f"{name}", each.ratio) for name, each in recordings.items())]
     known = [(where, value) for where, value in said if value is not None]
     if not known:
         raise InputError(
-            f"{next(iter(recordings))}: the ratio of the gear is not known; say it, or name the axis (on the "
+            f"{next(iter(recordings))}: the ratio of the gear is unknown; state it, or name the axis (on the "
             "command line: --ratio N or --axis PROFILE)"
         )
     for where, value in known[1:]:

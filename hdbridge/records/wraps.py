@@ -1,7 +1,7 @@
 """Angles that jump by a constant: a wrapping counter, or an angle within one turn.
 
-A wrap jumps in one angle and not in the other, whereas a concatenated record jumps in both. Its size is
-constant, whereas a misread sample is off by any amount and the next one is right again.
+A wrap jumps in one angle only, whereas a concatenated record jumps in both. Its size is constant, whereas a
+misread sample is wrong by any amount and the next sample is right again.
 """
 
 import math
@@ -19,7 +19,7 @@ from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 LEAST_JUMP_DEG: Final = 900.0 / ARCSEC_PER_DEG
 """Minimum jump, larger than any gear error; degrees."""
 CONSTANT_SHARE: Final = 0.05
-"""Maximum deviation of the jumps of one counter from each other, as a share of their size."""
+"""Maximum deviation between the jumps of one counter, as a share of their size."""
 NOMINAL_SHARE: Final = 0.02
 """Maximum deviation of a jump from the period of a counter, as a share."""
 LEAST_TIMES: Final = 3.0
@@ -50,8 +50,8 @@ class Wraps(NamedTuple):
 def find_wraps(angle_deg: FloatArray, other_deg: FloatArray, starts: Sequence[int] = (0,)) -> Wraps | None:
     """Finds the constant jumps of an angle that the axis's other angle does not make; shapes (n,).
 
-    None without jumps. A single jump counts if it is a whole number of turns or a power of two of
-    counts. A step to the first sample of a record (`starts`) is not a step of the axis.
+    None without jumps. A single jump counts if it is a whole number of turns or a power of two of counts. A
+    step to the first sample of a record (`starts`) does not count.
     """
     if len(angle_deg) < 2 * WINDOW:
         return None
@@ -116,7 +116,7 @@ def _nominal(wraps: Wraps, scale: float, count: float) -> float:
 
 
 def _slope(step: FloatArray, other: FloatArray) -> float:
-    """Returns the travel of the angle per unit of the other one, from the median of the larger steps."""
+    """Returns the travel of the angle per unit of the other angle, from the median of the larger steps."""
     size = np.abs(other)
     large = size > 0.5 * float(np.quantile(size, 0.9))
     return float(np.median(step[large] / other[large])) if np.any(large) else 0.0

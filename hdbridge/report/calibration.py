@@ -41,14 +41,14 @@ TURN_LABEL: Final = "motor angle within its turn, deg"
 LOAD_LABEL: Final = "load angle, deg"
 R_LABEL: Final = "residual, arcsec"
 PAUSE_STEPS: Final = 20.0
-"""Gap in time that separates two runs, in median steps."""
+"""Gap in time between two runs, in median steps."""
 HIGHEST_ORDER: Final = 16.0
 """Highest order in the spectrum chart."""
 BINS_PER_TURN: Final = 128
 
 
 def calibration_page(result: Calibration) -> Page:
-    """Returns the page of a calibration, or of a fit of any records: result first, then the evidence."""
+    """Returns the page of a calibration, or of a fit of any records: the result, then the evidence."""
     traces = result.fit.traces
     sections = []
     if result.validation is not None:
@@ -104,7 +104,9 @@ def _status(result: Calibration) -> tuple[Status, tuple[Command, ...]]:
         return of_offer(result.offer)
     records = " ".join(result.recordings)
     return Status.MEASURED, (
-        Command(f"hdbridge diagnose {records} --model MODEL.yaml", "says what the fitted model still lacks"),
+        Command(
+            f"hdbridge diagnose {records} --model MODEL.yaml", "lists the causes that the fitted model lacks"
+        ),
     )
 
 
@@ -142,7 +144,7 @@ def _by_angle(traces: Traces, ratio: float) -> Iterator[Chart]:
 def _over(
     x: FloatArray, y: FloatArray, width: float, middle: Callable[[FloatArray], Any]
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns the middle of y over intervals of x of a given width; an interval without samples is a gap."""
+    """Returns the median of y over intervals of x of a given width; an interval without samples is a gap."""
     first = float(np.min(x))
     place = ((x - first) / width).astype(np.intp)
     values: FloatArray = np.full(int(np.max(place)) + 1, np.nan)
@@ -155,13 +157,13 @@ def _over(
 
 
 def _both_ways(traces: Traces, x: FloatArray, y: FloatArray, chosen: BoolArray) -> list[Series]:
-    """Returns the chosen samples by direction, without a direction that does not occur."""
+    """Returns the chosen samples by direction, omitting a direction without samples."""
     ways = (("forward", chosen & (traces.direction > 0.0)), ("backward", chosen & (traces.direction < 0.0)))
     return [Series(name, x[rows], y[rows], Mark.POINTS) for name, rows in ways if np.any(rows)]
 
 
 def _loops(traces: Traces) -> Iterator[Chart]:
-    """Yields one chart for each sine or run of reversals, in the order measured."""
+    """Yields one chart for each sine or run of reversals, in the order of measurement."""
     for kind, words in (("sine", "Sine"), ("reversal", "Reversals")):
         runs = [rows for rows in _runs(_of_kind(traces, kind)) if _is_loop(traces.motor_deg[rows])]
         for number, rows in enumerate(runs, 1):
@@ -252,7 +254,7 @@ def _residual(result: Calibration) -> Iterator[Block]:
     yield Facts(
         [
             ("residual of the model, rms of a sample", f"{noise.residual_arcsec:.2f} arcsec"),
-            ("... with what was fitted in addition to it", f"{noise.fitted_arcsec:.2f} arcsec"),
+            ("... with the terms fitted in addition", f"{noise.fitted_arcsec:.2f} arcsec"),
             (
                 "noise at rest",
                 "not measured" if noise.standing_arcsec is None else f"{noise.standing_arcsec:.2f} arcsec",
@@ -313,7 +315,7 @@ def _parameters(result: Calibration) -> Iterator[Block]:
 
 
 def _parameter_words(effect: str, parameter: str) -> str:
-    """Returns ``orders[2].amplitude_arcsec`` of synchronous as "synchronous, order 2: amplitude"."""
+    """Formats ``orders[2].amplitude_arcsec`` of synchronous as "synchronous, order 2: amplitude"."""
     words = re.sub(r"^orders\[(\d+)\]\.", r"order \1: ", without_unit(parameter)).replace("_", " ")
     return f"{effect.replace('_', ' ')}, {words}" if ": " in words else f"{effect.replace('_', ' ')}: {words}"
 
@@ -345,7 +347,7 @@ def _provenance(result: Calibration) -> Facts:
         for name, value in (("date", result.date), ("plan", result.plan), ("axis", result.axis))
         if value is not None
     ]
-    rows += [("the plan gave up", each) for each in result.shortened]
+    rows += [("shortened parts of the plan", each) for each in result.shortened]
     rows += [(name.replace("_", " "), _text(value)) for name, value in result.model.provenance.items()]
     return Facts(rows)
 

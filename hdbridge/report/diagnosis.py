@@ -44,8 +44,8 @@ def diagnosis_page(
 ) -> Page:
     """Returns the page of a diagnosis.
 
-    ``provenance`` holds names and values about the origin of records and model. ``stepping`` is the stepping
-    test with the old and the extended model, if there was one; it precedes everything else. ``offer`` is the
+    ``provenance`` contains names and values about the origin of records and model. ``stepping`` is the
+    stepping test with the old and the extended model, if any; it precedes everything else. ``offer`` is the
     outcome for the extended model, if it was proposed for commit. ``command`` is the command line of the
     diagnosis.
     """
@@ -62,8 +62,8 @@ def diagnosis_page(
         _figures(diagnosis),
         Section(
             "Model and measurement",
-            "The transmission error on the same trajectory: load encoder less motor angle over the ratio, "
-            "the zero taken off.",
+            "The transmission error on the same trajectory: load encoder minus motor angle over the ratio, "
+            "without the zero.",
             [Grid([*beside_charts(diagnosis.traces)], columns=1)],
         ),
         _over(seen),
@@ -128,7 +128,7 @@ def _verdict(diagnosis: Diagnosis, stepping: Validation | None) -> str:
 
 
 def _claim(finding: Finding) -> str:
-    """Phrases a finding with its certainty: "backlash behind the gear, up to 3.1 arcsec"."""
+    """Describes a finding with its certainty: "backlash behind the gear, up to 3.1 arcsec"."""
     if finding.cause == UNEXPLAINED:
         size = f"up to {_two(finding.peak_arcsec)} arcsec"
         return f"something unexplained that depends on the {finding.lives_in or 'time'}, {size}"
@@ -142,12 +142,12 @@ def _to_do(diagnosis: Diagnosis) -> Section:
     if not diagnosis.findings:
         return Section(
             "What to do",
-            "Nothing. What this record would have shown, and what it would not, stands under 'What this "
-            "record could show'.",
+            "Nothing. 'What this record could show' lists the causes that it would have shown, and those "
+            "that it would not.",
         )
     rows: list[tuple[str, str]] = []
     for number, each in enumerate(diagnosis.findings, 1):
-        remedy = "do not correct what has no name; look closer first, and keep the record"
+        remedy = "do not compensate for an unexplained error; investigate it first, and keep the record"
         if each.cause in CATALOGUE:
             remedy = CATALOGUE[each.cause].about.remedy
         rows.append((f"{number}. {_name(each.cause)}", sentence(remedy)))
@@ -198,15 +198,15 @@ def _finding(number: int, finding: Finding, diagnosis: Diagnosis) -> Section:
     blocks.append(Facts([*_about(finding)]))
     if drawn.strength is not None:
         text = (
-            f"How much the {drawn.strength.of} of the model has to grow, by least squares in each bin; "
+            f"Growth of the {drawn.strength.of} of the model, by least squares in each bin; "
             "bars are one standard deviation."
         )
     elif drawn.own_arcsec is None:
-        text = "What no cause accounts for. Dots are means, bars the spread of the readings in them."
+        text = "The residual that no cause explains. Dots are means, bars the spread of the readings in them."
     else:
         text = (
-            "Everything else that was found is in the model, so this is the finding alone, with the "
-            "noise. Dots are means, bars the spread of their readings, lines the finding's contribution."
+            "All other findings are in the model, so this is the finding alone, with the noise. Dots are "
+            "means, bars the spread of their readings, lines the finding's contribution."
         )
     return Section(f"{number}. {sentence(title).rstrip('.')}", text, blocks)
 
@@ -229,18 +229,18 @@ def _about(finding: Finding) -> Iterator[tuple[str, str]]:
     about = CATALOGUE[finding.cause].about if finding.cause in CATALOGUE else None
     yield "probability", _sure(finding)
     yield (
-        "what else it could be",
+        "aliases",
         _listed([*map(_title, finding.aliases)], "or")
         if finding.aliases
-        else "of the catalogue nothing that these data cannot distinguish from it"
+        else "no other cause of the catalogue: all are separable with these data"
         if about
-        else "the catalogue has nothing that fits",
+        else "no cause of the catalogue fits",
     )
     if finding.lives_in:
         yield "depends on", finding.lives_in
     if about:
-        yield "how it shows", sentence(about.signature)
-        yield "what it does", sentence(about.consequence)
+        yield "symptom", sentence(about.signature)
+        yield "consequence", sentence(about.consequence)
         able = CATALOGUE[finding.cause].compensable
         yield "compensation", f"{'possible' if able.possible else 'no'}: {able.why.removeprefix('no, ')}"
         yield "equation", about.equation
@@ -274,7 +274,7 @@ def _figures(diagnosis: Diagnosis) -> Section:
     ]
     return Section(
         "Figures",
-        "How far model and measurement are apart: overall, by kind of motion and by direction.",
+        "Differences between model and measurement: overall, by kind of motion and by direction.",
         [
             Table(["overall", Heading("rms"), Heading(SIGMA)], stages),
             Table(["motion", *map(Heading, ("as given, rms", SIGMA, "extended, rms", SIGMA))], kinds),
@@ -288,10 +288,10 @@ def _over(seen: ResidualViews) -> Section:
         [name, f"{100.0 * before:.1f} %", f"{100.0 * after:.1f} %"] for name, (before, after) in shares
     ]
     return Section(
-        "What is left, over everything",
-        "Measurement less model; lines are means over bins, grey dots readings less the model as given, "
-        "all charts to one scale, the most telling first.\n\nThe table says which share of the mean square "
-        "such means predict on stretches of time that they were not taken from.",
+        "Residuals over all coordinates",
+        "Measurement minus model; lines are means over bins, grey dots readings minus the model as given, "
+        "all charts to one scale, the most informative first.\n\nThe table lists the share of the mean "
+        "square that such means predict on other stretches of time.",
         [
             Grid([*residual_charts(seen)]),
             Table(
@@ -319,16 +319,15 @@ def _could(diagnosis: Diagnosis) -> Section:
         )
     return Section(
         "What this record could show",
-        "From which peak on each cause would be named, and what it would be taken for; or why it cannot be "
-        "seen.",
-        [Table(["cause", Heading("from"), "not distinguished from, or why not"], rows)],
+        "Detection limit and aliases of each cause, or the reason why it is not detectable.",
+        [Table(["cause", Heading("from"), "not separable from, or why not"], rows)],
     )
 
 
 def _remarks(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     yield from (("about the record", each) for each in diagnosis.remarks)
     yield from (("considered, not named", each.replace("_", " ")) for each in diagnosis.considered)
-    yield "samples looked at", f"{len(diagnosis.traces.time_s):,}"
+    yield "samples evaluated", f"{len(diagnosis.traces.time_s):,}"
 
 
 def _name(cause: str) -> str:
@@ -351,5 +350,5 @@ def _listed(words: Sequence[str], last: str = "and") -> str:
 
 
 def _two(value: float) -> str:
-    """Formats two or three digits, without an exponent."""
+    """Formats a value with two or three digits, without an exponent."""
     return f"{value:.1f}" if value >= 9.95 else f"{value:.2f}"

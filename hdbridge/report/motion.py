@@ -11,15 +11,15 @@ RIPPLE_COLUMNS = ("deg/s", "none", "static", "removed", "filtered", "removed", "
 PATH_COLUMNS = ("path", "correction", "path error", "with wind-up", "at rest", "settled after, ms")
 PATH_WORDS = (
     "Errors of the load over a move at the limits and over a sine, rms arcsec. The path error is without the "
-    "servo's lag and the wind-up of the load; 'with wind-up' has them in, the same curve with the static and "
-    "the filtered correction. If that figure grows while the path error falls, the error that the filter "
-    "removed had hidden a part of the curve. At rest: mean error after the path. "
+    "servo's lag and the wind-up of the load; 'with wind-up' includes them, on the same curve with the "
+    "static and the filtered correction. If that figure grows while the path error falls, the removed "
+    "error had hidden part of the curve. At rest: mean error after the path. "
     "Settled: the load stays within 3 arcsec of its rest."
 )
 
 
 def motion_page(axis_name: str, result: MotionTest) -> Page:
-    """Returns the page of one test."""
+    """Returns the page of a motion test."""
     return Page(
         title=f"Motion test of axis '{axis_name}'",
         verdict=_verdict(result),
@@ -29,7 +29,7 @@ def motion_page(axis_name: str, result: MotionTest) -> Page:
 
 
 def motion_sections(result: MotionTest) -> list[Section]:
-    """Returns the ripple over speed, the path errors, and the response if there is one."""
+    """Returns the ripple over speed, the path errors, and the response if measured."""
     sections = [
         Section(
             "Ripple over speed", blocks=[Grid([_ripple(result)]), Table(RIPPLE_COLUMNS, ripple_rows(result))]
@@ -46,8 +46,8 @@ def motion_sections(result: MotionTest) -> list[Section]:
         sections.append(
             Section(
                 "Response of the load to a correction",
-                "At rest the load answers a correction fully: gain 1, phase 0. The filter of the correction "
-                "makes up for the rest up to the last known frequency.",
+                "At rest the load answers a correction fully: gain 1, phase 0. In motion the response "
+                "differs, and the filter compensates for it up to the last known frequency.",
                 [Grid(_response(result.response))],
             )
         )
@@ -69,7 +69,7 @@ def _ripple(result: MotionTest) -> Chart:
     none = [each.none_arcsec for each in result.ripples]
     series = [Series("without correction", speeds, none)]
     for name, values in (
-        ("correction of rest", [each.static_arcsec for each in result.ripples]),
+        ("static correction", [each.static_arcsec for each in result.ripples]),
         ("filtered correction", [each.filtered_arcsec for each in result.ripples]),
     ):
         if any(each is not None for each in values):
@@ -94,7 +94,7 @@ def ripple_rows(result: MotionTest) -> list[list[str]]:
 
 
 def figure(value: float | None) -> str:
-    """Formats two decimals; empty for None."""
+    """Formats two decimals; None is empty."""
     return "" if value is None else f"{value:.2f}"
 
 
@@ -106,7 +106,7 @@ def _spectrum(ripple: Ripple) -> Chart:
     hertz = [each.frequency_hz for each in ripple.orders]
     series = [Series("without correction", hertz, [each.none_arcsec for each in ripple.orders], Mark.POINTS)]
     for name, values in (
-        ("correction of rest", [each.static_arcsec for each in ripple.orders]),
+        ("static correction", [each.static_arcsec for each in ripple.orders]),
         ("filtered correction", [each.filtered_arcsec for each in ripple.orders]),
     ):
         known = [math.nan if each is None else each for each in values]

@@ -27,7 +27,7 @@ from hdbridge.axis.effects import FloatArray
 
 SIGMA: Final = "3\N{GREEK SMALL LETTER SIGMA}"
 SCATTER: Final = (f"pooled {SIGMA}", "mean", f"CW {SIGMA}", "mean", f"CCW {SIGMA}", "mean")
-"""Columns of a stepping test. Pooled comes first as the result, because a telephone shows two columns."""
+"""Columns of a stepping test. Pooled comes first as the result, because a mobile phone shows two columns."""
 
 
 def sentence(text: str) -> str:
@@ -51,7 +51,8 @@ def _typeset(number: str) -> str:
 
 
 POINTS_MAXIMUM: Final = 4000
-"""Maximum points of one series in a page; longer ones are thinned to keep a page below a megabyte."""
+"""Maximum number of points of a series in a page; longer series are thinned to keep a page below a
+megabyte."""
 _FIGURE: Final = re.compile(r"\(?[-+\N{MINUS SIGN}\N{PLUS-MINUS SIGN}]?\d[\d,.]*(e[-+]\d+)?\)?( ?%)?$")
 DIGITS: Final = 5
 """Significant digits of a series' span, a hundredth of the screen resolution; more only enlarge the page."""
@@ -61,7 +62,7 @@ class Mark(Enum):
     """Drawing style of a series."""
 
     LINE = "line"
-    """Joined in the order given, also for loops, whose x goes back and forth."""
+    """Points joined in the given order, also for loops, whose x goes back and forth."""
     DASHED = "dashed"
     POINTS = "points"
     FAINT = "faint"
@@ -72,7 +73,7 @@ class Mark(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One set of points; x and y of one length, in the units of the chart's labels. NaN is a gap."""
+    """Set of points; x and y of equal length, in the units of the chart's labels. NaN is a gap."""
 
     label: str
     x: FloatArray | Sequence[float]
@@ -83,7 +84,7 @@ class Series:
     spread: FloatArray | Sequence[float] | None = None
     """For `Mark.POINTS`: half the length of a vertical error bar at each point, in units of y."""
     colour: int | None = None
-    """Index in the palette for series that belong together; None for a colour of its own."""
+    """Index in the palette for series that belong together; None for a different colour."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,10 +167,10 @@ class Section:
 
 
 class Status(Enum):
-    """Outcome that the page reports: the first word of its verdict."""
+    """Outcome reported on the page: the first word of its verdict."""
 
     OFFERED = "offered"
-    """The model is better; the profile records if it has been committed since."""
+    """The model is better; the profile records whether it has been committed since."""
     PENDING = "pending"
     """The model is better and awaits commit."""
     REFUSED = "refused"
@@ -189,7 +190,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """The whole page; ``verdict`` is the summary that follows the word of ``status``."""
+    """Content of a page; ``verdict`` is the summary after the word of ``status``."""
 
     title: str
     verdict: str
@@ -228,7 +229,7 @@ def histogram(
 ) -> Chart:
     """Returns a histogram with bins of equal width common to all groups; ignores NaN and infinity.
 
-    ``bins`` is their number, by default the square root of the number of values, between 5 and 60.
+    ``bins`` is the number of bins, by default the square root of the number of values, between 5 and 60.
     """
     finite = {name: np.asarray(each, dtype=np.float64) for name, each in groups.items()}
     finite = {name: each[np.isfinite(each)] for name, each in finite.items()}
@@ -245,18 +246,18 @@ def histogram(
 
 
 def thinned(x: FloatArray, y: FloatArray, most: int = POINTS_MAXIMUM) -> tuple[FloatArray, FloatArray]:
-    """Returns at most ``most`` points of a line in their order: those of least and greatest y of each run.
+    """Returns at most ``most`` points of a line in order: those of least and greatest y of each run.
 
-    The visible shape is preserved: peaks are kept, points between them are dropped.
+    The visible shape is preserved: peaks are kept, and points between them are dropped.
     """
     keep = _extremes(y, most)
     return (x, y) if keep is None else (x[keep], y[keep])
 
 
 def sampled(x: FloatArray, y: FloatArray, most: int = POINTS_MAXIMUM) -> tuple[FloatArray, FloatArray]:
-    """Returns at most ``most`` points of a cloud in their order: three in four evenly spaced, the rest peaks.
+    """Returns at most ``most`` points of a cloud in order: three in four evenly spaced, the rest peaks.
 
-    Peaks alone, as for a line, would make a cloud look wider than it is.
+    Peaks alone, as for a line, would make a cloud look wider.
     """
     if len(x) <= most:
         return x, y
@@ -350,7 +351,7 @@ def _text_of(cell: Cell) -> str:
 
 
 def _is_words(table: Table, column: int) -> bool:
-    """Returns True for a column of text, which is left-aligned, without figures."""
+    """Returns True for a column of text without figures, which is left-aligned."""
     cells = [row[column] for row in table.rows if column < len(row)]
     return column == 0 or not any(
         isinstance(cell, int | float) or (isinstance(cell, str) and _FIGURE.match(cell) is not None)

@@ -14,12 +14,12 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.report.page import Chart, Mark, Series, histogram, sampled, thinned
 
 LEAST_IN_BIN: Final = 3
-"""Minimum number of points per bin; emptier bins are not shown."""
+"""Minimum number of points per bin; bins with fewer are not shown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bins:
-    """Means over sufficiently filled bins; arrays of one length."""
+    """Means over sufficiently filled bins; arrays of equal length."""
 
     place: FloatArray
     """Mean of the coordinate."""
@@ -57,7 +57,7 @@ SEEN_BINS: Final = 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Strength:
-    """Scale factor of a part of the model, bin by bin; arrays of one length."""
+    """Scale factor of a part of the model, bin by bin; arrays of equal length."""
 
     of: str
     """Name of the scaled part."""
@@ -71,15 +71,15 @@ class Strength:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartialResidual:
-    """A finding over its coordinate; arrays of shape (m,), like those of `Traces`."""
+    """Finding over its coordinate; arrays of shape (m,), like those of `Traces`."""
 
     coordinate: Coordinate
     residual_arcsec: FloatArray
     """Measurement minus the model with everything except this finding."""
     own_arcsec: FloatArray | None
-    """Contribution of the finding; None if it has no law."""
+    """Contribution of the finding; None without a law."""
     rows: BoolArray
-    """Mask of the points that show it."""
+    """Mask of the points that show the finding."""
     forward: BoolArray
     """True for forward motion, held at rest."""
     strength: Strength | None = None
@@ -119,7 +119,7 @@ def _does(effect: Effect, traces: Traces) -> FloatArray:
 
 
 def _home(finding: Finding, traces: Traces, ratio: float) -> Coordinate:
-    """Returns the coordinate of a finding: its effect's, or the one that it was found to depend on."""
+    """Returns the coordinate of a finding: that of its effect, else the coordinate that it depends on."""
     if finding.effect is not None:
         own = finding.effect.coordinate(traces.motion, ratio).at(traces.rows)
         return own if own.varies() else time(traces.motion).at(traces.rows)
@@ -162,12 +162,12 @@ SMALL_CLOUD: Final = 1200
 """Maximum raw points in a small chart."""
 LINE_POINTS: Final = 2000
 FINER: Final = 3
-"""Bins of a finding's own curve per bin of the means."""
+"""Number of bins of a finding's own curve per bin of the means."""
 CLOSER_POINTS: Final = 400
 MORE_TURNS_DEG: Final = 540.0
-"""Minimum span of the position; below it the chart adds little to that over the load angle."""
+"""Minimum span of the position for its chart; below it, the chart adds little to that over the load angle."""
 PAUSE_STEPS: Final = 20.0
-"""Gap in time that separates two runs, in median steps."""
+"""Gap in time between two runs, in median steps."""
 BLUE: Final = 0
 ORANGE: Final = 1
 GREEN: Final = 2
@@ -265,7 +265,7 @@ def residual_charts(seen: ResidualViews) -> Iterator[Chart]:
 
 
 def beside_charts(traces: Traces) -> Iterator[Chart]:
-    """Yields charts of model and measurement: the whole record, and where the extended model gains most."""
+    """Yields charts of model and measurement: the whole record, and the part with the largest gain."""
     whole = np.arange(len(traces.time_s))
     given = (traces.measured_arcsec - traces.model_arcsec) ** 2
     left = (traces.measured_arcsec - traces.extended_arcsec) ** 2
@@ -295,7 +295,7 @@ def beside_charts(traces: Traces) -> Iterator[Chart]:
 
 
 def _cloud(label: str, x: FloatArray, y: FloatArray, most: int) -> Series:
-    """Draws ``most`` points at random (always the same ones), a cloud as dense and as wide as the whole."""
+    """Draws ``most`` random (but reproducible) points, a cloud as dense and as wide as the whole."""
     if len(x) > most:
         kept = np.sort(np.random.default_rng(0).choice(len(x), most, replace=False))
         label, x, y = f"{label} ({most:,} of {len(x):,})", x[kept], y[kept]
@@ -303,7 +303,7 @@ def _cloud(label: str, x: FloatArray, y: FloatArray, most: int) -> Series:
 
 
 def _ways(forward: BoolArray, rows: BoolArray) -> list[tuple[str, int, BoolArray]]:
-    """Returns name, colour and points of each direction that occurs."""
+    """Returns name, colour and points of each direction of motion."""
     both = ((FORWARD, BLUE, rows & forward), (BACKWARD, ORANGE, rows & ~forward))
     return [each for each in both if np.any(each[2])]
 

@@ -40,7 +40,7 @@ ISO_FIGURES: Final = (
 
 
 def stepping_sections(checked: Validation) -> list[Section]:
-    """Returns the stepping test, and the ISO 230-2 figures if the plan had a positioning test."""
+    """Returns the stepping test, and the ISO 230-2 figures of the plan's positioning test, if any."""
     return [Section("Stepping test", _stepping_text(checked), [*_stepping(checked)]), *_iso_section(checked)]
 
 
@@ -73,7 +73,7 @@ def _stepping(checked: Validation) -> Iterator[Block]:
 
 
 def _range(tests: Iterable[Stepped]) -> tuple[float, float]:
-    """Returns a range of errors that holds all tests, so that they are drawn to one scale."""
+    """Returns a range of errors that contains all tests, so that they are drawn to one scale."""
     errors = [abs(error) for each in tests for way in each.errors_arcsec for error in way]
     reach = 1.08 * max(errors, default=1.0)
     return -reach, reach
@@ -120,7 +120,9 @@ def of_offer(offer: Offer) -> tuple[Status, tuple[Command, ...]]:
         return Status.REFUSED, ()
     if offer.pending is None:
         return Status.OFFERED, (
-            Command("hdbridge model log PROFILE", "says whether this model waits, or was committed since"),
+            Command(
+                "hdbridge model log PROFILE", "shows whether this model is pending or has been committed"
+            ),
         )
     profile = offer.pending.parent
     return Status.PENDING, (
@@ -176,7 +178,7 @@ def stepping_page(
                 "count.",
                 [Grid(_remaining(results[best], floor_arcsec))],
             ),
-            Section("What was done", blocks=[Facts([*facts.items()])]),
+            Section("Test conditions", blocks=[Facts([*facts.items()])]),
         ],
         footer=f"hdbridge {__version__}. Errors are arcseconds at the load; {SIGMA} is three standard "
         "deviations about the mean.",
@@ -221,7 +223,7 @@ def _remaining(result: Stepped, floor_arcsec: float) -> list[Chart]:
 
 
 def _signed(value: float) -> str:
-    """Formats two decimals with a typographic minus sign, and no minus before a zero."""
+    """Formats two decimals with a typographic minus sign, but without a minus before a zero."""
     text = f"{value:.2f}"
     return text.lstrip("-") if float(text) == 0.0 else text.replace("-", "\N{MINUS SIGN}")
 

@@ -37,7 +37,7 @@ MEASURED, SIMULATED, BEFORE, DIFFERENCE = "measured", "simulated", "before", "di
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """A fitted value of the plant."""
+    """Fitted value of the plant."""
 
     name: str
     unit: str
@@ -45,7 +45,7 @@ class Learned:
     """Value before; None if it was only assumed."""
     after: float
     interval: tuple[float, float] | None
-    """95 %; None if the value is not the axis's."""
+    """95 % interval; None if the value is not the axis's."""
 
     @property
     def text(self) -> str:
@@ -62,7 +62,7 @@ class TwinReport:
     before: Comparison
     """Comparison of the measured record with the initial simulation."""
     after: Comparison | None = None
-    """Comparison with the fitted simulation; None if it was only compared."""
+    """Comparison with the fitted simulation; None without a fit."""
     learned: Sequence[Learned] = ()
     named: Sequence[Finding | Alike | Left] = ()
     translated: Sequence[Translated] = ()
@@ -70,7 +70,7 @@ class TwinReport:
     verdict: str = ""
     """Quality of the values, and the outcome for the twin, in one sentence."""
     values: str = ""
-    """Origin of the values (`hdbridge.twin.twin.Values`); empty if nothing was fitted."""
+    """Origin of the values (`hdbridge.twin.twin.Values`); empty without a fit."""
     left: Sequence[Left] = ()
     """Residuals of each channel."""
     commands: Sequence[Command] = ()
@@ -78,7 +78,7 @@ class TwinReport:
 
     @property
     def now(self) -> Comparison:
-        """The later of the two comparisons."""
+        """Comparison after the fit, else before."""
         return self.after or self.before
 
 
@@ -86,7 +86,7 @@ def twin_page(report: TwinReport) -> Page:
     """Returns the page."""
     sections = [
         Section(
-            "How far simulation and axis are apart",
+            "Differences between simulation and axis",
             "Each figure is the rms difference of the two records, sample by sample or stop by stop, also "
             "in units of the noise of the measured channel. Two equal axes differ by less than one.",
             [Table(*figures(report))],
@@ -94,12 +94,12 @@ def twin_page(report: TwinReport) -> Page:
     ]
     if report.named:
         rows = [[each.cause, each.text] for each in report.named]
-        sections.append(Section("What was wrong with the simulation", "", [Table(["cause", ""], rows)]))
+        sections.append(Section("Errors of the initial simulation", "", [Table(["cause", ""], rows)]))
     sections += [_pictures(name, report) for name in report.now.traces]
     sections.append(
         Section(
             "By kind of motion",
-            "The same figures, leg by leg of one kind.",
+            "The same figures for the legs of each kind.",
             [Table(*figures(report, by_kind=True))],
         )
     )
@@ -118,8 +118,8 @@ def twin_page(report: TwinReport) -> Page:
         sections.append(
             Section(
                 "From the model",
-                "What became of each effect of the axis's model in the simulated plant.",
-                [Table(["effect", "place in the truth file", "what differs there"], rows)],
+                "Translation of each effect of the axis's model to the simulated plant.",
+                [Table(["effect", "path in the truth file", "differences"], rows)],
             )
         )
     if report.facts:
@@ -132,8 +132,8 @@ def twin_page(report: TwinReport) -> Page:
         status=report.status,
         commands=report.commands,
         sections=sections,
-        footer=f"hdbridge {__version__}. The load error is load angle less motor angle over the ratio, in "
-        "arcsec at the load; the following error is command less motor angle. Both records got the same "
+        footer=f"hdbridge {__version__}. The load error is load angle minus motor angle over the ratio, in "
+        "arcsec at the load; the following error is command minus motor angle. Both records have the same "
         "commands.",
     )
 
@@ -168,7 +168,7 @@ def _title(row: Row) -> str:
 
 
 def figures(report: TwinReport, *, by_kind: bool = False) -> tuple[list[str], list[list[str]]]:
-    """Returns header and rows of the figures of each channel: of the whole record, or by kind of motion."""
+    """Returns header and rows of each channel's figures, of the whole record or by kind of motion."""
     before = ["difference before"] if report.after is not None else []
     header = ["", "measured", "simulated", *before, "difference", "of the noise", "unit"]
     if not by_kind:
@@ -216,9 +216,9 @@ def _pictures(name: str, report: TwinReport) -> Section:
             [
                 _chart(f"{TITLES[name].capitalize()} over the whole record", label, trace, slice(None)),
                 _chart(
-                    "Where the simulation was off most"
+                    "Largest deviation of the initial simulation"
                     if report.after
-                    else "Where the simulation is off most",
+                    else "Largest deviation of the simulation",
                     label,
                     trace,
                     worst,
@@ -245,7 +245,7 @@ def _difference(caption: str, before: Trace, after: Trace | None) -> Chart:
     series = [Series(BEFORE if after is not None else DIFFERENCE, before.time_s, before.difference, colour=2)]
     if after is not None:
         series.append(Series("now", after.time_s, after.difference, colour=1))
-    return Chart(caption, "time, s", "measured less simulated", series, height_px=260)
+    return Chart(caption, "time, s", "measured minus simulated", series, height_px=260)
 
 
 def _spectrum(name: str, spectrum: Spectrum | None) -> list[Chart]:

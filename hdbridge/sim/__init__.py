@@ -1,1 +1,1 @@
-"""The simulated axis: plant, encoders, and the bench with a CiA-402 drive (`hdbridge.device`) in front."""
+"""Simulated axis: plant, encoders, and the bench with a CiA-402 drive (`hdbridge.device`) in front."""

@@ -14,7 +14,7 @@ from hdbridge.sim.truth.gear import TrueAgeing
 
 @state
 class Age:
-    """Completed share of the ageing: 0 when the axis is switched on, rises to 1 and stays there."""
+    """Completed share of the ageing, which rises from 0 at switch-on to 1 and stays there."""
 
     _share: float
     _step: float
@@ -41,7 +41,6 @@ class AgeFactor:
         self._growth = truth.hysteresis_growth
 
     def factor(self, now: Conditions) -> float:
-        """Returns the factor after one more substep."""
         return 1.0 + self._growth * self._age.grown()
 
 

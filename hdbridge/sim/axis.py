@@ -1,6 +1,6 @@
 """Simulated axis, cycle by cycle: the loops, the heat, and the encoder readings at the end of a cycle.
 
-It contains everything that `hdbridge.sim.machine` does in a cycle except noise, so it can be compiled as a
+It contains all computations of `hdbridge.sim.machine` in a cycle except noise, so it can be compiled as a
 whole and advanced by one call per cycle.
 """
 
@@ -23,9 +23,9 @@ class Measured(NamedTuple):
     load_reading: float
     """Load encoder in counts, before rounding; includes noise."""
     torque_nm: float
-    """Motor torque, not rounded, in the sense of the motor encoder."""
+    """Motor torque, not rounded, in the direction of the motor encoder."""
     torque_permille: int
-    """Motor torque, in thousandths of the rated one, in the sense of the motor encoder."""
+    """Motor torque, in thousandths of the rated torque, in the direction of the motor encoder."""
     temperature_c: float
     """Temperature of motor and gear."""
     load_torque_nm: float
@@ -33,9 +33,9 @@ class Measured(NamedTuple):
     that the truth file states. Friction of the gear's bearings and the load's inertia are not included.
     """
     motor_counts: int
-    """Motor encoder: whole counts, multi-turn, never wrapped. The middle of a count is its angle."""
+    """Motor encoder in whole counts, multi-turn, never wrapped, each at the middle of its count."""
     load_counts: int
-    """Load encoder: whole counts, multi-turn, never wrapped."""
+    """Load encoder in whole counts, multi-turn, never wrapped."""
     velocity_counts_s: float
     """Motor speed as measured by the drive."""
     elapsed_s: float
@@ -50,7 +50,7 @@ class Measured(NamedTuple):
 
 @state
 class Axis:
-    """Servo axis, initially at rest at the angle zero with its power stage off."""
+    """Servo axis, initially at rest at angle zero with its power stage off."""
 
     heat: Heat
     loops: Loops
@@ -58,7 +58,7 @@ class Axis:
     _hold_counts: float
     _hold_deg: float
     _holds: bool
-    """True while the demand is still that at which the loops were switched on."""
+    """True while the demand is still that of switch-on."""
     _load_counts_per_deg: float
     _load_errors: FixedErrors
     _load_losses: Losses
@@ -105,8 +105,8 @@ class Axis:
     ) -> Measured:
         """Runs a closed-loop cycle in which the demand moves linearly from start to end, in motor counts.
 
-        ``limit_nm`` is the torque limit, ``noise_deg`` the noise of the load encoder at the end,
-        ``outer_nm`` the external torque on the load.
+        ``limit_nm`` is the torque limit, ``noise_deg`` the noise of the load encoder at the end, ``outer_nm``
+        the external torque on the load.
         """
         loops, per_deg = self.loops, self.motor_counts_per_deg
         self._prepare(limit_nm, outer_nm)
@@ -139,7 +139,7 @@ class Axis:
         return self._readings(substeps * self.loops.dt_s, noise_deg, outer_nm)
 
     def hold(self, torque_nm: float) -> None:
-        """Sets the torque by which the loops hold the axis at rest."""
+        """Sets the torque with which the loops hold the axis at rest."""
         self.loops.hold(torque_nm)
 
     def _prepare(self, limit_nm: float, outer_nm: float) -> None:
@@ -180,5 +180,5 @@ class Axis:
         return read_deg * self.motor_counts_per_deg + self._motor_zero
 
     def _lost_deg(self) -> float:
-        """Returns the angle that the motor encoder has lost."""
+        """Returns the angle lost by the motor encoder."""
         return self._motor_losses.counts(self.heat.since_s) / self.motor_counts_per_deg

@@ -1,13 +1,13 @@
-"""Axis compiled to machine code from the same classes that Python runs, with the same numbers.
+"""Axis compiled to machine code from the Python classes, with identical results.
 
 An object of the classes that `hdbridge.sim.state` declares is laid out as a numpy record, attribute by
-attribute, and numba compiles the classes' methods for such records. The physics is written only once. If an
-attribute may belong to one of several classes (a hysteresis law, a cause of transmission error), its record
-has space for each, and a field for the kind.
+attribute, and numba compiles the classes' methods for such records. The physics is therefore written only
+once. If an attribute may belong to one of several classes (a hysteresis law, a cause of transmission error),
+its record has space for each, and a field for the kind.
 
 Results are identical bit for bit, because nothing is reordered or fused (no ``fastmath``), and exp, sin and
-similar functions are those of the C library that Python uses. What cannot be laid out (`Uncompilable`) runs
-in Python.
+similar functions are those of the C library that Python uses. An axis that cannot be laid out
+(`Uncompilable`) runs in Python.
 """
 
 import hashlib
@@ -47,7 +47,7 @@ class Kinds(NamedTuple):
     room: int
     """Capacity of the tuple of elements."""
     neutral: float
-    """Value of an empty place in such a tuple."""
+    """Value of an unused place in such a tuple."""
 
 
 KINDS: Final[dict[Any, Kinds]] = {
@@ -90,7 +90,7 @@ _NUMBERS: Final = {float: "f8", int: "i8", bool: "?", complex: "c16"}
 
 
 class CompiledAxis:
-    """State of an `Axis` as one record, with compiled methods; has the interface of `Axis`."""
+    """State of an `Axis` as one record, with compiled methods and the interface of `Axis`."""
 
     def __init__(self, axis: Axis) -> None:
         """Lays out the axis; raises `Uncompilable` if that is not possible."""
@@ -104,7 +104,6 @@ class CompiledAxis:
         self._drive = self._entry_point("drive")
 
     def drive(self, *inputs: float) -> Measured:
-        """Runs a closed-loop cycle; see `Axis`."""
         measured: Measured = self._drive(self._record, *inputs)
         return measured
 
@@ -116,24 +115,22 @@ class CompiledAxis:
         noise_deg: FloatArray,
         outer_nm: FloatArray,
         held_nm: FloatArray,
-        told: FloatArray,
+        readings: FloatArray,
     ) -> Measured:
-        """Runs `Axis.drive` over many cycles, each from the demand before it, and first held by ``held_nm``.
+        """Runs `Axis.drive` over many cycles, each from the demand before it, first held by ``held_nm``.
 
-        ``told`` receives the first six values of each cycle (`machine.Cycles`).
+        ``readings`` receives the first six values of each cycle (`machine.Cycles`).
         """
         last: Measured = _methods()["drive_all"](
-            self._record, counts, substeps, limit_nm, noise_deg, outer_nm, held_nm, told
+            self._record, counts, substeps, limit_nm, noise_deg, outer_nm, held_nm, readings
         )
         return last
 
     def roll(self, *inputs: float) -> Measured:
-        """Runs a cycle with the power stage off; see `Axis`."""
         measured: Measured = self._entry_point("roll")(self._record, *inputs)
         return measured
 
     def hold(self, torque_nm: float) -> None:
-        """Sets the holding torque; see `Axis`."""
         self._entry_point("hold")(self._record, torque_nm)
 
 
@@ -141,8 +138,8 @@ class CompiledAxis:
 def _entry_point(plant: Any, room: int, name: str) -> Callable[..., Any]:
     """Returns a compiled method of an `Axis` with this plant.
 
-    It converts its arguments to the declared types. Numba's dispatcher would check the types in each call,
-    and compile again for whole numbers.
+    The method converts its arguments to the declared types. Numba's dispatcher would check the types in each
+    call, and compile again for whole numbers.
     """
     *hints, _ = get_type_hints(getattr(Axis, name)).values()
     numbers = [types.float64 if hint is float else types.int64 for hint in hints]
@@ -178,7 +175,7 @@ def _methods() -> dict[str, Any]:
         noise_deg: Any,
         outer_nm: Any,
         held_nm: Any,
-        told: Any,
+        readings: Any,
     ) -> Any:
         assert version
         now = axis[0].at_first()
@@ -187,8 +184,8 @@ def _methods() -> dict[str, Any]:
                 axis[0].hold(held_nm[cycle])
             start, end, count = counts[cycle], counts[cycle + 1], substeps[cycle]
             now = axis[0].drive(start, end, count, limit_nm, noise_deg[cycle], outer_nm[cycle])
-            told[cycle, 0], told[cycle, 1], told[cycle, 2] = now[0], now[1], now[2]
-            told[cycle, 3], told[cycle, 4], told[cycle, 5] = now[3], now[4], now[5]
+            readings[cycle, 0], readings[cycle, 1], readings[cycle, 2] = now[0], now[1], now[2]
+            readings[cycle, 3], readings[cycle, 4], readings[cycle, 5] = now[3], now[4], now[5]
         return now
 
     def roll(
@@ -224,7 +221,7 @@ def _attributes(cls: Any) -> dict[str, Any]:
 
 
 class Members(NamedTuple):
-    """Attributes of a state class, by the form in which its record has them."""
+    """Attributes of a state class, by their form in the record."""
 
     numbers: tuple[str, ...]
     lists: tuple[str, ...]
@@ -360,8 +357,8 @@ _METHOD: Final[dict[str, Any]] = {
     "strict": False,
     "jit_options": {"no_cpython_wrapper": True, "no_cfunc_wrapper": True},
 }
-"""Numba's options for methods, which only compiled code calls: without entries for Python and C they
-compile in an eighth of the time."""
+"""Numba's options for methods called only by compiled code: without entries for Python and C they compile in
+an eighth of the time."""
 _KNOWN: Final[dict[str, int]] = {}
 """Registered methods, with the number of their parameters."""
 
@@ -395,7 +392,7 @@ def _dispatch(protocol: Any, name: str) -> Any:
 
 
 def _of_the_c_library(function: Any) -> None:
-    """Makes numba call the C function that Python calls; numba has none of its own."""
+    """Makes numba call the C function that Python calls, because numba has none of its own."""
     same = types.ExternalFunction(function.__name__, types.float64(types.float64, types.float64))
 
     @overload(function, strict=False)  # type: ignore[untyped-decorator]

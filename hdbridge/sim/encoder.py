@@ -35,8 +35,9 @@ class ReadingError(Protocol):
 class Disc:
     """Disc with eccentricity and with a distortion twice per turn.
 
-    The head is fixed. Seen from the graduation's centre, at a distance e from the axis of a disc of radius
-    R, its angle differs from that seen from the axis by ``atan2(e sin a, R + e cos a)``, about e/R sin a.
+    The head is fixed. The graduation's centre is at a distance e from the axis of a disc of radius R. The
+    angle of the head about that centre differs from its angle about the axis by ``atan2(e sin a, R + e cos
+    a)``, about e/R sin a.
     """
 
     _eccentric_rad: float
@@ -88,7 +89,7 @@ class Signals:
 
 @state
 class Cable:
-    """Cable that is taut beyond an angle and turns the encoder's body, which reduces the reading."""
+    """Cable that is taut beyond an angle and twists the encoder's body, which reduces the reading."""
 
     _drag: float
     _from_deg: float
@@ -151,7 +152,6 @@ class Losses:
     """Lost counts of an encoder."""
 
     _counts: tuple[float, ...]
-    """Counts of each loss."""
     _count: int
     _lost: float
     _past: int
@@ -166,7 +166,7 @@ class Losses:
         self._past, self._lost = 0, 0.0
 
     def counts(self, now_s: float) -> float:
-        """Returns the reading error at a time; times must not decrease."""
+        """Returns the reading error at a time; successive times must not decrease."""
         while self._past < self._count and self._times_s[self._past] <= now_s:
             self._lost += self._counts[self._past]
             self._past += 1
@@ -175,7 +175,7 @@ class Losses:
 
 @state
 class Late:
-    """Delayed angle of a shaft; fed once per substep."""
+    """Delayed angle of a shaft; updated once per substep."""
 
     deg: float
     """Delayed angle."""
@@ -235,9 +235,9 @@ class FixedErrors:
 
 @state
 class Body:
-    """Movement of the load encoder's body, caused by the travel of its shaft.
+    """Movement of the load encoder's body due to the travel of its shaft.
 
-    It has a state, so it is fed once per substep, and may be read at any time.
+    It has a state, so it must be updated once per substep; it may be read at any time.
     """
 
     deg: float

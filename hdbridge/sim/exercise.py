@@ -1,7 +1,7 @@
 """Moves the simulated axis without a bus and records its encoders.
 
-This produces records in bulk: the same loops, mechanics and encoders as behind the firmware, at least 250
-times faster than real time. All moves begin and end at rest, with continuous speed.
+This generates records in bulk with the same loops, mechanics and encoders as behind the firmware, at least
+250 times faster than real time. All moves begin and end at rest, with continuous speed.
 """
 
 import math
@@ -60,7 +60,6 @@ class Exercise:
         return len(self._rows)
 
     def hold(self, duration_s: float) -> None:
-        """Holds the position."""
         self.lead(lambda seconds: 0.0 * seconds, duration_s)
 
     def move(self, distance_deg: float, speed_deg_s: float, acceleration_deg_s2: float) -> None:
@@ -99,7 +98,7 @@ class Exercise:
     def lead(
         self, way: Callable[[Floats], Floats], duration_s: float, distance_deg: float | None = None
     ) -> None:
-        """Follows ``way``, distance by time, for a duration; ends exactly at ``distance_deg`` if given."""
+        """Follows ``way``, distance over time, for a duration; ends exactly at ``distance_deg`` if given."""
         cycles = max(1, math.ceil(duration_s / self.cycle_s - 1e-9))
         ways = way(np.arange(1, cycles + 1, dtype=np.float64) * self.cycle_s)
         if distance_deg is not None:

@@ -1,8 +1,8 @@
-"""Decision when to compile the simulated axis: if numba is installed, and once compiling pays off.
+"""Decision whether and when to compile the simulated axis: with numba, and once compiling pays off.
 
 numba comes with the extra ``hdbridge[fast]``. Loading it takes a second, and compiling another twelve the
-first time on a computer; compiled code is kept on disk. So a process begins in Python and switches to the
-compiled axis after the number of steps that would have paid for it. The numbers are the same.
+first time on a computer; compiled code is kept on disk. A process therefore begins in Python and switches to
+the compiled axis after the number of steps that would have paid for it. The numbers are the same.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 PAYS_AFTER_SUBSTEPS: Final = 140_000
-"""Substeps after which compiling pays off: each takes 10 microseconds in Python, and loading the
+"""Number of substeps after which compiling pays off: each takes 10 microseconds in Python, and loading the
 compiled axis takes 1.4 s. A control cycle of 4 ms has eight substeps."""
 SWITCH: Final = "HDBRIDGE_COMPILE"
-"""Environment variable that keeps everything in Python if it is ``0``."""
+"""Environment variable that disables compilation if it is ``0``."""
 _PROOF_CYCLES: Final = 100
 _PROOF_STEP_DEG: Final = 0.9
 
@@ -69,7 +69,7 @@ _agreeing: Final[dict[type[Plant], bool]] = {}
 
 
 def _agree(axis: Axis) -> bool:
-    """Runs both back and forth; returns True if all results are identical bit for bit."""
+    """Runs both axes back and forth; returns True if all results are identical bit for bit."""
     from hdbridge.sim import compiled  # noqa: PLC0415
 
     other = compiled.CompiledAxis(axis)

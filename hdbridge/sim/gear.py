@@ -1,8 +1,8 @@
 """Gear output: motor angle / ratio, plus the transmission error.
 
-The error is a sum of pieces, each one physical cause. To add a cause, write a class in
-`hdbridge.sim.gear_pieces` (or a file of its own) and a line in `pieces_of`; the class reads its inputs from
-the `Conditions`. A cause that is off has no piece and costs nothing.
+The error is a sum of pieces, each a physical cause. To add a cause, write a class in
+`hdbridge.sim.gear_pieces` (or in its own file) and a line in `pieces_of`; the class reads its inputs from the
+`Conditions`. An inactive cause has no piece and no cost.
 """
 
 import math
@@ -41,17 +41,17 @@ class Piece(Protocol):
 
     @property
     def by_motor_only(self) -> bool:
-        """True if it cannot change while the motor stands still."""
+        """True if the piece cannot change while the motor stands still."""
         ...
 
     def arcsec(self, now: Conditions) -> float:
-        """Returns its part of the output error under the new conditions, arcsec."""
+        """Returns the piece's part of the output error under the new conditions, arcsec."""
         ...
 
 
 @state
 class MotorOrders:
-    """Tooth error by motor angle, or by the angle between wave generator and flexspline.
+    """Tooth error over motor angle, or over the angle between wave generator and flexspline.
 
     It may also depend on the loaded flank, the torque and the temperature.
     """
@@ -96,7 +96,7 @@ class MotorOrders:
 
 @state
 class LoadOrders:
-    """Tooth error by load angle."""
+    """Tooth error over load angle."""
 
     by_motor_only: ClassVar[bool] = False
     _orders: Orders
@@ -110,7 +110,7 @@ class LoadOrders:
 
 @state
 class ElasticHysteresis:
-    """Elastic hysteresis, by the travel of the motor; it may also depend on speed, temperature or age."""
+    """Elastic hysteresis over the motor's travel; may also depend on speed, temperature or age."""
 
     by_motor_only: bool
     _factors: tuple[Factor, ...]
@@ -160,7 +160,7 @@ class ZeroDrift:
 
 @state
 class SlowZeroDrift:
-    """Shift by the temperature of a housing that lags the measured one."""
+    """Shift by the temperature of a housing that lags the measured temperature."""
 
     by_motor_only: ClassVar[bool] = False
     _ambient_c: float
@@ -209,7 +209,7 @@ def pieces_of(truth: Truth) -> list[Piece]:
 
 
 def warmth_factor(truth: Truth, per_k: float) -> WarmthFactor | None:
-    """Returns the growth with temperature; None if there is none."""
+    """Returns the growth with temperature, or None."""
     return WarmthFactor(per_k, truth.temperature.unchanged_c) if per_k else None
 
 

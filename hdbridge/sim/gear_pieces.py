@@ -1,6 +1,6 @@
 """Causes of transmission error in the gear other than orders and hysteresis; see `hdbridge.sim.gear`.
 
-Each piece is evaluated once per substep, in order of time, so those with a state advance by one substep.
+Each piece is evaluated once per substep, in order of time, so pieces with a state advance by one substep.
 """
 
 import math
@@ -26,7 +26,7 @@ SLIDING_DEG_S: Final = 0.5
 
 @state
 class Flank:
-    """Loaded flank of the teeth, -1 to 1, by the travel of the motor."""
+    """Loaded flank of the teeth, -1 to 1, over the motor's travel."""
 
     _last_deg: float
     _share: float
@@ -67,7 +67,6 @@ class SpeedFactor:
         self._now = 0.0
 
     def factor(self, now: Conditions) -> float:
-        """Returns the factor after one more substep."""
         speed_deg_s = abs(now.motor_deg - self._last_deg) / self._dt
         self._last_deg = now.motor_deg
         goal = self._gain * math.log10(1.0 + speed_deg_s / self._from_deg_s)
@@ -87,11 +86,9 @@ class WarmthFactor:
         self._reference_c = reference_c
 
     def factor(self, now: Conditions) -> float:
-        """Returns the factor under these conditions."""
         return self.at(now.temperature_c)
 
     def at(self, temperature_c: float) -> float:
-        """Returns the factor at a temperature."""
         return max(0.05, 1.0 + self._per_k * (temperature_c - self._reference_c))
 
 
@@ -129,8 +126,8 @@ class Wear:
 class Creep:
     """Kelvin-Voigt elements in series, each yielding to the teeth's drag and to the load.
 
-    The drag acts against the motion while the motor turns, and ceases at standstill, so the output creeps on
-    after a stop. A torque at the load acts for as long as it lasts.
+    The drag acts against the motion while the motor turns, and ceases at standstill, so the output continues
+    to creep after a stop. A torque at the load acts for as long as it lasts.
     """
 
     by_motor_only: ClassVar[bool] = False
@@ -196,7 +193,7 @@ class Jumps:
 
 @state
 class Damage:
-    """Damaged teeth: smooth bumps by load angle."""
+    """Damaged teeth: smooth bumps over load angle."""
 
     by_motor_only: ClassVar[bool] = False
     _at_deg: tuple[float, ...]
@@ -221,7 +218,7 @@ class Damage:
 
 @state
 class Roller:
-    """Roller on the motor's hub: an error by its own angle, largest at the load angle that presses it on."""
+    """Roller on the motor's hub: an error over its own angle, largest at the load angle of the contact."""
 
     by_motor_only: ClassVar[bool] = False
     _amplitude: float
@@ -246,7 +243,7 @@ class Roller:
 
 
 class Seat:
-    """Bearing ring that is carried along by the motion and slips back at random angles."""
+    """Bearing ring that is dragged along by the motion and slips back at random angles."""
 
     by_motor_only: ClassVar[bool] = True
 

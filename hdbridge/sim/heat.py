@@ -9,7 +9,7 @@ from hdbridge.sim.truth import Truth
 
 @state
 class Heat:
-    """One heat store between its losses and its surroundings, advanced once per control cycle."""
+    """Heat store between its losses and its surroundings, advanced once per control cycle."""
 
     body_c: float
     """Temperature of motor and gear."""

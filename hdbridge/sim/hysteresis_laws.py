@@ -1,7 +1,7 @@
-"""Elastic hysteresis of the gear: lead of its output, by the travel of the motor.
+"""Elastic hysteresis of the gear: lead of its output, over the motor's travel.
 
 Each law is rate-independent and advances from one motor angle to the next. The output leads in the direction
-of motion, so a closed loop of the motor angle has a positive area, the integral of error by angle.
+of motion, so a closed loop of the motor angle has a positive area, the integral of error over angle.
 """
 
 import math
@@ -23,7 +23,7 @@ class Law(Protocol):
 
 
 def law_of(truth: Hysteresis | None, motor_deg: float) -> Law | None:
-    """Returns the law of a truth file in its initial state at a motor angle; None if there is none."""
+    """Returns the law of a truth file in its initial state at a motor angle, or None."""
     if isinstance(truth, RollingFriction):
         return RollingFrictionLaw(truth, motor_deg)
     if isinstance(truth, MaxwellSlip):
@@ -39,7 +39,7 @@ class RollingFrictionLaw:
 
     After a reversal at angle a with error e the error is ``e + s 2 offset g(x)``, limited to ``s offset``; s
     is the direction and ``x = |motor - a| / width``, at most 1. ``g(x) = (x^(n-1) - (n-1) x) / (2-n)``, and
-    ``x (1 - ln x)`` for n = 2. Only the last reversal counts: it has no return-point memory.
+    ``x (1 - ln x)`` for n = 2. Only the last reversal counts, so there is no return-point memory.
     """
 
     _branch_arcsec: float
@@ -132,7 +132,7 @@ class MaxwellSlipLaw:
 class BoucWenLaw:
     """Bouc-Wen law: ``dz/dx = (1 - |z|^n (beta sgn(dx z) + gamma)) / yield``; the error is offset * z.
 
-    beta + gamma = 1. Integrated over the motor's travel x by the midpoint rule, in short steps.
+    beta + gamma = 1. It is integrated over the motor's travel x by the midpoint rule, in short steps.
     """
 
     _beta: float
@@ -198,7 +198,7 @@ class DahlLaw:
         return self._offset * self._z
 
     def _left(self, left: float, travel: float) -> float:
-        """Returns the distance left to the offset ahead (0 to 2) after a travel, in units of the yield."""
+        """Returns the remaining distance to the offset ahead (0 to 2) after a travel, in yield units."""
         if left <= 0.0:
             return 0.0
         rest = 1.0 - self._exponent

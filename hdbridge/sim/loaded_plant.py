@@ -1,8 +1,8 @@
 """Mechanics with a multi-stage spring, a dead zone behind it, and torques on the load.
 
 Gravity, drag and shaking act on the load as a torque that is constant within a substep, and so does the
-deviation of the spring from its linear first stage. The linear step thus stays exact, and at rest the load
-stands exactly where the torques balance.
+deviation of the spring from its linear first stage. The linear step therefore stays exact, and at rest the
+load stands exactly where the torques balance.
 """
 
 import math
@@ -124,7 +124,7 @@ class LoadedPlant(Plant):
 
     @staticmethod
     def needed(truth: Truth) -> bool:
-        """Returns True if a truth file needs anything that `Plant` does not have."""
+        """Returns True if a truth file needs anything beyond `Plant`."""
         gear, load = truth.gear, truth.load_
         coupling = load.encoder.coupling
         return bool(
@@ -139,11 +139,9 @@ class LoadedPlant(Plant):
         )
 
     def weight_nm(self, load_deg: float) -> float:
-        """Returns the torque of gravity; see `Plant`."""
         return -self._arm_nm * math.sin((load_deg - self._down_deg) * RAD_PER_DEG)
 
     def step(self, torque_nm: float, brake_nm: float) -> None:
-        """Runs one substep; see `Plant`."""
         now, dt = self.now, self._dt
         output, load = self.output_deg, now.load_deg
         load_speed = self.load_deg_s
@@ -188,7 +186,7 @@ class LoadedPlant(Plant):
         self._turn_encoder(load, new_load)
 
     def _outer_nm(self, load_deg: float, load_speed: float) -> float:
-        """Returns the torque on the load from outside, gravity, viscous drag, sliders and shaking."""
+        """Returns the external torque on the load, gravity, viscous drag, sliders and shaking."""
         outer = self.outer_nm
         if self._arm_nm:
             outer += self.weight_nm(load_deg)
@@ -219,7 +217,7 @@ class LoadedPlant(Plant):
         return min(limit, max(-limit, held))
 
     def _play(self, load_deg: float) -> float:
-        """Moves the near side of the coupling, which the load carries along once the play is used up."""
+        """Moves the near side of the coupling, which the load drags along once the play is used up."""
         played = min(load_deg + self._play_deg, max(load_deg - self._play_deg, self._played_deg))
         self._played_deg = played
         return played

@@ -1,8 +1,8 @@
 """Simulated bench without real time: master and simulated drives in one thread, on one virtual clock.
 
-The master uses ``LockstepBus`` and sleeps on ``VirtualClock``. Its sending and waiting makes the drives run:
-a frame it sends is answered before ``send`` returns, and time passes only while it waits, from one event of a
-drive to the next. So nothing sleeps, there are no races, and the same run gives the same frames. The frames
+The master uses ``LockstepBus`` and sleeps on ``VirtualClock``. Its sending and waiting run the drives: a
+frame is answered before ``send`` returns, and time passes only while the master waits, from one event of a
+drive to the next. Nothing sleeps, there are no races, and the same run always has the same frames. The frames
 are real python-can messages over python-can ``virtual`` buses.
 """
 
@@ -35,7 +35,7 @@ LONGEST_WAIT_S: Final = 3600.0
 
 
 class Node(Protocol):
-    """Bus participant that runs when it is polled."""
+    """Bus participant that runs when polled."""
 
     def poll(self, now_s: float) -> None:
         """Processes received frames and everything that is due until ``now_s``."""
@@ -47,7 +47,7 @@ class Node(Protocol):
 
 
 class VirtualClock:
-    """``hdbridge.clock.Clock`` that advances when it is waited on, and runs the nodes meanwhile."""
+    """``hdbridge.clock.Clock`` that advances when waited on, and meanwhile runs the nodes."""
 
     def __init__(self, start_s: float = 0.0) -> None:
         self.now_s = start_s
@@ -92,8 +92,8 @@ class _PolledBus(VirtualBus):
     """Virtual bus of python-can, polled by one thread, with less overhead per frame.
 
     The general ``recv`` reads the wall clock and takes two locks, although in lockstep most polls find
-    nothing; the general ``send`` makes a deep copy and takes another lock. Ordinary virtual buses on the
-    same channel work with it. It never waits, whatever time-out ``recv`` is given.
+    nothing; the general ``send`` makes a deep copy and takes another lock. It works together with ordinary
+    virtual buses on the same channel. It never waits, whatever the time-out of ``recv``.
     """
 
     def __init__(self, channel: str) -> None:
@@ -152,7 +152,7 @@ class LockstepBus(can.BusABC):
         self._clock = clock
         super().__init__(channel=channel, **kwargs)
         self.private = False
-        """True if only the master and the drives of the clock know the channel."""
+        """True if the channel is known only to the master and the drives of the clock."""
         self.channel_info = "the simulated bus"
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
@@ -207,8 +207,8 @@ class LockstepBus(can.BusABC):
 def _unsearched() -> Iterator[None]:
     """Excludes everything loaded so far from garbage collection.
 
-    The samples of a long run trigger collections again and again, and a search of the libraries' 160,000
-    objects takes as long as 1000 control cycles.
+    The samples of a long run trigger repeated collections, and a search of the libraries' 160,000 objects
+    takes as long as 1000 control cycles.
     """
     gc.freeze()
     try:
@@ -259,9 +259,9 @@ def simulated_bench(
     channel: str | None = None,
     load_object: tuple[int, int] = LOAD_OBJECT,
 ) -> Iterator[tuple[LockstepBus, VirtualClock, DriveNode]]:
-    """Provides the simulated axis of a truth file; the same truth and seed give the same frames.
+    """Provides the simulated axis of a truth file; the same truth and seed yield the same frames.
 
-    ``load_object`` is the index and sub-index from which its load encoder is read.
+    ``load_object`` is the index and sub-index of the load encoder.
     """
     axis = SimulatedAxis(truth, eds_path, node_id, seed, load_object)
     with simulated_benches([axis], channel) as (bus, clock, (node,)):
@@ -286,8 +286,8 @@ def simulated_benches(
 ) -> Iterator[tuple[LockstepBus, VirtualClock, tuple[DriveNode, ...]]]:
     """Provides several simulated axes on one bus and one clock, with the master's bus; see `lockstep_bench`.
 
-    Each axis has its own noise, so the same axis gives the same frames, whatever the others do. ``clock``
-    starts at zero by default. InputError if two axes have the same node id.
+    Each axis has its own noise, so the same axis yields the same frames, whatever the other axes do.
+    ``clock`` starts at zero by default. InputError if two axes have the same node id.
     """
     node_ids = [axis.node_id for axis in axes]
     twice = next((node_id for node_id in node_ids if node_ids.count(node_id) > 1), None)

@@ -1,6 +1,6 @@
 """Substeps of the simulated axis: the drive's loops, the mechanics, and the sampling of the encoders.
 
-`hdbridge.sim.machine` calls it once per control cycle. All inputs and outputs are numbers, so that it can be
+`hdbridge.sim.machine` calls it once per control cycle. All inputs and outputs are numbers, so it can be
 compiled as a whole.
 """
 
@@ -33,7 +33,7 @@ class Loops:
     _plain: bool
     """True if the demand is not delayed and the encoders are ideal."""
     _rounded_nm: float
-    """Largest rounding error of the torque that the drive reports: half a thousandth of the rated one."""
+    """Largest rounding error of the reported torque: half a thousandth of the rated torque."""
     _off_deg: float
     _with_body: bool
     _with_disc: bool
@@ -68,8 +68,8 @@ class Loops:
     ) -> None:
         """Sets the inputs that change only from cycle to cycle.
 
-        They are the temperature, the motor's friction at it relative to the truth file, the torque limit, the
-        lost angle of the motor encoder, and the external torque on the load.
+        These are the temperature, the motor's friction at this temperature relative to the truth file, the
+        torque limit, the lost angle of the motor encoder, and the external torque on the load.
         """
         self.plant.now.temperature_c = temperature_c
         self.plant.scale_friction(friction)
@@ -78,19 +78,19 @@ class Loops:
         self.plant.outer_nm = outer_nm
 
     def switch_on(self) -> float:
-        """Starts the loops at the motor's angle, as they see it, and returns that angle."""
+        """Starts the loops at the motor's angle as they see it, and returns that angle."""
         return self.servo.engage(self._seen_deg(self.plant.now.motor_deg), self.plant.motor_deg_s)
 
     def sampled_motor_deg(self) -> float:
-        """Returns the motor's angle when its encoder was sampled."""
+        """Returns the motor's angle at the time of its encoder's sample."""
         return self._late_motor.deg if self._with_late_motor else self.plant.now.motor_deg
 
     def sampled_load_deg(self) -> float:
-        """Returns the angle of the load encoder's shaft when it was sampled."""
+        """Returns the angle of the load encoder's shaft at the time of the sample."""
         return self._late_load.deg if self._with_late_load else self.plant.encoder_deg
 
     def begin_demand(self, demand_deg: float) -> None:
-        """Resets to a demand that has always been this one."""
+        """Resets to a demand that has always been constant."""
         self._late_demand.begin(demand_deg)
 
     def hold(self, torque_nm: float) -> None:
@@ -142,7 +142,7 @@ class Loops:
         return motor_deg + self._off_deg
 
     def _watch(self) -> None:
-        """Feeds the delays and the encoder's body with one substep."""
+        """Updates the delays and the encoder's body by one substep."""
         plant = self.plant
         if self._with_late_motor:
             self._late_motor.feed(plant.now.motor_deg)

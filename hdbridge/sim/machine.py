@@ -1,7 +1,7 @@
 """Simulated axis as seen by a drive's firmware: loops, motor, gear, load and two encoders.
 
-Deterministic: the same truth, seed and commands give the same numbers bit for bit. It has no clock; each call
-advances it by whole substeps.
+Deterministic: the same truth, seed and commands yield the same numbers bit for bit. It has no clock; each
+call advances it by whole substeps.
 """
 
 import math
@@ -32,33 +32,19 @@ class Cycles(NamedTuple):
 
 
 class Machine:
-    """Servo axis, initially at rest at the angle zero with its power stage off.
+    """Servo axis, initially at rest at angle zero with its power stage off.
 
     It has the attributes of `Measured`.
     """
 
-    motor_reading: float
-    load_reading: float
-    torque_nm: float
-    torque_permille: int
-    temperature_c: float
-    load_torque_nm: float
-    motor_counts: int
-    load_counts: int
-    velocity_counts_s: float
-    elapsed_s: float
-    true_motor_deg: float
-    true_load_deg: float
-    true_output_deg: float
-
     def __init__(self, truth: Truth, seed: int, *, may_compile: bool = False, loaded: bool = False) -> None:
-        """``may_compile`` allows a pause of some seconds, after which it runs faster; see `sim.fast`.
+        """``may_compile`` permits a pause of some seconds, after which the machine runs faster; see
+        `sim.fast`.
 
-        ``loaded`` allows an external torque on the load in `follow_all`.
+        ``loaded`` permits an external torque on the load in `follow_all`.
         """
         self.truth = truth
         self.dt_s = truth.substep_s
-        """Length of a substep."""
         axis = Axis(truth, loaded=loaded)
         self._axis: fast.AnyAxis = axis
         self._to_compile = axis if may_compile else None
@@ -74,10 +60,10 @@ class Machine:
         self._take(axis.at_first())
 
     def follow(self, start_counts: float, end_counts: float, substeps: int, outer_nm: float = 0.0) -> None:
-        """Runs a closed-loop cycle: the demand moves linearly from start to end, in motor counts.
+        """Runs a closed-loop cycle in which the demand moves linearly from start to end, in motor counts.
 
-        If the power stage was off before, the loops start at the motor's position, so a resting demand
-        within a count of it does not move the axis.
+        If the power stage was off, the loops start at the motor's position, so a resting demand within a
+        count of this position does not move the axis.
         """
         if substeps < 1:
             return
@@ -100,14 +86,14 @@ class Machine:
     ) -> Cycles:
         """Runs many closed-loop cycles, each from the demand before it, with the same numbers as `follow`.
 
-        ``counts`` has the demand at the start of the first and at the end of each cycle, shape (n + 1,);
+        ``counts`` contains the demand at the start of the first and at the end of each cycle, shape (n + 1,);
         ``substeps`` the substeps of each cycle; ``outer_nm`` the external torque on the load in each, in
-        addition to its weight; ``held_nm`` the torque by which the loops hold the axis before each, positive
-        forward, or NaN to leave it.
+        addition to its weight; ``held_nm`` the torque with which the loops hold the axis before each,
+        positive forward, or NaN for no change.
         """
         outer_nm = np.zeros(len(substeps)) if outer_nm is None else outer_nm
         held_nm = np.full(len(substeps), np.nan) if held_nm is None else held_nm
-        told = np.empty((len(substeps), len(Cycles._fields)))
+        readings = np.empty((len(substeps), len(Cycles._fields)))
         for cycle, count in enumerate(substeps):
             if not isinstance(self._axis, Axis) and min(substeps[cycle:]) > 0:
                 counts, torque_nm = self._responded(counts, substeps, cycle)
@@ -119,18 +105,20 @@ class Machine:
                 on = slice(cycle, None)
                 self._take(
                     self._axis.drive_all(
-                        demand, steps, self._limit_nm, noise_deg, outer_nm[on], held_nm[on], told[on]
+                        demand, steps, self._limit_nm, noise_deg, outer_nm[on], held_nm[on], readings[on]
                     )
                 )
                 if self._response is not None:
-                    told[on, 2] += torque_nm
-                    told[on, 3] = [round(1000.0 * each / self._rated_nm) for each in told[on, 2].tolist()]
+                    readings[on, 2] += torque_nm
+                    readings[on, 3] = [
+                        round(1000.0 * each / self._rated_nm) for each in readings[on, 2].tolist()
+                    ]
                 break
             if not math.isnan(held_nm[cycle]):
                 self._axis.hold(float(held_nm[cycle]))
             self.follow(counts[cycle], counts[cycle + 1], count, float(outer_nm[cycle]))
-            told[cycle] = [getattr(self, name) for name in Cycles._fields]
-        return Cycles(*told.T)
+            readings[cycle] = [getattr(self, name) for name in Cycles._fields]
+        return Cycles(*readings.T)
 
     def coast(self, substeps: int, braked: bool, outer_nm: float = 0.0) -> None:
         """Runs a cycle with the power stage off; friction and, if ``braked``, the brake slow the motor."""
@@ -141,7 +129,7 @@ class Machine:
 
     @property
     def torque_limit_permille(self) -> float:
-        """Torque limit, in thousandths of the rated one; the truth file's limit is the maximum."""
+        """Torque limit, in thousandths of the rated torque; the truth file's limit is the maximum."""
         return self._limit_permille
 
     @torque_limit_permille.setter

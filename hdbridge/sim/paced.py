@@ -1,7 +1,7 @@
-"""Virtual clock that does not run ahead of real time, for simulated drives under observation.
+"""Virtual clock that never runs ahead of real time, for simulated drives under observation.
 
-If the computer is late, virtual time is late with it: nothing is skipped, and lost time is not caught up in
-a rush. A stall of the computer is therefore not a fault of a simulated bus.
+If the computer is late, virtual time is equally late. Nothing is skipped, and lost time is not made up for. A
+stall of the computer is therefore not a fault of a simulated bus.
 """
 
 import math
@@ -13,11 +13,11 @@ from hdbridge.errors import InputError
 from hdbridge.sim.lockstep import VirtualClock
 
 FORGIVEN_S: Final = 0.1
-"""Longest delay in real time that is caught up; after a longer one the pace restarts."""
+"""Longest delay in real time that is made up for; after a longer delay the pace restarts."""
 
 
 class PacedClock(VirtualClock):
-    """A `VirtualClock` whose time passes at most ``speed`` times as fast as real time."""
+    """`VirtualClock` whose time passes at most ``speed`` times as fast as real time."""
 
     def __init__(
         self,
@@ -26,7 +26,7 @@ class PacedClock(VirtualClock):
         real_s: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """``real_s`` and ``sleep`` are the computer's clock. InputError if ``speed`` is not above 0."""
+        """``real_s`` and ``sleep`` are the computer's clock. InputError if ``speed`` is not positive."""
         if not (math.isfinite(speed) and speed > 0.0):
             raise InputError(f"a simulation at {speed!r} times real time; expected a finite number above 0")
         super().__init__(start_s)
@@ -35,7 +35,7 @@ class PacedClock(VirtualClock):
         self._anchor_s, self._anchor_real_s = start_s, real_s()
 
     def sleep_until(self, deadline_s: float) -> None:
-        """Advances to ``deadline_s``, not before the corresponding real time."""
+        """Advances to ``deadline_s``, but not before the corresponding real time."""
         due_s = self._anchor_real_s + (deadline_s - self._anchor_s) / self._speed
         wait_s = due_s - self._real_s()
         if wait_s > 0.0:

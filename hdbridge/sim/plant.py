@@ -146,7 +146,7 @@ class Plant:
         self._drag = self._cold_drag * factor
 
     def _turn_motor(self, torque_nm: float, brake_nm: float, spring: float) -> bool:
-        """Runs the motor's part of a substep; returns True if it moved.
+        """Runs the motor's part of a substep; returns True if the motor moved.
 
         ``spring`` is the spring's torque without the share that the motor's own motion adds: arm * lever *
         (old speed + new speed).

@@ -1,7 +1,7 @@
 """Measured response of a drive in addition to its loops: finite impulse responses, so always stable.
 
-The command's speed and direction of each control cycle change the demand that the loops get and the torque
-that the drive reports. Nothing is changed once the command has been at rest for the length of the responses.
+The command's speed and direction of each control cycle change the demand of the loops and the reported
+torque. Both are unchanged once the command has been at rest for the length of the responses.
 """
 
 from typing import Any
@@ -28,12 +28,12 @@ class Response:
         self.rest()
 
     def rest(self) -> None:
-        """Forgets the latest cycles."""
+        """Clears the latest cycles."""
         self._speed, self._direction = (np.zeros(len(each)) for each in self._taps[1:])
         self.demand_counts = self.torque_nm = 0.0
 
     def advance(self, start_counts: float, end_counts: float, cycle_s: float) -> None:
-        """Takes in the command of a cycle, which moves linearly from start to end."""
+        """Adds the command of a cycle, which moves linearly from start to end."""
         if cycle_s != self._cycle_s:
             self._cycle_s, self._taps = cycle_s, self._at(cycle_s)
             self.rest()
@@ -46,7 +46,7 @@ class Response:
         self.torque_nm = float(torque @ self._speed + friction @ self._direction)
 
     def _at(self, cycle_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Returns the taps for this cycle; those of speed are as long as each other."""
+        """Returns the taps for this cycle; both responses to speed have the same length."""
         length = max(len(self._truth.demand_ms), len(self._truth.torque_nm_s_per_rad), 1)
         demand, torque, friction = (
             self._regridded(taps, size, cycle_s)

@@ -1,11 +1,11 @@
 """Servo loops of the drive: demand filters, position and velocity cascade with feed-forward, torque filters.
 
-The blocks in their order: moving average and two lags of the demand, position P, velocity PI on the filtered
-speed (whose integral may sum the position error instead: PIV), feed-forwards, disturbance observer, notch,
-torque filter, limit.
+The blocks in order: moving average and two lags of the demand, position P, velocity PI on the filtered speed
+(whose integral may sum the position error instead: PIV), feed-forwards, disturbance observer, notch, torque
+filter, limit.
 
-Like real drives of this class it closes its loops on an interpolated encoder: a settled motor stands at the
-middle of the commanded count, not anywhere within it.
+Like real drives of this class, it closes its loops on an interpolated encoder, so a settled motor stands in
+the middle of the commanded count rather than anywhere within it.
 """
 
 import math
@@ -18,15 +18,15 @@ from hdbridge.sim.truth.motor import TrueNotch
 
 RAD_PER_DEG = math.pi / 180.0
 HIGHEST_NOTCH = 0.45
-"""Frequency of a notch over the rate of the substeps: at half of it the bilinear transform ends."""
+"""Maximum notch frequency over the substep rate; the bilinear transform ends at half the rate."""
 AT_REST_DEG_S = 0.05
-"""Speed below which the demand is at rest: friction feed-forward keeps its direction, the integral may
-rest."""
+"""Speed below which the demand counts as at rest: friction feed-forward keeps its direction, and the
+integral may rest."""
 
 
 @state
 class MovingAverage:
-    """Moving average of the demand, from its integral now and a duration ago."""
+    """Moving average of the demand, from its integral now and one duration ago."""
 
     _duration_s: float
     _integral: float
@@ -39,7 +39,7 @@ class MovingAverage:
         self.start_at(0.0)
 
     def start_at(self, demand_deg: float) -> None:
-        """Resets to a demand that has always been this one."""
+        """Resets to a demand that has always been constant."""
         self._start_deg, self._integral = demand_deg, 0.0
         self._late_integral.begin(0.0)
 
@@ -75,7 +75,7 @@ class Notch:
         self.rest_at(0.0)
 
     def rest_at(self, torque_nm: float) -> None:
-        """Resets to a torque that has always been this one, at input and output."""
+        """Resets to a constant torque at input and output."""
         self._first = (1.0 - self._b0) * torque_nm
         self._second = (self._b2 - self._a2) * torque_nm
 
@@ -171,7 +171,7 @@ class Servo:
         self.engage(0.0, 0.0)
 
     def engage(self, motor_deg: float, motor_deg_s: float) -> float:
-        """Starts at the motor's position, without torque or error; returns its angle as the loops see it."""
+        """Starts at the motor's position, without torque or error; returns its angle as seen by the loops."""
         self._measured = self._interpolated(motor_deg)
         self._reference = self._last_reference = self._measured
         self._reference_speed = self.measured_deg_s = motor_deg_s
@@ -266,7 +266,7 @@ class Servo:
         return torque
 
     def _load_torque(self, reference_speed: float) -> float:
-        """Returns the mean torque over the substep that makes a load on a spring follow the reference."""
+        """Returns the mean torque over the substep with which a load on a spring follows the reference."""
         step, ahead, speed = self._load_model, self._load_ahead, self._load_speed
         slip = speed - reference_speed
         self._load_ahead = step.distance_by_distance * ahead + step.distance_by_rate * slip

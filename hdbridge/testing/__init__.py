@@ -1,6 +1,6 @@
 """Simulated drive for users' own tests: on a bus, with faults by name and the true angles.
 
-`hdbridge.pytest_plugin` creates one per test (the fixture `hdbridge_drive`); without pytest use ``with
+`hdbridge.pytest_plugin` creates one per test (the fixture `hdbridge_drive`); without pytest, use ``with
 simulated_drive("article") as drive:``. docs/ci.md has a complete example. These names are public, like those
 of `hdbridge` itself.
 """

@@ -1,8 +1,8 @@
 """Faults of a simulated drive by name: one row each.
 
-They are those of the fault table in docs/reliability.md, seen from the other end of the bus: actions of
-the drive, its encoders, other nodes and the interface. Faults of the program itself (a target that is not a
-number, a full disk) must be made by the program.
+They are those of the fault table in docs/reliability.md, seen from the other end of the bus: actions of the
+drive, its encoders, other nodes and the interface. Faults of the program itself (a target that is not a
+number, a full disk) must be caused by the program.
 """
 
 import struct
@@ -27,13 +27,13 @@ _BUS_OFF: Final = 0x40
 
 @dataclass(frozen=True)
 class Reach:
-    """Objects that a fault can act on."""
+    """Objects on which a fault can act."""
 
     drive: WatchedDrive
     another: Callable[[], AbstractContextManager[can.BusABC]]
     """Opens another node's end of the bus."""
     port: Port | None
-    """The program's interface, if it is in this process."""
+    """Program's interface, if it is in this process."""
     bus: str
     """Name of the bus, for messages."""
 
@@ -46,7 +46,7 @@ class Reach:
         return _nothing
 
     def wish(self, name: str, value: object) -> End:
-        """Sets an attribute of the drive's fault settings; its end restores the previous value."""
+        """Sets an attribute of the drive's fault settings; ending the fault restores the previous value."""
         wishes = self.drive.faults
         before = getattr(wishes, name)
         setattr(wishes, name, value)
@@ -64,7 +64,7 @@ class Reach:
 
     @property
     def interface(self) -> Port:
-        """The program's interface, for rows that require it."""
+        """Program's interface, for rows that require it."""
         assert self.port is not None
         return self.port
 
@@ -90,12 +90,11 @@ class Row:
 
     name: str
     what: str
-    """One sentence; arguments by their names."""
+    """One sentence, with the arguments by name."""
     make: Make
     arguments: Mapping[str, Value] = field(default_factory=dict)
-    """Arguments with their defaults."""
     answers: str = ""
-    """First words of the row of the fault table that this fault produces."""
+    """First words of the corresponding row of the fault table."""
     needs: Needs = Needs.NOTHING
     touches: Callable[[Mapping[str, Any]], tuple[int, int]] | None = None
     """Returns the object that the drive must have, given the arguments."""
@@ -125,7 +124,7 @@ class Row:
             raise BusError(f"fault '{self.name}' cannot be made on {reach.bus}: {error}") from error
 
     def checked(self, given: Mapping[str, Any]) -> dict[str, Value]:
-        """Returns the complete arguments; raises `InputError` with the existing ones."""
+        """Returns the complete arguments; raises `InputError` with the existing arguments."""
         __tracebackhide__ = True  # pytest shows the test's line
         signature = ", ".join(f"{name}={value!r}" for name, value in self.arguments.items()) or "none"
         for name, value in given.items():
@@ -159,7 +158,7 @@ def _once(act: Callable[[WatchedDrive], object]) -> Make:
 
 
 def _frame(can_id: int, data: bytes = b"", *, own: bool = False, **kind: bool) -> Make:
-    """Returns a maker of a frame; with ``own`` the drive's node id is added to its identifier."""
+    """Returns a function that sends a frame; with ``own``, the drive's node id is added to its identifier."""
     return lambda reach: reach.send(can_id + own * reach.drive.node_id, data, **kind)
 
 
@@ -242,12 +241,12 @@ def _stall(reach: Reach, duration_s: float) -> End:
     return _nothing
 
 
-def _told(reach: Reach, index: int, subindex: int, value: int) -> End:
-    return reach.drive.tell_instead(index, subindex, value)
+def _reported(reach: Reach, index: int, subindex: int, value: int) -> End:
+    return reach.drive.report_instead(index, subindex, value)
 
 
 def _identity(reach: Reach, product_code: int) -> End:
-    return reach.drive.tell_instead(0x1018, 2, product_code)
+    return reach.drive.report_instead(0x1018, 2, product_code)
 
 
 def _no_object(reach: Reach, index: int, subindex: int) -> End:
@@ -350,7 +349,7 @@ _ROWS: Final = (
     Row("sdo_silent", "SDO requests are not answered.",
         lambda reach: reach.mute(0x580 + reach.drive.node_id)),
     Row("wrong_value", "The drive reports `value` for an object, by SDO and in its TPDOs.",
-        _told, {"index": 0x2100, "subindex": 0, "value": 32767}, _CHANNEL, touches=_named_object),
+        _reported, {"index": 0x2100, "subindex": 0, "value": 32767}, _CHANNEL, touches=_named_object),
     Row("wrong_identity", "Object 1018h:02 holds another `product_code`.", _identity, {"product_code": 1}),
     Row("missing_object", "The drive has no object `index`:`subindex` (for good).",
         _no_object, {"index": 0x60E4, "subindex": 1}, touches=_named_object),
@@ -361,17 +360,16 @@ _ROWS: Final = (
 )  # fmt: skip
 
 FAULTS: Final[Mapping[str, Row]] = MappingProxyType({row.name: row for row in _ROWS})
-"""All faults by name."""
 
 OF_THE_PROGRAM: Final = (
     "the target is not a number within the limits",
     "a load torque or temperature stays away",
 )
-"""Rows of the fault table without a fault here: those of the program, and consequences of another row."""
+"""Rows of the fault table without a fault here: those of the program, and consequences of other rows."""
 
 
 def find(name: str) -> Row:
-    """Returns the fault with a name; raises `InputError` with the nearest one."""
+    """Returns the fault with a name; raises `InputError` with the nearest name."""
     __tracebackhide__ = True  # pytest shows the test's line
     row = FAULTS.get(name)
     if row is None:

@@ -35,14 +35,14 @@ EXAMPLES: Final = (VIRTUAL, LOCKSTEP, "socketcan:vcan0", "udp_multicast:239.74.1
 
 @dataclass(frozen=True)
 class BusChoice:
-    """A bus: one of this process, or an interface of python-can with its channel."""
+    """Bus of this process, or an interface of python-can with its channel."""
 
     interface: str
     channel: str = ""
 
     @property
     def in_process(self) -> bool:
-        """True if only this process can reach it."""
+        """True if the bus is accessible only to this process."""
         return self.interface in (VIRTUAL, LOCKSTEP)
 
     def __str__(self) -> str:
@@ -67,7 +67,7 @@ class BusChoice:
 
 @dataclass(frozen=True)
 class Settings:
-    """One drive, loaded and checked."""
+    """Settings of one drive, loaded and checked."""
 
     axis: AxisConfig
     truth: Truth
@@ -87,9 +87,9 @@ class Settings:
     ) -> Self:
         """Loads and checks the settings; raises a one-line `InputError`.
 
-        ``folder`` is the base of relative paths, by default the present one. Without ``truth``, the profile's
-        ``twin.yaml`` is used if it has one, else its ``truth.yaml``. ``firmware`` has keys of the truth
-        file's section of that name.
+        ``folder`` is the base of relative paths, by default the present folder. Without ``truth``, the
+        profile's ``twin.yaml`` is used if it exists, else its ``truth.yaml``. ``firmware`` contains keys of
+        the truth file's section of that name.
         """
         folder = folder or Path()
         choice = BusChoice.parse(bus)
@@ -129,7 +129,7 @@ _IN_USE: Final[dict[str, int]] = {}
 
 @dataclass
 class Line:
-    """One bus, with its clock and its drives."""
+    """Bus with its clock and its drives."""
 
     choice: BusChoice
     interface: str
@@ -139,7 +139,7 @@ class Line:
     opened: Callable[[], AbstractContextManager[can.BusABC]]
     """Opens a node's end of the bus."""
     port: Port | None = None
-    """The program's interface, if it is in this process."""
+    """Program's interface, if it is in this process."""
     nodes: list[WatchedDrive] = field(default_factory=list)
 
     def note(self, kind: str, text: str) -> None:

@@ -1,7 +1,8 @@
-"""The program's end of a simulated bus in this process: a python-can interface called ``hdbridge``.
+"""Program's end of a simulated bus in this process: a python-can interface called ``hdbridge``.
 
 A program opens it like any other, by interface and channel. Its failures are those of SocketCAN: an interface
-that goes down raises ENETDOWN once in ``recv`` and on each ``send``; a deleted one must be opened again.
+that goes down raises ENETDOWN once in ``recv`` and on each ``send``; a deleted interface must be opened
+again.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class StallingClock(VirtualClock):
     """Delay to be added to the next wait; s."""
 
     def step(self, deadline_s: float) -> bool:
-        """Steps as `VirtualClock` does; a requested stall adds to the elapsed time."""
+        """Steps like `VirtualClock`; a requested stall adds to the elapsed time."""
         going_on = super().step(deadline_s)
         if self.stall_s > 0.0:
             until_s, self.stall_s = self.now() + self.stall_s, 0.0
@@ -66,7 +67,7 @@ class Port:
         self.note = note
         self.condition = Condition.UP
         self.losses = 0
-        """Number of times that it went away."""
+        """Number of losses of the interface."""
         self.deletions = 0
         self.refused_sends = 0
         """Number of further frames that find the transmit queue full."""
@@ -94,7 +95,7 @@ class Port:
 
 
 class ProgramBus(can.BusABC):
-    """One end that the program has opened. An end left open is closed with the drive."""
+    """End of the bus opened by the program. An end left open is closed with the drive."""
 
     def __init__(self, channel: str, can_filters: Any = None, **_: Any) -> None:
         """Further options, such as a bit rate, concern hardware and are ignored."""
@@ -120,7 +121,6 @@ class ProgramBus(can.BusABC):
         port.note("bus", "the program opens its bus")
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """See `can.BusABC`."""
         port = self._port
         if port.deletions != self._deletions:
             raise can.CanOperationError(*_ERRORS[Condition.DELETED])
@@ -132,7 +132,6 @@ class ProgramBus(can.BusABC):
         self._inner.send(msg, timeout)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """See `can.BusABC`."""
         return self._inner.recv(timeout)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
@@ -142,7 +141,6 @@ class ProgramBus(can.BusABC):
         self._inner.set_filters(filters)
 
     def shutdown(self) -> None:
-        """See `can.BusABC`."""
         if self in self._port.open_buses:
             self._port.open_buses.remove(self)
             self._port.note("bus", "the program closes its bus")

@@ -21,7 +21,7 @@ POLL_S: Final = 0.005
 class DriveTime:
     """Drive time with the interface of the module ``time``; missing names are that module's.
 
-    In real time it is the module's own time. In lockstep ``sleep`` runs the drive for that time and returns
+    In real time, it is the module's own time. In lockstep ``sleep`` runs the drive for that time and returns
     at once. ``monkeypatch.setattr(program, "time", drive.time)`` makes a program use it.
     """
 
@@ -56,7 +56,7 @@ class DriveTime:
 class SimulatedDrive:
     """CiA-402 drive with an axis on a bus, created by `simulated_drive` and the fixture ``hdbridge_drive``.
 
-    A program reaches it by ``interface`` and ``channel``, which it passes to python-can, and ``node_id``.
+    A program addresses it by ``interface`` and ``channel``, which it passes to python-can, and ``node_id``.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class SimulatedDrive:
         self.channel: Final = line.channel
         """Channel for ``can.Bus``."""
         self.in_process: Final = settings.bus.in_process
-        """True if only this process reaches the bus; else a separate program can be the master."""
+        """True if the bus is accessible only to this process; else a separate program can be the master."""
         self.lockstep: Final = settings.bus.interface == LOCKSTEP
         """True if time passes only while the program waits."""
         self.node_id: Final = node.node_id
@@ -96,7 +96,7 @@ class SimulatedDrive:
 
     @property
     def truth(self) -> TrueState:
-        """The true angles now."""
+        """Present true angles."""
         with self._node.lock:
             return self._node.true_state()
 
@@ -132,7 +132,7 @@ class SimulatedDrive:
 
     @property
     def frames(self) -> tuple[Frame, ...]:
-        """Frames that the drive has sent and seen; the newest 1,000."""
+        """Frames sent and received by the drive; the newest 1,000."""
         with self._node.lock:
             return tuple(self._node.history.frames)
 
@@ -161,10 +161,10 @@ class SimulatedDrive:
         for_s: float | None = None,
         **arguments: float,
     ) -> Fault:
-        """Makes a fault: now, after a time (the drive's), or once the load passes an angle.
+        """Causes a fault: now, after a time (the drive's), or once the load passes an angle.
 
         It ends ``for_s`` after it began, at the end of a ``with`` block, or by ``.end()``. Raises
-        `InputError` for an unknown name or argument, with the nearest one, and if the fault cannot be made on
+        `InputError` for an unknown name or argument, with the nearest one, and if the fault is impossible on
         this bus.
         """
         __tracebackhide__ = True  # pytest shows the test's line
@@ -194,7 +194,7 @@ class SimulatedDrive:
         return self._node.time_s
 
     def sleep(self, seconds: float) -> None:
-        """Lets the drive run for this time."""
+        """Runs the drive for this time."""
         self.time.sleep(seconds)
         self._check()
 
@@ -204,7 +204,7 @@ class SimulatedDrive:
         end_s = self._clock.now() + timeout_s
         while not condition():
             if self._clock.now() >= end_s:
-                raise TimeoutError(f"{what} did not come about in {timeout_s:g} s\n{self.report()}")
+                raise TimeoutError(f"{what} did not occur in {timeout_s:g} s\n{self.report()}")
             self.sleep(POLL_S)
 
     def open_bus(self, **options: Any) -> can.BusABC:
@@ -235,9 +235,9 @@ def simulated_drive(
     ``folder``. ``bus`` is ``virtual`` (this process, in real time), ``lockstep`` (this process, one thread,
     time passes only while the program waits) or ``INTERFACE:CHANNEL`` of python-can, for programs of any
     process. ``truth`` replaces the profile's twin.yaml or truth.yaml. The same truth and seed give the same
-    axis, and in lockstep the same frames. ``beside`` is another drive whose bus it shares; their node ids
-    must differ. If another test has a drive on a bus of the computer, this one waits. ``firmware`` sets keys
-    of the truth file's section of that name, such as ``{"controlword": "level"}``.
+    axis, and in lockstep the same frames. ``beside`` is another drive on the same bus; their node ids must
+    differ. While another test has a drive on a bus of the computer, this function waits. ``firmware`` sets
+    keys of the truth file's section of that name, such as ``{"controlword": "level"}``.
 
     Raises a one-line `InputError` or `BusError`.
     """

@@ -1,4 +1,4 @@
-"""Simulated drive that keeps its history and makes faults on request."""
+"""Simulated drive that keeps its history and causes faults on request."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 EVENTS: Final = 10_000
 FRAMES: Final = 1_000
 PERIODS: Final = 250_000
-"""Maximum number of kept entries, the newest; periods for a thousand seconds at 4 ms."""
+"""Maximum number of kept entries, newest first; periods for a thousand seconds at 4 ms."""
 
 SHOWN_EVENTS: Final = 40
 SHOWN_FRAMES: Final = 12
@@ -36,7 +36,7 @@ class Event:
     """Event at ``time_s`` of the drive's time, with a ``kind`` and a text.
 
     Kinds: ``state`` (power states of CiA 402), ``nmt``, ``emcy``, ``fault`` (start and end of a requested
-    one), ``bus`` (the program opens or closes its end), ``note`` (from the test).
+    fault), ``bus`` (the program opens or closes its end), ``note`` (from the test).
     """
 
     time_s: float
@@ -55,18 +55,18 @@ class TrueState(NamedTuple):
     motor_deg: float
     """Motor angle; the axis starts at 0."""
     load_deg: float
-    """Load angle; it starts near 0, displaced by the gear's error."""
+    """Load angle, which starts near 0, displaced by the gear's error."""
     ratio: float
     """Nominal motor turns per load turn."""
 
     @property
     def error_arcsec(self) -> float:
-        """Deviation of the load from the angle that an ideal gear would give."""
+        """Deviation of the load from the angle of an ideal gear."""
         return (self.load_deg - self.motor_deg / self.ratio) * ARCSEC_PER_DEG
 
 
 class Frame(NamedTuple):
-    """A frame that the drive sent or saw."""
+    """Frame sent or received by the drive."""
 
     time_s: float
     sent: bool
@@ -90,7 +90,7 @@ class Frame(NamedTuple):
 
 
 class History:
-    """The newest events, frames and true states; bounded in size."""
+    """Newest events, frames and true states; bounded in size."""
 
     def __init__(self) -> None:
         self.events: deque[Event] = deque(maxlen=EVENTS)
@@ -117,7 +117,7 @@ class History:
 
 
 End = Callable[[], None]
-"""Undoes a fault."""
+"""Function that undoes a fault."""
 
 _NEVER: Final = float("inf")
 _EMERGENCIES: Final = range(0x081, 0x100)
@@ -127,12 +127,12 @@ _BOOT_UP: Final = (0x700, b"\0")
 
 @dataclass
 class Fault:
-    """Fault requested by a test. As a context manager it ends with its block."""
+    """Fault requested by a test. As a context manager, it ends with its block."""
 
     name: str
     arguments: Mapping[str, Any]
     begun_s: float | None = None
-    """Start in drive time, s; None while it is pending."""
+    """Start in drive time, s; None while pending."""
     ended_s: float | None = None
     """End or cancellation in drive time, s; None before."""
     _finish: Callable[[Fault], None] = field(default=lambda _: None, repr=False)
@@ -154,7 +154,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class When:
-    """Trigger of a fault; immediate if neither is given."""
+    """Trigger of a fault; immediate if neither time nor angle is given."""
 
     after_s: float = 0.0
     beyond_deg: float | None = None
@@ -179,7 +179,7 @@ class _Plan:
 
 
 class WatchedDrive(DriveNode):
-    """The drive of `hdbridge.sim` with a `History`, and with faults that begin and end in its own time.
+    """Drive of `hdbridge.sim` with a `History`, and with faults that begin and end in its own time.
 
     Thread-safe.
     """
@@ -252,8 +252,8 @@ class WatchedDrive(DriveNode):
                 fault._undo()
             self.note("fault", f"{fault.name} {'ends' if fault._undo is not None else 'is called off'}")
 
-    def tell_instead(self, index: int, subindex: int, value: int) -> End:
-        """Reports another value of an object than it has, by SDO and in TPDOs."""
+    def report_instead(self, index: int, subindex: int, value: int) -> End:
+        """Makes the drive report a false value of an object, by SDO and in TPDOs."""
         entry = self.dictionary[index, subindex]
         before = entry.bound
 
@@ -273,14 +273,12 @@ class WatchedDrive(DriveNode):
         return min((event_s, *(plan.at_s for plan in self._plans))) if self._plans else event_s
 
     def handle(self, message: can.Message, now_s: float) -> None:
-        """See `hdbridge.device.node.DriveNode`."""
         with self.lock:
             self.history.frames.append(Frame(self.time_s, False, message))
             super().handle(message, now_s)
             self._look()
 
     def run_until(self, now_s: float) -> None:
-        """See `hdbridge.device.node.DriveNode`."""
         with self.lock:
             while due := next((each for each in self._plans if self._is_due(each, now_s)), None):
                 self._plans.remove(due)

@@ -1,7 +1,7 @@
-"""Changes since a twin was made: compares the misfit with the one at that time and names the causes.
+"""Changes since a twin was made: compares the present misfit with that of its fit, and names the causes.
 
-The unit of the comparison is the misfit that the twin had when it was made. It is the noise if the twin has
-the axis's values, and more for a replay of another drive, so both kinds of twin are checked alike.
+The unit of the comparison is the misfit of the fit. This is the noise if the twin has the axis's values, and
+more if it replays another drive, so both kinds of twin are checked in the same way.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ from hdbridge.twin.parameters import BY_NAME, Parameter, by_cause, coordinates
 from hdbridge.units import figure
 
 CHECK_S = 17.0
-"""Duration of the pieces on which a longer recording is checked."""
+"""Duration of the pieces into which a check divides a longer recording."""
 NOTICEABLE = 2.5
 """Change that a check must be able to show, in units of a parameter's least change."""
 WARMTH = "temperature"
 OWN = ("load friction", WARMTH, "current limit", "velocity feed-forward")
-"""Parameters checked in addition to those that a fit changes; the temperature unless twin and recording have
+"""Parameters that a check fits in addition to those of a fit; the temperature unless twin and recording have
 it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of a check: the changes, and the growth of the misfit that they leave."""
+    """Result of a check: the changes, and the growth of the misfit that remains after them."""
 
     changes: tuple[Finding, ...]
     growth_before: Mapping[str, float]
     """Ratio, by channel, of the twin's misfit to this recording and to its own recordings."""
     growth_after: Mapping[str, float]
-    """The same with the changes."""
+    """Same ratio with the changes."""
     unseen: tuple[str, ...] = ()
-    """Causes of which even a large change would not show, in this motion or with this twin."""
+    """Causes whose changes, however large, would not show in this motion or with this twin."""
     blind: bool = False
     """True if no change of any cause would show."""
 
     @property
     def sentence(self) -> str:
-        """Summary in words: the changes, channels whose misfit has grown, and causes that cannot show."""
+        """Summary in words: the changes, channels with increased misfit, and causes that cannot show."""
         causes = ", ".join(self.unseen)
         found = [f"This recording would not show a change in: {causes}"] if causes else []
         if self.changes:
@@ -79,9 +79,9 @@ def check(
     progress: Callable[[float], None] = lambda _: None,
     workers: int | None = None,
 ) -> Check:
-    """Reports what has changed between a twin and the axis that the recording shows.
+    """Reports the changes between a twin and the axis in the recording.
 
-    A change of a twin with the axis's values is given by its values, of any other twin by its ratio.
+    For a twin with the axis's values, a change is given as a value; for any other twin, as a ratio.
     InputError if the twin was not fitted, or the recording has no command.
     """
     about: Any = twin.provenance.get("fit")
@@ -113,8 +113,8 @@ def check(
 def _shows(replays: Replays, twin: Truth, own: Sequence[Parameter], was: Mapping[str, Any]) -> bool:
     """Returns True if a noticeable change of one of the parameters cannot have happened unseen.
 
-    Then the twin with such a change, in either direction, explains the recording no more. What the twin
-    leaves may hide a change or add to it, so the changed twin is compared with the recording itself.
+    The twin with such a change, in either direction, then no longer explains the recording. The twin's own
+    residual may hide a change or add to it, so the changed twin is compared with the recording itself.
     """
     for each in own:
         (now,) = coordinates(twin, [each])

@@ -1,6 +1,6 @@
 """Comparison of a measured and a simulated record of the same commands.
 
-Each difference is given with the noise of the measured channel, which is the best that a simulation can
+Each difference is stated with the noise of the measured channel, which is the best that a simulation can
 reach. Pure.
 """
 
@@ -154,7 +154,8 @@ TITLES: Final[Mapping[str, str]] = {
 STAND_S: Final = 0.2
 """Minimum rest of the command after a motion for a stop to count."""
 SIGHT_S: Final = 1.0
-"""Maximum time after a stop in which settling is evaluated; such servo axes settle in tenths of it."""
+"""Maximum time after a stop in which settling is evaluated; servo axes of this kind settle in tenths of a
+second."""
 CALM_S: Final = 0.3
 """Time at rest after which the ringing of a stop has ended and only noise remains."""
 MOVING_DEG_S: Final = 0.05
@@ -202,7 +203,7 @@ class Comparison:
     spectra: Mapping[str, Spectrum]
 
     def row(self, channel: str, kind: str = ALL) -> Row | None:
-        """Returns the figure of a channel, or None if the records do not have it."""
+        """Returns the figure of a channel; None if the records lack it."""
         return next((each for each in self.rows if (each.channel, each.kind) == (channel, kind)), None)
 
     def as_dict(self) -> dict[str, Any]:
@@ -217,7 +218,6 @@ class _Signals:
     time_s: FloatArray
     command_deg: FloatArray
     load_arcsec: FloatArray
-    """The load's reading."""
     by_name: Mapping[str, FloatArray]
 
 
@@ -343,8 +343,8 @@ def _of_signal(
 def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
     """Estimates the noise of a signal from third differences; at least that of its resolution.
 
-    Motion that is smooth over four samples does not contribute, and the median ignores rows where it is not
-    smooth (a jerk, a reversal). A resolution q makes a noise of q / sqrt(12).
+    Motion that is smooth over four samples does not contribute, and the median ignores rows without smooth
+    motion (a jerk, a reversal). A resolution q causes a noise of q / sqrt(12).
     """
     thirds, resolution = [], math.inf
     for part in parts:
@@ -369,7 +369,7 @@ class _Stop:
     """One stop in both records."""
 
     moved: int
-    """Last row of the motion before it."""
+    """Last row of the motion before the stop."""
     settled_s: tuple[float, float]
     overshoot_arcsec: tuple[float, float]
     noise_arcsec: float
@@ -378,7 +378,7 @@ class _Stop:
 
 
 def _stops(real: _Signals, twin: _Signals, parts: Sequence[slice]) -> Iterator[_Stop]:
-    """Yields the stops: places at which the command comes to rest after a motion and stays."""
+    """Yields the stops, where the command comes to rest after a motion and stays at rest."""
     moves = _moving(real, parts)
     for part in parts:
         edges = np.flatnonzero(moves[part][:-1] & ~moves[part][1:]) + part.start + 1

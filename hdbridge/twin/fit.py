@@ -1,6 +1,6 @@
 """Fits the plant's parameters to recordings: regressions first, then least squares over replays.
 
-The residuals of following error, torque and load angle are scaled by each channel's own deviation; a weak
+The residuals of following error, torque and load angle are scaled by each channel's own deviation. A weak
 prior about the start holds parameters that the motion does not show. The misfit has several minima, so a fit
 has several starts. The covariance allows for residuals correlated within a leg, because model errors are not
 white noise.
@@ -70,7 +70,7 @@ from hdbridge.twin.replay import MOVING_DEG_S, demand_deg
 FILTER, DEAD_TIME = BY_NAME["command filter"], BY_NAME["servo dead time"]
 LIMIT: Final = BY_NAME["current limit"]
 HELD_ROWS = 3
-"""Minimum rows at the highest torque for a limit; a mere peak lasts one or two."""
+"""Minimum number of rows at the highest torque for a limit; a mere peak lasts one or two."""
 LATEST_S = 0.1
 """Maximum age of the demand."""
 
@@ -90,9 +90,9 @@ def start_of(truth: Truth, data: Data) -> Truth:
 
 def _held_nm(data: Data) -> float:
     """Returns the highest torque if it is held for `HELD_ROWS`, else infinity; without rows at standstill."""
-    told = [np.abs(piece.measured[TORQUE]) * (piece.counts[TORQUE] > 0.0) for piece in data.pieces]
-    highest = max(float(np.max(each)) for each in told)
-    for each in told:
+    torque_nm = [np.abs(piece.measured[TORQUE]) * (piece.counts[TORQUE] > 0.0) for piece in data.pieces]
+    highest = max(float(np.max(each)) for each in torque_nm)
+    for each in torque_nm:
         there = np.concatenate([[0.0], each > highest - 0.5 * rounding(data.axis)[TORQUE], [0.0]])
         first, end = np.flatnonzero(np.diff(there) > 0.0), np.flatnonzero(np.diff(there) < 0.0)
         if highest > 0.0 and np.any(end - first >= HELD_ROWS):
@@ -123,25 +123,25 @@ def lag_s(data: Data) -> float:
 # law, whose shape may differ from the gear's.
 
 LOOP: Final = ("loop offset", "loop width", "loop yield", "loop exponent")
-"""Parameters of the hysteresis laws; no law has all parameters."""
+"""Parameters of all hysteresis laws; each law has only some of them."""
 LAWS: Final[tuple[dict[str, Any], ...]] = (
     {"law": "rolling_friction", "offset_arcsec": 1.0, "width_deg": 1.0, "exponent": 1.6},
     {"law": "bouc_wen", "offset_arcsec": 1.0, "yield_deg": 1.0},
     {"law": "dahl", "offset_arcsec": 1.0, "yield_deg": 1.0},
 )
-"""Unit loops by the laws with few parameters; the exponent of the first is that of a published gear."""
+"""Unit loops of the laws with few parameters; the exponent of the first is that of a published gear."""
 LONG = 20.0
-"""Travel after which each loop has reached its limit; widths."""
+"""Travel after which each loop has reached its limit, in widths."""
 _TRUE: Final[TypeAdapter[Hysteresis]] = TypeAdapter(Hysteresis)
 
 
 def loop_parameters(truth: Truth) -> tuple[Parameter, ...]:
-    """Returns the parameters that the law of this truth has."""
+    """Returns the loop parameters of the law of this truth."""
     return tuple(BY_NAME[name] for name in LOOP if value_in(truth, BY_NAME[name]) is not None)
 
 
 def by_each_law(truth: Truth) -> list[Truth]:
-    """Returns the truth, and the truth with each other law; an empty list if the gear has no loop."""
+    """Returns the truth, and the truth with each other law; an empty list for a gear without a loop."""
     own = truth.gear.hysteresis
     if own is None:
         return []
@@ -196,7 +196,7 @@ def _with_loop(truth: Truth, loop: Hysteresis) -> Truth:
 # Uncertainty of the coordinates: information from the slopes, and a jackknife over legs.
 
 LEAST = 1e-9
-"""Regularisation of the jackknife: share of the information that a single leg cannot have alone."""
+"""Regularisation of the jackknife: share of the information that no single leg may contribute alone."""
 
 
 def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
@@ -214,11 +214,11 @@ def sandwich(slopes: FloatArray, left: FloatArray, legs: FloatArray, spread: Flo
 
     It is a jackknife over legs: the shift of the fit when one leg is left out (Bell and McCaffrey, Survey
     Methodology 28, 2002). A leg that a replay cannot follow shifts the fit in every direction that the others
-    leave open, and has small residuals itself.
+    leave undetermined, and has small residuals itself.
 
     Variances are estimated by principal direction, because a few legs do not determine more. Each is at least
     that of independent residuals of the present size and at most the prior's. The part of the residuals that
-    the slopes can still explain is removed first, because it is not scatter of the legs.
+    the slopes can still explain is removed first, because it is not scatter between legs.
     """
     along = principal(slopes, spread)
     rows = slopes @ along
@@ -248,25 +248,26 @@ def eigen(slopes: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArra
 STEP = 0.01
 """Step of the first Jacobian's finite differences, in spreads of a parameter."""
 RESPONSE = 1.0
-"""Norm of the scaled residuals' change that sets the later difference steps: one standard deviation, the
-smallest change that a motion shows."""
+"""Norm of the change of the scaled residuals that determines the later difference steps: one standard
+deviation, the smallest visible change."""
 FARTHEST = 0.1
 """Longest of these steps, in spreads, because the valley is curved."""
 WIDE = 3.0
-"""Factor of the difference steps for intervals, which are two-sided. A sticking motor breaks away differently
-in each replay, so short differences are too steep and intervals too narrow."""
+"""Factor of the difference steps for intervals, which are two-sided. A sticking motor breaks away
+differently in each replay, so slopes over short differences are too steep and intervals too narrow."""
 TOO_FAR = 1.0
-"""Change of the scaled residuals (rms) above which the end of a difference has unstable loops."""
+"""Change of the scaled residuals (rms) above which the loops at the end of a difference count as unstable."""
 NEARER = 0.1
 """Factor by which such a difference is shortened."""
 ROUND = 4
-"""Steps between two estimates of the residuals' scales."""
+"""Number of steps between two estimates of the residuals' scales."""
 EDGE = 1e-6
-"""Distance to the bounds, in spreads, that `scipy.optimize.least_squares` needs about a place."""
+"""Minimum distance to the bounds, in spreads, as required by `scipy.optimize.least_squares`."""
 WORTH = 1.0
-"""Drop of half the sum of squares in a round below which a fit ends."""
+"""Fall of half the sum of squares in a round below which a fit ends."""
 SOFT = 4.0
-"""Residual, in scales, above which it counts less: a motor that slips elsewhere is not evidence."""
+"""Residual, in scales, above which a residual is down-weighted, because a motor that slips elsewhere is not
+evidence."""
 
 Progress = Callable[[float], None]
 
@@ -284,7 +285,6 @@ class Fitted:
     covariance: FloatArray
     """Covariance of the coordinates, shape (p, p)."""
     scales: Scales
-    """Scales of the residuals."""
     residuals: dict[str, FloatArray]
     rows: NDArray[np.bool_]
     """Mask of the fitted rows, one channel after the other."""
@@ -293,7 +293,7 @@ class Fitted:
     jacobian: FloatArray
     """Derivatives of `vector` with respect to the coordinates, shape (n, p)."""
     interrupted: bool = False
-    """True if the fit was ended before it had reached a minimum."""
+    """True if the fit was ended before it reached a minimum."""
 
     @property
     def cost(self) -> float:
@@ -302,7 +302,8 @@ class Fitted:
 
     @property
     def loss(self) -> float:
-        """Negative log likelihood of the fitted readings by the fit's own scales, which must have steps.
+        """Negative log likelihood of the fitted readings with the fit's own scales, which must include
+        resolutions.
 
         The likelihood ratio of two fits of the same readings is the exponential of the difference.
         """
@@ -343,19 +344,19 @@ class _Problem:
         self.spread = np.array([each.spread for each in parameters])
         self.low, self.high = np.array([each.bounds for each in parameters]).T
         self.along: FloatArray | None = None
-        """Latest slopes, which give the directions of the next differences."""
+        """Latest slopes, which determine the directions of the next differences."""
         self.scale = Scales({})
         self._found: dict[bytes, dict[str, FloatArray]] = {}
 
     def found(self, place: FloatArray) -> dict[str, FloatArray]:
-        """Returns the residuals by channel; each place is replayed once."""
+        """Returns the residuals by channel, replaying each place only once."""
         key = place.tobytes()
         if key not in self._found:
             self._found = {key: self._shown([place])[0]}
         return self._found[key]
 
     def residuals(self, place: FloatArray) -> FloatArray:
-        """Returns the softened scaled residuals, and the distances from the prior."""
+        """Returns the softened scaled residuals, followed by the distances from the prior."""
         left = softened(self.found(place), self.scale, self._rows)
         return np.concatenate([left, (place - self._prior) / self.spread])
 
@@ -368,8 +369,8 @@ class _Problem:
         return np.concatenate([self.along * self.spread, np.eye(len(self.spread))])
 
     def stepped(self, place: FloatArray, steps: int) -> FloatArray:
-        """Returns the best place after at most ``steps`` trust-region steps; the first has the length of a
-        spread.
+        """Returns the best place after up to ``steps`` trust-region steps, the first of which has the length
+        of a spread.
         """
         left, latest = 1 + steps, np.empty(0)
 
@@ -419,13 +420,13 @@ def solve(
     wide: bool = False,
     linear: bool = True,
 ) -> Fitted:
-    """Fits parameters by `scipy.optimize.least_squares` in at most ``steps`` steps; with none, linearises.
+    """Fits parameters by `scipy.optimize.least_squares` in up to ``steps`` steps; with 0 steps, linearises.
 
     ``prior`` is the prior's mean, shape (p,), by default the start. ``known`` are the channels' scales, which
     grow with the residuals on the way to the minimum; by default they are estimated from the residuals before
     each round. Held-out legs count only with ``everything``. ``near`` is a fit of the same parameters that
-    gives the directions of the first differences. ``wide``: the covariance uses wide differences. Without
-    ``linear`` it is the prior's, and the Jacobian that of the last place but one.
+    provides the directions of the first differences. With ``wide``, the covariance uses wide differences.
+    Without ``linear``, the covariance is that of the prior, and the Jacobian that of the last place but one.
     """
     data = replays.data
     rows = fitted_rows(data, everything=everything)
@@ -467,7 +468,7 @@ def continued(
 
 
 def fitted_rows(data: Data, *, everything: bool = False) -> NDArray[np.bool_]:
-    """Returns the mask of the rows that a fit sees, one channel after the other."""
+    """Returns the mask of the rows used in a fit, one channel after the other."""
     out = 0.0 if everything else data.out
     return np.concatenate([each * (1.0 - out) > 0.0 for each in counted(data).values()])
 
@@ -483,7 +484,7 @@ def softened(found: dict[str, FloatArray], scale: Scales, rows: NDArray[np.bool_
 
 
 def counting(off: FloatArray, scale: Scales, rows: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-    """Transforms scaled residuals by their likelihood and softens them; returns also the derivative."""
+    """Transforms scaled residuals by their likelihood and softens them; also returns the derivative."""
     half, stray = (each[rows] for each in scale.halves(len(rows) // len(CHANNELS)))
     root, slope = rooted(off, half, stray)
     # Beyond `SOFT`, squares grow linearly (Huber loss).
@@ -496,7 +497,7 @@ def _tempered(known: Scales, found: dict[str, FloatArray], rows: NDArray[np.bool
     """Returns scales enlarged by the overall rms of the scaled residuals, if that exceeds one.
 
     Far from the minimum, residuals are much larger than the noise, and the prior would have no weight. All
-    channels share one factor, so the worst channel still dominates.
+    channels share one factor, so that the worst channel still dominates.
     """
     left = softened(found, known, rows)
     factor = max(1.0, float(np.sqrt(np.mean(np.square(left)))))
@@ -514,9 +515,9 @@ def slopes_at(
 ) -> FloatArray:
     """Returns finite-difference derivatives of the scaled residuals at ``place``, shape (n, p).
 
-    ``seen`` evaluates residuals at places, ``now`` are those at ``place``. Differences go along the moves, in
-    the direction with more space to the bounds; ``wide`` ones, for intervals, are `WIDE` times as long and
-    two-sided.
+    ``seen`` evaluates residuals at places, ``now`` are those at ``place``. Differences are taken along the
+    moves, in the direction with more distance to the bounds; ``wide`` differences, for intervals, are `WIDE`
+    times as long and two-sided.
     """
     both = [
         [np.clip(place + way * move, *bounds) for way in (1.0, -1.0)]
@@ -549,17 +550,17 @@ def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
 # legs that the fit has not seen.
 
 BANDWIDTHS: Final = ((25.0, 100.0), (80.0, 300.0), (200.0, 800.0))
-"""Position gain, 1/s, and velocity gain over the whole inertia, rad/s: a geared axis with a soft load, an
-ordinary one, and a stiff one."""
+"""Position gain, 1/s, and velocity gain over the total inertia, rad/s: a geared axis with a soft load, an
+ordinary load, and a stiff load."""
 REJECTIONS: Final = ("speed", "position", "observer")
-"""Block that supplies friction and load torque: the integral of the speed error (PI velocity loop) or of the
-position error (PIV), or a disturbance observer."""
+"""Block that compensates friction and load torque: the integral of the speed error (PI velocity loop) or of
+the position error (PIV), or a disturbance observer."""
 INTEGRAL: Final = 3.0
 """Integral time times that bandwidth (symmetric optimum: 2 to 4)."""
 SLOW_INTEGRAL: Final = 30.0
-"""The same next to an observer, which leaves an integral little to do."""
+"""Same factor next to an observer, which leaves little to the integral."""
 OBSERVED: Final = 0.9
-"""Start value of an observer's share of the disturbance: most of it."""
+"""Start value of the observer's share of the disturbance: nearly all."""
 FILTER_MS: Final = 0.5
 """Speed and torque filter at the start: half to twice the period of common velocity loops."""
 SHORT_MS: Final = 0.1
@@ -567,12 +568,13 @@ SHORT_MS: Final = 0.1
 VELOCITY_FEEDFORWARD: Final = 0.9
 """Start value between none (rare) and the full speed."""
 FEW_STEPS = 3
-"""Maximum steps of a fit from each start between two halvings."""
+"""Maximum number of steps of a fit from each start between two halvings."""
 HOPELESS: Final = 2.0
-"""Ratio to the least cost after as many steps above which a start is dropped as well: the starts that won on
-three foreign servos had at most 1.8."""
+"""Ratio to the lowest cost after as many steps above which a start is dropped as well. The starts that won
+on three foreign servos had at most 1.8."""
 GAIN: Final = 0.97
-"""Maximum ratio of the misfits with and without a block for keeping it; mere extra parameters gain less."""
+"""Maximum ratio of the misfits with and without a block for keeping the block; superfluous parameters gain
+less."""
 MECHANICS: Final = (
     "motor inertia", "Coulomb friction", "viscous friction", "friction's rise at rest", "Stribeck speed",
     "load inertia", "gear stiffness", "gear damping",
@@ -582,19 +584,20 @@ SERVOS: Final = (
     "servo dead time", "speed filter", "torque filter", "load encoder delay",
 )  # fmt: skip
 EQUAL_MOTORS: Final = 4.0
-"""Maximum ratio of the motor's inertia to the start's, or its inverse: servo motors of equal torque differ by
-a factor of three to five (catalogues). Observers and filters could otherwise replace it."""
+"""Maximum ratio of the motor's inertia to the start's, or its inverse. Servo motors of equal torque differ
+by a factor of three to five (catalogues). Without this limit, observers and filters could replace the
+inertia."""
 NOTCH: Final = ("notch frequency", "notch depth", "notch width")
 REACTION: Final = "loop reaction"
 OBSERVER: Final = ("observer frequency", "observer share", "observer inertia")
 MOST_DEAD_CYCLES: Final = 2.0
-"""Maximum dead time in SYNC cycles: one to take over the demand, one to execute it (CiA 402)."""
+"""Maximum dead time in SYNC cycles: one to accept the demand, one to execute it (CiA 402)."""
 PLACES: Final = (0.7, 1.0, 1.4)
 """Start values of the notch frequency, relative to the resonance of motor and load."""
 
 
 Start = tuple[Truth, tuple[Parameter, ...]]
-"""Start of a fit of a servo, whose prior is about its own values."""
+"""Start of a fit of a servo, with a prior about the servo's own values."""
 
 
 def in_best_structure(
@@ -602,7 +605,7 @@ def in_best_structure(
 ) -> Fitted:
     """Fits the servo structure that explains a few legs best, and adds blocks that held-out legs confirm.
 
-    A servo that is already fitted joins the ``others`` at the end, because they need as many steps.
+    A servo that is already fitted joins the ``others`` at the end, because these require as many steps.
     """
     scale = Scales(units(few.data))
     begun = [by_halving(few, each, scale) for each in ([(near.truth, near.parameters)], [*others]) if each]
@@ -622,9 +625,9 @@ def by_halving(
 ) -> Fitted:
     """Fits from each start for a few steps, from the better half for as many more, until one is left.
 
-    A start that takes more steps to a better place is not lost to one that is near its minimum (successive
-    halving; Jamieson and Talwalkar, AISTATS 2016). All legs count, because a few held-out ones do not decide
-    between servos with equally many parameters.
+    Successive halving (Jamieson and Talwalkar, AISTATS 2016) does not lose a start with a longer way to a
+    better minimum to one that is already near its minimum. All legs count, because a few held-out legs do not
+    decide between servos with equally many parameters.
     """
 
     def led(start: Start) -> Fitted:
@@ -644,7 +647,8 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
     """Yields the servos at which a fit starts.
 
     An acceleration feed-forward uses the filtered demand, or differences over whole SYNC cycles, which is a
-    moving average of one cycle. A lag beyond the longest possible dead time is the command filter's.
+    moving average of one cycle. A lag beyond the longest possible dead time is attributed to the command
+    filter.
     """
     longest_ms = min(MOST_DEAD_CYCLES * cycle_ms, DEAD_TIME.most)
     reaction = (REACTION,) if truth.gear.hysteresis else ()
@@ -735,16 +739,16 @@ FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
 FILTER_SHARES = (0.25, 0.5, 0.75, 0.9)
 """Start values of the command filter's share of the lag."""
 INERTIA_FACTORS = (0.25, 0.5, 2.0, 4.0)
-"""Factors for start values of the motor's inertia, which shows only just after each new demand."""
+"""Factors for start values of the motor's inertia, which is visible only just after each new demand."""
 
 
 def elsewhere(truth: Truth, usual: Truth) -> list[Truth]:
-    """Returns other start values about a truth; ``usual`` is the start of the fit."""
+    """Returns alternative start values for a truth; ``usual`` is the start of the fit."""
     return [*springs(truth), *delays(truth), *feedforwards(truth, usual), *inertias(truth)]
 
 
 def springs(truth: Truth) -> list[Truth]:
-    """Returns the truth with the load's resonance at other frequencies that its time step resolves."""
+    """Returns the truth with the load's resonance at each other frequency that its time step resolves."""
     inertia, now = truth.load_.whole_inertia_kg_m2, truth.gear.stiffness_nm_per_rad
     found = []
     for hz in FREQUENCIES_HZ:
@@ -764,7 +768,8 @@ def delays(truth: Truth) -> list[Truth]:
     """Returns the truth with the dead time in each other substep within the lag.
 
     The demand changes slope at the start of a cycle, and a torque lasts for a substep. A change within a
-    substep is spread over two, as by a filter, so the dead time has a minimum in every substep.
+    substep is spread over two substeps, as by a filter, so the misfit over the dead time has a minimum in
+    every substep.
     """
     step_ms, now = truth.substep_ms, _substep(truth)
     most_ms = min(_lag_ms(truth) - 2.0 * FILTER.least, DEAD_TIME.most)
@@ -778,7 +783,7 @@ def neighbours(truth: Truth) -> list[Truth]:
 
 
 def inertias(truth: Truth) -> list[Truth]:
-    """Returns the truth with other motor inertias; a spring too stiff for the time step becomes softer."""
+    """Returns the truth with other motor inertias; a spring too stiff for the time step is made softer."""
     motor = [BY_NAME["motor inertia"]]
     (now,) = coordinates(truth, motor)
     return [at_coordinates(truth, motor, [now + math.log(factor)]) for factor in INERTIA_FACTORS]
@@ -814,8 +819,8 @@ def feedforwards(truth: Truth, usual: Truth) -> list[Truth]:
 def exchanged(truth: Truth) -> Truth:
     """Returns the truth with position gain and inverse integral time exchanged.
 
-    In motion this is the same loop, because its response depends only on their sum and product, so there are
-    two minima.
+    In motion the loop is the same, because its response depends only on their sum and product. The misfit
+    therefore has two minima.
     """
     servo = truth.servo
     return with_values(
@@ -834,19 +839,20 @@ LAST: Final = (
     (GROWTH,),
     ("friction's rise at rest", "Stribeck speed"),
 )
-"""Groups of optional parameters; each is added as a whole or not at all."""
+"""Groups of optional parameters; each group is added as a whole or not at all."""
 EARNED = 8.0
-"""Minimum log likelihood ratio for adding parameters or for leaving the start's minimum: exp(8) to one."""
+"""Minimum log likelihood ratio for adding parameters or leaving the start's minimum: exp(8) to one."""
 SURE = 4.0
-"""Minimum change of the first parameter of a group of `LAST`; standard deviations."""
+"""Minimum change of the first parameter of a group of `LAST`, standard deviations."""
 EARNED_STEPS = 6
-"""Steps of a trial fit with added parameters: the Stribeck speed shows only once the rise is not zero."""
+"""Steps of a trial fit with added parameters; several, because the Stribeck speed is visible only once the
+rise is not zero."""
 LOOP_STEPS = 10
-"""Steps of a trial fit of each loop law on a few legs, all else held."""
+"""Steps of a trial fit of each loop law on a few legs, with all other parameters held."""
 
 
 def with_last(replays: Replays, best: Fitted) -> Fitted:
-    """Adds the significant groups of `LAST`; the fit returned is not yet at its minimum."""
+    """Adds the significant groups of `LAST`; the returned fit is not yet at its minimum."""
     for names in LAST:
         extra = [BY_NAME[name] for name in names if BY_NAME[name] not in best.parameters]
         if not extra or (GROWTH in names and not _warms(replays.data)):
@@ -870,11 +876,11 @@ def _warms(data: Data) -> bool:
 
 
 def with_loop(replays: Replays, best: Fitted) -> Fitted | None:
-    """Returns the fit with another loop law of the gear, or None if none is better.
+    """Returns the fit with another loop law of the gear; None if no law is better.
 
-    There is none if the load's residuals are as small as those of the true axis, or if no law reduces them.
-    Each law is fitted to a few legs, all else held. Call again after a new fit, because another law may then
-    be the best.
+    This is the case if the load's residuals are as small as those of the true axis, or if no law reduces
+    them. Each law is fitted to a few legs, with all other parameters held. To be called again after a new
+    fit, because another law may then be the best.
     """
     noise, few = expected(replays.data), replays.rough
     if best.scales.deviation[LOAD] <= noise.deviation[LOAD]:
@@ -894,8 +900,8 @@ def with_loop(replays: Replays, best: Fitted) -> Fitted | None:
 def with_limit(replays: Replays, best: Fitted, usual: Truth) -> Fitted:
     """Fits the drive's torque limit if the recording shows it, else sets the usual limit.
 
-    So far the fit used the highest recorded torque as the limit (`start_of`). It is the drive's limit, and
-    not just the torque that the motion needed, if a replay without it has larger residuals.
+    Until then, the fit uses the highest recorded torque as the limit (`start_of`). It is the drive's limit,
+    rather than merely the torque required by the motion, if a replay without it has larger residuals.
     """
     highest = free_value(usual, LIMIT)
     if free_value(best.truth, LIMIT) >= highest or LIMIT in best.parameters:
@@ -908,7 +914,7 @@ def with_limit(replays: Replays, best: Fitted, usual: Truth) -> Fitted:
 
 
 def _cost(replays: Replays, truth: Truth, best: Fitted) -> float:
-    """Returns half the sum of squares of a truth's residuals, by the scales of a fit."""
+    """Returns half the sum of squares of a truth's residuals, with the scales of a fit."""
     (found,) = replays([truth])
     left = softened(found, best.scales, fitted_rows(replays.data))
     return 0.5 * float(left @ left)
@@ -917,24 +923,25 @@ def _cost(replays: Replays, truth: Truth, best: Fitted) -> float:
 # ----------------------------------------------------------------
 
 FIT_S = 60.0
-"""Duration of the pieces on which a longer recording is fitted, with all kinds of motion if possible: a
-thousand replays of a quarter of an hour would take hours."""
+"""Duration of the pieces of a longer recording that are fitted, with all kinds of motion if possible,
+because a thousand replays of a quarter of an hour would take hours."""
 MORE_STEPS = 10
 """Steps from another place over the whole recording."""
 STEPS = 30
 """Maximum steps over the whole recording."""
 MORE = 1.1
-"""Ratio to the true axis's residuals above which a fit leaves more; a scale is not known better than that."""
+"""Ratio to the true axis's residuals above which a fit has excess residuals; scales are not known more
+accurately."""
 OPTIONAL = (
     "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay",
     "encoder coupling", "friction growth", "moving average", REACTION, *LOOP,
 )  # fmt: skip
-"""Parameters fitted only on request or if significant: ordinary motion does not show them, others can replace
-them, or a calibration has determined them."""
+"""Parameters fitted only on request or if significant, because ordinary motion does not show them, others
+can replace them, or a calibration has determined them."""
 
 
 def free_parameters(truth: Truth, more: Sequence[str] = ()) -> tuple[Parameter, ...]:
-    """Returns the parameters to fit: all that the truth has, except `OPTIONAL` ones not in ``more``."""
+    """Returns the parameters of the truth to fit, without `OPTIONAL` ones that are not in ``more``."""
     free = []
     for each in PARAMETERS:
         value = value_in(truth, each)
@@ -945,10 +952,10 @@ def free_parameters(truth: Truth, more: Sequence[str] = ()) -> tuple[Parameter, 
 
 
 def fit(replays: Replays, progress: Progress = lambda _: None) -> Fitted:
-    """Fits the parameters, starting from the truth that the recordings were prepared with.
+    """Fits the parameters, starting from the truth with which the recordings were prepared.
 
     If its servo leaves many times the noise, other servos join the starts; if it leaves a little, blocks are
-    added. Ctrl-C ends the fit at the best place so far, if there is one.
+    added. Ctrl-C ends the fit at the best place so far, if any.
     """
     reached: list[Fitted] = []
     try:
@@ -1021,15 +1028,14 @@ def _polished(replays: Replays, near: Fitted, begun: Truth, keep: Callable[[Fitt
 
 
 def _linearised(replays: Replays, found: Fitted) -> Fitted:
-    """Returns a fit at the same place, by the scales that its residuals have on these recordings."""
+    """Returns a fit at the same place, with the scales of its residuals on these recordings."""
     return solve(replays, found.truth, found.parameters, 0)
 
 
 def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
-    """Moves the fit to significantly better minima until it finds no other.
+    """Moves the fit to significantly better minima until none is found.
 
-    This comes after the other parameters are known, because at the start of the fit these places were equally
-    good.
+    This step comes last, because these places are equally good until the other parameters are known.
     """
     few, noise = replays.rough, expected(replays.rough.data)
     least = least_deviation(replays.data) | {LOAD: noise.deviation[LOAD]}

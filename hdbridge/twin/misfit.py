@@ -1,4 +1,4 @@
-"""Residuals between a recording and its replay, by channel; their noise, their scales, and what they say.
+"""Residuals between a recording and its replay, by channel: their noise, their scales, and the conclusions.
 
 The replay has no noise, unrounded encoders and torque, and loops that close on a much finer encoder, so the
 residuals are smooth in the plant's parameters. The scale of each channel accounts for rounding and noise.
@@ -49,19 +49,20 @@ from hdbridge.units import ARCSEC_PER_DEG
 # Residuals between a recording and its replay, by channel, which a fit minimises.
 
 FINEST_STEPS_PER_TURN = 2**40
-"""Resolution of the loops' encoder in a smooth replay. One step makes about 1e-9 of the rated torque; with a
-drive's own steps, the smallest change of a parameter would disturb the torque as much as a relevant one."""
+"""Resolution of the loops' encoder in a smooth replay. One step changes the torque by about 1e-9 of the
+rated torque. With a drive's own steps, the smallest change of a parameter would disturb the torque as
+much as a relevant change."""
 CHANNELS = (FOLLOWING, TORQUE, LOAD)
 UNKNOWN_DEG = 60.0
 """Motor travel after which the elastic state and the loops' integral no longer depend on the time before the
-recording, if they are not known (from a gear without such a state, or from the holding torque)."""
+recording, unless they are known (from a gear without such a state, or from the holding torque)."""
 LONGEST_LEG_S = 2.0
 """Maximum length of a leg; a longer one is split, because residuals further apart are uncorrelated."""
 COARSE_S = 17.0
-"""Duration of the pieces on which the first steps of a fit are made: a sweep, steps and a sine of the plan
-`dynamics`, each after its run-in."""
+"""Duration of the pieces for the first steps of a fit: a sweep, steps and a sine of the plan `dynamics`,
+each after its run-in."""
 WITHOUT_MOTION = frozenset({"standstill", "reference", "settle"})
-"""Kinds of leg that alone do not qualify a piece for a coarse fit."""
+"""Kinds of legs that alone do not qualify a piece for a coarse fit."""
 HELD_OUT = 4
 
 
@@ -77,7 +78,6 @@ class Piece:
     leg: FloatArray
     """Leg number of each row, from zero."""
     kind: tuple[str, ...]
-    """Kind of each leg."""
     out: FloatArray
     """1 for each row of a held-out leg, else 0."""
     rest: FloatArray
@@ -86,7 +86,7 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """Recordings prepared for replays with truths like ``base``."""
+    """Recordings prepared for replays of truths like ``base``."""
 
     axis: AxisConfig
     base: Truth
@@ -94,7 +94,7 @@ class Data:
 
     @property
     def leg(self) -> FloatArray:
-        """Leg number of each row, continuing through all pieces."""
+        """Leg number of each row, consecutive over all pieces."""
         firsts = np.cumsum([0, *(len(each.kind) for each in self.pieces)])[:-1]
         return np.concatenate([first + each.leg for first, each in zip(firsts, self.pieces, strict=True)])
 
@@ -105,12 +105,11 @@ class Data:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kind of each leg."""
         return tuple(kind for each in self.pieces for kind in each.kind)
 
 
 def held_out_legs(recording: Recording) -> tuple[Segment, ...]:
-    """Returns the legs that a fit does not see: every `HELD_OUT`-th of its kind."""
+    """Returns the legs excluded from a fit: every `HELD_OUT`-th of its kind."""
     seen: dict[str, int] = {}
     out = []
     for leg in legs_of(recording):
@@ -121,7 +120,8 @@ def held_out_legs(recording: Recording) -> tuple[Segment, ...]:
 
 
 def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
-    """Prepares a recording, long parts in stretches; InputError without a command or for another ratio.
+    """Prepares a recording, with long parts in stretches; InputError without a command or with another
+    ratio.
 
     Up to `RUN_IN_S` of the recording before a stretch is replayed as its run-in and does not count.
     """
@@ -142,7 +142,7 @@ def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
 
 
 def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
-    """Selects pieces of about ``wanted_s`` in total with as many kinds of motion as possible, and then with
+    """Selects pieces of about ``wanted_s`` in total, with as many kinds of motion as possible, then with
     different temperatures.
     """
     pieces, left, taken = data.pieces, [*range(len(data.pieces))], list[int]()
@@ -168,7 +168,7 @@ def _replayed_s(piece: Piece) -> float:
 
 
 def traces_of(data: Data, truth: Truth) -> list[dict[str, FloatArray]]:
-    """Replays a truth smoothly; returns its traces by piece and channel, as in `Piece.measured`."""
+    """Replays a truth smoothly; returns its traces by piece and channel, like `Piece.measured`."""
     simulated, shown = smooth(truth), []
     for piece in data.pieces:
         commands = piece.commands
@@ -184,11 +184,12 @@ def traces_of(data: Data, truth: Truth) -> list[dict[str, FloatArray]]:
 
 
 def residuals(data: Data, truth: Truth) -> dict[str, FloatArray]:
-    """Returns measured minus simulated by channel over all rows, shape (n,); zero if a row does not count.
+    """Returns measured minus simulated by channel over all rows, shape (n,); zero for rows that do not
+    count.
 
     Zero offsets are removed in each piece: the load angle's zero is independent of the motor's, and a
     constant following error of more than a count at rest means that the command has another zero. The part of
-    the load residual that follows from the motor's is removed, because a late motor makes the load late.
+    the load residual that follows from the motor's is removed, because a lag of the motor delays the load.
     """
     found: dict[str, list[FloatArray]] = {name: [] for name in CHANNELS}
     step_deg = rounding(data.axis)[FOLLOWING]
@@ -212,9 +213,9 @@ def beyond(values: FloatArray, least: float) -> FloatArray:
 def _not_taken_along(
     data: Data, following: Sequence[FloatArray], load: Sequence[FloatArray]
 ) -> list[FloatArray]:
-    """Returns the load's residuals by piece, without the part due to the motor's and without their zeros.
+    """Returns the load's residuals by piece, without the part due to the motor and without their zeros.
 
-    The share of the motor's residuals is a regression coefficient between 0 and 1; it is one if the loops are
+    The motor's residuals enter with a regression coefficient between 0 and 1, which is one if the loops are
     wrong and both shafts are late. The motor encoder's rounding is excluded.
     """
     inside = [piece.counts[LOAD] > 0.0 for piece in data.pieces]
@@ -250,7 +251,7 @@ def rounding(axis: AxisConfig) -> dict[str, float]:
 
 
 def smooth(truth: Truth) -> Truth:
-    """Returns the truth without noise, and with loops that close on a much finer encoder."""
+    """Returns the truth without noise, with loops that close on a much finer encoder."""
     motor, servo = truth.motor.encoder, truth.servo
     steps = max(FINEST_STEPS_PER_TURN // motor.counts_per_turn, motor.interpolation)
     finer = steps / motor.interpolation
@@ -276,7 +277,7 @@ def _piece(
     axis: AxisConfig,
     base: Truth,
 ) -> Piece:
-    """Prepares a part; only ``judged`` rows count, and none that is ``unknown``."""
+    """Prepares a part; only ``judged`` rows that are not ``unknown`` count."""
     commands = commands_of(part, axis, base)
     leg, kinds = _legs(part, legs)
     out = np.zeros(len(part))
@@ -337,7 +338,7 @@ def _legs(part: Record, legs: Sequence[Segment]) -> tuple[FloatArray, tuple[str,
 # Parallel replays.
 
 MOST_WORKERS: Final = 8
-"""Maximum number of threads by default: a fit asks for some thirty replays at a time."""
+"""Maximum number of threads by default; a fit requests some thirty replays at a time."""
 
 
 class Replays:
@@ -347,7 +348,7 @@ class Replays:
     """
 
     rough: Replays
-    """Replays of a few of their legs, in the same threads."""
+    """Replays of a few legs of these recordings, in the same threads."""
 
     def __init__(self, data: Data, workers: int | None = None) -> None:
         self.data = data
@@ -370,14 +371,15 @@ class Replays:
 # Likelihood of a rounded reading under an unrounded simulation.
 
 FINE = 1e-3
-"""Half step, in standard deviations, below which rounding is negligible."""
+"""Half the resolution, in standard deviations, below which rounding is negligible."""
 STRAY = 0.02
-"""Share of outliers among the readings: the break-away of a stuck motor and its position at switching on are
-not evidence of the simulation's error or of a parameter."""
+"""Share of outliers among the readings. The break-away of a stuck motor and its position at switch-on are
+not evidence of a simulation error or of a parameter."""
 
 
 def rooted(off: FloatArray, half: FloatArray, stray: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Returns residuals whose half squares are the loss of log likelihood, and their derivative by ``off``.
+    """Returns residuals whose half squares are the loss of log likelihood, and their derivative with respect
+    to ``off``.
 
     ``off`` is reading minus simulation, ``half`` half the resolution, both in standard deviations of the
     simulation, shape (n,); ``stray`` the probability of an outlier. Without resolution, ``off`` is returned
@@ -438,7 +440,7 @@ MOST_ANSWERED = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Scales:
-    """Standard deviation of a simulation's error and resolution of the readings, by channel.
+    """Standard deviation of a simulation's error, and resolution of the readings, by channel.
 
     Without resolutions, rounding counts as noise.
     """
@@ -462,7 +464,7 @@ class Scales:
 
     @property
     def noise(self) -> dict[str, float]:
-        """Standard deviation with the rounding included as noise."""
+        """Standard deviation with rounding included as noise."""
         return {name: float(np.hypot(self.deviation[name], self.step[name] / 12.0**0.5)) for name in CHANNELS}
 
 
@@ -474,7 +476,7 @@ def noise_floor(data: Data) -> dict[str, float]:
 def least_deviation(data: Data) -> dict[str, float]:
     """Returns, by channel, the error of a smooth replay of the true axis beyond the readings' rounding.
 
-    It comes from the resolution of the loops' encoder and the load encoder's noise.
+    It results from the resolution of the loops' encoder and the load encoder's noise.
     """
     truth = data.base
     encoder = truth.motor.encoder
@@ -489,7 +491,7 @@ def least_deviation(data: Data) -> dict[str, float]:
 
 
 def _shaken_nm(truth: Truth, off_rad: float) -> float:
-    """Returns the rms torque that the velocity loop makes of independent reading errors of this rms.
+    """Returns the rms torque of the velocity loop due to independent reading errors of this rms.
 
     Speed is the readings' difference over the step, and the motor responds within the next step. The transfer
     function is K (1 - 1/z)^2 / (dt (1 - (1 - a)/z)) with a = K dt / J; the result is its norm times the
@@ -502,7 +504,7 @@ def _shaken_nm(truth: Truth, off_rad: float) -> float:
 
 
 def scales(data: Data, found: Mapping[str, FloatArray]) -> Scales:
-    """Estimates the scales of the residuals in motion; at least the error of a smooth replay.
+    """Estimates the scales of the residuals in motion, at least the error of a smooth replay.
 
     Residuals at rest are excluded, because they would dominate a recording that rests half of the time.
     """
@@ -527,7 +529,7 @@ ARCSEC_PER_TURN = 360.0 * ARCSEC_PER_DEG
 def noise_in_motion(data: Data) -> dict[str, float]:
     """Estimates the noise in motion by channel, in its unit (`compare.noise_of`); at least the rounding.
 
-    At rest, count and torque stay constant, which is no reference for a simulation in motion.
+    At rest, count and torque are constant, so rest is no reference for a simulation in motion.
     """
     floor, ends = noise_floor(data), np.cumsum([len(each.rest) for each in data.pieces]).tolist()
     parts = [slice(first, end) for first, end in pairwise([0, *ends])]
@@ -574,7 +576,7 @@ Misfit = Mapping[str, Mapping[str, float]]
 def misfit_of(
     data: Data, residuals: Mapping[str, FloatArray], rows: Mapping[str, NDArray[np.bool_]] | None = None
 ) -> dict[str, dict[str, float]]:
-    """Returns the rms of the residuals of each recorded channel, by kind of leg; ``rows``: by default all."""
+    """Returns the rms of the residuals of each recorded channel by kind of leg; all ``rows`` by default."""
     kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
     found: dict[str, dict[str, float]] = {}
     for name, counts in counted(data).items():
@@ -612,7 +614,7 @@ def units(data: Data) -> dict[str, float]:
 
 
 def judged_rows(data: Data) -> dict[str, NDArray[np.bool_]]:
-    """Returns the mask of the rows that judge a twin, by channel: held-out ones, or all without these."""
+    """Returns the mask of the rows that judge a twin, by channel: held-out rows, or else all."""
     rows = {}
     for name, counts in counted(data).items():
         held_out = (counts > 0.0) & (data.out > 0.0)
@@ -621,7 +623,7 @@ def judged_rows(data: Data) -> dict[str, NDArray[np.bool_]]:
 
 
 def misfit(data: Data, left: Mapping[str, FloatArray]) -> float:
-    """Returns the root mean square over the channels in `units`, on held-out legs if there are any."""
+    """Returns the root mean square over the channels in `units`, on held-out legs if any."""
     scale, rows = units(data), judged_rows(data)
     return rms(np.array([rms(left[name][each] / scale[name]) for name, each in rows.items() if each.any()]))
 
@@ -630,11 +632,11 @@ def misfit(data: Data, left: Mapping[str, FloatArray]) -> float:
 # Verdict on the values of a twin, from what it leaves on held-out legs.
 
 NOISE_LEVEL: Final = 1.3
-"""Rms residual, in units of the noise in motion, up to which a channel is explained: replays of the true
-values of axes 608, 609 and 612 (tools/twin_random_axes.py) leave 0.3 to 1.22."""
+"""Maximum rms residual of an explained channel, in units of the noise in motion. Replays of the true values
+of axes 608, 609 and 612 (tools/twin_random_axes.py) leave 0.3 to 1.22."""
 MOST_NOISE: Final = 3.0
-"""Limit if the residual is also a small share of the signal: axis 620, whose intervals hold 1 of 18 true
-values, leaves 2.9 to 28 with its true values."""
+"""Maximum if the residual is also a small share of the signal. Axis 620, whose intervals contain 1 of 18
+true values, leaves 2.9 to 28 with its true values."""
 MOST_SHARE: Final = 0.05
 """Maximum share for `MOST_NOISE`: rms residual over rms signal."""
 
@@ -671,7 +673,7 @@ class Left:
 
     @property
     def text(self) -> str:
-        """In words."""
+        """Description in words."""
         return (
             f"{self.channel} is left with {self.times_noise:.3g} times its noise, most of it in legs of the "
             f"kind {self.kind}"
@@ -679,7 +681,7 @@ class Left:
 
     @property
     def explained(self) -> bool:
-        """True if it is within the noise, or nearly so and a small share of the signal."""
+        """True if the residual is within the noise, or nearly so and a small share of the signal."""
         return self.times_noise <= NOISE_LEVEL or (
             self.times_noise <= MOST_NOISE and self.share <= MOST_SHARE
         )
@@ -688,7 +690,7 @@ class Left:
 def what_is_left(
     data: Data, residuals: Mapping[str, FloatArray], noise: Mapping[str, float]
 ) -> tuple[Left, ...]:
-    """Returns the residual of each recorded channel, on held-out legs if there are any.
+    """Returns the residual of each recorded channel, on held-out legs if any.
 
     ``residuals`` by channel over all rows of the data, ``noise`` by channel in its unit (`noise_in_motion`).
     """

@@ -1,7 +1,7 @@
-"""Names the causes by which a simulation leaves more of a recording than it should, by forward selection.
+"""Names the causes of a simulation's excess residuals, by forward selection.
 
-The question is the same after a fit (which values of the start were wrong?) and in a check (what has changed
-since the twin was made?). Also finds parameters that a motion does not separate.
+The question is the same after a fit (wrong initial values) and in a check (changes since the twin was made).
+Also finds parameters that a motion does not separate.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from hdbridge.units import figure
 # Growth of a misfit, and significance of a rival's larger residuals against their scatter between legs.
 
 STRAY = 4.0
-"""Limit at which residuals are clipped, in rms of their kind of leg: a motor that breaks away at a different
-time is not a change of the axis."""
+"""Limit to which residuals are clipped, in rms of their kind of leg, because a motor that breaks away at a
+different time is not a change of the axis."""
 FALSE_ALARM = 0.02
 """Probability that one of two equally good simulations counts as worse."""
 
@@ -38,7 +38,7 @@ FALSE_ALARM = 0.02
 def scales_by_kind(data: Data, known: Misfit, noise: Mapping[str, float]) -> dict[str, Any]:
     """Returns, by channel and row, the known misfit on this kind of leg, or the noise if larger.
 
-    A kind without a known misfit is compared with the largest of the others.
+    A kind without a known misfit is compared with the largest misfit of the others.
     """
     found = {}
     for name in CHANNELS:
@@ -52,8 +52,8 @@ def scales_by_kind(data: Data, known: Misfit, noise: Mapping[str, float]) -> dic
 def growth(data: Data, residuals: Mapping[str, FloatArray], was: Mapping[str, Any]) -> dict[str, float]:
     """Returns, by channel, the rms residual relative to ``was`` (`scales_by_kind`).
 
-    A row counts as no more than `STRAY` times the typical residual of its leg, because single rows may be
-    readings that are wrong, but a whole leg is not.
+    A row counts as at most `STRAY` times the typical residual of its leg, because a single reading may be
+    wrong, but not a whole leg.
     """
     found = {}
     for name, counts in counted(data).items():
@@ -71,8 +71,8 @@ def growth(data: Data, residuals: Mapping[str, FloatArray], was: Mapping[str, An
 def worse_than_chance(left: FloatArray, change: FloatArray, legs: FloatArray) -> bool:
     """Returns True if a rival's residuals are larger than by chance.
 
-    ``left`` are the simulation's residuals by row, in units of the noise; ``change`` the rival's residuals
-    minus these; ``legs`` the leg number of each row.
+    ``left`` are the simulation's residuals by row, in units of the noise; ``change`` is the rival's residuals
+    minus ``left``; ``legs`` is the leg number of each row.
     """
     loss = float(change @ (change + 2.0 * left))
     within = sandwich((left * change)[:, None], numbered(legs.astype(np.intp)))
@@ -85,17 +85,18 @@ def worse_than_chance(left: FloatArray, change: FloatArray, legs: FloatArray) ->
 # Causes: the ones that bring the misfit back, one after the other.
 
 GROWN = 1.5
-"""Ratio of two misfits above which they differ; smaller ones come from noise and different legs."""
+"""Ratio above which two misfits count as different; smaller ratios result from noise and different legs."""
 EXPLAINED = 0.5
-"""Minimum share of the growth that a named cause explains, in squares: most of what the others leave."""
+"""Minimum share of the growth that a named cause explains, in squares: most of the growth left by the other
+causes."""
 OF_REPLAY = 0.25
-"""Minimum share of all growth if the values are not the axis's: such a simulation is off by a share of each
-change, so smaller rests are not causes."""
+"""Minimum share of all growth if the values are not the axis's, because such a simulation is wrong by a
+share of each change, and smaller remainders are not causes."""
 STEPS = 8
 """Maximum steps of the fit of one cause."""
 SIZES = (2.5, 6.0)
-"""Changes of each parameter, in both directions, at which a fit may start; in units of its least change. The
-ringing of a load is out of phase already at small changes, where a fit finds no way back."""
+"""Changes of each parameter, in both directions, at which a fit may start, in units of its least change. The
+ringing of a load is out of phase after a small change, from which a fit finds no way back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,11 +120,11 @@ def explain(
     progress: Callable[[float], None] = lambda _: None,
     least: float = 0.0,
 ) -> Explained:
-    """Names causes until the misfit of ``base`` is what it ``was`` (`scales_by_kind`).
+    """Names causes until the misfit of ``base`` is back at ``was`` (`scales_by_kind`).
 
-    In each round every other cause is fitted together with the named ones. The best is named if it explains
-    most of the growth, and at least the share ``least`` of all growth. Causes that a later one has made
-    superfluous are dropped. A rival of the last cause does no worse by more than the scatter of the legs.
+    In each round every other cause is fitted together with the named causes. The best is named if it explains
+    most of the growth, and at least the share ``least`` of all growth. Causes made superfluous by a later one
+    are dropped. A rival of the last cause is worse by no more than the scatter of the legs.
     """
     data, groups = replays.data, by_cause(parameters)
     legs = legs_of_rows(data, fitted_rows(data, everything=True))
@@ -166,7 +167,7 @@ def explain(
 
 
 def _nearest(replays: Replays, truth: Truth, own: Sequence[Parameter], was: Mapping[str, Any]) -> Truth:
-    """Returns the truth, or the one with a parameter moved that leaves less."""
+    """Returns the truth, or the truth with a shifted parameter if that has smaller residuals."""
     moved = [
         shifted(truth, each, sign * size * each.least_change)
         for each in own
@@ -179,14 +180,14 @@ def _nearest(replays: Replays, truth: Truth, own: Sequence[Parameter], was: Mapp
 
 
 def shifted(truth: Truth, parameter: Parameter, by: float) -> Truth:
-    """Returns the truth with one coordinate moved, within its bounds."""
+    """Returns the truth with one coordinate shifted, within its bounds."""
     low, high = parameter.bounds
     (now,) = coordinates(truth, [parameter])
     return at_coordinates(truth, [parameter], [min(max(now + by, low), high)])
 
 
 def _excess(grown: Mapping[str, float]) -> float:
-    """Returns the sum of the channels' growth in squares."""
+    """Returns the sum of squares of the channels' growth."""
     return sum(max(each**2 - 1.0, 0.0) for each in grown.values())
 
 
@@ -194,7 +195,7 @@ def _excess(grown: Mapping[str, float]) -> float:
 # Findings.
 
 ALIKE = 0.4
-"""Minimum component of a parameter in an unobservable direction for it to belong to the set."""
+"""Minimum component of a parameter in an unobservable direction for including it in the set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +208,7 @@ class Moved:
     after: float
     lower: float = math.nan
     upper: float = math.nan
-    """95 % interval of the value after; NaN if it has none."""
+    """Upper end of the 95 % interval of the value after; NaN without an interval."""
 
     @property
     def sentence(self) -> str:
@@ -226,13 +227,13 @@ class Finding:
     cause: str
     parameters: tuple[Moved, ...]
     aliases: tuple[str, ...] = ()
-    """Other causes that the motion does not separate from this one."""
+    """Other causes that are not separable from this one in the motion."""
     move: str = ""
     """Motion that would separate them."""
 
     @property
     def text(self) -> str:
-        """The change in words."""
+        """Change in words."""
         moved = "; ".join(each.sentence for each in self.parameters)
         rest = f", or {' or '.join(self.aliases)}: {self.move} would separate them" if self.aliases else ""
         return f"{moved}{rest}"
@@ -243,7 +244,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Alike:
-    """Parameters that the motion does not separate, and motions that would separate them."""
+    """Parameters that are not separable in the motion, and motions that would separate them."""
 
     cause: ClassVar[str] = "not separable"
     names: tuple[str, ...]
@@ -251,7 +252,7 @@ class Alike:
 
     @property
     def text(self) -> str:
-        """In words."""
+        """Description in words."""
         return f"{', '.join(self.names)}; {'; '.join(self.moves)} would separate them"
 
 
@@ -264,10 +265,10 @@ def finding(
     *,
     ratio: bool = False,
 ) -> Finding:
-    """Returns the finding of one cause: the parameters that have changed by as much as matters, or the most.
+    """Returns the finding of one cause: the parameters with a relevant change, or the one with the largest.
 
-    Those ``instead`` may have changed in their place. ``ratio``: by ratios, because neither value is the
-    axis's; by the difference if a parameter may be zero.
+    The causes ``instead`` may have changed in their place. With ``ratio``, changes are given as ratios,
+    because neither value is the axis's; as differences if a parameter may be zero.
     """
     off = np.subtract(coordinates(after, parameters), coordinates(before, parameters))
     sizes = np.abs(off) / [each.least_change for each in parameters]
@@ -280,9 +281,9 @@ def finding(
             moved.append(Moved(each.name, each.unit, 0.0, by))
         else:
             moved.append(Moved(each.name, "times what it was", 1.0, math.exp(by)))
-    told = tuple(compress(moved, sizes >= min(1.0, np.max(sizes))))
+    relevant = tuple(compress(moved, sizes >= min(1.0, np.max(sizes))))
     moves = "; ".join(dict.fromkeys(each.move for each in instead))
-    return Finding(parameters[0].cause, told, tuple(dict.fromkeys(each.cause for each in instead)), moves)
+    return Finding(parameters[0].cause, relevant, tuple(dict.fromkeys(each.cause for each in instead)), moves)
 
 
 def findings(
@@ -293,7 +294,7 @@ def findings(
     *,
     ratio: bool = False,
 ) -> tuple[Finding, ...]:
-    """Returns the findings of the named causes; options as in `finding`."""
+    """Returns the findings of the named causes; options as for `finding`."""
     rivals = [each for cause in found.rivals for each in groups[cause]]
     instead = dict.fromkeys(found.causes[-1:], rivals)
     return tuple(
@@ -303,9 +304,9 @@ def findings(
 
 
 def alike(fitted: Fitted, legs: FloatArray) -> tuple[Alike, ...]:
-    """Returns sets of parameters that may move together by the prior's width without a significant change.
+    """Returns sets of parameters that can change together by the prior's width without a significant effect.
 
-    ``legs`` holds the leg number of each fitted row.
+    ``legs`` contains the leg number of each fitted row.
     """
     spread = np.array([each.spread for each in fitted.parameters])
     scaled = fitted.jacobian * spread

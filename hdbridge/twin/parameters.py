@@ -1,7 +1,7 @@
 """Parameters of the simulated drive that a fit may change, and their usual values.
 
-Each has a path in the truth file. Positive parameters are fitted by their logarithm, so that half and double
-are equally far; delays and parameters that may be zero are fitted directly.
+Each has a path in the truth file. Positive parameters are fitted by their logarithm, so half and double are
+equally distant; delays and parameters that may be zero are fitted directly.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hdbridge.sim.truth.resonance import Resonance
 # Parameters of the simulated drive that a fit may change.
 
 RESOLVED = 0.98
-"""Maximum phase of the fastest resonance in a time step, in radians; the truth file allows one."""
+"""Maximum phase of the fastest resonance in a time step, in radians; the truth file permits one."""
 FOLLOWING, TORQUE, LOAD = "following error", "motor torque", "load error"
 """Channels in which a replay is compared with a recording."""
 
@@ -36,15 +36,15 @@ class Parameter:
     unit: str
     least: float
     most: float
-    """Bounds of the value in a fit."""
+    """Upper bound of the value in a fit."""
     spread: float
     """Prior standard deviation about the start: of the natural logarithm, or in ``unit`` if `linear`."""
     least_change: float
-    """Smallest change that matters in practice, in the unit of `spread`; smaller ones are not reported."""
+    """Smallest relevant change, in the unit of `spread`; smaller changes are not reported."""
     cause: str
-    """Cause that is reported if it has changed; several parameters may share one."""
+    """Reported cause if the parameter has changed; several parameters may share a cause."""
     move: str
-    """Motion that separates it from parameters with similar effects."""
+    """Motion that separates the parameter from parameters with similar effects."""
     linear: bool = False
 
     def coordinate(self, value: float) -> float:
@@ -52,7 +52,7 @@ class Parameter:
         return value if self.linear else math.log(value)
 
     def value(self, coordinate: float) -> float:
-        """Returns the value at a coordinate, kept within its bounds."""
+        """Returns the value at a coordinate, clipped to its bounds."""
         value = coordinate if self.linear else math.exp(min(coordinate, 700.0))
         return min(max(value, self.least), self.most)
 
@@ -159,7 +159,7 @@ def by_cause(parameters: Iterable[Parameter]) -> dict[str, tuple[Parameter, ...]
 
 
 def value_in(truth: Truth, parameter: Parameter) -> float | None:
-    """Returns a parameter's value in a truth; None if its section is missing or the law does not have it."""
+    """Returns a parameter's value in a truth; None if its section is missing or the law lacks it."""
     place: Any = truth
     for key in parameter.path.split("."):
         place = getattr(place, "load_" if key == "load" else key, None)
@@ -169,19 +169,19 @@ def value_in(truth: Truth, parameter: Parameter) -> float | None:
 
 
 def free_value(truth: Truth, parameter: Parameter) -> float:
-    """Returns the value of a parameter that is known to exist."""
+    """Returns the value of a parameter that must exist."""
     value = value_in(truth, parameter)
     assert value is not None, parameter.name
     return value
 
 
 def with_values(truth: Truth, values: Mapping[str, float]) -> Truth:
-    """Returns the truth with other values by parameter name, validated as a file is."""
+    """Returns the truth with other values by parameter name, validated like a file."""
     return Truth.model_validate(_with(truth, values))
 
 
 def with_load_encoder(truth: Truth, **fields: Any) -> Truth:
-    """Returns the truth with other fields of its load encoder, including whole sections, unchecked."""
+    """Returns the truth with other fields of the load encoder, including whole sections, unchecked."""
     encoder = truth.load_.encoder.model_copy(update=fields)
     return truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": encoder})})
 
@@ -199,7 +199,7 @@ def _with(truth: Truth, values: Mapping[str, float]) -> dict[str, Any]:
 
 
 def coordinates(truth: Truth, parameters: Iterable[Parameter]) -> list[float]:
-    """Returns the coordinates of a truth; values beyond a bound count as the bound."""
+    """Returns the coordinates of a truth; values beyond a bound are set to the bound."""
     found = []
     for each in parameters:
         value = free_value(truth, each)
@@ -210,7 +210,7 @@ def coordinates(truth: Truth, parameters: Iterable[Parameter]) -> list[float]:
 def at_coordinates(truth: Truth, parameters: Sequence[Parameter], place: Sequence[float]) -> Truth:
     """Returns the truth at these coordinates, with a spring no stiffer than its time step resolves.
 
-    A fit may ask for a stiffer one, because a recording hardly shows resonances of hundreds of hertz.
+    A fit may try a stiffer spring, because a recording hardly shows resonances of hundreds of hertz.
     """
     data = _with(truth, {each.name: each.value(float(x)) for each, x in zip(parameters, place, strict=True)})
     gear = data["gear"]
@@ -229,11 +229,11 @@ def at_coordinates(truth: Truth, parameters: Sequence[Parameter], place: Sequenc
 
 
 TORQUE_PER_INERTIA: Final = 10_000.0
-"""Acceleration of the bare rotor of a small brushless servo motor at its rated torque, rad/s^2: about 1e4."""
+"""Acceleration of the bare rotor of a small brushless servo motor at its rated torque, rad/s^2."""
 INERTIA_RATIO: Final = 3.0
 """Load over motor inertia seen by the motor; the article's bench has 3."""
 RESONANCE_HZ: Final = 40.0
-"""Load on the gear's spring: 15 to 80 Hz for arms on strain wave gears."""
+"""Resonance of the load on the gear's spring: 15 to 80 Hz for arms on strain wave gears."""
 DAMPING_RATIO: Final = 0.2
 """Damping ratio of that resonance: material and grease; the article's bench has 0.2."""
 COULOMB_SHARE: Final = 0.1
@@ -243,33 +243,33 @@ VISCOUS_SHARE: Final = 0.2
 RATED_SPEED_RAD_S: Final = 3000.0 * math.tau / 60.0
 """Rated speed of small servo motors."""
 STRIBECK_RAD_S: Final = 5.0
-"""Bearings and teeth in grease: a film carries from some tens of turns a minute on."""
+"""Stribeck speed of bearings and teeth in grease: a film carries from some tens of turns a minute on."""
 COUPLING_HZ: Final = 1000.0
-"""An encoder whose coupling is not known: stiffer than a recording shows."""
+"""Resonance of an encoder on an unknown coupling: stiffer than a recording shows."""
 COUPLING_DAMPING: Final = 0.1
-"""Metal bellows couplings: 0.05 to 0.2 with the bearings of the encoder."""
+"""Damping ratio of metal bellows couplings: 0.05 to 0.2 with the bearings of the encoder."""
 NOTCH_HZ: Final = 100.0
-"""A notch on the resonance of motor and load: 40 to 200 Hz."""
+"""Frequency of a notch on the resonance of motor and load: 40 to 200 Hz."""
 OBSERVER_HZ: Final = 50.0
-"""Disturbance observers: one to three velocity loops, 20 to 150 Hz."""
+"""Bandwidth of disturbance observers: one to three velocity loops, 20 to 150 Hz."""
 SHORTEST_FILTER_MS: Final = 0.02
-"""A negligible filter: a tenth of a short substep."""
+"""Negligible filter: a tenth of a short substep."""
 BRAKE_SHARE: Final = 3.0
-"""Torque of a holding brake, as a share of the rated torque: more than the motor gives."""
+"""Torque of a holding brake, as a share of the rated torque: more than the torque of the motor."""
 POSITION_GAIN_PER_S: Final = 200.0
-"""Stiff position loop of a direct sine/cosine feedback drive."""
+"""Position gain of a stiff loop with direct sine/cosine feedback."""
 VELOCITY_BANDWIDTH_RAD_S: Final = 1000.0
-"""Velocity loop on the motor's own inertia: 160 Hz."""
+"""Bandwidth of the velocity loop on the motor's own inertia: 160 Hz."""
 INTEGRAL_TIME_MS: Final = 15.0
-"""Some three times the period of the velocity loop's bandwidth."""
+"""About three times the period of the velocity loop's bandwidth."""
 COMMAND_FILTER_MS: Final = 1.0
-"""Drives interpolate the demand between SYNCs by a short filter."""
-FRICTION_TOLD: Final = 0.8
-"""Friction feed-forward as a share of the friction: without overshoot at reversals."""
+"""Short filter by which drives interpolate the demand between SYNCs."""
+FRICTION_FEEDFORWARD_SHARE: Final = 0.8
+"""Friction feed-forward as a share of the friction, without overshoot at reversals."""
 TORQUE_LIMIT_PERCENT: Final = 300.0
 """Peak over rated torque of small servo motors."""
 NOISE_COUNTS: Final = 0.3
-"""Rms noise of an encoder in counts: usually below one."""
+"""Rms noise of an encoder in counts, usually below one."""
 SUBSTEP_MS: Final = 0.5
 
 
@@ -306,7 +306,7 @@ def default_truth(axis: AxisConfig) -> Truth:
                 "damping_ratio": DAMPING_RATIO,
             },
             "viscous_feedforward_nm_s_per_rad": viscous,
-            "friction_feedforward_nm": FRICTION_TOLD * coulomb,
+            "friction_feedforward_nm": FRICTION_FEEDFORWARD_SHARE * coulomb,
             "torque_limit_percent": max(TORQUE_LIMIT_PERCENT, axis.limits.torque_percent),
         },
         "gear": {

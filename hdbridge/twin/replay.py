@@ -1,11 +1,11 @@
 """Replays a recording's commands through a simulated drive, without bus and master.
 
-The state before a recording is unknown, so the replay switches the drive on at its angle zero and moves to
-the first command at the axis's limits; so does each part that does not follow another one. If the recording
-begins with the drive holding the axis, its torque sets the integrals of the loops. Between parts that follow
-each other the drive is switched off, as on the bench, and the load continues to ring.
+The state before a recording is unknown. The replay therefore switches the drive on at its angle zero and
+moves to the first command at the axis's limits, and does so before each part that does not follow another. If
+the recording begins with the drive holding the axis, its torque sets the integrals of the loops. Between
+consecutive parts, the drive is switched off, as on the bench, and the load continues to ring.
 
-External influences are part of a recording like its commands: a recorded torque on the load acts on the
+External influences are part of a recording, like its commands. A recorded torque on the load acts on the
 simulated load in place of its own weight, and the recorded temperature sets its initial temperature.
 """
 
@@ -35,20 +35,20 @@ from hdbridge.sim.truth import Truth
 # Stretches: pieces of long recordings that a fit replays separately.
 
 STRETCH_S = 10.0
-"""Length of a stretch: long against its unknown beginning (60 motor degrees, ringing)."""
+"""Length of a stretch, long compared with its unknown beginning (60 motor degrees, ringing)."""
 LONG_S = 30.0
-"""Maximum length of a part that is not divided."""
+"""Maximum length of an undivided part."""
 GAP_S = 0.5
-"""Maximum gap between two parts that follow each other, as between two tasks of a master."""
+"""Maximum gap between two consecutive parts, such as two tasks of a master."""
 SAME_DEG = 1e-6
 """Maximum change of the command that counts as unchanged; motor degrees."""
 STOPPED_DEG = 5.0
 """Maximum motor travel from the last row of a procedure to standstill."""
 IDLE = 0.002
-"""Share of a record's largest torque below which the torque counts as zero."""
+"""Share of a record's largest torque below which a torque counts as zero."""
 RUN_IN_S = 2.0
-"""Time after which earlier motion no longer matters: the ringing of a weakly damped load (15 Hz, damping
-ratio 0.03) has decayed to a three-hundredth."""
+"""Time after which earlier motion is irrelevant: the ringing of a weakly damped load (15 Hz, damping ratio
+0.03) has decayed to a three-hundredth."""
 
 
 def stretches(part: Record, legs: Sequence[Segment]) -> list[Record]:
@@ -89,7 +89,7 @@ def continuous(record: Record) -> list[slice]:
 def just_on(record: Record, row: int) -> bool:
     """Returns True if the drive has just been switched on at a row, because it has no torque yet.
 
-    Returns True for a record without torque, on the assumption that power is on only during a procedure.
+    Also True for a record without torque, on the assumption that power is on only during a procedure.
     """
     torque_nm = record.columns.get("motor_torque_nm")
     if torque_nm is None:
@@ -101,12 +101,13 @@ def just_on(record: Record, row: int) -> bool:
 # Standstill in a recording, the holding torque, and rows with an unknown history.
 
 RINGING_S = 0.25
-"""Time after the command's stop in which the torque still shows the motion; later it depends on sticking."""
+"""Time after a stop of the command in which the torque still shows the motion; later, the torque depends on
+sticking."""
 STANDS_COUNTS = 1.5
-"""Distance from the rest position within which the motor is at standstill; counts. Its torque is then
-constant or creeps up against friction, depending on a thousandth of a count."""
+"""Distance from the rest position within which the motor is at standstill, counts. Its torque is then
+constant, or creeps up against friction by an amount that depends on a thousandth of a count."""
 HELD_S = 0.1
-"""Standstill after which the integral alone holds the motor; the loops respond within a few milliseconds."""
+"""Standstill after which only the integral holds the motor; the loops respond within a few milliseconds."""
 LARGEST_UNKNOWN = 0.25
 """Maximum share of a recording that is excluded for its unknown history."""
 
@@ -117,10 +118,10 @@ class Standing(NamedTuple):
     stuck: NDArray[np.bool_]
     """Mask of the rows at which the command has been at rest for `RINGING_S`."""
     still: NDArray[np.bool_]
-    """Mask of the rows from which command and motor stay at rest until the command moves again."""
+    """Mask of the rows from which command and motor stay at rest until the next command motion."""
     held: NDArray[np.intp]
-    """Rows that show its holding torque: every `HELD_S`, and the last. The last one alone would not do,
-    because the integral may have moved until the motor broke away."""
+    """Rows that show the motor's holding torque: every `HELD_S`, and the last. The last row alone is
+    insufficient, because the integral may have moved until the motor broke away."""
 
 
 def standing(part: Record, count_deg: float) -> Standing:
@@ -136,10 +137,10 @@ def standing(part: Record, count_deg: float) -> Standing:
     still = np.maximum.accumulate(np.where(away | moved, rows, -1)) < rows
     rested_s = time_s - np.maximum.accumulate(np.where(moved, time_s, time_s[0]))
     times = np.floor(rested_s / HELD_S)
-    told = still & (times >= 1.0)
-    told[1:-1] &= (times[1:-1] > times[:-2]) | moved[2:]
-    told[-1:] = False
-    return Standing(stuck, still, np.flatnonzero(told))
+    held = still & (times >= 1.0)
+    held[1:-1] &= (times[1:-1] > times[:-2]) | moved[2:]
+    held[-1:] = False
+    return Standing(stuck, still, np.flatnonzero(held))
 
 
 def begins_in_motion(part: Record) -> bool:
@@ -152,8 +153,8 @@ def begins_in_motion(part: Record) -> bool:
 def unknown_rows(record: Record, count_deg: float) -> NDArray[np.bool_]:
     """Returns the mask of rows in which the load may still ring from an unknown motion.
 
-    This is the motion before a recording that begins (or resumes) in motion, or the cycles before switching
-    off after a procedure that ended in motion. ``count_deg`` is one motor count.
+    Such a motion precedes a recording that begins (or resumes) in motion, and the switch-off after a
+    procedure that ended in motion. ``count_deg`` is one motor count.
     """
     target, time_s = record.motor_target_deg, record.time_s
     unknown = np.zeros(len(record), dtype=np.bool_)
@@ -179,24 +180,24 @@ def unknown_rows(record: Record, count_deg: float) -> NDArray[np.bool_]:
 STANDING_S = 0.3
 """Standstill before the approach, and between it and a recording that begins at rest."""
 SETTLING_S = 0.75
-"""The latter if the recording begins with the drive on: long enough for loops with a gain of 8/s. At 25/s,
-half of it changes no residual by more than 2e-5 of the noise."""
+"""Standstill before a recording that begins with the drive on, long enough for loops with a gain of 8/s. At
+25/s, halving it changes no residual by more than 2e-5 of the noise."""
 UNEVEN = 0.25
-"""Maximum deviation of a sample's time from the grid; cycles."""
+"""Maximum deviation of a sample's time from the grid, cycles."""
 MOSTLY = 0.95
-"""Minimum share of samples within `UNEVEN`: a few late stamps do not mean late commands."""
+"""Minimum share of samples within `UNEVEN`, because a few late stamps do not imply late commands."""
 REST_S = 0.1
 """Minimum rest of the command between two legs if the recording names no legs."""
 RINGS_S = 1.0
-"""Time from the end of a leg's motion to the end of the leg; a longer standstill belongs to no leg."""
+"""Time from the end of a leg's motion to the end of the leg; a longer standstill is not part of any leg."""
 LEAST_LEG_S = 0.4
 """Minimum length of such a leg: an acceleration and the ringing of a load at 15 Hz."""
 SIGN_SHARE = 0.2
-"""Share of the mean torque that must oppose the motion for the sign to be wrong."""
+"""Share of the mean torque that must oppose the motion for the sign to count as wrong."""
 TORQUE_MARGIN = 1.5
-"""Ratio of a torque to the axis's limit above which its unit must be wrong."""
+"""Ratio of a torque to the axis's limit above which its unit counts as wrong."""
 AHEAD_CYCLES = 0.5
-"""Lead of the motor over its command above which the command was logged late; cycles."""
+"""Lead of the motor over its command above which the command counts as logged late, cycles."""
 MOVING_DEG_S = 5.0
 """Motor speed above which the direction of friction is certain."""
 OFF_AFTER, ON_BEFORE = 2, 1
@@ -217,14 +218,14 @@ class Commands:
     time_s: FloatArray
     """Time of each row."""
     cycle_s: float
-    told_nm: FloatArray | None = None
-    """Recorded torque on the load by cycle (during the approach its first value); None if not recorded."""
+    torque_on_load_nm: FloatArray | None = None
+    """Recorded torque on the load by cycle (its first value during the approach); None if not recorded."""
     off: tuple[slice, ...] = ()
     """Cycles in which the drive is switched off."""
     held: tuple[tuple[int, float], ...] = ()
-    """Cycles before which the loops' integrals are set to a holding torque, and that torque in Nm."""
+    """Cycles before which the loops' integrals are set to a holding torque, with that torque in Nm."""
     start_c: float | None = None
-    """Initial temperature of the axis; None: the truth's own."""
+    """Initial temperature of the axis; None for that of the truth."""
 
 
 def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
@@ -233,8 +234,8 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
     name = f"{part.source}: " if part.source else ""
     if target is None or np.isnan(target).any():
         raise InputError(
-            f"{name}no commanded motor angle (motor_target_deg); expected one in each row: what the drive "
-            "was told is what a simulated one is told again"
+            f"{name}no commanded motor angle (motor_target_deg); expected one in each row, because a replay "
+            "sends the drive's commands to a simulated drive"
         )
     if len(part) < 2:
         raise InputError(f"{name}{len(part)} rows; expected at least two in each part of a recording")
@@ -261,9 +262,11 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
     recorded = np.round(axis.motor_encoder.counts(1.0) * demand_deg).tolist()
     holds = target[0] == target[1] and not just_on(part, 0)
     approach = _approach(truth, axis, demand_deg, cycle_s, SETTLING_S if holds else STANDING_S)
-    told_nm = part.columns.get(Channel.LOAD_TORQUE.value)
-    if told_nm is not None:
-        told_nm = np.concatenate([np.full(len(approach), told_nm[0]), np.interp(grid, cycles, told_nm)])
+    torque_on_load_nm = part.columns.get(Channel.LOAD_TORQUE.value)
+    if torque_on_load_nm is not None:
+        torque_on_load_nm = np.concatenate(
+            [np.full(len(approach), torque_on_load_nm[0]), np.interp(grid, cycles, torque_on_load_nm)]
+        )
     lead = len(approach)
     off = [
         slice(
@@ -289,7 +292,7 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
         cycles,
         time_s,
         cycle_s,
-        told_nm,
+        torque_on_load_nm,
         tuple(off),
         tuple(held),
         start_c,
@@ -297,7 +300,7 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
 
 
 def cycle_of(part: Record, axis: AxisConfig) -> float:
-    """Returns a record's cycle in seconds, as 60C2h can express it, or the axis's if they agree."""
+    """Returns a record's cycle in seconds, as 60C2h can express it, or the axis's cycle if they agree."""
     own_ms = 1e3 * float(np.median(np.diff(part.time_s)))
     if not own_ms > 0.0:
         raise InputError(f"{part.source or 'the record'}: its time stands still; expected rising times")
@@ -343,7 +346,7 @@ def _approach(
 def counted_cycles(time_s: FloatArray, cycle_s: float) -> FloatArray:
     """Returns the cycle number of each row, from zero; fractional if the rows do not follow the cycle.
 
-    Rows are counted, because a late stamp does not mean a late command. Gaps count as whole cycles.
+    Rows are counted, because a late stamp does not imply a late command. Gaps count as whole cycles.
     """
     cycles: FloatArray = (time_s - time_s[0]) / cycle_s
     counted: FloatArray = np.concatenate([[0.0], np.cumsum(np.maximum(np.round(np.diff(cycles)), 1.0))])
@@ -354,7 +357,7 @@ def counted_cycles(time_s: FloatArray, cycle_s: float) -> FloatArray:
 
 
 def legs_of(recording: Recording) -> tuple[Segment, ...]:
-    """Returns the recording's legs; if it names none, its motions between rests and reversals."""
+    """Returns the recording's legs; without named legs, its motions between rests and reversals."""
     if recording.segments:
         return recording.segments
     return tuple(leg for part in recording.record.parts() for leg in _legs_of_command(part))
@@ -380,7 +383,7 @@ def _legs_of_command(part: Record) -> Iterator[Segment]:
 
 
 def doubts(recording: Recording, axis: AxisConfig) -> tuple[str, ...]:
-    """Returns suspected faults of a recording's torque and command, each in a sentence with a remedy."""
+    """Returns suspected errors of a recording's torque and command, each in a sentence with a remedy."""
     lags, forward, backward = [], [], []
     for part in recording.record.parts():
         target, torque_nm = part.motor_target_deg, part.columns.get(Channel.MOTOR_TORQUE.value)
@@ -422,7 +425,7 @@ def doubts(recording: Recording, axis: AxisConfig) -> tuple[str, ...]:
 def replay(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) -> Record:
     """Replays the recording's commands, and returns the simulated drive's record with its rows and times.
 
-    It gives the numbers that a bench reads over frames; supervision and speed limits are not applied.
+    The numbers are those that a bench reads over frames; supervision and speed limits are not applied.
     InputError if the recording has no command.
     """
     records = []
@@ -446,21 +449,23 @@ def run(
     if commands.start_c is not None:
         heat = truth.temperature.model_copy(update={"start_c": commands.start_c})
         truth = truth.model_copy(update={"temperature": heat})
-    if commands.told_nm is not None:
-        outer_nm = truth.load_.torque_sense * commands.told_nm
+    if commands.torque_on_load_nm is not None:
+        outer_nm = truth.load_.torque_sense * commands.torque_on_load_nm
         # The recorded torque is the weight; the hanging mass keeps its inertia.
         upright = mass and mass.model_copy(update={"tilt_deg": 90.0})
         truth = truth.model_copy(update={"load_": truth.load_.model_copy(update={"gravity": upright})})
-    machine = Machine(truth, seed, may_compile=True, loaded=commands.told_nm is not None)
-    machine.torque_limit_permille = 10.0 * axis.limits.torque_percent  # as the master tells the drive
+    machine = Machine(truth, seed, may_compile=True, loaded=commands.torque_on_load_nm is not None)
+    machine.torque_limit_permille = (
+        10.0 * axis.limits.torque_percent
+    )  # the limit that the master sets in the drive
     permille_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
     sense = float(axis.motor_encoder.direction)
     substeps = _substeps(len(commands.counts), commands.cycle_s, machine.dt_s)
-    told = _told(machine, [commands.counts[0], *commands.counts], substeps, commands, outer_nm)
-    motor, load = told.motor_reading, told.load_reading
+    measured = _followed(machine, [commands.counts[0], *commands.counts], substeps, commands, outer_nm)
+    motor, load = measured.motor_reading, measured.load_reading
     if not smooth:
         motor, load = np.floor(motor + 0.5), np.floor(load + 0.5)
-    torque = sense * told.torque_nm if smooth else told.torque_permille * permille_nm
+    torque = sense * measured.torque_nm if smooth else measured.torque_permille * permille_nm
     encoder = axis.motor_encoder
     motor = encoder.direction * motor * 360.0 / encoder.counts_per_turn
     load = axis.load_encoder.direction * load * 360.0 / truth.load_.encoder.counts_per_turn
@@ -468,8 +473,8 @@ def run(
         "motor_position_deg": motor,
         "load_position_deg": load,
         "motor_torque_nm": torque,
-        Channel.TEMPERATURE.value: told.temperature_c,
-        Channel.LOAD_TORQUE.value: told.load_torque_nm,
+        Channel.TEMPERATURE.value: measured.temperature_c,
+        Channel.LOAD_TORQUE.value: measured.load_torque_nm,
     }
     cycles = np.arange(len(motor))
     return {name: np.interp(commands.row_cycles, cycles, each) for name, each in columns.items()}
@@ -477,7 +482,7 @@ def run(
 
 @cache
 def _substeps(cycles: int, cycle_s: float, dt_s: float) -> tuple[int, ...]:
-    """Returns the number of substeps of each cycle; the remainder of one is added to the next."""
+    """Returns the number of substeps of each cycle; remainders are carried to the next cycle."""
     found, owed_s = [], 0.0
     for _ in range(cycles):
         owed_s += cycle_s
@@ -486,7 +491,7 @@ def _substeps(cycles: int, cycle_s: float, dt_s: float) -> tuple[int, ...]:
     return tuple(found)
 
 
-def _told(
+def _followed(
     machine: Machine,
     demand: list[float],
     substeps: Sequence[int],
@@ -494,18 +499,20 @@ def _told(
     outer_nm: FloatArray,
 ) -> Cycles:
     """Runs the machine through all cycles; returns those after the approach."""
-    told: list[Cycles] = []
+    pieces: list[Cycles] = []
     held_nm = np.full(len(substeps), np.nan)
     for cycle, torque_nm in commands.held:
         held_nm[cycle : cycle + 1] = torque_nm
     done = 0
     for off in (*commands.off, slice(len(substeps), len(substeps))):
         on = slice(done, off.start)
-        told.append(machine.follow_all(demand[done : off.start + 1], substeps[on], outer_nm[on], held_nm[on]))
-        told.append(_coasted(machine, substeps[off], outer_nm[off]))
+        pieces.append(
+            machine.follow_all(demand[done : off.start + 1], substeps[on], outer_nm[on], held_nm[on])
+        )
+        pieces.append(_coasted(machine, substeps[off], outer_nm[off]))
         demand[off.stop] = demand[min(off.stop + 1, len(demand) - 1)]  # where the drive is on again
         done = off.stop
-    whole = Cycles(*(np.concatenate(each) for each in zip(*told, strict=True)))
+    whole = Cycles(*(np.concatenate(each) for each in zip(*pieces, strict=True)))
     return Cycles(*(each[commands.lead :] for each in whole))
 
 

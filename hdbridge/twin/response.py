@@ -1,8 +1,9 @@
-"""Measured response: the fall-back for drives whose loops the simulated servo does not have.
+"""Measured response: fall-back for drives whose loops differ in structure from the simulated servo.
 
-What the best servo leaves of following error and torque is fitted by finite impulse responses to the speed
-and the direction of the command (`hdbridge.sim.response`), by ridge regressions. The simulated motor follows
-a change of the demand as it follows the command, so the response of the demand is fitted to its speed.
+The residuals of following error and torque with the best servo are fitted by finite impulse responses to the
+speed and the direction of the command (`hdbridge.sim.response`), by ridge regressions. The simulated motor
+follows a change of the demand like it follows the command, so the response of the demand is fitted to its
+speed.
 """
 
 from __future__ import annotations
@@ -30,17 +31,17 @@ tenth."""
 DIRECTION_S: Final = 0.12
 """Length of the responses to the direction: three periods of a velocity loop of 25 Hz."""
 RIDGES: Final = (1e-1, 1e-2, 1e-3, 1e-4)
-"""Weights of the taps' squares, as a share of what the rows say of each; held-out legs choose."""
+"""Weights of the taps' squares, as a share of each tap's information in the rows; chosen by held-out legs."""
 ROUNDS: Final = 2
-"""Number of times that the demand's response is fitted: the second corrects what friction changed."""
+"""Number of fits of the demand's response; the second corrects the changes due to friction."""
 GAIN: Final = 0.97
-"""Share of the misfit without a response below which the misfit with it must be for keeping the response."""
+"""Maximum ratio of the misfit with a response to that without for keeping the response."""
 
 
 def with_response(replays: Replays, fitted: Fitted) -> Fitted:
-    """Returns the fit with measured responses, if held-out legs are explained better by them.
+    """Returns the fit with measured responses if they explain held-out legs better.
 
-    A response of the demand also changes the torque, so it has to be worth that.
+    A response of the demand also changes the torque, so it must improve both together.
     """
     best = fitted
     for demanded, ridge in product((0, ROUNDS), RIDGES):
@@ -89,14 +90,14 @@ def _added(truth: Truth, data: Data, found: dict[str, FloatArray], ridge: float,
 
 
 def _command_speed(piece: Piece, data: Data) -> FloatArray:
-    """Returns the speed of the demand in each cycle, with those of the approach; motor rad/s."""
+    """Returns the speed of the demand in each cycle, including the approach; motor rad/s."""
     encoder = data.axis.motor_encoder
     turned = math.tau * encoder.direction / encoder.counts_per_turn * np.asarray(piece.commands.counts)
     return np.asarray(np.diff(turned, prepend=turned[0]) / piece.commands.cycle_s, dtype=np.float64)
 
 
 def _lagged(column: FloatArray, length: int) -> FloatArray:
-    """Returns a column and its past as columns, the latest first, shape (n, length)."""
+    """Returns a column and its past as columns, latest first, shape (n, length)."""
     return sliding_window_view(np.concatenate([np.zeros(length - 1), column]), length)[:, ::-1]
 
 
@@ -108,7 +109,7 @@ def _ridge(table: FloatArray, wanted: FloatArray, ridge: float) -> FloatArray:
 
 
 def _grown(before: Sequence[float], taps: FloatArray) -> FloatArray:
-    """Returns the sum of the taps so far and further ones."""
+    """Returns the sum of the taps so far and the new taps."""
     return np.append(before, np.zeros(len(taps)))[: len(taps)] + taps
 
 

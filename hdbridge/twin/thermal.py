@@ -2,8 +2,8 @@
 
 The plant is one body between its losses and its surroundings (`hdbridge.sim.heat`). The losses are a copper
 loss by the torque squared, and the work of the motor's friction. All other parameters are already fitted, so
-two replays give the losses. The fit itself needs no replays, because the temperature is linear in losses and
-ambient temperature.
+two replays provide the losses. The fit itself needs no replays, because the temperature is linear in losses
+and ambient temperature.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ AMBIENT: Final = replace(BY_NAME["temperature"], name="ambient temperature")
 _WARM_UP = "a warm-up of half an hour and more, and a rest after it, with the temperature recorded"
 RISE_K: Final = 100.0
 """Temperature rise of a winding at rated torque (IEC 60034-1 allows 105 K for class F by the resistance
-method, and motors are rated by it). The housing warms less."""
+method, the usual rating of motors). The housing warms less."""
 MATTERS_K: Final = 5.0
-"""Smallest change of that temperature rise that matters in practice."""
+"""Smallest relevant change of that temperature rise."""
 RESISTANCE: Final = Parameter(
     "thermal resistance", "temperature.resistance_k_per_w", "K/W", 1e-4, 1e3, 0.7, 0.25, AMBIENT.cause,
     _WARM_UP,
@@ -56,11 +56,12 @@ STEP_S: Final = 1.0
 """Time step with constant losses: a hundredth of the time constant of the smallest motor."""
 MINIMUM_STEPS: Final = 3
 LARGE_S: Final = 1e6
-"""Time constant of a body at one kelvin per watt that hardly warms: in an hour at 10 W by 0.04 K."""
+"""Time constant of a body at one kelvin per watt that hardly warms: by 0.04 K in an hour at 10 W."""
 LEAST_ERROR: Final = 1e-4
 """Minimum relative standard deviation of the friction's work."""
 START_K: Final = 1.0
-"""Standard deviation of the body's temperature about the first reading of a part: a sensor lags behind."""
+"""Standard deviation of the body's temperature about the first reading of a part, because a sensor lags
+behind."""
 TOGETHER: Final = 0.25
 """Correlation time of the thermal model's error, as a share of the time constant."""
 PLACES: Final = (0.0, -1.4, 1.4)
@@ -81,7 +82,7 @@ class _Part:
     """Change of the truth's ambient temperature since the start of the part."""
     reading_c: FloatArray
     rows: NDArray[np.intp]
-    """Indices of the times whose reading counts."""
+    """Indices of the times whose readings count."""
     firsts: NDArray[np.intp]
     """Index into `rows` of the first of each run of equal readings."""
 
@@ -97,8 +98,8 @@ def with_warmth(
 ) -> tuple[Truth, Finding | None]:
     """Fits the thermal constants; returns the truth with them and their intervals, and a finding.
 
-    Returns the truth unchanged if the recording has no temperature. Constants that it does not show keep
-    their values.
+    Returns the truth unchanged if the recording has no temperature. Constants that are not visible in the
+    recording keep their values.
     """
     record = recording.record
     if Channel.TEMPERATURE.value not in record.columns:
@@ -189,7 +190,7 @@ def _scaled(truth: Truth) -> list[Parameter]:
 
 
 def _shown(parts: Sequence[_Part], place: FloatArray) -> FloatArray:
-    """Returns the body's mean temperature of each run."""
+    """Returns the body's mean temperature over each run."""
     count = len(THERMAL)
     ambient_c, k_per_w, time_s, copper_w = _values(place[:count])
     friction, shown = math.exp(place[count]), []
@@ -241,8 +242,8 @@ def _parts(
 def _losses(recording: Recording, axis: AxisConfig, truth: Truth) -> tuple[FloatArray, FloatArray]:
     """Computes the accumulated losses by two replays with a body so large that it hardly warms.
 
-    Replays are needed because a recording has the torque at the end of each cycle, while the torque within it
-    heats the motor. The friction's work is corrected to the recorded temperature.
+    Replays are needed because a recording contains the torque at the end of each cycle, while the motor is
+    heated by the torque within the cycle. The friction's work is corrected to the recorded temperature.
     """
     told_c = recording.record.columns[Channel.TEMPERATURE.value]
     taken_j = []

@@ -1,9 +1,9 @@
 """Translates an axis file and a model to a truth file: each effect to the simulated plant's own physics.
 
-A model describes the error of the load; the plant has parts that cause it. `TABLE` has one row with that part
-for each effect of the catalogue, and a translation reports for each effect of a model if it was translated in
-full, in part or not at all. The transmission error comes from the model alone; everything else (motor, loops,
-friction, load, and the spring unless the model has it) comes from the given truth, or else from usual values
+A model describes the error of the load; the plant has parts that cause it. `TABLE` assigns such a part to
+each effect of the catalogue, and a translation reports whether each effect of a model was translated in full,
+in part or not at all. The transmission error comes from the model alone. Everything else (motor, loops,
+friction, load, and the spring unless the model has one) comes from the given truth, else from usual values
 (`hdbridge.twin.parameters`).
 """
 
@@ -41,19 +41,19 @@ ARCSEC_PER_RAD = math.degrees(1.0) * ARCSEC_PER_DEG
 
 @dataclass(slots=True)
 class Draft:
-    """Content of a truth file, `data`, which is changed in place."""
+    """Content of a truth file (`data`), which is changed in place."""
 
     data: dict[str, Any]
     axis: AxisConfig
-    tells_servo: bool
-    """True if the drive's feed-forward is set to the load that is written, as after commissioning."""
+    sets_servo: bool
+    """True if the drive's feed-forward is set to the written load, as after commissioning."""
     place: str | None = None
-    """Place of the present effect in the truth file; None if the plant has no counterpart."""
+    """Path of the present effect in the truth file; None if the plant has no counterpart."""
     notes: list[str] = field(default_factory=list)
-    """Differences of the present effect there."""
+    """Differences between the present effect and its counterpart in the truth file."""
 
     def note(self, difference: str) -> None:
-        """Notes a difference of the present effect, once."""
+        """Notes a difference of the present effect from its counterpart, once."""
         if difference not in self.notes:
             self.notes.append(difference)
 
@@ -63,16 +63,14 @@ class Draft:
 
     @property
     def gear(self) -> dict[str, Any]:
-        """The section ``gear``."""
         return self.part("gear")
 
     @property
     def load(self) -> dict[str, Any]:
-        """The section ``load``."""
         return self.part("load")
 
     def part(self, *names: str) -> dict[str, Any]:
-        """Returns a nested section; creates it if it is missing."""
+        """Returns a nested section, which is created if missing."""
         place = self.data
         for name in names:
             if place.get(name) is None:
@@ -91,13 +89,13 @@ class Draft:
         return float(self.gear["stiffness_nm_per_rad"])
 
     def set_stiffness(self, nm_per_rad: float) -> None:
-        """Sets the stiffness and keeps the damping ratio of the load."""
+        """Sets the stiffness without changing the damping ratio of the load."""
         self.gear["damping_nm_s_per_rad"] *= math.sqrt(nm_per_rad / self.stiffness_nm_per_rad)
         self.gear["stiffness_nm_per_rad"] = nm_per_rad
 
     @property
     def hanging_kg_m2(self) -> float:
-        """Inertia of the hanging mass, which is not part of the load's own."""
+        """Inertia of the hanging mass, which is not part of the load's own inertia."""
         mass = self.load.get("gravity")
         return float(mass["mass_kg"] * mass["arm_m"] ** 2) if mass else 0.0
 
@@ -107,7 +105,7 @@ class Draft:
         return float(self.load["inertia_kg_m2"]) + self.hanging_kg_m2
 
     def set_inertia(self, kg_m2: float) -> None:
-        """Sets the load's total inertia, more than the hanging mass's, and keeps the damping ratio."""
+        """Sets the load's total inertia, above that of the hanging mass, keeping the damping ratio."""
         self.gear["damping_nm_s_per_rad"] *= math.sqrt(kg_m2 / self.inertia_kg_m2)
         self.load["inertia_kg_m2"] = kg_m2 - self.hanging_kg_m2
 
@@ -126,7 +124,7 @@ class Draft:
     def finish(self) -> None:
         """Sets the load feed-forward, and a time step that resolves the fastest resonance."""
         servo, load = self.data["servo"], self.inertia_kg_m2
-        if self.tells_servo and servo.get("load_feedforward"):
+        if self.sets_servo and servo.get("load_feedforward"):
             turn = math.sqrt(self.stiffness_nm_per_rad / load)
             servo["load_feedforward"] = {
                 "inertia_kg_m2": load / self.ratio**2,
@@ -147,7 +145,7 @@ SHORTEST_MS = 0.0625
 
 
 def branch(exponent: float, nodes: int) -> tuple[FloatArray, FloatArray]:
-    """Returns xi from 0 to 1 and the branch g(xi), dense in its bend, shape (nodes + 1,) each."""
+    """Returns xi from 0 to 1 and the branch g(xi), dense at its bend, shape (nodes + 1,) each."""
     xi = np.linspace(0.0, 1.0, nodes + 1) ** (2.0 / min(max(exponent - 1.0, 0.2), 1.0))
     return xi, rise(xi, exponent)
 
@@ -155,8 +153,8 @@ def branch(exponent: float, nodes: int) -> tuple[FloatArray, FloatArray]:
 def elements(travel: FloatArray, height: FloatArray) -> list[tuple[float, float]]:
     """Returns limit and travel to slipping of each element of a concave curve through the origin.
 
-    The curve is the sum of the elements from rest. Its points are in order, from (0, 0); it is flat beyond
-    the last.
+    The curve is the sum of the elements from rest. Its points are in order, from (0, 0); beyond the last it
+    is flat.
     """
     slopes = [(h1 - h0) / (t1 - t0) for (t0, h0), (t1, h1) in pairwise(zip(travel, height, strict=True))]
     return [
@@ -182,12 +180,12 @@ def ratio_error(effect: effects.RatioError, draft: Draft) -> None:
 
 
 def orders(key: str, effect: Any, draft: Draft) -> None:
-    """Sets the tooth error by the angle of this key; orders in two effects are added."""
+    """Sets the tooth error over the angle of this key; orders in two effects are added."""
     _add_orders(effect.orders, draft, key)
 
 
 def direction_phase(effect: effects.DirectionPhase, draft: Draft) -> None:
-    """Sets two flanks; the model's orders are the mean of both, the plant's those of each."""
+    """Sets two flanks. The model's orders are the mean of both flanks, the plant's orders those of each."""
     held = []
     flanks: list[dict[str, Any]] = []
     for each in draft.gear.get("motor_orders", ()):
@@ -266,10 +264,10 @@ def _add_orders(more: Sequence[effects.MotorOrder], draft: Draft, key: str) -> N
 # Encoder errors.
 
 RADIUS_MM: Final = 20.0
-"""Assumed radius of a disc's graduation: only the ratio of the eccentricity to it has an effect."""
+"""Assumed radius of a disc's graduation. Only its ratio to the eccentricity has an effect."""
 LATEST_MS: Final = 100.0
 SMALL_ARCSEC: Final = 0.05
-"""Maximum loss in a translation that is not noted: a tenth of a usual count."""
+"""Maximum deviation of a translation that is not noted: a tenth of a usual count."""
 _LIMITS: Final = {
     "sine_offset": 0.5, "cosine_offset": 0.5, "gain_mismatch": 0.5, "phase_mismatch_deg": 45.0,
     "third_harmonic": 0.3,
@@ -277,9 +275,10 @@ _LIMITS: Final = {
 
 
 def motor_eccentricity(effect: effects.MotorEncoderEccentricity, draft: Draft) -> None:
-    """Sets the disc of the motor encoder. The drive controls its reading, so the load has the opposite error.
+    """Sets the disc of the motor encoder. The drive controls its reading, so the load has the opposite
+    error.
 
-    A disc reads (e / r) sin(a - a0) too much, so the load lags by this divided by the ratio.
+    A disc reads too much by (e / r) sin(a - a0), so the load lags by this divided by the ratio.
     """
     # -sin(a - a0) = cos(a + 90 deg - a0), and the same for twice the angle.
     disc = _disc(effect.orders, draft.ratio, lambda phase_deg: 90.0 - phase_deg)
@@ -288,7 +287,7 @@ def motor_eccentricity(effect: effects.MotorEncoderEccentricity, draft: Draft) -
 
 
 def load_orders(effect: effects.LoadOrders, draft: Draft) -> None:
-    """Sets the load encoder's disc if it is the known origin, else a pitch error of the spline."""
+    """Sets the load encoder's disc if it is the known source, else a pitch error of the spline."""
     if effect.origin != "load_encoder":
         if effect.origin == "unknown":
             draft.note("origin unknown: taken for the gear's")
@@ -318,7 +317,7 @@ def _disc(orders: Iterable[effects.MotorOrder], ratio: float, at_deg: Any) -> di
 
 
 def channel_skew(effect: effects.ChannelSkew, draft: Draft) -> None:
-    """Sets the delay of the other encoder: a load that is read later has an older motor reading."""
+    """Sets the delay of the other encoder: a late load reading means an older motor reading."""
     delay_ms = effect.delay_ms
     late = "motor" if delay_ms > 0.0 else "load"
     draft.part(late, "encoder")["late_ms"] = min(abs(delay_ms), LATEST_MS)
@@ -380,7 +379,7 @@ def count_loss(effect: effects.CountLoss, draft: Draft) -> None:
 # Effects of temperature, travel and time.
 
 LINEAR_BUILD_UP: Final = 0.5
-"""Build-up ratio below which the plant's element, with equal times of strain and release, differs."""
+"""Build-up ratio below which the plant's element, with equal times of strain and release, deviates."""
 
 
 def zero_drift(effect: effects.ZeroDrift, draft: Draft) -> None:
@@ -424,7 +423,7 @@ def wear(effect: effects.Wear, draft: Draft) -> None:
 
 
 def creep(effect: effects.Creep, draft: Draft) -> None:
-    """Sets Kelvin-Voigt elements. The model's strain leads in motion, the plant's yields to the drag."""
+    """Sets Kelvin-Voigt elements. The model's strain leads in motion; the plant's yields to the drag."""
     parts = [
         {"time_constant_s": each.tau_s, "amplitude_arcsec": -each.amplitude_arcsec} for each in effect.parts
     ]
@@ -446,14 +445,15 @@ def _warm_up(effect: Warmed, draft: Draft) -> None:
 # Effects of spring, friction, play and loop.
 
 NODES: Final = 24
-"""Nodes of a branch; linear interpolation is then accurate to a hundredth of the offset."""
+"""Number of nodes of a branch; linear interpolation is then accurate to a hundredth of the offset."""
 SLIDERS: Final = 16
 """Maximum number of sliders at the load in a truth file."""
 DRY_TIME_S: Final = 0.01
 """Time constant of a drag that depends only on direction: two or three control cycles."""
 HIGHEST_SHAKE_HZ: Final = 500.0
 HOLDS: Final = 1.5
-"""Friction that holds the load in a dead zone, over its inertial torque at the highest acceleration."""
+"""Ratio of the friction that holds the load in a dead zone to its inertial torque at the highest
+acceleration."""
 MOST_HELD: Final = 0.3
 """Maximum wind-up of the spring by this friction, as a share of half the gap."""
 
@@ -506,7 +506,7 @@ def inertial_windup(effect: effects.InertialWindup, draft: Draft) -> None:
         )
         seconds2 = least
     inertia = seconds2 * draft.stiffness_nm_per_rad
-    known = draft.gear.get("stiffening") is not None or not draft.tells_servo
+    known = draft.gear.get("stiffening") is not None or not draft.sets_servo
     if known and inertia > draft.hanging_kg_m2:
         draft.set_inertia(inertia)
         draft.place = "load.inertia_kg_m2"
@@ -520,7 +520,7 @@ def inertial_windup(effect: effects.InertialWindup, draft: Draft) -> None:
 def velocity_windup(effect: effects.VelocityWindup, draft: Draft) -> None:
     """Sets shear-thinning viscous friction at the load, and the dry part as a fast creep element.
 
-    Coulomb friction at the load would keep its wind-up at rest, which the model does not.
+    The wind-up of Coulomb friction at the load would remain at rest, unlike that of the model.
     """
     places = []
     if effect.viscous_arcsec_s_per_deg:
@@ -538,7 +538,7 @@ def velocity_windup(effect: effects.VelocityWindup, draft: Draft) -> None:
 
 
 def hysteresis_parameters(effect: effects.HysteresisParameters, draft: Draft) -> None:
-    """Replaces the model's loop by the changed one."""
+    """Replaces the model's loop by the changed loop."""
     draft.gear.pop("hysteresis", None)
     draft.load.pop("presliding", None)
     hysteresis(effect.changed().law(), draft)
@@ -601,7 +601,7 @@ def _lagging(effect: effects.Hysteresis | effects.HysteresisMemory, draft: Draft
 
 
 def backlash(effect: effects.Backlash, draft: Draft) -> None:
-    """Sets a dead zone between spring and load, with friction that holds the load in it."""
+    """Sets a dead zone between spring and load, with friction that holds the load within it."""
     half, per_nm = 0.5 * effect.gap_arcsec, ARCSEC_PER_RAD / draft.stiffness_nm_per_rad
     acceleration = math.radians(draft.axis.limits.acceleration_deg_s2)
     already_nm = float(draft.load.get("coulomb_nm") or 0.0)
@@ -661,7 +661,7 @@ OF_GEAR: Final = (
     "torque_growth_per_nm", "backlash_arcsec", "rate_dependence", "wear", "ageing", "creep", "damage",
     "roller", "seat",
 )  # fmt: skip
-"""Keys of the section `gear` for transmission error, which a model replaces."""
+"""Keys of the section `gear` for transmission error, which are replaced by those of a model."""
 OF_ENCODERS: Final = ("disc", "late_ms", "losses", "signals", "cable", "sensor_warming")
 OF_TEMPERATURE: Final = (
     "zero_drift_arcsec_per_k", "zero_time_constant_s", "reference_c", "tooth_growth_per_k",
@@ -677,7 +677,7 @@ class Row:
     counterpart: str | None
     """Dotted paths in the truth file; None if the plant has no counterpart."""
     note: str
-    """Differences, or the reason why there is no counterpart; empty for an exact translation."""
+    """Differences, or the reason for the lack of a counterpart; empty for an exact translation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -686,7 +686,7 @@ class Translation:
 
     truth: Truth
     rows: tuple[Row, ...]
-    """One row per effect of the model, in the order of the catalogue; effects outside it come last."""
+    """One row per effect of the model, in catalogue order; effects outside it come last."""
 
 
 class Entry(NamedTuple):
@@ -695,7 +695,7 @@ class Entry(NamedTuple):
     counterpart: str
     """Dotted paths in the truth file."""
     write: Callable[[Any, Draft], None]
-    """Writes an effect of this kind to a draft, with the place (if there are several) and differences."""
+    """Writes an effect of this kind to a draft, with its path (if there are several) and differences."""
 
 
 TABLE: Final[Mapping[str, Entry]] = MappingProxyType(
@@ -739,15 +739,15 @@ def translate(
 ) -> Translation:
     """Returns the simulated drive with the model's errors, on the axis of the axis file.
 
-    ``base`` (default: usual values) provides everything that the model does not describe. Without a model it
-    keeps its transmission error. InputError if the model has another gear ratio, or a value that the plant
-    cannot have.
+    ``base`` (default: usual values) provides everything that the model does not describe. Without a model,
+    ``base`` keeps its transmission error. InputError if the model has another gear ratio, or a value that the
+    plant cannot have.
     """
     truth = _of_axis(axis, base) if base is not None else default_truth(axis)
     if model is None:
         return Translation(truth, ())
     model.check_ratio(axis)
-    draft = Draft(_without_error(truth, axis), axis, tells_servo=base is None)
+    draft = Draft(_without_error(truth, axis), axis, sets_servo=base is None)
     by_name = {each.name: each for each in model.effects}
     rows = {name: Row(name, None, UNKNOWN) for name in (*effects.CATALOGUE, *by_name) if name in by_name}
     for name, entry in TABLE.items():

@@ -1,8 +1,8 @@
-"""The twin of an axis: makes it from recordings, judges it, and keeps it as a file.
+"""Twin of an axis: fit to recordings, verdict, and file.
 
-A fit assumes that the simulated drive can behave like the axis. The residuals on held-out legs show if that
-is so. Only a twin that explains every channel has the values of the axis. Any other twin replays the motion,
-and its values are those of a different drive with similar motion.
+A fit assumes that the simulated drive can behave like the axis. The residuals on held-out legs test this
+assumption. Only the values of a twin that explains every channel are those of the axis. Any other twin merely
+replays the motion: its values belong to a different drive with similar motion.
 
 profiles/NAME/twin.yaml           the active twin, which `hdbridge simulate` and `--simulate` use
               pending-twin.yaml   proposed by `hdbridge twin`, not yet committed
@@ -75,13 +75,13 @@ class Twin:
     """A simulated drive fitted to an axis."""
 
     truth: Truth
-    """Parameters with the intervals of the fitted ones; its provenance holds the data that `check` needs."""
+    """Parameters, with intervals of the fitted ones; the provenance contains the data for `check`."""
     findings: tuple[Finding, ...]
-    """Causes by which the initial simulation was wrong, if its values were the axis's."""
+    """Causes of the errors of the initial simulation, if its values were the axis's."""
     alike: tuple[Alike, ...]
-    """Sets of parameters that the recorded motion does not separate."""
+    """Sets of parameters that are not separable in the recorded motion."""
     left: tuple[Left, ...]
-    """Residual of each recorded channel, on held-out legs if there are any."""
+    """Residual of each recorded channel, on held-out legs if any."""
     before: Comparison
     """Recordings against the initial simulation; the kind `HELD_OUT` covers the held-out legs."""
     after: Comparison
@@ -91,7 +91,7 @@ class Twin:
 
     @property
     def values(self) -> Values:
-        """Origin of its values: the axis, or only a replay."""
+        """Origin of the values: the axis, or only a replay."""
         return Values.of(self.truth) or Values.REPLAY
 
     @property
@@ -105,18 +105,19 @@ class Twin:
 
 SIGNALS: Final = (LOAD_ERROR, FOLLOWING_ERROR, MOTOR_TORQUE, TEMPERATURE)
 LEAST_GAIN: Final = 0.01
-"""Minimum reduction of the mean ratio of the differences; smaller ones are due to noise."""
+"""Minimum reduction of the mean ratio of the differences; smaller reductions are due to noise."""
 EQUAL: Final = 0.01
-"""Share of the noise below which differences are equal; a few held-out readings may all agree."""
+"""Share of the noise below which differences count as equal, because a few held-out readings may all
+agree."""
 WORSE: Final = 1.1
-"""Ratio of the differences after and before above which a signal is worse, if it exceeds its noise."""
+"""Ratio of the differences after and before above which a signal counts as worse, if it exceeds its noise."""
 DECADE: Final = 10.0
-"""Maximum ratio of a motor's inertia to the usual one for its rated torque, and of load and motor inertia
+"""Maximum ratio of a motor's inertia to the usual inertia for its rated torque, and of load to motor inertia
 seen by the motor. Servo motors of equal torque differ by a factor of three to five (catalogues)."""
 
 
 def impossible(truth: Truth, axis: AxisConfig, cycle_s: float) -> tuple[str, ...]:
-    """Returns values of a truth that are impossible for this axis file, each in a sentence."""
+    """Returns the values of a truth that are impossible for this axis file, each in a sentence."""
     motor, servo = truth.motor, truth.servo
     usual = default_truth(axis).motor.inertia_kg_m2
     load = truth.load_.whole_inertia_kg_m2 / axis.gear.ratio**2
@@ -153,7 +154,7 @@ class Verdict:
 
 
 def judge(twin: Twin) -> Verdict:
-    """Decides if a twin is kept, and states the validity of its values first."""
+    """Decides whether to keep a twin; the reason first states the validity of its values."""
     gain = better(twin.before, twin.after)
     if twin.impossible:
         return Verdict(False, f"the twin is not kept: no axis has these values: {'; '.join(twin.impossible)}")
@@ -183,9 +184,9 @@ def replays_only(twin: Twin) -> str:
 
 
 def better(before: Comparison, after: Comparison) -> Verdict:
-    """Compares the rms differences of load error, following error, torque and temperature, if recorded.
+    """Compares the rms differences of load error, following error, torque and (if recorded) temperature.
 
-    On held-out legs, or on all legs if none was held out.
+    On held-out legs, or on all legs without any.
     """
     kind = HELD_OUT if any(row.kind == HELD_OUT for row in after.rows) else ALL
     where = "on legs that the fit has not seen" if kind == HELD_OUT else "on the legs that it was fitted to"
@@ -262,7 +263,7 @@ HEADER: Final = (
 
 @dataclass(frozen=True)
 class KeptTwin:
-    """A twin and the file that it was read from."""
+    """Twin, and the file from which it was read."""
 
     truth: Truth
     path: Path | None = field(default=None, compare=False)
@@ -274,7 +275,7 @@ class KeptTwin:
 
     @property
     def provenance(self) -> Mapping[str, Any]:
-        """Axis, drive and gear to which it is bound, date, reason and recordings."""
+        """Axis, drive and gear to which the twin is bound, date, reason and recordings."""
         return self.truth.provenance
 
     def with_provenance(self, **provenance: Any) -> Self:
@@ -283,13 +284,13 @@ class KeptTwin:
         return type(self)(self.truth.model_copy(update={"provenance": known}), self.path)
 
     def bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> Self:
-        """Returns the twin bound to an axis and the drive that answered (else the axis file's)."""
+        """Returns the twin bound to an axis and the drive that answered (else that of the axis file)."""
         return self.with_provenance(**binding(axis, identity))
 
     def check_ratio(self, axis: AxisConfig) -> None:
         """Raises InputError if the twin has another gear ratio than the axis file.
 
-        The ratio compared is the one of the measurement; the gear's true ratio may differ by a `ratio_error`.
+        The compared ratio is that of the measurement; the gear's true ratio may differ by a `ratio_error`.
         """
         bound = Provenance.model_validate(self.truth.provenance).gear
         ratio, allowed = (bound.ratio, 1e-9) if bound else (self.truth.gear.ratio, WRONG_RATIO)
@@ -305,7 +306,7 @@ class KeptTwin:
         check_binding(self.truth.provenance, axis, identity, self._name(), "twin", "make one")
 
     def dump(self) -> str:
-        """Returns the file's text, which reads back exactly; default values are omitted."""
+        """Returns the file's text, from which the same twin is read; default values are omitted."""
         data = self.truth.model_dump(by_alias=True, mode="json", exclude_defaults=True)
         provenance = data.get("provenance", {})
         drive = provenance.get("drive")
@@ -334,7 +335,6 @@ TWINS: Final = Store(
     "hdbridge model log PROFILE --twin",
     KeptTwin.load,
 )
-"""The twins of a profile."""
 
 
 # ----------------------------------------------------------------
@@ -348,13 +348,13 @@ def fit_twin(
     progress: Callable[[float], None] = lambda _: None,
     workers: int | None = None,
 ) -> Twin:
-    """Fits the twin of an axis to recordings that have the commanded motor angle.
+    """Fits the twin of an axis to recordings with the commanded motor angle.
 
     ``start`` is the initial simulation: the translated axis file and model, or an older twin. Replays run in
     ``workers`` threads. InputError if a recording has no command or is of another gear.
 
-    Causes are named only if the values before and after the fit are the axis's; intervals are given only if
-    those after it are. Otherwise a measured response is added, if held-out legs confirm it.
+    Causes are named only if the values before and after the fit are the axis's, and intervals given only if
+    those after the fit are. Otherwise a measured response is added if held-out legs confirm it.
     """
     whole = Recording.joined(list(recordings))
     plain = start.model_copy(update={"servo": start.servo.model_copy(update={"response": None})})
@@ -393,7 +393,7 @@ def fit_twin(
 
 
 def _wrong(replays: Replays, start: Truth, fitted: Fitted) -> tuple[Finding, ...]:
-    """Names the values of the start that were wrong, on a few legs; the values after are the fit's."""
+    """Names the wrong values of the start on a few legs; the values after are those of the fit."""
     few, like = replays.rough, by_law_of(with_sections(start, fitted.parameters), fitted.truth)
     was = scales_by_kind(few.data, misfit_of(replays.data, fitted.residuals), noise_floor(few.data))
     groups = by_cause(fitted.parameters)
@@ -409,7 +409,7 @@ def _compared(whole: Recording, axis: AxisConfig, truth: Truth) -> Comparison:
 
 
 def with_knowledge(fitted: Fitted, data: Data, values: Values = Values.AXIS) -> Truth:
-    """Returns the fitted truth with its intervals, and the data for a later check in its provenance."""
+    """Returns the fitted truth with its intervals, and with the data for a later check in its provenance."""
     intervals = fitted.intervals()
     about: dict[str, Any] = {
         "parameters": [each.name for each in fitted.parameters],

@@ -24,7 +24,7 @@ def bench(rng: np.random.Generator) -> np.ndarray:
 
 
 def kept(angle: np.ndarray, digits: int) -> np.ndarray:
-    """As a file of so many significant digits has it."""
+    """Rounds values to this number of significant digits, as in a file."""
     return np.array([float(f"{each:.{digits}g}") for each in angle.tolist()])
 
 

@@ -75,7 +75,7 @@ def test_a_quickly_changing_lag_is_not_encoder_noise() -> None:
 def test_fast_moves_of_a_healthy_axis_yield_a_remark_only(
     order: MotorOrder, move_s: float, way_deg: float, every_s: float
 ) -> None:
-    """The record begins in the middle of a move, with the elastic state of what went before."""
+    """The record begins in the middle of a move, with the elastic state of the motion before."""
     step_s, number = 0.0005, 48
     clock_s = np.arange(round(number * 2.0 * move_s / step_s)) * step_s
     move, since_s = np.divmod(clock_s, 2.0 * move_s)

@@ -87,7 +87,7 @@ def test_power_is_on_only_while_a_procedure_runs_and_switching_moves_nothing(axi
 
 
 def test_pauses_between_procedures_are_allowed(axis, bench_on):
-    """A pause without heartbeats (files are written, say) is no fault while power is off."""
+    """A pause without heartbeats, for example to write files, is not a fault while power is off."""
     drive, _ = bench_on
     bench = Bench(drive)
     bench.run(Moves(MoveTo(1.0)))

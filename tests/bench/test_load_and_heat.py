@@ -66,7 +66,7 @@ class Moves:
 
 
 class Script:
-    """Something to do in given cycles of a run: what a bench asks in each cycle."""
+    """Actions in given cycles of a run; a bench calls it in each cycle."""
 
     def __init__(self, **at):
         self._at = {int(cycle.removeprefix("cycle_")): todo for cycle, todo in at.items()}

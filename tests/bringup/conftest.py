@@ -1,4 +1,4 @@
-"""Shared by the tests of the bring-up: the article's axis with one thing wrong, and what is found."""
+"""Shared by the tests of the bring-up: the article's axis with one fault, and the findings."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

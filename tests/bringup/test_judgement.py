@@ -221,7 +221,7 @@ def test_checks_run_in_order_with_their_prerequisites() -> None:
         Check("e", "E", lambda _: passed("never"), moves=True),
     ]
     told: list[str] = []
-    rows = run_checks(None, checks, tell=lambda row: told.append(row.check.name))
+    rows = run_checks(None, checks, notify=lambda row: told.append(row.check.name))
     assert told == list("abcde")
     assert [row.verdict.outcome.value for row in rows] == ["pass", "fail", "not possible", "fail", "pass"]
     assert rows[1].verdict.measured == "no answer"

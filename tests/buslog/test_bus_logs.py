@@ -218,7 +218,7 @@ def test_an_mf4_log_without_its_reader_names_the_extra(tmp_path: Path) -> None:
 def test_without_6062h_the_target_is_the_command(
     tmp_path: Path, without_demand: Logged, logged: Logged
 ) -> None:
-    """The same axis and seed: the drive reaches what was sent two cycles before."""
+    """Same axis and seed: the drive reaches the target sent two cycles before."""
     recording = import_log(without_demand.write(tmp_path / "bus.log"), AXIS)
     target = recording.record.motor_target_deg
     assert target is not None

@@ -75,7 +75,7 @@ def cell(tmp_path):
 
 @pytest.fixture(scope="session")
 def calibrated_once(tmp_path_factory):
-    """A calibration that was run once, for everybody to copy; with what the command printed."""
+    """Calibration that was run once, for all tests to copy, with the output of the command."""
     cell = Cell(tmp_path_factory.mktemp("calibrated") / "cell")
     done = cell.calibrate("--plan", "short.yaml", "--out", "rec", "--json", "result.json")
     return cell, done

@@ -21,7 +21,7 @@ def hdbridge(tmp_path):
 
 @pytest.fixture
 def process(tmp_path):
-    """The same in a process of its own, for what is done with its standard output."""
+    """Runs a command in a process of its own, for tests of its standard output."""
 
     def run(*arguments: object) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
@@ -37,7 +37,7 @@ def process(tmp_path):
 
 @pytest.fixture
 def unread(tmp_path):
-    """Run `hdbridge ARGS... | true`, where nobody reads what it prints: its standard error."""
+    """Runs `hdbridge ARGS... | true`, whose output nobody reads; returns its standard error."""
 
     def run(*arguments: object) -> str:
         reader, writer = os.pipe()

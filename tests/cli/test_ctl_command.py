@@ -34,7 +34,7 @@ def machine(place, monkeypatch):
 
 @pytest.fixture
 def ctl(hdbridge, machine):
-    """Run `hdbridge ctl ARGS...`; what it prints, after it was checked that it went well."""
+    """Runs `hdbridge ctl ARGS...`, checks that it succeeds, and returns its output."""
 
     def run(*arguments: object, status: int = 0) -> str:
         done = hdbridge("ctl", *arguments)

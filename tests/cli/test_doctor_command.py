@@ -41,7 +41,7 @@ def test_a_real_axis_moves_only_with_consent(hdbridge, monkeypatch):
     monkeypatch.setattr(Session, "connected", lambda session: real(replace(session, simulate=True)))
     done = hdbridge("doctor", "article")
     assert done.returncode == 4
-    assert "Keep the way clear" in done.stderr
+    assert "Keep the path clear" in done.stderr
     assert "not possible  power on at rest" in done.stdout
     assert "FAIL" not in done.stdout
     assert "motion was not confirmed" in done.stderr

@@ -26,7 +26,9 @@ RECORD = "time_s,motor_position_deg,load_position_deg\n" + "".join(
 
 @pytest.fixture
 def bench(tmp_path, profile):
-    """A folder with a profile, a record and a recording, and a function that says whether they stand."""
+    """A folder with a profile, a record and a recording, and a function that checks that they are
+    unchanged.
+    """
     (tmp_path / "one.csv").write_text(RECORD)
     (tmp_path / "other.csv").write_text(RECORD)
     shutil.copytree(profile.folder, tmp_path / "p")
@@ -53,8 +55,8 @@ def bench(tmp_path, profile):
         ("fit one.csv --ratio 50 --json one.csv", "--json would overwrite one.csv, which this command reads"),
         ("fit one.csv --ratio 50 --html sub/../one.csv", "--html would overwrite one.csv"),
         ("fit one.csv --ratio 50 --json other.csv", "which is not a result of hdbridge"),
-        ("fit one.csv --ratio 50 --out out --json out", "--out and --json both write there"),
-        ("fit one.csv --ratio 50 --out Out --json out", "both write there"),
+        ("fit one.csv --ratio 50 --out out --json out", "--out and --json both write to this path"),
+        ("fit one.csv --ratio 50 --out Out --json out", "both write to this path"),
         ("fit one.csv --ratio 50 --out p/model.yaml", "hdbridge model commit"),
         ("fit one.csv --ratio 50 --out p/axis.yaml", "file of a profile"),
         ("fit rec --ratio 50 --json rec/sweep.csv", "of the recording"),
@@ -187,7 +189,7 @@ def _linked(path: Path, link: typing.Callable[[Path, Path], None]) -> Path:
 
 
 def _is_seen_to_be_one(one: Path, other: Path) -> None:
-    with pytest.raises(InputError, match="both write there"):
+    with pytest.raises(InputError, match="both write to this path"):
         check_outputs([Output("--json", one, Kind.JSON), Output("--html", other, Kind.JSON)])
     check_outputs([Output("--json", one, Kind.JSON), Output("--html", other.parent / "two", Kind.PAGE)])
 
@@ -210,7 +212,7 @@ def test_aliases_of_a_future_file_are_recognised(tmp_path_factory, names):
 
 
 def test_every_output_option_is_guarded():
-    """`--json` and `--html` everywhere; whatever else names what it writes, by the word in its help."""
+    """`--json` and `--html` are outputs everywhere; other outputs begin their help with "Write"."""
     for name in (name for panel in PANELS.values() for name in panel):
         loaded = load(name)
         groups = [each.typer_instance for each in loaded.registered_groups]
@@ -222,6 +224,6 @@ def test_every_output_option_is_guarded():
                 )
                 says = (info.help or "") if info else ""
                 names_a_place = bool not in typing.get_args(hint)  # a flag does not
-                writes = names_a_place and says.startswith(("Write", "Keep what", "Where the re"))
+                writes = names_a_place and says.startswith("Write")
                 guarded = any(isinstance(each, Kind) for each in getattr(hint, "__metadata__", ()))
                 assert writes == guarded, (name, parameter, says)

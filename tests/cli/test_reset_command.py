@@ -17,7 +17,7 @@ ASKS = re.compile(r"\breset (it|its|the (fault|axis|drive)|that)\b")
 
 @pytest.fixture
 def faulty():
-    """A drive in fault that this process reaches, and how to say so on the command line."""
+    """Drive in fault in this process, and the command-line options that address it."""
     with simulated_drive("article", bus="virtual") as drive:
         drive.fault("drive_fault", code=0x3210)
         drive.sleep(0.5)

@@ -41,7 +41,7 @@ def test_an_object_is_written_and_read_back(hdbridge, tmp_path):
         (("get", "2345h"), "2345h:00: neither the EDS nor the profile has this object"),
         (("get", "1018h:9"), "it has the sub-indices 00, 01, 02, 03, 04"),
         (("get", "Position actual"), "did you mean 'Position actual value'?"),
-        (("set", "6064h", "3"), "can only be read, by the EDS; nothing was written"),
+        (("set", "6064h", "3"), "is read-only in the EDS; nothing was written"),
         (("set", "6065h", "-3"), "found '-3'; expected an integer from 0 to 4294967295 (uint32)"),
         (("set", "6065h", "few"), "found 'few'; expected an integer"),
     ],

@@ -113,7 +113,7 @@ def test_a_subclass_of_an_error_arrives_as_its_public_base_class():
 
 
 def test_subclasses_precede_their_base_classes_in_the_table():
-    """A kind that stands behind one that it is derived from would never be told."""
+    """A kind listed after its base class would never be reported."""
     kinds = list(STATUS)
     assert [
         (early, late)

@@ -105,7 +105,7 @@ def test_the_filter_has_no_peak_where_nothing_was_measured():
 
 
 def test_a_run_that_explores_extends_the_known_range():
-    """The correction of rest has no effect at high frequencies that could be seen in the noise."""
+    """The static correction has no effect at high frequencies that could be seen in the noise."""
 
     def answer(hertz: float) -> complex:
         return 1.0 / (1.0 + 1j * hertz / 15.0) ** 2

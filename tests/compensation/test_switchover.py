@@ -94,7 +94,7 @@ def test_a_change_is_continuous_and_ends_at_the_new_model(old, new, before, afte
 
 @given(models, speeds)
 def test_the_new_model_starts_in_the_state_given_by_the_path(its, way):
-    """At rest from the beginning of the change on: nothing but the path before can tell it."""
+    """At rest from the beginning of the change, only the earlier path determines the state."""
     correction, alone = Correction(made(its)), made(its)
     load = 0.0
     for load in places([(2.0, 100), *way]):

@@ -25,7 +25,7 @@ Frame = tuple[int, bytes]
 
 
 class Spoiled:
-    """A bus that changes what the node sends and receives."""
+    """Bus that modifies the frames that the node sends and receives."""
 
     def __init__(self, bus: can.BusABC) -> None:
         self.bus = bus

@@ -131,7 +131,7 @@ class Rig:
         raise AssertionError(f"no stop within {cycles} cycles; target went from {first} to {self.target}")
 
     def stands_still(self) -> None:
-        """Time passes without the master: the axis comes to rest where it is, and stays."""
+        """Lets time pass without the master; the axis comes to rest and stays there."""
         self.clock.sleep_until(self.clock.now() + 1.0)
         place = self.node.firmware.motion.machine.motor_counts
         self.clock.sleep_until(self.clock.now() + 0.5)

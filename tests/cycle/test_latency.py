@@ -105,7 +105,7 @@ def test_report_names_the_shortest_sustained_cycle() -> None:
     assert [each.period_s for each in report.measurements] == [0.001, 0.002, 0.004]
     assert [each.carried for each in report.measurements] == [False, True, True]
     assert report.carried_s == 0.002
-    assert "carries a cycle of 2 ms" in report.table()
+    assert "sustains a cycle of 2 ms" in report.table()
     assert report.as_dict()["carried_cycle_ms"] == 2.0
 
 

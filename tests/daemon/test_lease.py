@@ -68,7 +68,7 @@ def test_a_lease_expires_unless_it_is_used(lease: Lease, time: Time) -> None:
     lease.check(token)
     time.s = 29.98
     assert lease.holder is None
-    with pytest.raises(LeaseError, match="run out"):
+    with pytest.raises(LeaseError, match="expired"):
         lease.check(token)
 
 

@@ -133,7 +133,7 @@ def test_the_unit_is_shown_written_and_removed(
     for option in ("--yes", "--remove"):
         refused = run_here(tmp_path, "install-service", folder, "--user", option)
         assert refused.returncode == 2
-        assert "is not of this program" in refused.stderr
+        assert "was not written by this program" in refused.stderr
     assert unit.read_text(encoding="utf-8") == "[Service]\n"
 
 

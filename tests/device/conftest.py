@@ -16,7 +16,7 @@ PERIOD_S = 0.004
 
 
 class RawMaster:
-    """Writes and reads frames as bytes; knows nothing of the package's master."""
+    """Writes and reads frames as bytes, independently of the package's master."""
 
     def __init__(self, bus: LockstepBus, clock: VirtualClock, node: DriveNode, motor: IdealMotor) -> None:
         self.bus, self.clock, self.node, self.motor = bus, clock, node, motor

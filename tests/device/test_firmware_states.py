@@ -6,7 +6,7 @@ import pytest
 
 
 def test_a_repeated_controlword_does_not_enable_again(master):
-    """A target stream that goes on, with a stale 'enable', must not undo a stop."""
+    """A continuing target stream with a stale 'enable' must not undo a stop."""
     master.put(0x6007, 0, 3, 2)
     master.put(0x605A, 0, 6, 2)
     master.put(0x1016, 1, 0x7F0032, 4)

@@ -313,7 +313,7 @@ def after(event: str, state: str) -> tuple[str, ...]:
 @pytest.mark.parametrize("event", EVENTS)
 @pytest.mark.parametrize("state", STATES)
 def test_every_event_in_every_state_and_then_every_command(state, event, behaviour):
-    """Events lead where the standard says; then each command does what the table demands of that state."""
+    """Events lead to the states of the standard; each command then follows the table in that state."""
     commands = (0x00, 0x02, 0x06, 0x07, 0x0F, 0x8F)
     with slave(behaviour) as node:
         for word in commands:

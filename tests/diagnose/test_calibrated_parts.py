@@ -26,8 +26,8 @@ SEEDS = range(401, 407)
 def run_out(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> Callable[[int], tuple[float, Diagnosis]]:
-    """A load encoder's run-out beside a known spring under the same mass; the spring in the model, and what
-    is found.
+    """Run-out of a load encoder next to a known spring under the same mass; returns the modelled spring and
+    the findings.
     """
 
     def run(seed: int) -> tuple[float, Diagnosis]:

@@ -32,7 +32,7 @@ def names(found: Diagnosis) -> list[str]:
 
 
 def often_enough(right: int, of: int, rate: float) -> bool:
-    """True if so many right ones are no evidence against a rate, at 1 %."""
+    """Returns True if this number of correct findings does not contradict a rate, at 1 %."""
     return float(bdtr(right, of, rate)) > 0.01
 
 

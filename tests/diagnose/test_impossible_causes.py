@@ -35,7 +35,7 @@ MODEL = TransmissionModel(
 
 
 def sweeps(error_arcsec: Callable[[Any], Any], *legs: tuple[float, float]) -> Record:
-    """Legs of so many load turns at so many motor turns per second, and an error over the load angle."""
+    """Legs of this many load turns at this many motor turns per second, and an error over the load angle."""
     angles, at = [], 0.0
     for turns, motor_turns_s in legs:
         count = round(abs(turns) * RATIO / motor_turns_s * RATE_HZ)

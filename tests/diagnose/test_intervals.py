@@ -36,8 +36,9 @@ def held(parameter: Parameter, name: str, truth: float) -> bool:
 
 
 def hidden(seed: int) -> tuple[dict[str, Any], Hypothesis, dict[str, float]]:
-    """A wave of the flexspline, a ramp and a load order: for the plant, about right as effects, and as they
-    should be told."""
+    """Wave of the flexspline, ramp and load order: for the plant, as approximate effects, and as the
+    expected result.
+    """
     rng = np.random.default_rng(seed)
     order, turn, angle = int(rng.integers(2, 6)), *rng.uniform(-180.0, 180.0, 2)
     wave, ramp, run_out = rng.uniform(3.0, 6.0), rng.uniform(0.1, 0.2), rng.uniform(3.0, 6.0)

@@ -1,4 +1,4 @@
-"""Detection limits are what a diagnosis names, and what counts as a repetition."""
+"""Detection limits agree with the findings of a diagnosis; definition of a repetition."""
 
 from __future__ import annotations
 

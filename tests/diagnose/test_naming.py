@@ -41,7 +41,7 @@ def drifting(columns: Callable[..., dict[str, Any]], model: TransmissionModel) -
 
 
 def test_drift_is_reported_from_the_model_temperature(drifting: Callable[..., Diagnosis]) -> None:
-    """From any other the amplitudes of the model would have changed beside it."""
+    """From any other temperature, the model's amplitudes would appear to have changed as well."""
     result = drifting(0.025, rise_k=10.0, warmer_k=14.0)
     assert names(result) == ["amplitude_drift"]
     growth = result.findings[0].parameters["ripple_percent_per_k"]

@@ -1,7 +1,7 @@
-"""Rate of hidden causes that are named first, and rate of false names.
+"""Rate of hidden causes that are reported first, and rate of false findings.
 
-One record says little: what is claimed is a rate, and what is counted over records drawn at random has to be
-as large as that rate allows. A few in every run; more of them in the slow tests, and in the blind suites.
+A single record proves little: the claim is a rate, and the count over random records must be as large as this
+rate allows. Each run uses a few records; the slow tests and the blind suites use more.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from hdbridge.records.record import Record
 def sloping(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> Callable[[float, float], Diagnosis]:
-    """A record whose load errs by so many arcsec at its end, evenly from a share of its travel on."""
+    """Record whose load error rises to this many arcsec at its end, from a share of its travel on."""
 
     def run(begins: float, arcsec: float) -> Diagnosis:
         record = columns()

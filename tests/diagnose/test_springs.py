@@ -20,7 +20,7 @@ SEEDS = range(201, 209)
 def stiffening(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> Callable[[int], tuple[dict[str, float], Diagnosis]]:
-    """A mass on a spring that stiffens at some torque, drawn by the seed: the spring, and what is found."""
+    """Mass on a spring that stiffens at some torque, drawn by the seed; the spring, and the findings."""
 
     def run(seed: int) -> tuple[dict[str, float], Diagnosis]:
         rng = np.random.default_rng(seed)

@@ -35,7 +35,7 @@ from hdbridge.records.record import Record
 
 Columns = Callable[..., dict[str, Any]]
 HELD = 0.95
-"""Share of truths that intervals say they hold."""
+"""Nominal share of truths within the intervals."""
 
 
 def parameters(record: dict[str, Any], model: TransmissionModel, effect: Effect) -> dict[str, Parameter]:

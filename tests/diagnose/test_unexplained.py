@@ -27,7 +27,7 @@ def test_local_unknown_effects_are_unexplained(diagnosed: Callable[..., Diagnosi
 
 
 def test_effects_below_a_motor_count_are_remarks(diagnosed: Callable[..., Diagnosis]) -> None:
-    """A count of the motor is 3.2 arcsec at the load: nobody can act on less."""
+    """A motor count is 3.2 arcsec at the load; smaller effects cannot be acted on."""
     result = diagnosed({"unknown": {"kind": "packet", "size": 2.8, "width": 12.0}})
     assert not result.findings
     (remark,) = [each for each in result.remarks if "beyond the noise" in each]

@@ -23,7 +23,7 @@ def run(pytester: pytest.Pytester, *arguments: str) -> pytest.RunResult:
 
 
 def test_the_example_in_lockstep(pytester):
-    """And the one with canopen, which says by its marker that it needs real time."""
+    """Also the example with canopen, which states by its marker that it needs real time."""
     run(pytester).assert_outcomes(passed=13, skipped=1)
 
 

@@ -81,7 +81,7 @@ def test_a_drive_ignoring_a_transition(drive: Drive, tiny: Any) -> None:
     original = tiny.control
     tiny.control = lambda word: original(word) if word & 0x0F != 0x07 else None
     with pytest.raises(
-        TransitionError, match=r"'switched on' did not come about within 1 s.*'ready to switch on'"
+        TransitionError, match=r"'switched on' did not occur within 1 s.*'ready to switch on'"
     ):
         drive.enable(Mode.PP)
 
@@ -129,7 +129,7 @@ def test_speeds_beyond_the_limit_are_refused(drive: Drive, tiny: Any, velocity: 
 
 def test_a_blocked_axis_is_stopped_after_a_bounded_time(drive: Drive, tiny: Any) -> None:
     tiny.blocked = True
-    with pytest.raises(TransitionError, match="arrival at 2 deg did not come about"):
+    with pytest.raises(TransitionError, match="arrival at 2 deg did not occur"):
         drive.move_to(2.0)
     assert tiny.state == 0x07
 

@@ -21,7 +21,7 @@ def message(can_id: int = 0x181, data: bytes = b"\x01", **flags: bool) -> can.Me
 
 
 class FakeBus(can.BusABC):
-    """Gives what is queued, or raises it."""
+    """Returns queued messages, or raises queued errors."""
 
     def __init__(self, *inbox: can.Message | Exception | None, on_send: Exception | None = None) -> None:
         super().__init__(channel="x")

@@ -31,7 +31,7 @@ SDO_REQUEST = (0x601, b"\x40\x00\x10\0\0\0\0\0")
 def bench(
     *frames: tuple[int, bytes], period_s: float = 0.1
 ) -> Iterator[tuple[can.BusABC, VirtualClock, can.BusABC]]:
-    """The master's end of a bus on which somebody sends ``frames``, and a witness that hears what is sent."""
+    """Master's end of a bus on which another node sends ``frames``, and a witness of the sent frames."""
     channel = f"manners-{uuid4()}"
     truth = Truth.load(bundled_profile("article"))
     with ExitStack() as stack:

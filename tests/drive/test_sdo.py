@@ -229,7 +229,7 @@ def test_types_without_an_eds(bus: Any, clock: Any, tiny: Any) -> None:
 
 
 def test_a_non_integer_object_is_refused(client: SdoClient) -> None:
-    with pytest.raises(SdoError, match="not an integer by the EDS"):
+    with pytest.raises(SdoError, match="not an integer in the EDS"):
         client.read(0x1008)
 
 

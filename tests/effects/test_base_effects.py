@@ -61,7 +61,7 @@ def test_loops_wider_than_the_width_reach_the_offset_and_narrow_ones_have_the_he
 
 @given(effect=loops, path=paths, start=starts)
 def test_error_is_continuous_also_at_reversals(effect, path, start):
-    """A step of 1e-9 deg anywhere, in either direction, moves the error by what the law gives it."""
+    """A step of 1e-9 deg anywhere, in either direction, changes the error as predicted by the law."""
     tracker = effect.tracker(start)
     for angle in path:
         before = tracker.advance(float(angle), Moment())

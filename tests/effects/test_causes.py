@@ -154,7 +154,7 @@ def test_the_lower_torque_comes_first():
 
 
 def test_skew_is_what_a_late_sample_shows_also_while_it_accelerates():
-    """Against positions sampled late, with the true speed given: what is left is of third order."""
+    """Compared with positions sampled late, at the true speed; the remainder is of third order."""
     time_s = np.linspace(0, 1, 400)
     angle = 3000 * np.sin(3 * time_s)
     late = 3000 * np.sin(3 * (time_s + 0.002))

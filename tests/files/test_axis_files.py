@@ -115,7 +115,8 @@ def test_a_valid_file_gives_nested_values_and_defaults(folder):
         ("name: test", "name: a b", "2:7: name: found 'a b'; expected text (name: letters, digits, '.', '_', '-')"),
         ("channel: test", "channel: [1]", "3:36: bus.channel: found a list; expected text or an integer (channel of that interface, for example can0)"),
         ("channel: test", "chanel: test", "3:27: bus.chanel: unknown key; did you mean 'channel'?"),
-        ("hdbridge.axis/1", "hdbridge.model/1", "1:9: schema: found 'hdbridge.model/1'; expected 'hdbridge.axis/1' (kind and version of this file); did you mean 'hdbridge.axis/1'?"),
+        ("hdbridge.axis/1", "hdbridge.model/1", "1:9: schema: found 'hdbridge.model/1'; expected "
+            "'hdbridge.axis/1' (schema and version of this file); did you mean 'hdbridge.axis/1'?"),
     ],
 )  # fmt: skip
 def test_a_wrong_file_gets_one_exact_line(folder, wanted, given, expected):

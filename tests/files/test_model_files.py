@@ -87,7 +87,8 @@ def axis(tmp_path) -> AxisConfig:
         ("ratio: 50\n", "", "1:1: key 'ratio' is missing; expected a number above 0, at most 1000 (N: motor turns per load turn)"),
         ("axis: test", "axis: 5", "12:9: provenance.axis: found 5; expected text (name of the axis)"),
         ("axis: test", "drive: {vendor: 1}", "12:11: provenance.drive.vendor: unknown key; did you mean 'vendor_id'?"),
-        ("hdbridge.model/1", "hdbridge.model/2", "1:9: schema: found 'hdbridge.model/2'; expected 'hdbridge.model/1' (kind and version of this file); did you mean 'hdbridge.model/1'?"),
+        ("hdbridge.model/1", "hdbridge.model/2", "1:9: schema: found 'hdbridge.model/2'; expected "
+            "'hdbridge.model/1' (schema and version of this file); did you mean 'hdbridge.model/1'?"),
     ],
 )  # fmt: skip
 def test_a_wrong_file_gets_one_exact_line(tmp_path, wanted, given, expected):

@@ -187,7 +187,7 @@ STEPS = st.lists(st.sampled_from(["commit", "activate", "rollback"]), max_size=1
 
 @given(STEPS, st.randoms(use_true_random=False))
 def test_rolling_back_undoes_activations_one_by_one(steps, random):
-    """Against the obvious model: a stack of what was active."""
+    """Compared with the obvious model: a stack of active versions."""
     log: list[Activation] = []
     stack: list[int] = []
     newest = 0

@@ -103,7 +103,7 @@ def test_errors_of_a_recording_are_never_raised(fleet, tmp_path):
 
 
 def test_a_task_leaves_no_reference_cycles(fleet):
-    """A worker collects rarely, so its memory would grow by what each diagnosis caches."""
+    """A worker rarely collects garbage, so its memory would grow by the caches of each diagnosis."""
     model = local_model(str(fleet / "model.yaml"))
     source = Source(str(fleet / "J1-0.csv.gz"), joint="J", ratio=50.0)
     gc.collect()

@@ -107,7 +107,7 @@ def nameplate(truth: Truth) -> Nameplate:
 
 
 def write_axis(truth: Truth, folder: Path) -> Path:
-    """Writes the axis file: what a person knows who installed the axis."""
+    """Writes the axis file with the data known to the installer of the axis."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "axis.yaml"
     path.write_text(f"""schema: hdbridge.axis/1

@@ -88,7 +88,7 @@ Law = PiNotch | Piv | Observed | StateFeedback
 STRUCTURES = {"pi_notch": PiNotch, "piv": Piv, "observed": Observed, "state_feedback": StateFeedback}
 INTERPOLATIONS = ("hold", "linear", "cubic")
 AT_REST = 1e-6
-"""Speed of a demand that rests, rad/s: what rounding leaves of a cubic."""
+"""Speed of a resting demand, rad/s: the rounding error of a cubic."""
 
 
 @dataclass(frozen=True)

@@ -268,7 +268,7 @@ async def test_early_targets_and_mode_changes_do_not_move_the_axis(bench):
 
 
 async def test_target_reached_means_that_the_load_rests_there(bench):
-    """The window is what the axis can do, so the load is no farther away from then on."""
+    """The window is the capability of the axis, so the load stays within it from then on."""
     plc = bench.plc
     await bench.write(0x6060, 0, 1, 1)
     await bench.enable()

@@ -59,9 +59,9 @@ LOOP: Parts = (
 FAST: Parts = (Sweep(-15.0, 65.0, SPEED_DEG_S),)
 """The same orders at another speed, over a part of the load's turn."""
 TURN: Parts = (Sweep(*REACH_DEG, SPEED_DEG_S),)
-"""Every load angle both ways: what depends on it, or on the torque of a mass."""
+"""Every load angle in both directions: shows dependence on the angle, or on the torque of a mass."""
 AGAIN: Parts = (Still(6.0), Sweep(-10.0, 12.0, 4.0)) * 4
-"""The same place again and again: what changes with time, temperature or wear."""
+"""Repeated visits to one place: shows changes with time, temperature or wear."""
 SPEEDS: Parts = (*FAST, Sweep(-10.0, 30.0, 12.0), Sweep(-4.0, 6.0, 0.7))
 RESTS: Parts = (*FAST, Still(12.0), Sweep(-30.0, 60.0, SPEED_DEG_S), Still(12.0))
 SWINGS: Parts = (Sweep(-15.0, 40.0, 3.0), Sines(0.0, (100.0,), 0.7, 8.0))
@@ -71,7 +71,7 @@ TWICE: Parts = (Sweep(*REACH_DEG, SPEED_DEG_S, laps=2),)
 TORQUES: Parts = (*TURN, Sweep(80.0, 102.0, 2.0), Sweep(170.0, 192.0, 2.0))
 """The same motor turns under several torques of a mass."""
 SLOW: Parts = (*SPEEDS, Sweep(-1.0, 1.0, 0.1))
-"""Down to speeds at which a loop that depends on speed is what it is at rest."""
+"""Down to speeds at which a speed-dependent loop equals its value at rest."""
 AT_REST = replace(STEPPING, settle=Settle(minimum_s=1.0))
 """For a loop that needs a while to forget its speed."""
 

@@ -111,7 +111,7 @@ def test_a_motor_that_rests_and_continues_in_the_same_direction_does_not_turn(co
 
 @pytest.mark.parametrize("rate_hz", [25.0, 50.0, 100.0, 250.0])
 def test_acceleration_effects_are_independent_of_the_sampling_rate(rate_hz: float) -> None:
-    """Moves that speed up and slow down as half a cosine in 0.25 s, told in whole counts."""
+    """Moves with half-cosine acceleration in 0.25 s, recorded in whole counts."""
     time = np.arange(0.0, 60.0, 1.0 / rate_hz)
     turn, amplitude = 2.0 * np.pi / 0.5, 45.0
     since = np.mod(time, 0.8137)

@@ -67,7 +67,7 @@ def test_friction_that_yields_before_it_slips_is_fitted_with_memory(bench: Any) 
 
 
 def test_a_loop_of_another_shape_does_not_bend_the_offset(bench: Any) -> None:
-    """Misfit of the shape is not a drift: what the runs far from any turning point show is the offset."""
+    """Misfit of the shape is not a drift: samples far from any turning point determine the offset."""
     found = fit(lagging(bench, bouc_wen).record(bench.plan()), 20.0, replace(bench.options, highest_order=6))
     (loop,) = found.model.effects[1:]
     assert loop.offset_arcsec == pytest.approx(-25.0, abs=0.5)

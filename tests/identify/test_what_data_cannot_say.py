@@ -98,7 +98,7 @@ def segment(**changes):
         (
             lambda: segment(time_s=np.arange(400)[::-1] / 50.0),
             20.0,
-            r"a\.csv: time_s of sample 1 lies before",
+            r"a\.csv: time_s of sample 1 is earlier than",
         ),
         (segment, 21.0, r"a\.csv: the motor makes 20 turns per turn of the load .*; expected a ratio of 21"),
         (segment, -20.0, "ratio"),

@@ -84,7 +84,7 @@ class Cell:
         return self._run(self.folder, arguments, status)
 
     def improve(self, *arguments, status=0):
-        """The result for machines and what was printed."""
+        """Returns the JSON result and the printed output."""
         options = ("--simulate", "--plan", "small.yaml", "--out", "rec", "--json", "result.json")
         options = () if "--resume" in arguments else options
         out, err = self.run("improve", "axis", *options, *arguments, status=status)

@@ -144,6 +144,6 @@ def test_auto_runs_the_separating_experiment(cell):
     narrow, out, _ = cell.improve("--from", "rec", "--out", "again")
     assert "load_order" in narrow["not_told_from"]["ratio_error"]
     assert narrow["offered"] is False
-    assert "not yet distinguished from load_order" in out
+    assert "not yet separated from load_order" in out
     assert "--auto" in out
     assert "ratio_error or load_order" in narrow["further"]["separates"]

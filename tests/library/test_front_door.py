@@ -29,7 +29,7 @@ def test_every_public_name_is_documented(name):
 
 
 def test_nothing_else_is_shown():
-    """Whatever was loaded before: what completes `hdbridge.` is the front door."""
+    """Completion of `hdbridge.` lists only the public names, whatever was loaded before."""
     shown = python(
         "import hdbridge.analysis.diagnosis, hdbridge.axis, hdbridge; print(*dir(hdbridge))"
     ).split()

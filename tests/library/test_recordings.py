@@ -67,7 +67,7 @@ def test_another_gear_is_refused(run):
 
 
 def test_a_bare_record_needs_a_ratio(run):
-    with pytest.raises(InputError, match="the ratio of the gear is not known"):
+    with pytest.raises(InputError, match="the ratio of the gear is unknown"):
         fit(run.record)
 
 

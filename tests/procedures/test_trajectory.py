@@ -65,7 +65,7 @@ def test_an_invalid_trajectory_is_refused_before_anything_moves(trajectory, comp
 
 @given(st.floats(-80.0, 80.0), st.floats(-80.0, 80.0), st.floats(1.0, 1.5))
 def test_a_trajectory_within_the_limits_is_accepted(start_deg, end_deg, slower):
-    """Differences over a millisecond never say more than the derivatives are."""
+    """Differences over a millisecond never exceed the derivatives."""
     way = abs(end_deg - start_deg) or 1.0
     # Largest of the rounded move of a way in a time: 2 w/t, 2 pi w/t2, 4 pi2 w/t3.
     time_s = slower * max(

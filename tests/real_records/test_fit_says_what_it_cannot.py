@@ -78,7 +78,7 @@ def test_less_than_a_turn_resolves_no_order(tmp_path: Path) -> None:
 
 
 def test_the_residual_is_that_of_the_written_model(tmp_path: Path) -> None:
-    """A drag passes for a delay of one encoder, which is fitted beside the model and no part of it."""
+    """A drag looks like a delay of one encoder, which is fitted but not part of the model."""
     paths = moves(tmp_path, 2.0, (30.0,) * 3, drag=0.02)
     out = tmp_path / "model.yaml"
     _, data, said = fitted(tmp_path, paths, "--out", str(out))

@@ -171,7 +171,7 @@ FINE_LOAD = np.round(LONG_LOAD / GRID) * GRID
 
 
 def counter(bits: int, counts: np.ndarray, start: float = 0.0) -> np.ndarray:
-    """An unsigned counter of so many bits."""
+    """Unsigned counter with this many bits."""
     return (counts + start) % 2.0**bits
 
 
@@ -426,7 +426,7 @@ def test_too_short_a_travel_to_know_radians_is_remarked(
 def test_a_wrapping_clock_is_reported_with_its_period(tmp_path: Path) -> None:
     path = tmp_path / "bench.csv"
     path.write_text(text(time=(TIME * 1000.0 + 65_000.0) % 65_536.0))
-    with pytest.raises(InputError, match=r"time that does not run backwards: .* pass --unwrap time=65536$"):
+    with pytest.raises(InputError, match=r"times that do not decrease: .* pass --unwrap time=65536$"):
         Record.read_csv(path, units="time=ms")
     record = Record.read_csv(path, units="time=ms", unwrap="time=65536")
     np.testing.assert_allclose(np.diff(record.time_s), 0.01)

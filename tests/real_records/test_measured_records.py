@@ -24,7 +24,7 @@ from hdbridge.records.record import Record, concatenate
 
 BESIDE = Path(__file__).parents[3] / "shared" / "data"
 NOTHING = TransmissionModel(100.0, ())
-"""A ratio and no error: what is known of the robot beforehand."""
+"""A ratio without an error, the only prior knowledge of the robot."""
 UNLIKELY = {
     "local_defect",
     "count_loss",

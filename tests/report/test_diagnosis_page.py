@@ -229,7 +229,7 @@ def test_unexplained_findings_have_no_name_or_curve():
     said = words(text)
     assert "something unexplained that depends on the load angle and direction, up to " in said
     assert "No cause of the catalogue fits it" in said
-    assert "Do not correct what has no name" in said
+    assert "Do not compensate for an unexplained error" in said
     assert "--extend" not in said
     chart = charts(text)["Unexplained residual, over the load angle"]
     assert [each["label"].split(" (")[0] for each in chart["series"]] == [

@@ -14,7 +14,7 @@ PROFILES = Path(__file__).parents[2] / "profiles"
 
 
 def fingerprint(truth: Truth) -> str:
-    """A digest of what the encoders and the torque say in sines, sweeps, holds and coasting."""
+    """Digest of the encoder and torque readings in sines, sweeps, holds and coasting."""
     machine = Machine(truth, 7)
     digest = hashlib.sha256()
     substeps = round(0.004 / machine.dt_s)

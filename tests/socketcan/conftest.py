@@ -171,7 +171,7 @@ class Master:
 
 @contextmanager
 def master_on(channel: str, profile: Path | None = None, *, shared: bool = False) -> Iterator[Master]:
-    """``shared`` for a master beside one of this process whose link has died."""
+    """``shared`` permits a second master next to one of this process whose link has died."""
     axis = AxisConfig.load(profile or unhurried_profile())
     settings = axis.bus.model_copy(update={"interface": "socketcan", "channel": channel})
     with open_bus(settings, shared=shared) as bus:

@@ -9,7 +9,7 @@ from support.command import run_here
 from hdbridge.errors import SafetyStop
 
 ATTEMPTS = 3
-"""A machine that stalls for two periods stops the axis, as it should; then the test begins anew."""
+"""A computer that stalls for two periods stops the axis, as intended; the test is then repeated."""
 
 
 def test_step_masters_the_simulated_drive_in_another_process(interface, profile, tmp_path):

@@ -78,7 +78,7 @@ def test_an_interface_that_went_down_stays_unusable(pair, may_configure, interfa
 
 @pytest.fixture
 def stuck_slcan(may_configure) -> Iterator[str]:
-    """A serial CAN adapter that takes no more: a pseudo terminal that nobody reads."""
+    """Serial CAN adapter that accepts no more data: a pseudo terminal without a reader."""
     ours, theirs = os.openpty()
     name = "slcan9"
     daemon = subprocess.Popen(

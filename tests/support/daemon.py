@@ -135,7 +135,7 @@ class SteppedDaemon:
     def states(self) -> list[AxisState]:
         return [axis.state for axis in self.axes]
 
-    def told(self, kind: EventKind, axis: int | None = None) -> list[Event]:
+    def reported(self, kind: EventKind, axis: int | None = None) -> list[Event]:
         return [each for each in self.events if each.kind is kind and axis in (None, each.axis)]
 
     # ---------------------------------------------------------------- what a service does

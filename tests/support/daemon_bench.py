@@ -191,7 +191,7 @@ class DaemonBench:
         daemon.until(lambda: abs(daemon.axis().get("velocity_deg_s") or 0.0) > 0.9 * SLOW_DEG_S, "it moves")
         self.witness.begin()
 
-    def told(self, made: Made, kind: str, within: int, words: str = "", reaction: str = "") -> int:
+    def reported(self, made: Made, kind: str, within: int, words: str = "", reaction: str = "") -> int:
         """Returns the cycles from a fault until its event; AssertionError if it took more than ``within``."""
 
         def found() -> dict[str, Any] | None:

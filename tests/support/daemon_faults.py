@@ -38,7 +38,7 @@ def _bus_goes(
 ) -> tuple[str, int, int]:
     daemon = bench.daemon
     processes = daemon.pids("control"), daemon.pids("service")
-    cycles = bench.told(bench.made(goes), "bus-down", NOTICED)
+    cycles = bench.reported(bench.made(goes), "bus-down", NOTICED)
     if pause_s:
         bench.stopped("latched", "BUS_DOWN")
         time.sleep(pause_s)
@@ -70,7 +70,7 @@ def _stops(bench: DaemonBench, fault: str, end: str, *how: str) -> tuple[str, in
     """Disturbs the frames that leave an end so that the axis must stop, then stops disturbing them."""
     with ExitStack() as spoilt:
         made = bench.made(lambda: spoilt.enter_context(bench.cable.spoilt(end, *how)))
-        cycles = bench.told(made, "fault", NOTICED, Fault[fault].value, "quick stop")
+        cycles = bench.reported(made, "fault", NOTICED, Fault[fault].value, "quick stop")
         bench.stopped("quick-stopped", fault)
         time.sleep(1.0)
     return "quick stop, latched", cycles, NOTICED
@@ -98,7 +98,7 @@ def _doubled(bench: DaemonBench) -> tuple[str, int, int]:
     bench.goes_on(60)  # faults without a reaction are reported at most once a second
     with ExitStack() as spoilt:
         made = bench.made(lambda: spoilt.enter_context(bench.cable.spoilt(THEIRS, "duplicate", "100%")))
-        cycles = bench.told(made, "fault", NOTICED, Fault.DUPLICATE_TPDO.value, "go")
+        cycles = bench.reported(made, "fault", NOTICED, Fault.DUPLICATE_TPDO.value, "go")
         bench.goes_on()
     return "counted; the axis goes on", cycles, NOTICED
 
@@ -111,7 +111,7 @@ def _reordered(bench: DaemonBench) -> tuple[str, int, int]:
 
 def _second_master(bench: DaemonBench) -> tuple[str, int, int]:
     made = bench.made(lambda: bench.witness.send(0x080))
-    cycles = bench.told(made, "fault", NOTICED, Fault.FOREIGN_SYNC.value, "quick stop")
+    cycles = bench.reported(made, "fault", NOTICED, Fault.FOREIGN_SYNC.value, "quick stop")
     bench.stopped("quick-stopped", "FOREIGN_SYNC")
     return "quick stop, latched; the motor stands", cycles, NOTICED
 
@@ -120,8 +120,8 @@ def _node_reset(bench: DaemonBench) -> tuple[str, int, int]:
     daemon = bench.daemon
     processes = daemon.pids("control"), daemon.pids("service")
     made = bench.made(lambda: bench.witness.send(0x000, bytes([0x81, 0x01])))
-    bench.told(made, "fault", NOTICED, Fault.OWN_ID_ELSEWHERE.value, "quick stop")
-    cycles = bench.told(made, "fault", NOTICED, Fault.BOOT_UP.value, "latch")
+    bench.reported(made, "fault", NOTICED, Fault.OWN_ID_ELSEWHERE.value, "quick stop")
+    cycles = bench.reported(made, "fault", NOTICED, Fault.BOOT_UP.value, "latch")
     _is_back(bench)
     assert (daemon.pids("control"), daemon.pids("service")) == processes
     return "quick stop, latch; verified again, disabled", cycles, NOTICED

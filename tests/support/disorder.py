@@ -59,7 +59,7 @@ class Laws:
         self.mapped = self.operational = True
         """Mapped by the master, an RPDO waits for SYNC, and the cycle replaces it; by default it acts now."""
         self.unasked = ""
-        """Reason why the present following, once it moves, is motion that nobody asked for."""
+        """Reason why the present following, once it moves, is unrequested motion."""
         self.lowest = self.highest = self.began_deg = 0.0
         self.periods = self.moved = self.enabled = 0
         """Cycles judged, cycles with a moving set-point, and enablings by the master."""

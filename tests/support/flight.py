@@ -68,6 +68,6 @@ def flight_log(folder: Path, told: list[str] | None = None, free: Any = None, ax
     """Returns the recorder without its thread, and its clock."""
     clock = Clock()
     settings = RecorderSettings(**{"free_mb": 0.0, **limits})
-    tell = told.append if told is not None else (lambda _: None)
+    notify = told.append if told is not None else (lambda _: None)
     free = free or (lambda _: ROOM)
-    return FlightLog(folder, settings, about(axes), tell=tell, wall_ns=clock, free=free), clock
+    return FlightLog(folder, settings, about(axes), notify=notify, wall_ns=clock, free=free), clock

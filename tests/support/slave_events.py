@@ -117,7 +117,7 @@ class Laws:
 
 
 class Story:
-    """One slave, its master, and what happens to both."""
+    """One slave, its master, and the events on both."""
 
     def __init__(self, rng: Random, bus: LockstepBus, clock: VirtualClock, node: DriveNode, stage: TimedStage,
                  motor: WatchedMotor, laws: Laws) -> None:  # fmt: skip

@@ -1,4 +1,4 @@
-"""A program that knows nothing of hdbridge but the frames: it moves the simulated drive in lockstep."""
+"""Program independent of hdbridge that exchanges frames: it moves the simulated drive in lockstep."""
 
 import shutil
 import struct
@@ -24,7 +24,7 @@ class Program:
         self.bus = drive.open_bus()
         self.target = 0
         self.others: list[can.Message] = []
-        """Frames beside the answers to SYNC."""
+        """Frames other than the answers to SYNC."""
 
     def send(self, can_id: int, data: bytes = b"") -> None:
         self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))

@@ -30,7 +30,7 @@ def motor_counts(answers) -> int:
 
 
 def stands(drive) -> bool:
-    """The axis has come to rest by itself within half a second."""
+    """Checks that the axis has come to rest on its own within half a second."""
     drive.sleep(0.5)
     before = drive.truth.load_deg
     drive.sleep(0.1)
@@ -329,7 +329,7 @@ def test_each_fault_is_injected_as_described(drive, program, name):
 
 
 def test_without_a_fault_no_symptom_is_seen(drive, program):
-    """A drive under way without a fault shows nothing of it."""
+    """A drive in operation without a fault shows no symptom."""
     assert tpdos(drive, program, "heartbeat_lost") == [BOTH] * 3
     assert drive.emergencies == ()
     assert drive.state == "operation enabled"

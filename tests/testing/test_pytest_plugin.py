@@ -26,7 +26,7 @@ def session(pytester):
 
 
 def show(name: str) -> str:
-    """A test that prints what it got."""
+    """Returns a test that prints an attribute of the fixture."""
     return f"def test_it(hdbridge_drive):\n    print('got', hdbridge_drive.{name}, repr(hdbridge_drive))\n"
 
 

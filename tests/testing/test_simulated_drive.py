@@ -97,7 +97,7 @@ def test_drive_time_replaces_the_time_module(drive):
 
 def test_a_vain_wait_ends_with_the_log(drive):
     drive.note("here")
-    with pytest.raises(TimeoutError, match=r"rest did not come about in 2 s\n(.*\n)*.*here"):
+    with pytest.raises(TimeoutError, match=r"rest did not occur in 2 s\n(.*\n)*.*here"):
         drive.wait_until(lambda: False, timeout_s=2.0, what="rest")
     assert drive.now == pytest.approx(2.0, abs=0.01)
 

@@ -372,7 +372,7 @@ with (case / "runs").open("a") as file:
 
 @pytest.fixture
 def command(tmp_path: Path) -> str:
-    """A diagnosis that says what stands next to the record."""
+    """Command of a stand-in diagnosis, which prints the file next to the record."""
     path = tmp_path / "stand_in.py"
     path.write_text(STAND_IN)
     return f"{sys.executable} {path}"

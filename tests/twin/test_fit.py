@@ -243,7 +243,7 @@ def test_a_fit_that_is_interrupted_before_it_has_reached_anything_leaves_nothing
 
 
 TRUTH = with_values(Truth.load(DEMO), {"command filter": 1.06})
-"""At 90 motor degrees per second the motor is 4.24 counts late: its encoder says 4."""
+"""At 90 motor degrees per second the motor lags by 4.24 counts; its encoder reads 4."""
 PARAMETERS = (BY_NAME["command filter"],)
 
 

@@ -51,7 +51,7 @@ def recorded() -> Recording:
 
 
 def told_by_another_zero(counts: int = ZERO_COUNTS) -> Recording:
-    """The command as a controller tells it whose zero is not the drive's."""
+    """Command of a controller whose zero differs from the drive's."""
     columns = dict(recorded().record.columns)
     columns["motor_target_deg"] = columns["motor_target_deg"] + counts * COUNT_DEG
     return Recording(Record(columns), axis="demo", ratio=50.0)

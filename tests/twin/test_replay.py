@@ -321,7 +321,7 @@ def moved_twice(creeps_deg: float) -> tuple[Record, np.ndarray]:
 
 @pytest.mark.parametrize(("creeps_deg", "count"), [(COUNT_DEG, 5), (100.0 * COUNT_DEG, 1)])
 def test_a_resting_motor_reports_torque_repeatedly(creeps_deg: float, count: int) -> None:
-    """The integral goes on meanwhile: what it comes to at the end may be after the motor broke away."""
+    """The integral continues meanwhile; its final value may be from after the motor broke away."""
     record, moved = moved_twice(creeps_deg)
     _, still, held = standing(record, COUNT_DEG)
     assert still[held].all()

@@ -111,7 +111,7 @@ class Case:
     left: float = 0.03
     """Share of the effect's own part, rms, that a translation of another shape may leave."""
     floor_arcsec: float = 0.5
-    """... and what the plant's dynamics add at these speeds."""
+    """Contribution of the plant's dynamics at these speeds."""
     plant: Callable[[Truth], Truth] = lambda truth: truth
     in_python: bool = False
     """Its law has more elements than others: to compile an axis with room for them takes far longer."""
@@ -222,7 +222,7 @@ CASES = {
 
 
 BEFORE_DEG = 60.0
-"""A first move that says how the loop stands; before it model and plant begin differently."""
+"""First move, which determines the state of the loop; before it, model and plant begin differently."""
 
 
 def quiet(truth: Truth) -> Truth:
@@ -231,7 +231,7 @@ def quiet(truth: Truth) -> Truth:
 
 
 def exercised(truth: Truth, lead: Callable[[Exercise], None]) -> Record:
-    """The record of a first move, and of what comes after it."""
+    """Record of a first move and of the motion after it."""
 
     def both(bench: Exercise) -> None:
         bench.move(BEFORE_DEG, 100.0, 300.0)

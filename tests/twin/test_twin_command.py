@@ -70,7 +70,7 @@ def trips(truth: Truth, folder: Path) -> Path:
 
 @pytest.fixture
 def profile(tmp_path: Path) -> Path:
-    """The demo's profile, whose truth file says twice the friction."""
+    """Profile of the demo, with twice the friction in its truth file."""
     folder = tmp_path / "demo"
     shutil.copytree(DEMO, folder)
     text = (folder / "truth.yaml").read_text()
@@ -160,7 +160,7 @@ def test_a_recording_of_another_axis_or_without_commands_is_refused(profile: Pat
 
 
 def fitted(truth: Truth, values: str = "axis", times_noise: float = 2.5) -> Callable[..., Twin]:
-    """In place of a fit, which takes minutes: this is what it comes to."""
+    """Result of a fit, which itself would take minutes."""
 
     def fit_twin(recordings: Any, axis: AxisConfig, start: Truth, progress: Any) -> Twin:
         (recording,) = recordings
@@ -211,7 +211,7 @@ def test_a_better_twin_is_kept_as_pending(profile: Path, recording: Path, run: R
     assert figures(told, "after")["motor_torque"]["difference"] < 0.008
     (friction,) = told["parameters"]
     assert (friction["before"], friction["value"], friction["ci95"]) == (0.068, 0.034, [0.033, 0.035])
-    assert "What was wrong with the simulation" in page
+    assert "Errors of the initial simulation" in page
     assert "model commit" in page
 
 

@@ -1,4 +1,4 @@
-"""CPU time of one control cycle, beside a bare exchange of the same frames and beside canopen.
+"""CPU time of one control cycle, compared with a bare exchange of the same frames and with canopen.
 
     python tools/bench/cycle.py [--interface virtual|socketcan]... [--channel vcan0] [--json FILE]
 

@@ -1,4 +1,4 @@
-"""CPU time of one turn of the daemon's control loop, beside the bench's cycle on the same bus.
+"""CPU time of one turn of the daemon's control loop, compared with the bench's cycle on the same bus.
 
     python tools/bench/daemon_loop.py [--axes 1,2,6] [--blocks 21] [--cycles 500] [--json FILE]
 

@@ -188,7 +188,7 @@ class RunningDaemon:
 
 @contextmanager
 def clients(socket: Path) -> Iterator[Callable[[], dict[str, Any]]]:
-    """Runs the process of `clients.py`; yields a function that ends it and returns what it saw."""
+    """Runs the process of `clients.py`; yields a function that ends it and returns its results."""
     program = Path(__file__).with_name("clients.py")
     process = subprocess.Popen(
         [sys.executable, str(program), str(socket)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

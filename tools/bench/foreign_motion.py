@@ -4,7 +4,7 @@
     PYTHONPATH=tests python tools/bench/foreign_motion.py FILE --retuned [--seeds 0-4]
 
 Each axis is calibrated by `PLAN` with a motion test, and nothing is known beforehand. With ``--exact`` its
-model is the exact correction of rest, and only the response is measured. Then the error of the load is
+model is the exact static correction, and only the response is measured. Then the error of the load is
 measured at ten speeds up to the limit, both ways, without, with static and with filtered correction. Axes:
 the foreign servo structures, and the simulated drive with a servo, load and spring drawn at random.
 FILE keeps a line of JSON per axis; axes that it has are not measured again. Printed, per speed: the
@@ -305,7 +305,7 @@ if __name__ == "__main__":
     parser.add_argument("file", type=Path)
     parser.add_argument("--kinds", nargs="+", default=[*STRUCTURES, "simulated"])
     parser.add_argument("--seeds", default="0-4", help="first and last")
-    parser.add_argument("--exact", action="store_true", help="take the exact correction of rest as the model")
+    parser.add_argument("--exact", action="store_true", help="take the exact static correction as the model")
     parser.add_argument("--retuned", action="store_true", help="change the position gain afterwards")
     given = parser.parse_args()
     first, last = map(int, given.seeds.split("-"))

@@ -1,4 +1,4 @@
-"""Does the control cycle hold its period on SocketCAN? Master and simulated drive are two processes.
+"""Punctuality of the control cycle on SocketCAN; master and simulated drive are two processes.
 
     tools/socketcan.sh .venv/bin/python tools/bench/socketcan_cycle.py [--cycles 5000] [--json FILE]
 

@@ -50,7 +50,7 @@ def false_name(verdict: Verdict) -> bool:
 
 
 def everyday(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
-    """Returns the figures of everyday records: (what, figure, goal)."""
+    """Returns the figures of everyday records: (quantity, figure, goal)."""
     healthy = [each for each in verdicts if each.kind in {"healthy_bench", "healthy_work"}]
     faults = [each for each in verdicts if each.kind == "fault"]
     law = [each for each in verdicts if each.kind == "law"]
@@ -99,7 +99,7 @@ def _pairs(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
 
 
 def bench(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
-    """Returns the figures of the bench suite: (what, figure, goal)."""
+    """Returns the figures of the bench suite: (quantity, figure, goal)."""
     by_kind: dict[str, list[Verdict]] = {}
     for each in verdicts:
         by_kind.setdefault(each.kind, []).append(each)
@@ -137,7 +137,7 @@ def _several(kind: str, verdicts: Sequence[Verdict], goal: str) -> list[tuple[st
 
 
 def common(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
-    """Returns the figures of every suite: (what, figure, goal)."""
+    """Returns the figures of every suite: (quantity, figure, goal)."""
     compared = [each for verdict in verdicts for each in verdict.compared]
     pairs = probabilities(verdicts)
     sure = [right for chance, right in pairs if chance >= 0.95]
@@ -174,7 +174,7 @@ def probabilities(verdicts: Sequence[Verdict]) -> list[Pair]:
 
 
 def brier(pairs: Sequence[Pair]) -> tuple[str, str]:
-    """Returns the Brier score of the names: (what, figure)."""
+    """Returns the Brier score of the findings: (quantity, figure)."""
     score = statistics.fmean((chance - right) ** 2 for chance, right in pairs)
     base = statistics.fmean(right for _, right in pairs)
     words = f"Brier score of the names; {base * (1.0 - base):.3f} if all had the same probability"

@@ -66,9 +66,7 @@ CATALOGUE = {each.name: each for each in _KINDS}
 
 
 def causes() -> tuple[str, ...]:
-    """Returns the names of the causes that a diagnosis can find in addition to the two basic parts of a
-    model.
-    """
+    """Returns the causes that a diagnosis can find in addition to the two basic parts of a model."""
     return tuple(name for name in CATALOGUE if name not in BASIC)
 
 
@@ -93,7 +91,7 @@ def withdraw(kind: type[Effect]) -> None:
 
 
 def aliases_of(name: str) -> tuple[str, ...]:
-    """Returns the causes that can be confused with this one, by either's declaration, in catalogue order."""
+    """Returns the causes that can be confused with this one, as declared by either, in catalogue order."""
     own = CATALOGUE[name].about.aliases if name in CATALOGUE else ()
     return tuple(other for other, kind in CATALOGUE.items() if other in own or name in kind.about.aliases)
 

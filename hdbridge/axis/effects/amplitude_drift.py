@@ -1,8 +1,9 @@
 """Temperature dependence of ripple and friction.
 
-Ripple and loop that grow with warmth can be expressed at any reference temperature: amplitudes and growth
-differ, and the sum is the same. The reference is chosen so that the amplitudes are those of the model. At any
-other temperature the drift would come with an apparent change of the model's own orders or loop.
+A ripple and a loop that grow with warmth can be expressed at any reference temperature, with different
+amplitudes and growth but the same sum. The reference is chosen so that the amplitudes are those of the model.
+At any other temperature, the drift would be accompanied by an apparent change of the model's own orders or
+loop.
 """
 
 import math
@@ -47,13 +48,13 @@ class Reparametrised:
     orders: FloatArray
     """Cosines and sines, arcsec."""
     offsets: FloatArray
-    """Offsets of its loops, arcsec."""
+    """Offsets of the loops, arcsec."""
     per_ripple: float
     per_loop: float
     """Factors that convert a share of the former ripple or loop into a share of the present one."""
 
     def counted(self, effect: Effect) -> Effect:
-        """Re-expresses an effect of the model, or one that is given as a share of it."""
+        """Re-expresses an effect of the model, or an effect that is given as a share of the model."""
         if isinstance(effect, Synchronous):
             return effect.fitted(self.orders)
         if isinstance(effect, Hysteresis | HysteresisMemory):
@@ -70,8 +71,7 @@ def nearest(
     now: Sequence[Effect],
     given: Sequence[Effect],
 ) -> Reparametrised | None:
-    """Returns ``now`` re-expressed at the temperature at which it is nearest to ``given``; None if
-    impossible.
+    """Returns ``now`` re-expressed at the temperature where it is closest to ``given``; None if impossible.
 
     ``growth_percent`` is the growth of ripple and of loop per kelvin.
     """
@@ -107,7 +107,8 @@ def _offsets(base: Sequence[Effect]) -> FloatArray:
 class AmplitudeDrift(Modulating, Warmed):
     """w (ripple S(theta_M) + friction H): the model's ripple and loop change with the gear's warmth w.
 
-    Growth of the ripple with torque is the same warm or cold: the torque-dependent part is scaled as well.
+    The torque-dependent part of the ripple is scaled as well, so relative growth with torque is the same warm
+    or cold.
     """
 
     name = "amplitude_drift"
@@ -150,7 +151,7 @@ class AmplitudeDrift(Modulating, Warmed):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields effects driven by temperature if it changes, else by time."""
+        """Yields effects driven by temperature if it varies, else by time."""
         if has_orders(base) and has_loop(base):
             for driven_by, tau_s in cls.lags(observations):
                 yield cls(
@@ -169,7 +170,7 @@ class AmplitudeDrift(Modulating, Warmed):
     def retold(
         self, now: Sequence[Effect], given: Sequence[Effect], observations: Observations
     ) -> tuple[Effect, ...] | None:
-        """Re-expresses the drift with the reference temperature for which the rest of the model is nearest to
+        """Re-expresses the drift at the reference temperature where the rest of the model is closest to
         ``given``.
         """
         temperature = observations.motion.measured.get(Channel.TEMPERATURE)
@@ -211,8 +212,8 @@ class AmplitudeDrift(Modulating, Warmed):
         return _Tracker(self, self.loop.law().tracker(start))
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """If the load lags, returns a tracker whose loop, at the highest warmth, falls no more steeply than
-        this.
+        """Returns, if the load lags, a tracker whose loop falls no more steeply than this at the highest
+        warmth.
         """
         left = fall_arcsec_per_deg - self.ripple_fall()
         if not self.loop_share() or left <= 0.0:
@@ -226,10 +227,10 @@ class AmplitudeDrift(Modulating, Warmed):
         return 0.01 * self.limit_k * (ripple + abs(self.friction_percent_per_k * self.loop.offset_arcsec))
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Steepest fall of the ripple; infinite if the loop changes, because the effect falls as steeply as
-        the loop rises.
+        """Returns the steepest fall of the ripple; infinite if the loop changes.
 
-        It takes only a share of the model's loop, so the sum of both does not fall: see `combine.fall_bound`.
+        A changed loop falls as steeply as the loop rises. It removes only a share of the model's loop, so the
+        sum of both does not fall (`combine.fall_bound`).
         """
         return self.ripple_fall() if not self.friction_percent_per_k else math.inf
 

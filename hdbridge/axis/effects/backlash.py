@@ -13,16 +13,16 @@ from hdbridge.axis.effects.play import Stop, stop
 from hdbridge.units import ARCSEC_PER_DEG
 
 _SOFTNESS = 1.25
-"""Crossing angle of a gap that an inverse needs, relative to the ideal one."""
+"""Minimum crossing angle of an invertible gap, relative to that of an ideal gap."""
 
 
 class Backlash(Linear):
     """-gap / 2 times the stop operator of the motor angle: the load lags by half the gap on either side.
 
     In an ideal gap the load stands still while the motor crosses ``gap N / 3600`` degrees, and the total has
-    no inverse, because many motor angles give one load angle. `crossing_deg` may be larger (a soft contact).
-    If a gap is too steep to invert, the compensation treats it as a softer one (`gentle_tracker`) and makes
-    the motor jump most of the gap at once.
+    no inverse, because many motor angles correspond to one load angle. `crossing_deg` may be larger (a soft
+    contact). If a gap is too steep to invert, the compensation treats it as a softer gap (`gentle_tracker`)
+    and makes the motor jump most of the gap at once.
     """
 
     name = "backlash"
@@ -53,7 +53,7 @@ class Backlash(Linear):
     )
     shape = (Shape("crossing_deg", 0.02, 20.0, logarithmic=True),)
     ordinary_arcsec = 1.0
-    """Half a gap of 2 arcsec, as much as an elastic loop of another shape can leave as a residual."""
+    """Half a gap of 2 arcsec, which an elastic loop of another shape can leave as a residual."""
     linear = ("gap_arcsec",)
     typical = {"gap_arcsec": 10.0, "crossing_deg": 0.02}
 
@@ -72,10 +72,10 @@ class Backlash(Linear):
         return "" if observations.reversals >= 2 else "no reversal in which play would show"
 
     def tidied(self, ratio: float) -> Self:
-        """Widens the crossing to the angle that an inverse needs.
+        """Widens the crossing to the minimum angle of an invertible gap.
 
-        The load stands still while the motor crosses, but noise lets a fit return a smaller angle than is
-        possible.
+        The load stands still while the motor crosses, but noise can make a fit return a smaller angle than is
+        physically possible.
         """
         crossing = _SOFTNESS * self.gap_arcsec * ratio / ARCSEC_PER_DEG
         return self.model_copy(update={"crossing_deg": max(crossing, self.crossing_deg)})

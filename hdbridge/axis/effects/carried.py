@@ -1,8 +1,8 @@
 """Parts of a model that a modulating effect carries: synchronous orders, their growth with torque, the loop.
 
-An effect such as `torque_modulation` states that the synchronous part grows with torque. To be predicted,
-tracked and read on its own, it carries a copy of the part that it modulates, taken from the model when it is
-created; `combine.refreshed` keeps the copy up to date.
+An effect such as `torque_modulation` states that the synchronous part grows with torque. For prediction,
+tracking and reading on its own, it carries a copy of the modulated part, taken from the model at its
+creation; `combine.refreshed` keeps the copy up to date.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -21,7 +21,7 @@ from hdbridge.strictness import Strict
 
 
 class Loop(Strict):
-    """The modulated elastic loop: parameters of `hysteresis`, and the law it follows."""
+    """Modulated elastic loop: parameters of `hysteresis`, and its law."""
 
     offset_arcsec: float = Field(
         ge=-3600, le=3600, description="half the height, at the load; negative where it lags"
@@ -59,7 +59,7 @@ def is_ripple(effect: Effect) -> bool:
 
 
 def loop_of(base: Iterable[Effect]) -> Loop:
-    """Returns the loop of a model's elastic law, of either kind; a typical one if it has none."""
+    """Returns the loop of a model's elastic law, of either kind; a typical loop if the model has none."""
     for each in base:
         if isinstance(each, Hysteresis | HysteresisMemory):
             return Loop.model_construct(**each.parameters(), memory=isinstance(each, HysteresisMemory))
@@ -67,7 +67,7 @@ def loop_of(base: Iterable[Effect]) -> Loop:
 
 
 def orders_of(base: Iterable[Effect]) -> tuple[MotorOrder, ...]:
-    """Returns the orders of a model's synchronous part; typical ones if it has none."""
+    """Returns the orders of a model's synchronous part; typical orders if the model has none."""
     for each in base:
         if isinstance(each, Synchronous) and each.orders:
             return each.orders
@@ -85,7 +85,7 @@ def has_orders(base: Iterable[Effect]) -> bool:
 
 
 def growth_of(base: Iterable[Effect]) -> TorqueGrowth | None:
-    """Returns the growth of a model's orders with torque, or None; a fit may have left its range."""
+    """Returns the growth of a model's orders with torque, possibly out of its range after a fit, or None."""
     for each in base:
         if isinstance(each, TorqueGrowth):
             values = {name: getattr(each, name) for name in TorqueGrowth.model_fields}
@@ -94,7 +94,7 @@ def growth_of(base: Iterable[Effect]) -> TorqueGrowth | None:
 
 
 class Modulating(Linear):
-    """Base class of effects that scale parts of a model, of which they carry copies."""
+    """Base class of effects that scale parts of a model and carry copies of them."""
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:

@@ -15,11 +15,12 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 
 class ChannelSkew(Angleless, Linear):
-    """delay omega_L + second alpha_L / 2: the load encoder, sampled later than the motor's, reads farther on.
+    """delay omega_L + second alpha_L / 2: the load encoder, sampled later than the motor's, reads further
+    on.
 
     A pure delay has second = delay^2. It is a separate parameter because the speed is a difference over a
-    sample, delayed by half a step, and a delay is rarely a whole number of samples. Without it the residual
-    would be attributed to inertial wind-up.
+    sample, delayed by half a step, and a delay is rarely a whole number of samples. Without this parameter,
+    the residual would be attributed to inertial wind-up.
     """
 
     name = "channel_skew"
@@ -49,7 +50,7 @@ class ChannelSkew(Angleless, Linear):
     ordinary_arcsec = 1.0
     """Usual skew, because no two encoders are sampled at exactly the same instant."""
     incidental = frozenset({"second_order_ms2"})
-    """Includes the load's own wind-up."""
+    """Includes the load's own inertial wind-up."""
     linear = ("delay_ms", "second_order_ms2")
     typical = {"delay_ms": 0.5, "second_order_ms2": 0.25}
 

@@ -42,10 +42,10 @@ def extended(effects: Iterable[Effect], new: Effect) -> tuple[Effect, ...]:
 
 
 def refreshed(effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """Returns the effects with the copies of orders and loop that they carry updated to the present model.
+    """Returns the effects with their copies of orders and loop updated to the present model.
 
     The orders are those of the synchronous part and of added motor orders, because a change of the tooth
-    error changes all of it. If the model has no synchronous part, the orders stay as they are.
+    error changes all of them. If the model has no synchronous part, the orders stay as they are.
     """
     given = tuple(effects)
     loop = loop_of(given) if any(isinstance(each, _LAWS) for each in given) else None
@@ -76,7 +76,7 @@ def _refreshed(
 def in_place(effect: Effect, kinds: Iterable[type[Effect]]) -> tuple[Effect, ...]:
     """Returns the alternatives that can replace an effect, with its parameters; see `Effect.replaces`.
 
-    A fit may have moved these out of their ranges; `violations` reports it, as for `fitted`.
+    A fit may have moved the parameters out of their ranges, which `violations` reports.
     """
     return tuple(
         kind.model_construct(**effect.parameters())
@@ -91,11 +91,11 @@ def compensable(effects: Iterable[Effect]) -> tuple[Effect, ...]:
 
 
 def fall_bound(effects: Iterable[Effect]) -> float:
-    """Returns a bound on how steeply the *sum* can fall, arcsec per motor degree.
+    """Returns a bound on the steepest fall of the *sum*, arcsec per motor degree.
 
     This is the sum of the effects' own bounds, with one exception. An effect that removes a share of the
-    model's loop falls as steeply as the loop rises, and while no more than the whole loop is removed, the sum
-    still rises. (An effect on a loop in which the load lags may fall without bound in either direction.)
+    model's loop falls as steeply as the loop rises. The sum still rises if no more than the whole loop is
+    removed. (An effect on a loop with lagging load may fall without bound in either direction.)
     """
     given = tuple(effects)
     left = {

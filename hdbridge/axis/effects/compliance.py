@@ -15,7 +15,7 @@ from hdbridge.axis.effects.orders import orders_from
 from hdbridge.axis.effects.torque import TorqueChannel, TorqueLimit, top
 
 SOFTER = 1.05
-"""Factor by which noise alone may make a zone softer than the one before it."""
+"""Factor by which noise alone may make a zone softer than the zone before it."""
 
 _Softness = Annotated[float, Field(ge=0, le=1000)]
 
@@ -23,7 +23,8 @@ _Softness = Annotated[float, Field(ge=0, le=1000)]
 class Compliance(Angleless, Linear):
     """sense * (c1, c2, c3 per Nm in the zones up to T1, up to T2, beyond); c = 206265 / K.
 
-    Written in compliances, because the error is linear in them: c1 = 206265 / K1 arcsec/Nm with K1 in Nm/rad.
+    The parameters are compliances, because the error is linear in them: c1 = 206265 / K1 arcsec/Nm with K1 in
+    Nm/rad.
     """
 
     name = "compliance"
@@ -100,7 +101,7 @@ class Compliance(Angleless, Linear):
 
     @classmethod
     def unmeasured(cls, ratio: float) -> Effect:
-        """Returns load order 1, because with an off-centre mass the torque goes round once with the load."""
+        """Returns load order 1, because the torque of an off-centre mass goes round once per load turn."""
         return LoadOrders(ratio=ratio, orders=orders_from([1]))
 
     def needs(self) -> frozenset[Channel]:
@@ -122,7 +123,7 @@ class Compliance(Angleless, Linear):
         return signed
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns other compliances; if their sum is negative the sense flips, because a torque's sign is a
+        """Returns other compliances; if their sum is negative, the sense flips, because a torque's sign is a
         convention.
         """
         values = np.asarray(coefficients, dtype=np.float64)
@@ -136,7 +137,7 @@ class Compliance(Angleless, Linear):
         return self.sense * error if given >= 0.0 else -self.sense * error
 
     def _wind_up(self, torque: float) -> float:
-        """Returns the wind-up at a torque of at least zero, arcsec."""
+        """Returns the wind-up at a non-negative torque, arcsec."""
         error = self.c1_arcsec_per_nm * min(torque, self.torque1_nm)
         if torque > self.torque1_nm:
             error += self.c2_arcsec_per_nm * min(torque - self.torque1_nm, self.torque2_nm - self.torque1_nm)

@@ -1,4 +1,4 @@
-"""Quantities along a motion that an error may depend on: for plots, and for unexplained residuals."""
+"""Quantities along a motion on which an error may depend: for plots and unexplained residuals."""
 
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -13,12 +13,12 @@ from hdbridge.units import DEG_PER_TURN
 POINTS_PER_BIN: Final = 8
 LEAST_BINS: Final = 2
 SAME: Final = 1e-6
-"""Relative range below which a quantity counts as constant, because of rounding."""
+"""Relative range below which a quantity counts as constant, to allow for rounding."""
 NOTHING: Final = 1e-9
 """Absolute range below which a quantity counts as constant, in its unit."""
 SMALLEST_WAY_DEG: Final = 0.01
 SMALLEST_TIME_S: Final = 0.01
-"""Minimum time since a reversal, s, so that a logarithm can be taken."""
+"""Minimum time since a reversal, s, for a finite logarithm."""
 
 
 class Spacing(Enum):
@@ -26,7 +26,7 @@ class Spacing(Enum):
 
     EVEN = "even"
     FILLED = "filled"
-    """Equal numbers of points per bin, for quantities that mostly take a few values, such as a speed."""
+    """Equal numbers of points per bin, for quantities that take few values, such as a speed."""
     LOGARITHMIC = "logarithmic"
 
 
@@ -58,7 +58,7 @@ class Coordinate:
         return bool(np.ptp(self.values) > SAME * np.max(np.abs(self.values)) + NOTHING)
 
     def edges(self) -> FloatArray:
-        """Returns the bin edges, ascending, shape (b + 1,); two equal ones if there is only one value."""
+        """Returns the bin edges, ascending, shape (b + 1,); two equal edges for a single value."""
         low, high = float(np.min(self.values)), float(np.max(self.values))
         bins = min(self.bins, max(len(self.values) // POINTS_PER_BIN, LEAST_BINS))
         if self.spacing is Spacing.FILLED:

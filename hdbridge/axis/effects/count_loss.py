@@ -1,4 +1,4 @@
-"""Counts lost by an encoder, or a tooth jumped: a persistent step at one time."""
+"""Counts lost by an encoder, or a jumped tooth: a persistent step at one time."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Self
@@ -74,18 +74,18 @@ class CountLoss(Angleless):
             yield cls(steps=(Step(time_s=middle, size_arcsec=1.0),))
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Requires reversals: on an axis that never revisits a position, a step in time may be one in
+        """Requires reversals. If the axis never revisits a position, a step in time may be a step in
         position.
         """
         return "" if observations.reversals >= 2 else "a step in time may as well be one at a place"
 
     def shows(self, motion: Motion) -> Stretch | None:
-        """Returns the samples away from reversals, where a loop of another shape leaves no steps."""
+        """Returns the samples away from reversals, where a loop of another shape does not leave steps."""
         return away_from_reversals(motion)
 
     def changing(self, motion: Motion) -> FloatArray:
-        """Returns steps before and after it, within a time in which slow effects barely change: a real one is
-        sudden.
+        """Returns steps before and after the real one, which is sudden: slow effects barely change
+        meanwhile.
         """
         time_s = motion.channel(Channel.TIME, self.name)
         first = int(np.searchsorted(time_s, self.steps[0].time_s))

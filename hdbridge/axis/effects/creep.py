@@ -26,7 +26,7 @@ from hdbridge.axis.effects.recurrence import recurrence
 from hdbridge.strictness import Strict
 
 RESTS = 3.0
-"""Maximum ratio of the shortest time constant to the longest rest; beyond it the curvature is not visible."""
+"""Maximum ratio of the shortest time constant to the longest rest; above it, the curvature is not visible."""
 
 
 class Relaxation(Strict):
@@ -41,9 +41,9 @@ class Relaxation(Strict):
 class Creep(Effect):
     """Sum of A_j y_j; y_j approaches the direction in motion, and zero at rest.
 
-    In motion the time constant is ``build_up`` tau_j. A value of 1 is a linear viscoelastic element (short
-    moves strain it little); well below 1 each move strains it fully, and after each stop there is A_j exp(-t
-    / tau_j).
+    In motion the time constant is ``build_up`` tau_j. With a value of 1 this is a linear viscoelastic
+    element, which short moves strain only a little. Well below 1, each move strains it fully, and the error
+    after each stop is A_j exp(-t / tau_j).
     """
 
     name = "creep"
@@ -68,7 +68,7 @@ class Creep(Effect):
     """Time constant of the first exponential; the others keep their ratio to it."""
 
     usual = 8
-    """A real relaxation is a sum of exponentials."""
+    """A real relaxation is a sum of several exponentials."""
     typical = {
         "parts": tuple(Relaxation(amplitude_arcsec=2.0, tau_s=tau_s) for tau_s in (2.0, 20.0)),
         "build_up": 0.1,
@@ -83,19 +83,19 @@ class Creep(Effect):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields single exponentials; those found are combined afterwards."""
+        """Yields single exponentials; those found are combined later."""
         for tau_s in (0.3, 1.0, 3.0, 10.0, 30.0, 100.0):
             for build_up in (0.03, 0.3, 1.0):
                 yield cls(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=tau_s),), build_up=build_up)
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Requires a time constant comparable to a rest, because a much slower one need not end with it."""
+        """Requires a time constant comparable to a rest; a much slower relaxation need not end with it."""
         if min(each.tau_s for each in self.parts) <= RESTS * longest_rest_s(observations.motion):
             return ""
         return "no rest is long enough to see it bend"
 
     def shows(self, motion: Motion) -> Stretch:
-        """Returns the samples at rest; in motion it may be part of a speed-dependent effect."""
+        """Returns the samples at rest; in motion, creep may be part of a speed-dependent effect."""
         return Stretch(standing_s(motion) > 0.0, "not seen at rest")
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:

@@ -1,4 +1,4 @@
-"""Terms in which an effect is described: texts, shape parameters, its part in a model, on-line tracker."""
+"""Terms that describe an effect: texts, shape parameters, its part in a model, on-line tracker."""
 
 import math
 from abc import ABC, abstractmethod
@@ -11,7 +11,7 @@ from hdbridge.axis.effects.motion import BoolArray, Moment, Motion
 
 
 class Part(Enum):
-    """Part of a model that other effects may scale and therefore carry a copy of."""
+    """Part of a model that other effects may scale, and therefore copy."""
 
     ORDERS = "ripple"
     """Orders of the motor angle."""
@@ -20,7 +20,7 @@ class Part(Enum):
 
 
 class Sought(Enum):
-    """Form of an effect that a matched filter searches for at all locations simultaneously."""
+    """Form of an effect for which a matched filter searches at all locations simultaneously."""
 
     STEP = "a step in time"
     BUMP = "a bump at one load angle"
@@ -29,13 +29,13 @@ class Sought(Enum):
 
 
 class Moves(Enum):
-    """Range from which a local step improves a shape parameter."""
+    """Range in which a local step improves a shape parameter."""
 
     ANYWHERE = "anywhere"
     NEARBY = "nearby"
-    """A local step helps only near the optimum, which must be found by a search."""
+    """A local step improves it only near the optimum, which a search must find."""
     NEVER = "never"
-    """A local step never helps, because the error does not depend smoothly on the parameter."""
+    """A local step never improves it, because the error does not depend smoothly on the parameter."""
 
 
 class Experiment(NamedTuple):
@@ -47,7 +47,7 @@ class Experiment(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Parameter that the effect is *not* linear in, with the range in which a fit searches."""
+    """Parameter in which the effect is *not* linear, with the range of a fit."""
 
     name: str
     lower: float
@@ -56,10 +56,10 @@ class Shape:
     """True if the fit should step in the logarithm (widths, time constants)."""
     moves: Moves = Moves.ANYWHERE
     is_frequency: bool = False
-    """True if it counts periods in time, so that its resolution depends on the length of the record."""
+    """True for a frequency in time, whose resolution depends on the length of the record."""
 
     def grid(self, points: int) -> tuple[float, ...]:
-        """Returns ``points`` values over its range, evenly spaced (logarithmically if it is logarithmic)."""
+        """Returns ``points`` values over the range, evenly spaced (logarithmically if logarithmic)."""
         if points < 2:
             return (
                 math.sqrt(self.lower * self.upper) if self.logarithmic else 0.5 * (self.lower + self.upper),
@@ -77,32 +77,29 @@ class Cause:
     title: str
     """Short name in standard terms."""
     equation: str
-    """The law in plain text."""
+    """Law in plain text."""
     signature: str
     """Visible symptom in a record."""
     consequence: str
-    """Consequence for the axis."""
     remedy: str
     """Advice to the user."""
     experiment: str
-    """Measurement that separates it from similar causes."""
+    """Measurement that separates the cause from similar causes."""
     aliases: tuple[str, ...] = ()
-    """Names of the causes it can be confused with."""
+    """Names of the causes with which it can be confused."""
     source: str = ""
     """Source of the equation."""
     size: str = ""
     """Typical size."""
     subject: str = ""
-    """Plural noun that summaries of several causes use; empty for the name."""
+    """Plural noun for summaries of several causes; empty for the name."""
     apart: Mapping[str, Experiment] = field(default_factory=dict)
-    """Measurement that separates it from another cause, by that cause's name. Either of the two may declare
-    it.
-    """
+    """Measurement that separates the cause from another, by that cause's name. Either may declare it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Compensable:
-    """Decision to compensate an effect or not, with the reason."""
+    """Decision whether to compensate an effect, with the reason."""
 
     possible: bool
     why: str
@@ -115,28 +112,26 @@ class Coefficient:
     name: str
     """Name of the parameter with its unit; for a cosine and sine the prefix of amplitude and phase."""
     columns: tuple[int, ...]
-    """Its column; both columns for a cosine and sine."""
+    """Column of the coefficient, or both columns for a cosine and sine."""
     path: tuple[str | int, ...]
     """Path of the parameter in `Effect.parameters`; for a cosine and sine the path of their parent."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretch:
-    """Samples at which an effect must be visible if it is present, whatever else acts elsewhere."""
+    """Samples at which an effect, if present, must be visible, whatever else acts elsewhere."""
 
     rows: BoolArray
     """Mask of the samples, shape (n,)."""
     otherwise: str
-    """Reason to reject the effect if it is not visible there, for messages."""
+    """Reason for rejecting the effect if it is not visible there, for messages."""
 
 
 class Observations(Protocol):
-    """A record as seen by an effect."""
+    """Record as seen by an effect."""
 
     @property
-    def motion(self) -> Motion:
-        """Motion of the axis."""
-        ...
+    def motion(self) -> Motion: ...
 
     @property
     def ratio(self) -> float:
@@ -162,23 +157,21 @@ class Observations(Protocol):
 class Tracker(ABC):
     """On-line state of an effect.
 
-    `peek` returns the error at a motor angle reached from the present state, as often as it is called. Only
-    `advance` changes the state.
+    `peek` returns the error at a motor angle reached from the present state, and may be called repeatedly.
+    Only `advance` changes the state.
     """
 
     @property
     def memory_deg(self) -> float:
-        """Motor angle that, run in one direction, makes the state independent of the start.
+        """Motor travel in one direction after which the state no longer depends on the start.
 
-        0 if the path is not remembered at all. Memory in time (creep, warmth) does not count.
+        0 if the path is not remembered. Memory in time (creep, warmth) does not count.
         """
         return 0.0
 
     @abstractmethod
     def peek(self, motor_deg: float, moment: Moment) -> float:
-        """Returns the error at the load if the motor moved straight to ``motor_deg``, arcsec; changes
-        nothing.
-        """
+        """Returns the error at the load after a straight move to ``motor_deg``, arcsec; changes nothing."""
 
     @abstractmethod
     def advance(self, motor_deg: float, moment: Moment) -> float:
@@ -186,7 +179,7 @@ class Tracker(ABC):
 
 
 class Memoryless(Tracker):
-    """Tracker without state, for which `advance` equals `peek`."""
+    """Tracker without state, whose `advance` equals `peek`."""
 
     def __init__(self, at: Callable[[float, Moment], float]) -> None:
         """``at`` returns the error at a motor angle and a moment."""
@@ -200,4 +193,4 @@ class Memoryless(Tracker):
 
 
 class Level(Memoryless):
-    """Tracker whose error is the same at every motor angle: the moment alone decides."""
+    """Tracker whose error is the same at all motor angles and depends only on the moment."""

@@ -1,4 +1,4 @@
-"""Shift of the synchronous part with the direction of travel, because other tooth flanks carry."""
+"""Shift of the synchronous part with the direction of travel, because other tooth flanks carry the load."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -23,11 +23,11 @@ of the order.
 class DirectionPhase(Modulating):
     """Direction-odd part of a tooth error T(theta_M + d shift), S being the mean over both flanks.
 
-    An order A_k of the tooth error appears as A_k cos(k shift) in the mean, which is the model's synchronous
-    part because that was fitted over both directions, and as A_k sin(k shift) in the odd part. The odd part
-    is therefore tan(k shift) times the mean's order, a quarter of its period ahead. The tangent is limited to
-    `STEEPEST`, beyond which hardly anything of an order is left in the mean. One angle shifts all orders: a
-    free amplitude per order would be many parameters for one cause.
+    An order A_k of the tooth error appears as A_k cos(k shift) in the mean over both directions, to which the
+    model's synchronous part was fitted, and as A_k sin(k shift) in the odd part. The odd part is therefore
+    tan(k shift) times the mean's order, a quarter of its period ahead. The tangent is limited to `STEEPEST`,
+    beyond which hardly anything of an order remains in the mean. One angle shifts all orders, because a free
+    amplitude per order would be many parameters for one cause.
     """
 
     name = "direction_phase"
@@ -62,7 +62,7 @@ class DirectionPhase(Modulating):
             yield cls(orders=orders_of(base), shift_deg=0.0)
 
     def left_in_mean(self, order: int) -> float:
-        """Returns the cosine of the shift, because the mean of two shifted flanks is smaller than either."""
+        """Returns the cosine of the shift, because the mean of two shifted flanks is the smaller."""
         return math.cos(order * math.radians(self.shift_deg))
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
@@ -71,8 +71,9 @@ class DirectionPhase(Modulating):
         return Memoryless(lambda motor_deg, now: (now.direction or before) * orders.peek(motor_deg, now))
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the effect per degree of shift *at the present shift*, shape (n, 1); nearly linear, so
-        iterate the fit.
+        """Returns the effect per degree of shift *at the present shift*, shape (n, 1).
+
+        It is nearly linear, so the fit must be iterated.
         """
         error: FloatArray = direction_of(motion, start) * ripple(motion.motor_deg, self._odd())
         return error[:, np.newaxis]
@@ -85,8 +86,8 @@ class DirectionPhase(Modulating):
         return RAD_PER_DEG * abs(self.shift_deg) * steepness
 
     def _odd(self) -> tuple[complex, ...]:
-        """Returns the phasors of the odd part per degree of shift: j A_k tan(k shift) / shift
-        exp(j phi_k).
+        """Returns the phasors of the odd part per degree of shift: j A_k tan(k shift) / shift exp(j
+        phi_k).
         """
         given = phasors(self.orders)
         highest = len(given) - 1

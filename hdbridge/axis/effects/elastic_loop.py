@@ -6,7 +6,7 @@ The offset has a sign. Positive: the load leads in the direction of motion, and 
 path. Negative: the load lags, as it does behind friction at the load, and the error falls along the path. In
 that case the load stands still until the gear has wound up in the other direction, so the fall is at most the
 gear's own slope, 3600 / N arcsec per motor degree. Just after a reversal the formula is steeper; there the
-inverse uses a slope that it can invert (`gentle_tracker`).
+inverse uses a smaller slope (`gentle_tracker`).
 """
 
 import math
@@ -24,10 +24,10 @@ from hdbridge.axis.effects.path import once
 
 
 def rise(xi: FloatArray, n: float) -> FloatArray:
-    """Returns the branch g(xi): 0 at 0, 1 with zero slope at 1 and beyond.
+    """Returns the branch g(xi): 0 at 0, 1 with zero slope from 1 on.
 
-    g(xi) = (xi^(n-1) - (n-1) xi) / (2-n), and xi (1 - ln xi) for n = 2; written with expm1 so that it is
-    exact at n = 2 and on both sides of it.
+    g(xi) = (xi^(n-1) - (n-1) xi) / (2-n), and xi (1 - ln xi) for n = 2; the form with expm1 is exact at n = 2
+    and on both sides.
     """
     clipped = np.minimum(xi, 1.0)
     result = np.zeros_like(clipped)
@@ -65,7 +65,7 @@ class ElasticLoop(Effect):
     """A published gear of ratio 50."""
     part = Part.LOOP
     drifting = ("offset_arcsec",)
-    """The offset, because preload settles and friction changes; width and exponent stay."""
+    """Only the offset, because preload settles and friction changes; width and exponent do not."""
 
     offset_arcsec: float = Field(
         ge=-3600,
@@ -98,8 +98,9 @@ class ElasticLoop(Effect):
         return self._tracker(start, self.width_deg, math.inf)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero if the load leads, because the error only rises along its path. If it lags: the slope at a
-        reversal, which is unbounded for exponents up to 2.
+        """Returns 0 if the load leads, because the error only rises along its path.
+
+        If the load lags, returns the slope at a reversal, which is unbounded for exponents up to 2.
         """
         if self.offset_arcsec >= 0.0:
             return 0.0
@@ -107,7 +108,7 @@ class ElasticLoop(Effect):
         return -2.0 * self.offset_arcsec / self.width_deg * (n - 1.0) / (n - 2.0) if n > 2.0 else math.inf
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """If the load lags, returns the same branch with its slope after each reversal limited to this."""
+        """Returns, if the load lags, the same branch with its slope after each reversal limited to this."""
         if self.offset_arcsec >= 0.0:
             return None
         height = -2.0 * self.offset_arcsec

@@ -3,7 +3,7 @@
 The law is the rolling-friction law of the transmission-error literature, made exact in three places that are
 usually left open:
 
-* At a reversal the error is continuous: each branch starts from the value that the last one reached, and
+* At a reversal the error is continuous: each branch starts from the last value of the one before, and
   rises by ``2 offset g(xi)`` along the new direction until it meets the offset.
 * It saturates only in the direction of travel. (Taken literally, "saturated when |error| >= offset" would
   be a relay that jumps by twice the offset at each reversal.)
@@ -58,9 +58,7 @@ class Hysteresis(ElasticLoop):
         return _HysteresisTracker(self.offset_arcsec, width_deg, self.exponent, start, steepest)
 
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
-        """Returns the loop for an offset of one: a Python loop over the reversals, then all
-        samples at once.
-        """
+        """Returns the loop for an offset of one, with a Python loop over the reversals only."""
         path = path_of(motor_deg, start)
         value = float(start.value)
         values = []
@@ -107,7 +105,7 @@ class _HysteresisTracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """The width, which is the angle from side to side."""
+        """The width, which is the motor angle from side to side."""
         return self._width
 
     def peek(self, motor_deg: float, moment: Moment) -> float:

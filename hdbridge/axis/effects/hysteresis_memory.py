@@ -32,13 +32,12 @@ from hdbridge.axis.effects.motion import FloatArray, Moment, Start
 from hdbridge.axis.effects.path import path_of
 
 _DEPTH = 200
-"""Number of remembered reversals; beyond it the innermost loop is forgotten early (a fraction
-of its height).
-"""
+"""Number of remembered reversals; beyond it, the innermost loop (a fraction of its height) is forgotten
+early."""
 
 
 class HysteresisMemory(ElasticLoop):
-    """Masing's rules over the branch of `Hysteresis`; replaces it in a model."""
+    """Hysteresis with Masing's rules over the branch of `Hysteresis`; replaces it in a model."""
 
     name = "hysteresis_memory"
     replaces = "hysteresis"
@@ -79,9 +78,7 @@ class HysteresisMemory(ElasticLoop):
         return {}
 
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
-        """Returns the loop for an offset of one: a Python loop over the reversals, then all
-        samples at once.
-        """
+        """Returns the loop for an offset of one, with a Python loop over the reversals only."""
         # A saturated start is a direction, but only true reversals of the motion count here.
         way = path_of(motor_deg, start)
         turning, signs = way.turning, way.signs
@@ -128,8 +125,9 @@ class _Segment(NamedTuple):
 class _Memory:
     """Remembered reversals of a loop of unit offset, outermost first.
 
-    ``_points`` holds pairs of angle and value; the last is the start of the present branch, the one before it
-    is where the branch closes. If empty: on the virgin curve through ``_origin`` in direction ``_sign``.
+    ``_points`` holds pairs of angle and value; the last pair is the start of the present branch, and the
+    branch closes at the pair before it. If empty, the path is on the virgin curve through ``_origin`` in
+    direction ``_sign``.
     """
 
     def __init__(
@@ -178,7 +176,7 @@ class _Memory:
     def walk(
         self, last: float, value: float, angle: float, sign: int
     ) -> tuple[list[tuple[float | None, _Segment]], float]:
-        """Moves as `move` does; returns the segments, each with its closing angle, and the value."""
+        """Moves like `move`; returns the segments, each with its closing angle, and the value."""
         points = self._points
         if sign == -self._sign:
             if not points:
@@ -227,7 +225,7 @@ class _MemoryTracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """The width, which is the angle from side to side; after it all inner loops are forgotten."""
+        """The width, which is the motor angle from side to side; after it, all inner loops are forgotten."""
         return self._width
 
     def peek(self, motor_deg: float, moment: Moment) -> float:

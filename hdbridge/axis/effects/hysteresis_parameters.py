@@ -17,10 +17,9 @@ from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
 class HysteresisParameters(Effect):
     """Loop with new parameters minus the loop with the model's parameters (`base`).
 
-    It names a change. When a model is extended by it, it does not become an entry of its own: the model's
-    loop takes the new parameters (`combine.extended`). A separate entry would predict the same, but a
-    difference of loops falls infinitely steeply where the old one rises, so the compensation could not invert
-    it.
+    This cause describes a change. If a model is extended by it, the model's loop takes the new parameters
+    (`combine.extended`) and no entry is added. A separate entry would predict the same, but a difference of
+    loops falls infinitely steeply where the old loop rises, so the compensation could not invert it.
     """
 
     name = "hysteresis_parameters"
@@ -62,7 +61,7 @@ class HysteresisParameters(Effect):
         return cls(base=loop_of([before]), **loop_of([now]).model_dump(exclude={"memory"}))
 
     def found_in(self, effects: Sequence[Effect]) -> Effect:
-        """Returns the change from its own base to the loop that the model has."""
+        """Returns the change from its own base to the loop of the model."""
         return self.model_copy(update=loop_of(effects).model_dump(exclude={"memory"}))
 
     def changed(self) -> Loop:
@@ -96,8 +95,8 @@ class HysteresisParameters(Effect):
         return abs(self.offset_arcsec) + abs(self.base.offset_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Infinite if a loop is subtracted that starts infinitely steeply, because the difference then falls
-        as steeply.
+        """Returns infinity if the subtracted loop starts infinitely steeply, because the difference then
+        falls as steeply.
         """
         return math.inf if self.base.offset_arcsec > 0.0 or self.offset_arcsec < 0.0 else 0.0
 

@@ -15,7 +15,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 
 class InertialWindup(Angleless, Linear):
-    """-(J / K) alpha_L: the load lags while it is accelerated."""
+    """-(J / K) alpha_L: the load lags during acceleration."""
 
     name = "inertial_windup"
     channels = frozenset({Channel.ACCELERATION})
@@ -60,7 +60,7 @@ class InertialWindup(Angleless, Linear):
     def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Returns the next term of the resonance, which this law neglects, shape (n, 1).
 
-        The load swings beyond the wind-up by J / K times the second time derivative of the wind-up.
+        The term is J / K times the second time derivative of the wind-up.
         """
         beyond = np.zeros(len(motion))
         step_s = 0.0 if motion.time_s is None else float(np.median(np.diff(motion.time_s)))

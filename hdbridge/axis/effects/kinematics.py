@@ -7,9 +7,9 @@ Backward differences over the samples' own time steps:
     d[i] = sign(theta[i] - theta[i-1]), held at rest
 
 A time step of zero gives a speed of zero. On line the angle is the uncompensated command (N times the load
-target): the compensation is far slower than the motion, and feeding it back would difference each cycle's
-correction into the next. If a record has a better speed (from the procedure, or smoothed from the load
-encoder), `Motion` holds it and it is used directly.
+target): the compensation is far slower than the motion, and with feedback each cycle's correction would be
+differenced into the next. If a record has a better speed (from the procedure, or smoothed from the load
+encoder), `Motion` contains it, and it is used directly.
 """
 
 from collections.abc import Iterator
@@ -70,8 +70,8 @@ def _differences(values: FloatArray, time_s: FloatArray) -> FloatArray:
 
 
 class Observer:
-    """Builds the `Moment` of each control cycle from the command: the on-line counterpart of the functions
-    above.
+    """On-line counterpart of the functions above: computes the `Moment` of each control cycle from the
+    command.
     """
 
     def __init__(self) -> None:
@@ -87,7 +87,7 @@ class Observer:
         measured: tuple[float, ...] = AT_REST,
         load_deg: float = 0.0,
     ) -> Moment:
-        """Returns the moment of a cycle; call once per cycle.
+        """Returns the moment of a cycle; to be called once per cycle.
 
         ``motor_deg`` is the uncompensated command, N times the load target; ``measured`` is
         `Moment.measured`.
@@ -108,7 +108,7 @@ class Observer:
 
 
 def moments(motion: Motion) -> Iterator[Moment]:
-    """Yields a record's moments as the control loop would have seen them (defaults for missing channels)."""
+    """Yields the moments of a record as in the control loop, with defaults for missing channels."""
     here = motion.available()
     zeros = np.zeros(len(motion))
     known = [motion.measured.get(each, zeros + each.at_rest).tolist() for each in MEASURED]
@@ -128,7 +128,7 @@ def _or(values: FloatArray | None, default: FloatArray) -> FloatArray:
 
 
 def top_speed_deg_s(motion: Motion) -> float:
-    """Returns the highest motor speed, ignoring outliers; one turn per second if the speed is not known."""
+    """Returns the highest motor speed, ignoring outliers; one turn per second if the speed is unknown."""
     speed = motion.motor_speed_deg_s
     return 360.0 if speed is None else float(np.quantile(np.abs(speed), 0.99))
 

@@ -1,6 +1,4 @@
-"""Errors that repeat with every turn of the load: eccentricity of the load encoder, or pitch of
-the spline.
-"""
+"""Errors that repeat with every load turn: eccentricity of the load encoder, or pitch error of the spline."""
 
 from dataclasses import replace
 from typing import Annotated, Literal
@@ -64,5 +62,5 @@ class LoadOrders(OrderSeries):
         return 1.0 / self.ratio
 
     def is_compensable(self) -> bool:
-        """Returns True only if the gear is known to be the origin, so that the load really moves."""
+        """Returns True only if the gear is known to be the source, so that the load really moves."""
         return self.origin == "gear"

@@ -19,7 +19,7 @@ from hdbridge.units import DEG_PER_TURN
 
 PASSES = 3
 OTHER_SPEED = 1.5
-"""Minimum number of passes, which must be in both directions or at speeds that differ by this factor."""
+"""Minimum ratio of speeds among the passes, if all are in one direction."""
 
 
 FORM = 0.07
@@ -55,7 +55,7 @@ class LocalDefect(Momentary, Linear):
     usual = 2
     sought = Sought.BUMP
     inexact = 0.15
-    """The bump of a real damaged tooth never has exactly this form."""
+    """The bump of a real damaged tooth never has exactly this shape."""
     linear = ("height_arcsec",)
     typical = {"height_arcsec": 5.0, "centre_deg": 0.0, "half_width_deg": 3.6}
 
@@ -66,20 +66,20 @@ class LocalDefect(Momentary, Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields a tooth in the middle of the travel, as an example."""
+        """Yields a damaged tooth in the middle of the travel, as an example."""
         load = float(np.median(observations.motion.motor_deg)) / observations.ratio
         yield cls(
             ratio=observations.ratio, height_arcsec=1.0, centre_deg=load % DEG_PER_TURN, half_width_deg=3.6
         )
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Requires varied passes, because identical ones cannot separate a location from a moment of the
+        """Requires varied passes. In identical passes, a location is not separable from a moment of the
         move.
         """
         return "" if self._is_met(observations) else "not passed often enough, or always alike"
 
     def _is_met(self, observations: Observations) -> bool:
-        """Returns True if the axis passed the location several times, both ways or at different speeds."""
+        """Returns True if the axis passed the location repeatedly, both ways or at different speeds."""
         motion = observations.motion
         if motion.motor_speed_deg_s is None or motion.time_s is None:
             return False
@@ -101,7 +101,7 @@ class LocalDefect(Momentary, Linear):
         return away_from_reversals(motion)
 
     def changing(self, motion: Motion) -> FloatArray:
-        """Returns the neighbouring bumps: a damaged tooth has none, a wave has one on either side."""
+        """Returns the neighbouring bumps: none beside a damaged tooth, one on either side in a wave."""
         apart = 2.0 * self.half_width_deg
         beside = [self.model_copy(update={"centre_deg": self.centre_deg + each}) for each in (-apart, apart)]
         return np.hstack([each.columns(motion) for each in beside])
@@ -114,7 +114,7 @@ class LocalDefect(Momentary, Linear):
         return self._bump(motion, self.half_width_deg)[:, np.newaxis]
 
     def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns a sharper top and a wider foot, shape (n, 2)."""
+        """Returns the columns of a sharper top and a wider foot, shape (n, 2)."""
         widths = (0.5 * self.half_width_deg, 2.0 * self.half_width_deg)
         return FORM * self.height_arcsec * np.column_stack([self._bump(motion, each) for each in widths])
 

@@ -19,18 +19,18 @@ IntArray = NDArray[np.intp]
 class Channel(Enum):
     """Quantity that an effect uses in addition to the motor angle; the value is its column in a record.
 
-    This is the only table of measured channels: a new row is read from the drive, recorded, passed to effects
-    and offered to a diagnosis without further edits.
+    This is the only table of measured channels: each row is read from the drive, recorded, passed to effects
+    and offered to a diagnosis without other edits.
     """
 
     _value_: str
     about: str
-    """Description of a measured channel; empty for all others."""
+    """Description of a measured channel; empty for a derived channel."""
     unit: str
     at_rest: float
-    """Default if a measured channel is not known."""
+    """Default reading of a measured channel."""
     axis_key: str
-    """Key of the axis file that defines its source; empty if every drive provides it."""
+    """Key of the axis file that defines the source; empty if every drive provides it."""
 
     def __new__(
         cls, column: str, about: str = "", unit: str = "", at_rest: float = 0.0, axis_key: str = ""
@@ -67,23 +67,23 @@ class Channel(Enum):
 
 
 MEASURED: Final = tuple(each for each in Channel if each.about)
-"""The measured channels, in their order in a `Moment`."""
+"""Measured channels in the order of a `Moment`."""
 SLOT: Final[Mapping[Channel, int]] = {each: slot for slot, each in enumerate(MEASURED)}
-"""Position of each measured channel in `Moment.measured`."""
+"""Index of each measured channel in `Moment.measured`."""
 AT_REST: Final = tuple(each.at_rest for each in MEASURED)
 """Default readings."""
 
 
 def readings(known: Mapping[Channel, float]) -> tuple[float, ...]:
-    """Returns `Moment.measured` for the known channels, with defaults for the rest."""
+    """Returns `Moment.measured` for the known channels, with defaults for the others."""
     return tuple(known.get(each, each.at_rest) for each in MEASURED)
 
 
 class Start(Enum):
     """Knowledge of the gear's past at the first sample.
 
-    A pre-conditioning move leaves a saturated start: the axis last moved in that direction by more than any
-    memory it has. A virgin start assumes nothing and sets the elastic state to zero.
+    A pre-conditioning move leaves a saturated start: the last motion of the axis was in that direction and
+    longer than any memory. A virgin start assumes nothing and sets the elastic state to zero.
     """
 
     VIRGIN = 0
@@ -99,7 +99,7 @@ class Moment(NamedTuple):
 
     time_s: float = 0.0
     measured: tuple[float, ...] = AT_REST
-    """Readings of the channels in `MEASURED`, in that order; `SLOT` gives their positions."""
+    """Readings of the channels in `MEASURED`, in that order; `SLOT` contains their indices."""
     motor_speed_deg_s: float = 0.0
     motor_acceleration_deg_s2: float = 0.0
     direction: int = 0
@@ -110,10 +110,10 @@ class Moment(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Motion of an axis: the inputs of a prediction, as arrays of one length.
+    """Motion of an axis: the inputs of a prediction, as arrays of equal length.
 
-    ``motor_deg`` is the *commanded* multi-turn motor angle if the record has it: a quantised encoder chatters
-    at every reversal, and a hysteresis law with an infinite initial slope turns that into error.
+    ``motor_deg`` is the *commanded* multi-turn motor angle if the record has it. A quantised encoder chatters
+    at every reversal, and a hysteresis law with an infinite initial slope turns the chatter into error.
     """
 
     motor_deg: FloatArray
@@ -122,17 +122,18 @@ class Motion:
     measured: Mapping[Channel, FloatArray] = field(default_factory=dict)
     """Known measured channels (`MEASURED`), each of shape (n,)."""
     motor_speed_deg_s: FloatArray | None = None
-    """Given if a better speed is known than differences of a quantised angle."""
+    """Motor speed, if a better value is known than differences of a quantised angle."""
     motor_acceleration_deg_s2: FloatArray | None = None
     load_deg: FloatArray | None = None
-    """Predicted load angle, degrees of the load. Only the load encoder's line errors need this accuracy."""
+    """Predicted load angle, degrees of the load. Only the load encoder's line errors require this
+    accuracy."""
 
     def __len__(self) -> int:
         """Number of samples."""
         return len(self.motor_deg)
 
     def available(self) -> frozenset[Channel]:
-        """Returns the channels that these arrays provide, derived ones included."""
+        """Returns the channels that these arrays provide, including derived ones."""
         found = {each for each in Channel if self._given(each) is not None}
         found.add(Channel.DIRECTION)
         if self.time_s is not None:
@@ -154,7 +155,7 @@ class Motion:
 
 
 def missing_error(effect: str, channels: frozenset[Channel]) -> InputError:
-    """Returns the error to raise for missing channels."""
+    """Returns the error for missing channels."""
     names = ", ".join(sorted(each.value for each in channels))
     return InputError(
         f"the effect '{effect}' needs the channel {names}, which is not there; "

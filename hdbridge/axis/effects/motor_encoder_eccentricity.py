@@ -37,7 +37,7 @@ class MotorEncoderEccentricity(OrderSeries):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields both orders, whether or not the model has them, because they come from one disc."""
+        """Yields both orders, even if the model has one, because they come from one disc."""
         yield cls(orders=orders_from((1, 2)))
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Additional orders of the motor angle that the model's synchronous part lacks."""
+"""Orders of the motor angle in addition to those of the model's synchronous part."""
 
 from collections.abc import Sequence
 from typing import Any, Self
@@ -9,7 +9,7 @@ from hdbridge.axis.effects.orders import HIGHEST_MOTOR_ORDER, OrderSeries, order
 
 
 class MotorOrders(OrderSeries):
-    """Sum of A_k cos(k theta_M + phi_k) over orders that the model lacks."""
+    """Sum of A_k cos(k theta_M + phi_k) over orders that are not in the model."""
 
     name = "motor_order"
     about = Cause(
@@ -35,9 +35,9 @@ class MotorOrders(OrderSeries):
     part = Part.ORDERS
     searched = range(1, HIGHEST_MOTOR_ORDER + 1)
     usual = 4
-    """A worn wave generator bearing has several."""
+    """A worn wave generator bearing has several orders."""
     drifting = ("orders",)
-    """Orders, which change with the wear of teeth and bearing."""
+    """All orders, because wear of teeth and bearing changes them."""
 
     @classmethod
     def of_change(cls, before: Effect, now: Effect) -> Self | None:

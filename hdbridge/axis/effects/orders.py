@@ -17,9 +17,8 @@ from hdbridge.strictness import Strict
 
 RAD_PER_DEG = math.pi / 180.0
 HIGHEST_MOTOR_ORDER: Final = 24
-"""Highest motor order searched for: six times the strongest one of a strain wave gear, order 4 (two contacts,
-and harmonics of each from encoders or bearings).
-"""
+"""Highest candidate motor order: six times order 4, the strongest of a strain wave gear (two contacts, each
+with harmonics from encoders or bearings)."""
 _ComplexArray = np.ndarray[tuple[int], np.dtype[np.complex128]]
 _AT_ONCE: Final = 1 << 14
 """Number of samples whose powers fit in the processor's cache."""
@@ -43,7 +42,7 @@ class HarmonicSum(Effect):
     """Sum of A_k cos(k angle + phi_k) over an angle that a subclass defines."""
 
     few: ClassVar[frozenset[int]] = frozenset()
-    """Permitted orders, if only a few make physical sense."""
+    """Permitted orders, if only a few are physically possible."""
 
     orders: Orders
 
@@ -87,7 +86,7 @@ class HarmonicSum(Effect):
         return away_from_reversals(motion)
 
     def largest_piece_arcsec(self) -> float:
-        """Returns the largest amplitude, because an order that is sampled in part shows only in part."""
+        """Returns the largest amplitude, because a partly sampled order is only partly visible."""
         return max((each.amplitude_arcsec for each in self.orders), default=0.0)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
@@ -98,11 +97,11 @@ class HarmonicSum(Effect):
 
 
 class OrderSeries(HarmonicSum):
-    """HarmonicSum of an angle that turns with the motor, c times as fast."""
+    """Harmonic sum of an angle that turns with the motor, at c times its speed."""
 
     usual = 2
     searched: ClassVar[Sequence[int]] = ()
-    """Orders that a record is screened for, one by one."""
+    """Orders for which a record is screened, one by one."""
 
     def turns_per_motor_turn(self) -> float:
         """Returns c, the periods of order 1 per motor turn."""
@@ -110,7 +109,7 @@ class OrderSeries(HarmonicSum):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields single orders that the model lacks; those found are combined afterwards."""
+        """Yields single orders that the model lacks; those found are combined later."""
         values = {"ratio": observations.ratio} if "ratio" in cls.model_fields else {}
         turns = cls(orders=(), **values).turns_per_motor_turn()
         present = _present(base, turns)
@@ -139,14 +138,14 @@ class OrderSeries(HarmonicSum):
         return tuple((each.order * turns, each.amplitude_arcsec, each.phase_deg) for each in self.orders)
 
     def tidied(self, ratio: float) -> Self:
-        """Removes orders without amplitude, whose phases have no meaning."""
+        """Removes orders of zero amplitude, whose phases are meaningless."""
         orders = tuple(each for each in self.orders if each.amplitude_arcsec > 1e-6)
         return self.model_copy(update={"orders": orders})
 
     @classmethod
     def _change(cls, before: Effect, now: Effect) -> Self | None:
-        """Returns the difference of two series of motor orders, as orders of this kind; None if there is
-        none.
+        """Returns the difference of two series of motor orders, as orders of this kind; None without a
+        difference.
         """
         if not isinstance(before, OrderSeries) or not isinstance(now, type(before)):
             return None
@@ -172,7 +171,7 @@ def _present(base: Iterable[Effect], turns_per_motor_turn: float) -> dict[int, M
 
 
 def orders_from(numbers: Iterable[int], amplitude_arcsec: float = 1.0) -> tuple[MotorOrder, ...]:
-    """Returns harmonics of one amplitude and zero phase, as the start of a fit."""
+    """Returns harmonics of equal amplitude and zero phase, as the start of a fit."""
     return tuple(MotorOrder(order=each, amplitude_arcsec=amplitude_arcsec, phase_deg=0.0) for each in numbers)
 
 
@@ -189,8 +188,8 @@ def cosines_and_sines(angle_rad: FloatArray, numbers: Sequence[int]) -> FloatArr
 def waves(angle_rad: FloatArray, numbers: Iterable[float]) -> Iterator[_ComplexArray]:
     """Yields exp(j k angle), shape (n,), for each k.
 
-    Whole numbers are powers of exp(j angle): a multiplication is several times faster than a cosine and a
-    sine.
+    Whole numbers are computed as powers of exp(j angle), because a multiplication is several times faster
+    than a cosine and a sine.
     """
     turn = turn_of(angle_rad)
     power, before = None, 0

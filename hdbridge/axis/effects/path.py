@@ -11,9 +11,8 @@ from hdbridge.axis.effects.described import Stretch
 from hdbridge.axis.effects.motion import FloatArray, IntArray, Motion, Start
 
 LOOP_DEG: Final = 60.0
-"""Motor angle after a reversal within which an elastic loop is noticeable: three times the width of a
-published gear's loop.
-"""
+"""Motor travel after a reversal within which an elastic loop is noticeable: three times the loop width of a
+published gear."""
 
 KEPT_BYTES: Final = 24_000_000
 """Memory for cached per-sample quantities of a path, bytes: three of a million samples."""
@@ -30,11 +29,10 @@ class Path:
     steps_deg: FloatArray
     """Signed angle of each branch."""
     away_deg: FloatArray
-    """Signed angle from the reversal that began the branch, for the samples after the first of
-    ``turning``.
-    """
+    """Signed angle from the reversal at the start of the branch, for the samples after the first of
+    ``turning``."""
     sense: FloatArray
-    """Direction of the same samples."""
+    """Direction of motion for the same samples."""
     _kept: dict[object, FloatArray] = field(default_factory=dict)
 
     @classmethod
@@ -47,7 +45,7 @@ class Path:
         return cls(tuple(turning), tuple(signs), lengths, np.diff(angles), away, sense)
 
     def once(self, key: object, make: Callable[[], FloatArray]) -> FloatArray:
-        """Returns the quantity ``key``; computes it only if it is not cached."""
+        """Returns the quantity ``key``, computing it only if it is not cached."""
         found = self._kept.pop(key, None)
         if found is None:
             found = make()
@@ -63,7 +61,7 @@ _PATHS: dict[tuple[int, bool], tuple[weakref.ref[FloatArray], Path]] = {}
 
 
 def path_of(motor_deg: FloatArray, start: Start) -> Path:
-    """Returns `Path.of`, cached for read-only arrays, because a fit asks for it a thousand times."""
+    """Returns `Path.of`, cached for read-only arrays because a fit requests it a thousand times."""
     if motor_deg.flags.writeable:
         return Path.of(motor_deg, start)
     key = (id(motor_deg), start is Start.VIRGIN)
@@ -76,11 +74,11 @@ def path_of(motor_deg: FloatArray, start: Start) -> Path:
 
 
 def once(motor_deg: FloatArray, start: Start, key: object, make: Callable[[], FloatArray]) -> FloatArray:
-    """Returns a read-only quantity that several effects compute from the same angle, by a key of its
+    """Returns a read-only quantity that several effects compute from the same angle; ``key`` is its
     dependencies.
 
-    The elastic loop and the ripple occur in the model, in each effect that scales them, and in each
-    derivative with respect to that scaling. Cached for read-only arrays.
+    Elastic loop and ripple occur in the model, in each effect that scales them, and in each derivative with
+    respect to that scaling. Cached for read-only arrays.
     """
     if motor_deg.flags.writeable or not len(motor_deg):
         return make()
@@ -88,10 +86,11 @@ def once(motor_deg: FloatArray, start: Start, key: object, make: Callable[[], Fl
 
 
 def branches(motor_deg: FloatArray, start: Start = Start.VIRGIN) -> tuple[list[int], list[int]]:
-    """Returns the indices between which the motor moves in one direction (rest included), and the directions.
+    """Returns the indices between which the motor moves in one direction (including rests), and the
+    directions.
 
     ``turning`` has length b + 1 (first index, each turning point, last index) and ``signs`` length b. A
-    saturated start counts as a direction: continuing in it begins no new branch.
+    saturated start counts as a direction, so continuing in it does not begin a new branch.
     """
     steps = np.diff(motor_deg)
     moving = np.flatnonzero(steps)
@@ -108,7 +107,7 @@ def branches(motor_deg: FloatArray, start: Start = Start.VIRGIN) -> tuple[list[i
 
 
 def since_reversal_deg(motor_deg: FloatArray) -> FloatArray:
-    """Returns the motor angle since the last reversal (or the start), degrees, shape (n,)."""
+    """Returns the motor travel since the last reversal or the start, degrees, shape (n,)."""
     turning, _ = branches(motor_deg)
     result = np.zeros(len(motor_deg))
     if len(turning) > 1:
@@ -118,13 +117,13 @@ def since_reversal_deg(motor_deg: FloatArray) -> FloatArray:
 
 
 def away_from_reversals(motion: Motion) -> Stretch:
-    """Returns the samples at which no elastic loop is noticeable, whatever its shape."""
+    """Returns the samples at which no elastic loop of any shape is noticeable."""
     rows = since_reversal_deg(motion.motor_deg) > LOOP_DEG
     return Stretch(rows, "seen only where the axis reverses")
 
 
 def standing_s(motion: Motion) -> FloatArray:
-    """Returns the time since the axis came to rest, s, shape (n,); 0 in motion and at unknown speed."""
+    """Returns the time since the axis came to rest, s, shape (n,); 0 in motion or without a speed."""
     if motion.motor_speed_deg_s is None or motion.time_s is None:
         return np.zeros(len(motion))
     moving = motion.motor_speed_deg_s != 0.0

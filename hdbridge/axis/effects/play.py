@@ -1,4 +1,4 @@
-"""Stop operator: follows the motor, limited to plus or minus one; the building block of dead zones."""
+"""Stop operator: follows the motor, limited to plus or minus one. The building block of dead zones."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from hdbridge.axis.effects.path import path_of
 def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:
     """Returns s[i] = clip(s[i-1] + 2 (theta[i] - theta[i-1]) / width, -1, 1), shape (n,); linear time.
 
-    Between two reversals it suffices to clip once, so only the reversals need a Python loop.
+    One clipping between two reversals suffices, so only the reversals need a Python loop.
     """
     if not len(motor_deg):
         return np.empty(0)

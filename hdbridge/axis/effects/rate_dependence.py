@@ -45,7 +45,7 @@ class RateDependence(Modulating):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields growth from far below the speeds of the record, and from just below them."""
+        """Yields references far below and just below the speeds of the record."""
         fastest = top_speed_deg_s(observations.motion)
         if has_loop(base):
             for share in (0.02, 0.2):
@@ -74,14 +74,15 @@ class RateDependence(Modulating):
         return self._most() * abs(self.loop.offset_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero for a growing loop, which only rises along its path. A shrinking loop, or one in which the
-        load lags, falls as steeply as the loop starts.
+        """Returns 0 for a growing loop, which only rises along its path.
+
+        A shrinking loop, or a loop with lagging load, falls as steeply as the loop starts.
         """
         return 0.0 if self.growth_percent * self.loop.offset_arcsec >= 0.0 else math.inf
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """If the load lags, returns a tracker whose loop, at the highest speed, falls no more steeply than
-        this.
+        """Returns, if the load lags, a tracker whose loop falls no more steeply than this at the highest
+        speed.
         """
         if self.growth_percent <= 0.0:
             return None
@@ -89,7 +90,7 @@ class RateDependence(Modulating):
         return None if loop is None else _Tracker(self, loop)
 
     def _most(self) -> float:
-        """Returns the share of the loop at the highest speed."""
+        """Returns the relative growth of the loop at the highest speed."""
         return 0.01 * self.growth_percent * math.log10(1.0 + self.limit_deg_s / self.reference_deg_s)
 
 

@@ -14,12 +14,13 @@ from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 TEETH_PER_TURN = 2.0
-"""Difference of the tooth numbers of circular spline and flexspline: teeth passed per turn of the motor."""
+"""Teeth passed per motor turn: the difference of the tooth numbers of circular spline and flexspline."""
 SCALE = 1e-3
-"""Largest scale error of an encoder that was mounted as intended: a tape on a drum of 100 mm whose radius is
-0.1 mm off. A disc has none, because its lines are whole per turn."""
+"""Largest scale error of a correctly mounted encoder: a tape on a drum of 100 mm whose radius is 0.1 mm off.
+A disc has none, because its line count per turn is whole."""
 SAME_TEETH = 1e-4
-"""Accuracy of a ratio found from a ramp next to other causes, as a share of the ratio: a tenth of `SCALE`."""
+"""Accuracy of a ratio found from a ramp in the presence of other causes, as a share of the ratio: a tenth of
+`SCALE`."""
 
 
 class RatioError(Momentary, Linear):
@@ -50,7 +51,7 @@ class RatioError(Momentary, Linear):
     limit_deg: float = Field(1e6, gt=0, le=1e9, description="motor angle beyond which it is held")
 
     def true_ratio(self, ratio: float) -> float:
-        """Returns the ratio that would leave no ramp, for a model with ``ratio``."""
+        """Returns the ratio without a ramp, for a model with ``ratio``."""
         return 1.0 / (1.0 / ratio + self.ramp_arcsec_per_turn / (DEG_PER_TURN * ARCSEC_PER_DEG))
 
     @classmethod
@@ -58,10 +59,10 @@ class RatioError(Momentary, Linear):
         yield cls(ramp_arcsec_per_turn=1.0)
 
     def implausible(self, observations: Observations) -> str:
-        """Requires whole tooth numbers, a whole turn of the load, or a small error of an encoder's scale.
+        """Requires whole tooth numbers, a whole load turn, or the small scale error of an encoder.
 
-        The ratio of a strain wave gear is half the tooth number of its flexspline, or one more. On less than
-        a turn of the load, any other ramp is an arc of something that returns.
+        The ratio of a strain wave gear is half the tooth number of its flexspline, or one more. Within a load
+        turn, any other ramp is an arc of a periodic error.
         """
         ratio = self.true_ratio(observations.ratio)
         teeth = TEETH_PER_TURN * ratio
@@ -76,7 +77,7 @@ class RatioError(Momentary, Linear):
         return over.position(motion, ratio)
 
     def changing(self, motion: Motion) -> FloatArray:
-        """Returns bends at one third and two thirds of the travel: a wrong ratio has the same slope
+        """Returns bends at one third and two thirds of the travel, because a wrong ratio has the same slope
         everywhere.
         """
         angle = motion.motor_deg

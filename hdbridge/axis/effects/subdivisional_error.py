@@ -19,17 +19,17 @@ LEAST_LINES = 256
 """Minimum line count of an encoder that interpolates."""
 
 RESOLVED = 0.05
-"""Share of the moving samples that suffices to see a line, if they are denser than half a line."""
+"""Share of moving samples denser than half a line that suffices to show a line."""
 IN_STEP = 0.85
-"""Mean resultant length of the steps within a line, above which a slow wave has the same values: it
-explains its square, 0.72, of the line's."""
+"""Mean resultant length of the steps within a line, above which a slow wave has the same values. The wave
+explains the square, 0.72, of the line's power."""
 
 
 class SubdivisionalError(HarmonicSum):
     """Sum over k = 1, 2, 4 of A_k cos(k lines theta_L + phi_k).
 
-    The load angle must be the predicted one, error included. A line is often only a few hundred arcsec wide,
-    so motor angle / N is not accurate enough, and the noise of the measured angle would imitate the effect.
+    The load angle must be the predicted one, including the error. A line is often only a few hundred arcsec
+    wide, so motor angle / N is too inaccurate, and noise of the measured angle would imitate the effect.
     """
 
     name = "subdivisional_error"
@@ -59,7 +59,7 @@ class SubdivisionalError(HarmonicSum):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields one whose line spans a few samples of the record, as an example."""
+        """Yields an encoder whose lines span a few samples of the record, as an example."""
         step_deg = float(np.median(np.abs(np.diff(observations.motion.motor_deg)))) / observations.ratio
         lines = round(DEG_PER_TURN / max(2.7 * step_deg, 0.02))
         yield cls(lines_per_turn=max(lines, 1800), orders=orders_from([1]))
@@ -75,8 +75,10 @@ class SubdivisionalError(HarmonicSum):
                 yield cls(lines_per_turn=lines_per_turn // part, orders=orders_from(few))
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Requires samples denser than the lines or at varied speeds, because equal steps over many lines
-        cannot be distinguished from equal steps over the rest of a line, a slow wave.
+        """Requires samples denser than the lines, or varied speeds.
+
+        Otherwise, equal steps over many lines cannot be distinguished from equal steps of a slow wave within
+        a line.
         """
         speed = observations.motion.motor_speed_deg_s
         if speed is None or not np.any(speed):

@@ -33,4 +33,4 @@ class Synchronous(OrderSeries):
     """The published gear."""
     part = Part.ORDERS
     drifting = ("orders",)
-    """Teeth and the wave generator's bearing wear."""
+    """All orders, because teeth and wave generator bearing wear."""

@@ -28,7 +28,7 @@ TOP: Final = 0.98
 
 
 def top(motion: Motion, channel: Channel) -> float:
-    """Returns the largest magnitude of a measured channel; 0 if it was not measured or never changes."""
+    """Returns the largest magnitude of a measured channel; 0 if unmeasured or constant."""
     values = motion.measured.get(channel)
     if values is None or not float(np.ptp(values)) > 0.0:
         return 0.0
@@ -86,5 +86,5 @@ class TorqueGrowth(Strict):
         return 1.0 + 0.01 * self.growth_percent_per_nm * self.load_at_nm(moment)
 
     def most(self) -> float:
-        """Returns the largest growth, as a share."""
+        """Returns the largest relative growth."""
         return 0.01 * abs(self.growth_percent_per_nm) * self.limit_nm

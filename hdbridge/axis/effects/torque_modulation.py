@@ -24,7 +24,7 @@ from hdbridge.axis.effects.torque import TorqueGrowth, top
 
 
 class TorqueModulation(TorqueGrowth, Modulating):
-    """growth |T| S(theta_M): all carried orders grow alike; to let fewer grow, carry fewer."""
+    """growth |T| S(theta_M): all carried orders grow alike. For fewer orders to grow, carry fewer."""
 
     name = "torque_modulation"
     channels = frozenset({Channel.LOAD_TORQUE})
@@ -90,5 +90,5 @@ class TorqueModulation(TorqueGrowth, Modulating):
         return self.most() * sum(each.amplitude_arcsec for each in self.orders)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Slope of the ripple's growth at the highest torque."""
+        """Returns the slope of the ripple's growth at the highest torque."""
         return self.most() * RAD_PER_DEG * sum(each.order * each.amplitude_arcsec for each in self.orders)

@@ -19,16 +19,15 @@ STRAIGHT = 20.0
 EXPONENT = 0.58
 """Standard deviation of the exponent of speed over shear speed.
 
-It lies between 0, an oil without shear thinning, and 1, a paste with a yield stress: this is the rms distance
-from the law's 1 if all values are equally likely.
-"""
+The exponent lies between 0, an oil without shear thinning, and 1, a paste with a yield stress. With a uniform
+distribution, this is the rms distance from the law's value of 1."""
 
 
 class VelocityWindup(Angleless, Linear):
     """-(coulomb sgn(v) + viscous v / (1 + |v| / shear)): drag over stiffness; zero at rest.
 
-    Dry friction that remains at rest belongs to the elastic loop. The viscous part thins with shear: at the
-    shear speed it is half of the linear value, and far above it is constant.
+    Dry friction that remains at rest belongs to the elastic loop. Because of shear thinning, the viscous part
+    is half of the linear value at the shear speed, and constant far above it.
     """
 
     name = "velocity_windup"
@@ -49,7 +48,7 @@ class VelocityWindup(Angleless, Linear):
     compensable = Compensable(True, "the load really lags and the speed is commanded; at rest it is nothing")
     shape = (Shape("shear_deg_s", 10.0, 100_000.0, logarithmic=True),)
     nonnegative = True
-    """A drag never pushes. An absent one would otherwise come out on either side of zero by chance."""
+    """A drag never pushes. The estimate of an absent drag would otherwise have a random sign."""
     linear = ("coulomb_arcsec", "viscous_arcsec_s_per_deg")
     typical = {
         "coulomb_arcsec": 3.0,
@@ -77,8 +76,8 @@ class VelocityWindup(Angleless, Linear):
     def unidentifiable(self, observations: Observations) -> str:
         """Requires curvature, because a linear drag is indistinguishable from a delayed sample.
 
-        A small dry part is not evidence either. A command in whole counts is followed with a fixed fraction
-        of a count, with the sign of the direction, and that looks the same.
+        A small dry part is not evidence either. A drive follows a command in whole counts with a fixed lag of
+        a fraction of a count, whose sign is that of the direction, and this looks the same.
         """
         speed = observations.motion.motor_speed_deg_s
         if speed is None or self.coulomb_arcsec > 0.5 * observations.motor_count_arcsec:

@@ -49,9 +49,8 @@ class Vibration(Angleless):
     usual = 2
     sought = Sought.TONE
     inexact = 0.03
-    """No source keeps its frequency and amplitude exactly, and the gear's loop responds at
-    other frequencies.
-    """
+    """No source has an exactly constant frequency and amplitude, and the gear's loop responds at other
+    frequencies."""
     typical = {"frequency_hz": 50.0, "amplitude_arcsec": 1.0, "phase_deg": 0.0}
     """1 arcsec at 50 Hz, as an example; the real frequency comes from a search."""
 

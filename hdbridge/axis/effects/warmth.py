@@ -24,9 +24,9 @@ class Warmed(Effect):
     """Base class of effects that follow the gear's warmth: a temperature excess in kelvin, as a first-order
     lag.
 
-    Driven by the temperature channel, the gear follows the sensor with the time constant, in equilibrium at
-    the first sample; warmth is the excess over the reference. Without a sensor it is driven by time: the gear
-    warms up from a cold start at the first sample, finally by ``warm_up_k``.
+    With a temperature channel, the gear follows the sensor with the time constant, in equilibrium at the
+    first sample; warmth is the excess over the reference. Without a sensor, the gear warms up from a cold
+    start at the first sample, by ``warm_up_k`` in the end.
     """
 
     channels = frozenset({Channel.TIME})
@@ -49,7 +49,7 @@ class Warmed(Effect):
         """Yields the possible drivers in a record and their time constants (s).
 
         A sensor on the gear itself hardly leads it. Without a sensor, a change that settles within a minute
-        is creep, and one that takes far longer than the record is a straight line.
+        is creep, and a change that takes far longer than the record is a straight line.
         """
         temperature = observations.motion.measured.get(Channel.TEMPERATURE)
         if temperature is not None and float(np.ptp(temperature)) > VARIES_K:
@@ -59,7 +59,7 @@ class Warmed(Effect):
             yield from (("time", each) for each in SLOW_S if each <= longest)
 
     def needs(self) -> frozenset[Channel]:
-        """Returns time, and temperature if driven by it."""
+        """Returns time, and the temperature channel if the effect is driven by it."""
         return self.channels | ({Channel.TEMPERATURE} if self.driven_by == "temperature" else frozenset())
 
     def warmth(self, motion: Motion) -> FloatArray:

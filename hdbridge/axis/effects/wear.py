@@ -1,4 +1,4 @@
-"""Lost motion that grows with the distance run."""
+"""Lost motion that grows with the distance travelled."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -19,9 +19,9 @@ from hdbridge.units import DEG_PER_TURN
 class Wear(Linear):
     """(growth / 2) (run / 1000)^exponent s: a loop whose height grows with the motor turns run.
 
-    Growth is signed: a loop that widens in the sense of the elastic one is positive, a growing gap (the load
-    lags) negative. Steady wear has exponent 1; running-in, fast at first and then slower, an exponent below
-    1. Within the first turn the height grows linearly, because no power law holds there.
+    Growth is signed: positive for a loop that widens in the sense of the elastic loop, negative for a growing
+    gap (the load lags). Steady wear has exponent 1; running-in, fast at first and then slower, has an
+    exponent below 1. Within the first turn the height grows linearly, because no power law holds there.
     """
 
     name = "wear"
@@ -82,7 +82,7 @@ class Wear(Linear):
         return np.asarray(0.5 * _kiloturns(1.0, self.exponent) * share)
 
     def after(self, turns: float) -> Self:
-        """Returns the effect after the motor has run this many more turns."""
+        """Returns the effect after this many more motor turns."""
         return self.model_copy(update={"turns_before": self.turns_before + turns})
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
@@ -98,7 +98,7 @@ class Wear(Linear):
         return abs(self._half(self.turns_limit))
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Slope of a downward crossing at full height, plus the growth with travel."""
+        """Returns the slope of a downward crossing at full height, plus the growth with travel."""
         crossing = max(-2.0 * self._half(self.turns_limit) / self.width_deg, 0.0)
         return crossing + self._fastest_growth()
 
@@ -118,7 +118,7 @@ def _kiloturns(turns: float, exponent: float) -> float:
 
 
 class _Tracker(Tracker):
-    """State: the stop operator's value, the distance run (degrees), the last angle."""
+    """State: value of the stop operator, distance run (degrees), last angle."""
 
     def __init__(self, effect: Wear, start: Start, fall_arcsec_per_deg: float) -> None:
         """``fall_arcsec_per_deg`` limits the slope of the crossing."""
@@ -133,7 +133,7 @@ class _Tracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """Motor angle of a full crossing at the maximum height; the distance run comes from the file."""
+        """Motor angle of a full crossing at maximum height; the distance run is read from the file."""
         return max(2.0 / self._gain, 2.0 * abs(self._half(self._limit)) / self._fall)
 
     def peek(self, motor_deg: float, moment: Moment) -> float:

@@ -62,7 +62,7 @@ class ZeroDrift(Linear, Warmed):
             yield cls(drift_arcsec_per_k=1.0, tau_s=tau_s, driven_by=driven_by)
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the time, to show how the zero has moved since the record began."""
+        """Returns the time, to show the drift of the zero since the start of the record."""
         return over.time(motion)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:

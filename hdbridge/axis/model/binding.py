@@ -28,8 +28,8 @@ def check_binding(
     """Raises `InputError` if a model or twin belongs to another drive, axis or gear; ``noun`` names it in
     messages.
 
-    ``identity`` is the one read from the drive, by default that of the axis file. Values that the provenance
-    or the drive leaves open are not compared, and neither is the revision, because new firmware does not
+    ``identity`` is the identity read from the drive, by default that of the axis file. Values missing from
+    the provenance or the drive are not compared. Neither is the revision, because new firmware does not
     change a gear.
     """
     bound = Provenance.model_validate(provenance)

@@ -12,11 +12,11 @@ class Difference(NamedTuple):
     effect: str
     """Name of the effect; empty for the ratio."""
     parameter: str
-    """Name with its unit; in a list by its order or number: ``orders[2].amplitude_arcsec``."""
+    """Name with its unit; in a list, with the order or number: ``orders[2].amplitude_arcsec``."""
     before: Any
     after: Any
     half_width: float | None
-    """Half width of its 95 % interval in the later model (else the earlier), if known."""
+    """Half width of the 95 % interval in the later (else the earlier) model, if known."""
 
     @property
     def changed(self) -> bool:
@@ -50,7 +50,7 @@ def _half_widths(model: TransmissionModel) -> Iterator[tuple[tuple[str, str], fl
 
 
 def flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields the leaves of nested parameters; list items are named by their ``order`` if they have one."""
+    """Yields the leaves of nested parameters; list items are named by their ``order``, if any."""
     if isinstance(value, dict):
         for key, inner in value.items():
             yield from flat(inner, f"{name}.{key}" if name else key)

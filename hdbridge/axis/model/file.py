@@ -1,4 +1,4 @@
-"""Model file: schema, reading with errors that give the place, and writing."""
+"""Model file: schema, reading with located errors, and writing."""
 
 import math
 from collections.abc import Mapping
@@ -17,14 +17,14 @@ _HEADER = "# The transmission model of an axis, written by hdbridge. docs/files.
 
 
 class GearOfModel(Strict):
-    """Gear that a model was measured on."""
+    """Gear on which a model was measured."""
 
     ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")
     teeth: Teeth | None = Field(None, description="numbers of teeth")
 
 
 class Provenance(Strict):
-    """Origin and binding of a model; unknown keys are kept as they are."""
+    """Origin and binding of a model; unknown keys are preserved."""
 
     model_config = ConfigDict(defer_build=True, frozen=True, extra="allow")
 
@@ -48,7 +48,9 @@ class EffectEntry(BaseModel):
 class ModelFile(BaseModel):
     """Content of a model file; each effect checks its own parameters."""
 
-    schema_: Literal["hdbridge.model/1"] = Field(alias="schema", description="kind and version of this file")
+    schema_: Literal["hdbridge.model/1"] = Field(
+        alias="schema", description="schema and version of this file"
+    )
     ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")
     effects: tuple[EffectEntry, ...] = Field(description="effects, whose sum is the transmission error")
     provenance: Provenance | None = Field(None, description="origin of the numbers")
@@ -73,7 +75,7 @@ def effects_of(document: Document, file: ModelFile) -> tuple[tuple[Effect, ...],
 
 
 def text_of(document: Mapping[str, Any]) -> str:
-    """Returns the text of a model file; it reads back exactly."""
+    """Returns the text of a model file, from which the same model is read."""
     data = dict(document)
     if "provenance" in data:
         data["provenance"] = _hexadecimal(data["provenance"])
@@ -116,7 +118,7 @@ def _hexadecimal(provenance: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _in_lines(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the data with each list in one line."""
+    """Returns the data with each list on one line."""
     return {
         name: Line(value)
         if isinstance(value, list)

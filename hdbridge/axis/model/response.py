@@ -1,6 +1,6 @@
 """Response of an axis to its correction in motion, and the filter that compensates for it.
 
-At rest the load follows a correction fully. In motion servo, command filter and interpolation change its
+At rest the load follows a correction fully. In motion, servo, command filter and interpolation change its
 amplitude and phase. `Response` holds the measured points and the filter weights computed from them;
 `hdbridge.analysis.response` computes both.
 """
@@ -16,9 +16,9 @@ from hdbridge.strictness import Strict
 class LeadFilter(Strict):
     """Weights of the correction along the path, from the near future to the past, and of earlier outputs.
 
-    Near standstill the filter fades out, because the rest of the move in it would make the motor turn back.
-    Weight j applies to the correction of the load target ``lead_cycles - j / per_cycle`` cycles ahead. The
-    filter's output of i cycles before is subtracted with feedback i. The weights sum to 1 plus the feedback,
+    Near standstill the filter fades out, because the remains of the move in its memory would make the motor
+    turn back. Weight j applies to the correction of the load target ``lead_cycles - j / per_cycle`` cycles
+    ahead. Feedback i is subtracted for the output i cycles earlier. The weights sum to 1 plus the feedback,
     so that nothing changes at rest.
     """
 
@@ -49,7 +49,7 @@ class LeadFilter(Strict):
 
 
 class Response(Strict):
-    """Measured response of an axis to its correction; valid for the servo gains that it was measured with."""
+    """Measured response of an axis to its correction; valid only for the servo gains of the measurement."""
 
     cycle_ms: float = Field(gt=0, description="SYNC period of the measurement")
     following_lag_ms: float = Field(description="lag of the motor behind its target at constant speed")

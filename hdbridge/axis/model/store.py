@@ -10,8 +10,8 @@ Twins are stored in the same way under their own file names (`hdbridge.twin.twin
 here applies to any content of a `Store`.
 
 Each file is replaced atomically, in an order such that a kill at any moment leaves a usable profile: a
-version is in the history before it becomes active, and the log is written last. The active version is not
-recorded anywhere, so the record cannot be wrong: it is the one whose bytes model.yaml has.
+version is in the history before it becomes active, and the log is written last. The number of the active
+version is not stored: it is the version with the same bytes as model.yaml.
 
 The date of each step is passed in.
 """
@@ -46,23 +46,23 @@ class Activation(BaseModel):
 
     date: str = Field(description="date, ISO 8601")
     action: Action = Field(description="action")
-    version: int = Field(ge=1, description="number of the version")
+    version: int = Field(ge=1, description="version number")
     reason: str = Field("", description="why, in words")
 
 
 class LogFile(BaseModel):
-    """The content of ``history/log.yaml``."""
+    """Content of ``history/log.yaml``."""
 
     model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
     schema_: Literal["hdbridge.history/1"] = Field(
-        alias="schema", description="kind and version of this file"
+        alias="schema", description="schema and version of this file"
     )
     activations: tuple[Activation, ...] = Field(description="activations, oldest first")
 
 
 class Kept(Protocol):
-    """Content of a store: something with a provenance that binds it to an axis and its drive."""
+    """Content of a store, with a provenance that binds it to an axis and its drive."""
 
     @property
     def provenance(self) -> Mapping[str, Any]: ...
@@ -84,7 +84,7 @@ class Version(Generic[K]):
     """A stored version."""
 
     number: int | None
-    """None for the pending model, and for an active one that was copied there or edited by hand."""
+    """None for the pending model, and for an active model that was copied there or edited by hand."""
     path: Path
     active: bool
     date: str
@@ -104,7 +104,7 @@ class Store(Generic[K]):
     """All versions of one kind of content in a profile's folder."""
 
     noun: str
-    """Name of the kind, for messages."""
+    """Name of the kind of content, for messages."""
     active: str
     """File name of the active version."""
     pending: str
@@ -112,15 +112,16 @@ class Store(Generic[K]):
     history: str
     """Name of the folder with all versions."""
     first: str
-    """Advice if there is none, for messages."""
+    """Advice for an empty store, for messages."""
     command: str
     """Command that prints the log."""
     load: Callable[[Path], K]
 
     def log(self, profile: Path) -> list[Version[K]]:
-        """Returns all versions, newest first: pending, an active one outside the history, and the history.
+        """Returns all versions, newest first: pending, an active version outside the history, and the
+        history.
 
-        Another process, such as the daemon, may commit the pending one meanwhile.
+        Another process, such as the daemon, may commit the pending version meanwhile.
         """
         activations = self._activations(profile)
         active = _bytes(profile / self.active)
@@ -144,8 +145,8 @@ class Store(Generic[K]):
         return versions
 
     def find(self, profile: Path, name: str) -> Version[K]:
-        """Returns a version by name: ``active``, ``pending`` or a number; raises `InputError` with the
-        existing names.
+        """Returns the version ``active``, ``pending`` or of a number; raises `InputError` with the existing
+        names.
         """
         versions = self.log(profile)
         for version in versions:
@@ -169,19 +170,20 @@ class Store(Generic[K]):
     ) -> Path:
         """Stores content as pending, bound to the profile's axis and the drive's identity; returns the file.
 
-        Replaces another pending one. Raises `InputError` if the gear ratio differs.
+        Replaces a previous pending version. Raises `InputError` if the gear ratio differs.
         """
         axis = AxisConfig.load(profile)
         content.check_ratio(axis)
         with _locked(profile):
-            told = content.with_provenance(date=_iso(date), reason=reason)
-            told.bound_to(axis, identity).save(profile / self.pending)
+            dated = content.with_provenance(date=_iso(date), reason=reason)
+            dated.bound_to(axis, identity).save(profile / self.pending)
         return profile / self.pending
 
     def commit(self, profile: Path, date: datetime, identity: Identity | None = None) -> int:
         """Makes the pending version active; returns its number.
 
-        ``identity`` is the present one of the drive. Raises `InputError` if it, the axis or the gear differs.
+        ``identity`` is the present identity of the drive. Raises `InputError` if the identity, the axis or
+        the gear differs.
         """
         pending = profile / self.pending
         with _locked(profile):
@@ -214,7 +216,7 @@ class Store(Generic[K]):
             return self._activate(profile, path.read_bytes(), "activate", reason, date)
 
     def rollback(self, profile: Path, reason: str, date: datetime, identity: Identity | None = None) -> int:
-        """Undoes the last activation not undone yet; returns the number of the version now active."""
+        """Undoes the last activation that has not been undone; returns the number of the active version."""
         with _locked(profile):
             active = _bytes(profile / self.active)
             earlier = undone(
@@ -255,7 +257,7 @@ class Store(Generic[K]):
         return number
 
     def _keep(self, profile: Path, content: bytes) -> int:
-        """Returns the number of the version with this content; adds it to the history if necessary."""
+        """Returns the version number of this content, which is added to the history if necessary."""
         number = self._number(profile, content)
         if number is None:
             number = max(self._history(profile), default=0) + 1
@@ -304,10 +306,10 @@ class Store(Generic[K]):
 
 
 def undone(activations: Sequence[Activation], active: int | None) -> int | None:
-    """Returns the version that a roll-back returns to, given the log and the active version.
+    """Returns the version to which a roll-back returns, given the log and the active version.
 
-    Roll-backs undo activations one by one, like the undo of an editor. The log may lack the last step after a
-    kill; the active version then completes it. ``active`` is None for a model that is not in the history.
+    Roll-backs undo activations one by one, like the undo of an editor. After a kill the log may lack the last
+    step, which the active version then completes. ``active`` is None for a model outside the history.
     """
     stack: list[int] = []
     for each in activations:
@@ -345,8 +347,8 @@ def _iso(date: datetime) -> str:
 
 @contextmanager
 def measuring(axis_file: Path) -> Iterator[None]:
-    """Allows one measurement of a profile at a time, across processes, because of two proposals one would be
-    lost.
+    """Allows one measurement of a profile at a time, across processes, because a second proposal would
+    replace the first.
 
     Raises `InputError` at once if another process holds the lock. The lock ends with its process.
     """
@@ -390,6 +392,5 @@ MODELS: Final = Store(
     "hdbridge model log",
     TransmissionModel.load,
 )
-"""The models of a profile."""
 log, find, propose, commit = MODELS.log, MODELS.find, MODELS.propose, MODELS.commit
 discard, activate, rollback = MODELS.discard, MODELS.activate, MODELS.rollback

@@ -37,7 +37,7 @@ class TransmissionModel:
     response: Response | None = None
     """Response of the axis to the correction in motion; None if it has not been measured."""
     path: Path | None = field(default=None, compare=False)
-    """File that it was read from."""
+    """File from which the model was read."""
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Returns the transmission error in arcsec for each sample of a motion, shape (n,)."""
@@ -51,7 +51,7 @@ class TransmissionModel:
         return ModelTracker([effect.tracker(start) for effect in self.effects])
 
     def only(self, names: Iterable[str]) -> Self:
-        """Returns the model with only the named effects (unknown names are not an error).
+        """Returns the model with only the named effects; unknown names are ignored.
 
         A law that replaces another is also found by the other's name.
         """
@@ -106,7 +106,7 @@ class TransmissionModel:
         return data
 
     def dump(self) -> str:
-        """Returns the model file's text, which reads back exactly."""
+        """Returns the text of the model file, from which the same model is read."""
         return text_of(self.document())
 
     def save(self, path: Path | str) -> None:
@@ -118,7 +118,7 @@ class TransmissionModel:
         return replace(self, provenance={**self.provenance, **provenance})
 
     def bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> Self:
-        """Returns the model bound to an axis and the identity of its drive (by default the axis file's)."""
+        """Returns the model bound to an axis and the identity of its drive, by default the axis file's."""
         return replace(self, provenance={**self.provenance, **binding(axis, identity)})
 
     def check_ratio(self, axis: AxisConfig) -> None:

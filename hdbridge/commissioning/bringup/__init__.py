@@ -3,8 +3,8 @@
 from typing import Final
 
 LISTEN_S: Final = 1.0
-"""Time that a scan listens before it sends requests; s."""
+"""Time for which a scan listens before it sends requests; s."""
 ASK_TIMEOUT_S: Final = 0.02
-"""Time for a node's first answer to a scan, s; a node that has answered once gets longer for the rest."""
+"""Time-out of a node's first answer to a scan, s; longer for a node that has answered once."""
 TORQUE_PERCENT: Final = 50.0
 """Default motor torque limit of `doctor`, percent of the rated torque."""

@@ -27,20 +27,20 @@ class Verdict:
     measured: str
     """Measured result as text, with figures and units."""
     remedies: tuple[str, ...] = ()
-    """On failure: lines of the axis file to change, or actions, the likeliest first."""
+    """On failure: lines of the axis file to change, or actions, most likely first."""
     figures: Mapping[str, Figure] = field(default_factory=dict)
     """Measured figures as data, with units in the names."""
     error: type[HdbridgeError] = DriveError
-    """Error class of the failure, which decides the exit status."""
+    """Error class of the failure, which determines the exit status."""
 
 
 def passed(measured: str, **figures: Figure) -> Verdict:
-    """Returns a pass."""
+    """Returns a verdict of success."""
     return Verdict(Outcome.PASS, measured, (), figures)
 
 
 def failed(measured: str, *remedies: str, **figures: Figure) -> Verdict:
-    """Returns a failure with its remedies."""
+    """Returns a verdict of failure with its remedies."""
     return Verdict(Outcome.FAIL, measured, remedies, figures)
 
 
@@ -54,7 +54,7 @@ class Check(Generic[P]):
     """One row of a list of checks."""
 
     name: str
-    """One word that identifies the check in data."""
+    """Word that identifies the check in data."""
     title: str
     """Subject of the check, in a few words."""
     run: Callable[[P], Verdict]
@@ -88,13 +88,13 @@ def run_checks(
     checks: Iterable[Check[P]],
     *,
     permitted: Callable[[], str | None] = lambda: None,
-    tell: Callable[[Row[P]], None] = lambda _: None,
+    notify: Callable[[Row[P]], None] = lambda _: None,
 ) -> list[Row[P]]:
-    """Runs the checks in order; ``tell`` receives each row as soon as it is complete.
+    """Runs the checks in order; ``notify`` receives each row as soon as it is complete.
 
     A check whose dependencies have not passed is not possible. ``permitted`` is called once, before the first
-    check that moves the axis; a returned text is the reason why nothing may move. A `HdbridgeError` is a
-    failure of the check that raised it; all other exceptions pass through.
+    check that moves the axis; a returned text is the reason for not moving. An `HdbridgeError` is a failure
+    of the check that raised it; all other exceptions propagate.
     """
     rows: list[Row[P]] = []
     outcomes: dict[str, Outcome] = {}
@@ -113,7 +113,7 @@ def run_checks(
         outcomes[check.name], titles[check.name] = verdict.outcome, check.title
         row = Row(check, verdict)
         rows.append(row)
-        tell(row)
+        notify(row)
     return rows
 
 

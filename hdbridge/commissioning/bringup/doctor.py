@@ -1,4 +1,4 @@
-"""Checks of `doctor`, without power and under power. A new check is a function and a row."""
+"""Checks of `doctor`, without and with power. A new check is a function and a row."""
 
 from collections.abc import Iterator
 from typing import Final
@@ -73,7 +73,7 @@ def bus(context: BringUpContext) -> Verdict:
 
 
 def answers(context: BringUpContext) -> Verdict:
-    """Checks that the node answers; if it does not, lists the nodes that do."""
+    """Checks that the node answers; if not, lists the nodes that answer."""
     axis, drive = context.axis, context.drive
     try:
         where = axis.where("drive.node_id")
@@ -92,12 +92,12 @@ def answers(context: BringUpContext) -> Verdict:
             *(lines if found.nodes else (wiring, *lines)),
         )
     if complaints := [*device_type_complaints(axis, device_type)]:
-        return failed(f"device type {device_type:08X}h is no CiA-402 drive", *complaints)
+        return failed(f"device type {device_type:08X}h is not a CiA-402 drive", *complaints)
     return passed(f"node {axis.drive.node_id}, device type {device_type:08X}h (CiA 402)")
 
 
 def identity(context: BringUpContext) -> Verdict:
-    """Checks that it is the drive of the axis file and supports the required mode."""
+    """Checks that the drive is that of the axis file and supports the required mode."""
     axis, sdo = context.axis, context.drive.sdo
     found = {
         name: sdo.fetch(address)
@@ -113,7 +113,7 @@ def identity(context: BringUpContext) -> Verdict:
 
 
 def _retuned(context: BringUpContext) -> list[str]:
-    """Lines on servo gains that differ from those that the model's response in motion was measured with."""
+    """Yields lines on servo gains that differ from those during the measurement of the model's response."""
     path = context.axis.path.with_name("model.yaml")
     response = TransmissionModel.load(path).response if path.exists() else None
     if response is None or not response.gain_objects:
@@ -156,7 +156,7 @@ def eds(context: BringUpContext) -> Verdict:
 
 
 def _listed(context: BringUpContext) -> Iterator[tuple[int, int]]:
-    """Yields the objects to check: those that are used and that the EDS lists."""
+    """Yields the objects to check: those that are used and listed in the EDS."""
     axis, sdo = context.axis, context.drive.sdo
     target = context.drive.image.cyclic.target
     for address in (
@@ -243,11 +243,11 @@ _OFF: Final = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON)
 _DRIVES_DOING: Final = frozenset(
     {Fault.DROPPED_OUT, Fault.DRIVE_FAULT, Fault.NMT_CHANGE, Fault.LOST_TPDO, Fault.EMERGENCY}
 )
-"""Faults that the master's supervision sees when a drive stops on its own."""
+"""Faults seen by the master's supervision when a drive stops on its own."""
 
 
 def hold(context: BringUpContext) -> Verdict:
-    """Checks that the axis stays in place when power comes."""
+    """Checks that the axis stays in place when power is switched on."""
     with context.interruptible() as interrupted:
         slow = context.slow(interrupted)
         positions = context.drive.read_positions()
@@ -303,14 +303,14 @@ def turn(context: BringUpContext) -> Verdict:
 
 
 def following(context: BringUpContext) -> Verdict:
-    """Judges the following error of that move."""
+    """Judges the following error of the last move."""
     if not context.out:
         return not_possible(_NOT_MOVED)
     return judge_following(context.axis, [each.demand_counts - each.motor_counts for each in context.out])
 
 
 def torque(context: BringUpContext) -> Verdict:
-    """Judges the torque of that move."""
+    """Judges the torque of the last move."""
     if not context.out:
         return not_possible(_NOT_MOVED)
     if objects.TORQUE_ACTUAL in layouts(context.axis).absent:
@@ -320,7 +320,7 @@ def torque(context: BringUpContext) -> Verdict:
 
 
 def settling(context: BringUpContext) -> Verdict:
-    """Judges how the load settled after that move."""
+    """Judges the settling of the load after the last move."""
     if len(context.out) <= context.rest_begins:
         return not_possible(_NOT_MOVED)
     resting = [each.load_counts for each in context.out[context.rest_begins :]]
@@ -351,7 +351,7 @@ def quick_stop(context: BringUpContext) -> Verdict:
 
 
 def heartbeat(context: BringUpContext) -> Verdict:
-    """Withholds the master's heartbeat during slow motion: the drive must stop on its own."""
+    """Withholds the master's heartbeat during slow motion; the drive must stop on its own."""
     axis, sdo = context.axis, context.drive.sdo
     has_timer = _timer(context) is not None
     if not sdo.has(objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub):
@@ -382,7 +382,7 @@ def heartbeat(context: BringUpContext) -> Verdict:
 
 
 def set_points(context: BringUpContext) -> Verdict:
-    """Withholds SYNC and set-points during slow motion while the heartbeat continues: the drive must stop."""
+    """Withholds SYNC and set-points during slow motion while the heartbeat continues; the drive must stop."""
     axis, sdo = context.axis, context.drive.sdo
     timer = _timer(context)
     if timer is None:
@@ -432,7 +432,7 @@ def _plan(context: BringUpContext, slow: SlowAxis) -> TravelPlan:
 
 
 def _far_from(context: BringUpContext, slow: SlowAxis) -> float:
-    """Returns the target of a move to be stopped: back to the initial position, or away from it."""
+    """Returns the target of a move to be interrupted: back to the initial position, or away from it."""
     if abs(slow.place_deg - context.began_deg) > BACK_FROM_DEG:
         return context.began_deg
     return slow.place_deg + _plan(context, slow).span_deg
@@ -443,7 +443,7 @@ def _between(start: Turned, end: Turned) -> Turned:
 
 
 def _noticed(context: BringUpContext) -> str:
-    """Returns advice for a drive that reports the loss of its master and continues."""
+    """Returns advice for a drive that reports the loss of its master but continues."""
     axis = context.axis
     option = axis.drive.quick_stop_option
     again = (

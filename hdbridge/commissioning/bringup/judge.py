@@ -1,4 +1,4 @@
-"""Judgement of the measured figures, separate from their measurement. Pure."""
+"""Judgement of measured figures, separate from the measurement. Pure."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 TOOTH_SHARE: Final = 0.35
 """Maximum error of a ratio, as a share of the distance to its neighbour (N and N + 1 differ by 1/N)."""
 CLOSE_SHARE: Final = 0.001
-"""Accuracy with which a motor turn shows the ratio of a sound gear: 26 arcsec at N = 50."""
+"""Relative accuracy of the ratio of a sound gear from one motor turn: 26 arcsec at N = 50."""
 DEAD_SHARE: Final = 0.02
-"""A load encoder that moves less than this share of the expected travel counts as not moving."""
+"""Share of the expected travel below which a load encoder counts as not moving."""
 USUAL_RATIOS: Final = frozenset(
     each + output for each in (30, 50, 60, 64, 72, 80, 88, 100, 110, 120, 128, 160, 200) for output in (0, 1)
 )
@@ -139,7 +139,8 @@ def _direction(axis: AxisConfig) -> list[str]:
 def accuse(
     axis: AxisConfig, factor: float, tolerance: float, confirmed: frozenset[str] = frozenset()
 ) -> list[Accusation]:
-    """Returns the keys that explain a load travel of ``factor`` times the expected one, the likeliest first.
+    """Returns the keys that explain a load travel of ``factor`` times the expected travel, most likely
+    first.
 
     ``tolerance`` is the relative uncertainty of the factor.
     """
@@ -252,7 +253,7 @@ def judge_rest(axis: AxisConfig, motor: Sequence[int], load: Sequence[int]) -> V
 def judge_channels(
     axis: AxisConfig, readings: Mapping[str, float | None], waited_s: float, rest: Verdict
 ) -> Verdict:
-    """Adds load torque and temperature to the verdict on rest; None is no plausible reading."""
+    """Adds load torque and temperature to the verdict on rest; None is not a plausible reading."""
     text, figures, remedies = rest.measured, dict(rest.figures), list(rest.remedies)
     for key, value in readings.items():
         channel = axis.channels[key]
@@ -367,9 +368,9 @@ def judge_settling(
 def judge_stop(
     axis: AxisConfig, speed_deg_s: float, distance_deg: float, time_s: float, what: str, reaction_s: float
 ) -> Verdict:
-    """Checks that the axis stopped within the time and travel that its ramp allows.
+    """Checks that the axis stopped within the time and travel permitted by its ramp.
 
-    Speed and distance are the motor's. ``reaction_s`` may pass before braking starts.
+    Speed and distance are those of the motor. ``reaction_s`` may pass before braking starts.
     """
     deceleration = axis.limits.acceleration_deg_s2 * axis.gear.ratio
     cycles_s = 3.0 * axis.drive.cycle_s + reaction_s

@@ -1,4 +1,4 @@
-"""New profile folder: a copy of a bundled one, or the data of a drive on the bus."""
+"""New profile folder: a copy of a bundled profile, or the data of a drive on the bus."""
 
 import re
 from pathlib import Path
@@ -19,7 +19,7 @@ _TO_FILL_IN = {
     },
     "gear": {"ratio": "0         # fill in: motor turns per load turn"},
 }
-"""Required keys of an axis file that the drive may not provide; `hdbridge check` stops at unfilled ones."""
+"""Required keys of an axis file that the drive may not provide; `hdbridge check` stops at missing values."""
 _TAIL = """
 # At the load. Begin with little; `hdbridge doctor` moves within these.
 limits:
@@ -33,7 +33,7 @@ limits:
 
 
 def copy_bundled(source: str, folder: Path) -> list[Path]:
-    """Copies a bundled profile into a new folder, names the axis after it, and returns the written files."""
+    """Copies a bundled profile to a new folder and names the axis after it; returns the written files."""
     name = _axis_name(folder)
     origin = bundled_profile(source)
     # A model is bound to the axis by its name, so the copied model gets the new name.

@@ -1,7 +1,7 @@
 """Scan of a CAN bus: listens first, then queries each node id, and writes nothing.
 
-Only SDO read requests are sent (and an SDO abort if one was not answered). A node that is busy with another
-SDO client is left alone, because a second client on the same channel would spoil its transfer.
+Only SDO read requests are sent (and an SDO abort after an unanswered request). A node that is busy with
+another SDO client is skipped, because a second client on the same channel would spoil its transfer.
 """
 
 from collections.abc import Callable
@@ -54,15 +54,15 @@ ENCODER_UNITS_PER_TURN: Final = Address(0x6001, 0, IntegerType.UINT32, "measurin
 
 @dataclass(slots=True)
 class Node:
-    """One node, as far as it is known."""
+    """One node, as far as known."""
 
     node_id: int
     nmt_state: int | None = None
     """State byte of the node's last heartbeat; None without a heartbeat."""
     answers: bool = False
-    """True if it answered an SDO request."""
+    """True if the node answered an SDO request."""
     busy: bool = False
-    """True if another SDO client was using it, so that it was not queried."""
+    """True if the node was not queried because another SDO client was using it."""
     device_type: int | None = None
     identity: dict[str, int] = field(default_factory=dict)
     """Identity by the keys of ``drive.identity``; objects that the node lacks are missing."""
@@ -75,7 +75,7 @@ class Node:
 
     @property
     def profile(self) -> int | None:
-        """Device profile, 402 for a drive; None if it is not known."""
+        """Device profile, 402 for a drive; None if unknown."""
         return None if self.device_type is None else self.device_type & 0xFFFF
 
     @property
@@ -120,7 +120,7 @@ class Scan:
 
     nodes: tuple[Node, ...]
     remarks: tuple[str, ...] = ()
-    """Other observations that matter: other masters, other SDO clients."""
+    """Other relevant observations: other masters, other SDO clients."""
 
     def node(self, node_id: int) -> Node | None:
         """Returns the node with that id, or None."""
@@ -134,7 +134,7 @@ class _Hearing:
         self.link = link
         self.monitor = NetworkMonitor(*NODE_IDS)
         self.spoken: set[int] = set()
-        """Nodes of which any frame was heard."""
+        """Nodes that have sent a frame."""
         self.busy: set[int] = set()
         self.syncs = 0
         self.commands = 0
@@ -185,11 +185,12 @@ def scan_bus(
     progress: Callable[[float], None] = lambda _: None,
     force: bool = False,
 ) -> Scan:
-    """Listens for ``listen_s``, then queries the device type of every node id, and more of those that answer.
+    """Listens for ``listen_s``, then queries the device type of every node id, and further objects of those
+    that answer.
 
-    ``progress`` receives the share done. Raises `BusInUseError` before anything is sent if another master is
-    heard, because a request may stop the axis that it moves; it listens for as long as that detection takes.
-    ``force`` skips the detection. Raises `BusError` if the interface fails.
+    ``progress`` receives the completed share. Raises `BusInUseError` before anything is sent if another
+    master is heard, because a request may stop the axis that it moves; it listens for as long as this
+    detection requires. ``force`` skips the detection. Raises `BusError` if the interface fails.
     """
     force = force or link.private
     ear = _Hearing(link)
@@ -253,13 +254,13 @@ def _fetch(sdo: SdoClient, address: Address) -> int | None:
 
 
 def identity_matches(axis: AxisConfig, node: Node) -> bool:
-    """Returns True if the node's identity is the one that the axis file demands."""
+    """Returns True if the node's identity is that of the axis file."""
     wanted = axis.drive.identity.model_dump(exclude_none=True)
     return all(node.identity.get(name) == value for name, value in wanted.items())
 
 
 def compare(axis: AxisConfig, scan: Scan) -> tuple[bool, list[str]]:
-    """Returns True if the axis file's drive was found; else False and one line for each thing to change."""
+    """Returns True if the axis file's drive was found; else False and one line for each necessary change."""
     there = scan.node(axis.drive.node_id)
     if there is not None and there.answers and there.usable and identity_matches(axis, there):
         return True, []

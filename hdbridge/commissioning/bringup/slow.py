@@ -1,7 +1,7 @@
-"""The state that the checks share, and slow, torque-limited motion of an unverified axis in raw counts.
+"""Shared state of the checks, and slow, torque-limited motion of an unverified axis in raw counts.
 
-Each `enabled` block switches power on at rest, and on every exit brings the axis to rest and switches it off
-again. Everything runs in the control cycle with full supervision.
+Each `enabled` block switches power on at rest, and on every exit brings the axis to rest and switches power
+off again. Everything runs in the control cycle with full supervision.
 """
 
 import math
@@ -35,7 +35,7 @@ from hdbridge.motion.procedures.moves import MotionLimits, MoveTo, Path
 MOTOR_SPEED_DEG_S: Final = 120.0
 """Speed of the moves, motor degrees per second, if the limits allow four times as much."""
 LEAD_DEG: Final = 45.0
-"""Motor travel before a measured standstill, which puts the gear's hysteresis on the same side."""
+"""Motor travel before a measured standstill, which brings the gear's hysteresis to the same side."""
 MARGIN_DEG: Final = 1.0
 """Motor travel kept clear of the axis limits, degrees."""
 LEAST_TRAVEL_DEG: Final = 20.0
@@ -53,7 +53,7 @@ class TravelPlan(NamedTuple):
 def plan_travel(axis: AxisConfig, here_deg: float) -> TravelPlan | None:
     """Returns the travel from a motor angle, to the side with more space; None without enough space.
 
-    One motor turn, or more if the ratio is too high to be distinguished from its neighbour in one.
+    One motor turn, or more if the ratio is too high to be distinguished from its neighbour in one turn.
     """
     limits, ratio = axis.limits, axis.gear.ratio
     ahead = limits.position_max_deg * ratio - here_deg - MARGIN_DEG
@@ -71,7 +71,7 @@ def plan_travel(axis: AxisConfig, here_deg: float) -> TravelPlan | None:
 
 
 class QuietLink(Link):
-    """Link that withholds some identifiers, like a master that has died."""
+    """Link that withholds some identifiers, like a dead master."""
 
     def __init__(self, bus: can.BusABC, clock: Clock) -> None:
         super().__init__(bus, clock)
@@ -101,22 +101,22 @@ class Silence:
     """Reaction of the drive to a silent master."""
 
     noticed_after_s: float | None
-    """Time from the last frame to the drive's reaction, s; None without one within its time-out."""
+    """Time from the last frame to the drive's reaction, s; None without a reaction within its time-out."""
     event: Event | None
-    """First event of the master's supervision, if it kept running."""
+    """First event of the master's supervision, if it continued to run."""
     statusword: int
     """Statusword of the drive at standstill."""
     stands: bool
     distance_deg: float
     """Motor travel from the last frame to standstill, degrees."""
     emergencies: tuple[Emergency, ...] = ()
-    """Emergency messages that the drive sent about it."""
+    """Emergency messages of the drive about the silence."""
     resumed: bool = False
-    """True if it entered the quick stop and left it again by the master's own controlword."""
+    """True if the drive entered the quick stop and left it again by the master's own controlword."""
 
 
 class SlowAxis:
-    """Axis in slow motion. ``interrupted`` is called in each cycle; True stops the axis."""
+    """Axis in slow motion. ``interrupted`` is called in each cycle and stops the axis by returning True."""
 
     def __init__(self, drive: Drive, torque_percent: float, interrupted: Callable[[], bool]) -> None:
         self.axis = drive.axis
@@ -203,7 +203,7 @@ class SlowAxis:
         )
 
     def speed_deg_s(self, way_deg: float, least_s: float = 0.0) -> float:
-        """Returns the speed of a move over ``way_deg`` of the motor that is to last at least ``least_s``."""
+        """Returns the speed of a motor move over ``way_deg`` that lasts at least ``least_s``."""
         limits = self.axis.limits
         speed = min(MOTOR_SPEED_DEG_S, 0.25 * limits.velocity_deg_s * self.axis.gear.ratio)
         return min(speed, abs(way_deg) / least_s) if least_s > 0.0 else speed
@@ -251,7 +251,7 @@ class SlowAxis:
         return speed, way, (rest + 1) * self.cycle.period_s
 
     def lose_heartbeat(self, motor_deg: float, patience_s: float) -> tuple[float, Silence]:
-        """Moves and withholds the master's heartbeat from half-way on; returns the speed and the reaction."""
+        """Moves, withholding the master's heartbeat from half-way on; returns the speed and the reaction."""
         moving = self._follow(motor_deg, 2.0 * patience_s + 1.0)
         moved = self._half_way(moving, motor_deg)
         speed = self._measured_speed(moved)
@@ -309,7 +309,7 @@ class SlowAxis:
         return speed, result
 
     def _half_way(self, moving: Iterator[Feedback], motor_deg: float) -> Sequence[Feedback]:
-        """Moves to the middle of the travel, where it has full speed; ``moving`` is not exhausted."""
+        """Moves to the middle of the travel, at full speed; ``moving`` is not exhausted."""
         begin = self._place_deg
         seen: list[Feedback] = []
         for feedback in moving:
@@ -347,13 +347,13 @@ class SlowAxis:
 Connect = Callable[["AxisConfig"], AbstractContextManager[tuple["can.BusABC", Clock]]]
 """Opens an axis's bus and returns it with its clock."""
 Interruptible = Callable[[], AbstractContextManager[Callable[[], bool]]]
-"""Context that defers interrupts; the function that it yields reports if there was one."""
+"""Context that defers interrupts and yields a function that reports an interrupt."""
 
 
 class BringUpContext(ExitStack):
     """One axis under examination; a context manager that leaves the drive off and the bus closed.
 
-    ``load`` reads the axis file and ``connect`` opens its bus; both are checks, so they are passed as
+    ``load`` reads the axis file and ``connect`` opens its bus. Both are checks, so they are passed as
     functions. ``torque_percent`` limits every motion, percent of the rated torque, in addition to the axis
     file's own limit. With ``force``, frames are sent even if another master is heard on the bus.
     """
@@ -391,19 +391,18 @@ class BringUpContext(ExitStack):
         self._axis, self._od = axis, od
 
     def connect(self) -> None:
-        """Opens the bus; sends nothing yet. Raises `BusError`."""
+        """Opens the bus without sending. Raises `BusError`."""
         bus, clock = self.enter_context(self._connect(self.axis))
         self._drive = self.enter_context(Drive(bus, self.axis, clock, self._od, force=self._force))
 
     @property
     def axis(self) -> AxisConfig:
-        """The axis file."""
         assert self._axis is not None, "checks that need the files come after them"
         return self._axis
 
     @property
     def drive(self) -> Drive:
-        """The drive, not necessarily booted."""
+        """Drive, not necessarily booted."""
         assert self._drive is not None, "checks that need the bus come after it"
         return self._drive
 

@@ -39,15 +39,15 @@ def identify(
 
 
 def measured_of(recordings: Sequence[Recording], *, independent_zeros: bool = False) -> Measured:
-    """Joins recordings in order; uses their legs, or the whole record if there are none.
+    """Joins recordings in order, with their legs, or as a whole without legs.
 
-    ``independent_zeros`` means that the encoders lost their zeros between the recordings.
-    InputError if nothing usable is left.
+    ``independent_zeros`` states that the encoders lost their zeros between the recordings. InputError if
+    nothing usable is left.
     """
     pieces: list[_Piece] = []
     for recording in recordings:
         zeros = int(pieces[-1].zero[-1]) + 1 if pieces else 0
-        apart = independent_zeros or _sessions(recording)
+        apart = independent_zeros or len({each.session for each in tasks_of(recording)}) > 1
         pieces += _pieces(recording, zeros if apart else 0, independent_zeros)
     if not pieces:
         raise InputError("the recordings hold no leg to be used; expected samples: record more")
@@ -98,9 +98,9 @@ def resting(recording: Recording, window_s: float) -> FloatArray:
 def provenance(
     paths: Iterable[Path | str], recordings: Sequence[Recording], held_out: Mapping[str, Any] | str
 ) -> dict[str, Any]:
-    """Returns the provenance that a model file records.
+    """Returns the provenance for a model file.
 
-    ``held_out`` is the gain on unseen data, or the reason why there is none, in words.
+    ``held_out`` is the gain on held-out data, or the reason for its absence, in words.
     """
     dates = sorted({each.date for each in recordings if each.date})
     data: dict[str, Any] = {
@@ -116,11 +116,6 @@ def provenance(
 def with_provenance(model: TransmissionModel, data: dict[str, Any]) -> TransmissionModel:
     """Returns the model with ``data`` added to its provenance."""
     return replace(model, provenance={**model.provenance, **data})
-
-
-def _sessions(recording: Recording) -> bool:
-    """Returns True if the recording has several sessions, each with its own encoder zeros."""
-    return len({each.session for each in tasks_of(recording)}) > 1
 
 
 class _Piece(NamedTuple):

@@ -1,7 +1,7 @@
-"""Growing recording folder: one file per task of a plan; a valid recording at any time.
+"""Growing recording folder with one file per task of a plan; always a valid recording.
 
 After each task its samples are written, then ``recording.yaml`` is replaced atomically. However the
-measurement ends (Ctrl-C, a fault, a kill, a power cut), the folder holds all tasks completed before, and the
+measurement ends (Ctrl-C, a fault, a kill, a power cut), the folder contains all completed tasks, and the
 samples of an interrupted task if there was time to write them. `Journal.open` resumes it.
 """
 
@@ -32,7 +32,7 @@ PAUSE_S = 1.0
 
 
 class TaskEntry(BaseModel):
-    """One run of a task of the plan, as the recording's notes list it."""
+    """One run of a task of the plan, as listed in the recording's notes."""
 
     model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
@@ -59,7 +59,7 @@ class _Notes(BaseModel):
 
 
 class Journal:
-    """Recording folder of a calibration; `add` writes a task into it."""
+    """Recording folder of a calibration, to which `add` adds tasks."""
 
     def __init__(self, folder: Path, about: RecordingFile, plan: Plan) -> None:
         self.folder = folder
@@ -78,7 +78,7 @@ class Journal:
         identity: Identity,
         notes: dict[str, Any],
     ) -> Self:
-        """Creates a journal, written with its first task. InputError if the folder has a recording."""
+        """Creates a journal, written with its first task. InputError if the folder holds a recording."""
         if (folder / ABOUT_NAME).exists():
             raise InputError(
                 f"{folder}: there is a recording already; expected a new folder, or --resume to continue it"
@@ -111,7 +111,7 @@ class Journal:
         return cls(folder, about, plan)
 
     def check_is_of(self, axis: AxisConfig, identity: Identity | None = None) -> None:
-        """Refuses a recording of another axis, gear or drive with InputError."""
+        """Raises InputError for a recording of another axis, gear or drive."""
         for what, theirs, ours in (
             ("axis", self._about.axis, axis.name),
             ("gear ratio", self._about.ratio, axis.gear.ratio),
@@ -133,17 +133,16 @@ class Journal:
 
     @property
     def date(self) -> str:
-        """Date and time of its start, ISO 8601."""
+        """Date and time of the start, ISO 8601."""
         return self._about.date or ""
 
     @property
     def identity(self) -> Identity | None:
-        """Identity of the drive that it was measured with."""
+        """Identity of the drive during the measurement."""
         return self._about.drive
 
     @property
     def notes(self) -> dict[str, Any]:
-        """Notes of the recording."""
         return dict(self._about.notes)
 
     def begin_session(self) -> None:
@@ -160,7 +159,7 @@ class Journal:
         lost: tuple[str, ...] = (),
         survived: tuple[Survived, ...] = (),
     ) -> None:
-        """Writes a task's samples and legs; does nothing if there are no samples."""
+        """Writes a task's samples and legs; does nothing without samples."""
         if not len(record):
             return
         end_s = max((each.end_s for each in self._tasks), default=-PAUSE_S)
@@ -205,7 +204,7 @@ class Journal:
 
 
 def survived_in(folders: Iterable[Path]) -> tuple[str, ...]:
-    """Returns one line for each file whose run tolerated faults."""
+    """Returns one line for each file with tolerated faults."""
     found = []
     for folder in folders:
         if (folder / ABOUT_NAME).exists():
@@ -216,5 +215,5 @@ def survived_in(folders: Iterable[Path]) -> tuple[str, ...]:
 
 
 def tasks_of(recording: Recording) -> tuple[TaskEntry, ...]:
-    """Returns the tasks of a calibration's recording; none for any other recording."""
+    """Returns the tasks of a calibration's recording; empty for any other recording."""
     return _Notes.model_validate({"plan": {}, **recording.notes}).tasks if "plan" in recording.notes else ()

@@ -17,26 +17,26 @@ from hdbridge.files.atomic import make_folder
 from hdbridge.motion.procedures.plan import Plan, Task
 from hdbridge.motion.procedures.rehearsal import rehearse
 
-TELL_CYCLES = 50
-"""Cycles between two reports of progress."""
+REPORT_CYCLES = 50
+"""Number of cycles between two reports of progress."""
 
 
 class Pace:
-    """Progress of a measurement, counted in control cycles: a bench calls `interrupted` once per cycle."""
+    """Progress of a measurement in control cycles; a bench calls `interrupted` once per cycle."""
 
     def __init__(
         self,
         total_s: float,
         period_s: float,
-        tell: Callable[[str, float, float], None],
+        notify: Callable[[str, float, float], None],
         interrupted: Callable[[], bool],
     ) -> None:
-        """``tell`` receives the task's name, the seconds done and the seconds in all."""
+        """``notify`` receives the task's name, and the completed and total seconds."""
         self.name = ""
         self.total_s = total_s
         self._done_s = 0.0
         self._period_s = period_s
-        self._tell = tell
+        self._notify = notify
         self._interrupted = interrupted
         self._cycles = 0
 
@@ -48,14 +48,14 @@ class Pace:
     def interrupted(self) -> bool:
         """Counts a cycle and reports progress; returns the caller's ``interrupted()``."""
         self._cycles += 1
-        if self._cycles >= TELL_CYCLES:
+        if self._cycles >= REPORT_CYCLES:
             self._say()
         return self._interrupted()
 
     def _say(self) -> None:
         self._done_s += self._cycles * self._period_s
         self._cycles = 0
-        self._tell(self.name, min(self._done_s, self.total_s), self.total_s)
+        self._notify(self.name, min(self._done_s, self.total_s), self.total_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ def start_journal(
     identity: Identity,
     notes: dict[str, Any] | None = None,
 ) -> Journal:
-    """Creates a journal; its notes list how the plan was shortened for this axis.
+    """Creates a journal, with the reductions of the plan for this axis in its notes.
 
     InputError if the axis has no encoder at its load.
     """
@@ -112,7 +112,7 @@ def measure(
 ) -> None:
     """Runs the remaining tasks of the journal's plan on a booted drive.
 
-    ``progress`` receives the task's name, the seconds done and those in all. If a task is stopped
+    ``progress`` receives the task's name, and the completed and total seconds. If a task is stopped
     (KeyboardInterrupt, `SafetyStop`, `DriveError`, `BusError`), its samples are kept before the error is
     raised.
     """

@@ -1,4 +1,4 @@
-"""Motion test: ripple over speed by order, path errors, and the response of the axis measured by it."""
+"""Motion test: ripple over speed by order, path errors, and the response of the axis."""
 
 from __future__ import annotations
 
@@ -44,23 +44,23 @@ from hdbridge.motion.procedures.rehearsal import rehearse
 from hdbridge.units import ARCSEC_PER_DEG
 
 CHANCE = 1.05
-"""Factor by which a ripple must be larger to count as larger."""
+"""Ratio above which a ripple counts as larger."""
 FADED = 0.5
-"""Share of the wanted gain below which the filter no longer corrects an order."""
+"""Share of the wanted gain below which the filter counts as no longer correcting an order."""
 RETUNED = (
     "the servo does not answer as it did when the response was measured (following lag {:.1f} ms then, "
     "{:.1f} ms now; the response differs by {:.0f} %): it was retuned, or the load changed; measure the "
     "response again"
 )
 CHECKED = (0.64, 0.38, 0.18)
-"""Speeds of a check of the stored response, as shares of the limit."""
+"""Speeds for checking the stored response, as shares of the limit."""
 NO_LOAD_ENCODER = (
     "load_encoder.source is the motor encoder: the ripple is that of the load angle predicted from motor "
     "encoder and model; path errors are not measured"
 )
 TRIALS = 3
-"""Maximum number of filters tried, each based on the runs of those before it. The first one explores: it
-also corrects orders beyond the known frequency range."""
+"""Maximum number of filters tried, each based on the runs of those before it. The first one explores,
+correcting orders beyond the known frequency range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class OrderRipple:
 
 @dataclass(frozen=True, slots=True)
 class PathResult:
-    """Errors on one path: uncorrected, static, filtered, and with the wind-up compensated as well."""
+    """Errors on one path: uncorrected, static, filtered, and filtered with compensated wind-up."""
 
     name: str
     none: PathError
@@ -94,12 +94,12 @@ class Ripple:
     static_arcsec: float | None = None
     filtered_arcsec: float | None = None
     faded_orders: tuple[int, ...] = ()
-    """Motor orders that the filter does not correct at this speed, because they are too fast."""
+    """Motor orders that are too fast for the filter at this speed."""
     orders: tuple[OrderRipple, ...] = ()
 
     @property
     def in_force_arcsec(self) -> float | None:
-        """Ripple with the filtered correction, or with the static one if there is no filter."""
+        """Ripple with the filtered correction, or without a filter with the static correction."""
         return self.static_arcsec if self.filtered_arcsec is None else self.filtered_arcsec
 
     @property
@@ -120,7 +120,7 @@ class Ripple:
 
 @dataclass(frozen=True, slots=True)
 class MotionTest:
-    """Ripple over speed without correction, with the static one, and with the filtered one."""
+    """Ripple over speed without correction, with the static correction, and with the filtered correction."""
 
     ripples: tuple[Ripple, ...]
     response: Response | None
@@ -128,7 +128,7 @@ class MotionTest:
     remarks: tuple[str, ...] = ()
     paths: tuple[PathResult, ...] = ()
     wind_up: InertialWindup | None = None
-    """Wind-up of the load in acceleration, if compensating for it makes the path error smaller."""
+    """Wind-up of the load in acceleration, if its compensation reduces the path error."""
 
     def applied(self, model: TransmissionModel) -> TransmissionModel:
         """Returns a model with the response and the wind-up of this test."""
@@ -165,7 +165,7 @@ class MotionTest:
 
     @property
     def harms_paths(self) -> bool:
-        """True if the error on all paths together is larger with the filtered correction than without."""
+        """True if the total error on all paths is larger with the filtered correction than without."""
         filtered = [each.filtered.path_arcsec for each in self.paths if each.filtered is not None]
         return bool(filtered) and _rms(filtered) > CHANCE * _rms(
             [each.none.path_arcsec for each in self.paths]
@@ -173,14 +173,14 @@ class MotionTest:
 
     @property
     def gains_by_wind_up(self) -> bool:
-        """True if the error with wind-up, on all paths together, is smaller once that is compensated."""
+        """True if compensating for the wind-up reduces the total path error including wind-up."""
         pairs = [(each.filtered, each.wind_up) for each in self.paths]
         before, after = ([one.delayed_arcsec for one in each if one] for each in zip(*pairs, strict=True))
         return bool(after) and CHANCE * _rms(after) < _rms(before)
 
     @property
     def remaining(self) -> float:
-        """Mean share of the ripple that the filtered correction leaves; 1 without one."""
+        """Mean share of the ripple that remains with the filtered correction; 1 without one."""
         shares = [
             1.0 if each.filtered_arcsec is None else each.filtered_arcsec / each.none_arcsec
             for each in self.ripples
@@ -208,7 +208,6 @@ class MotionTest:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> MotionTest:
-        """Restores a test from `as_dict`."""
         restored: MotionTest = TypeAdapter(cls).validate_python({**data, "ripples": data["speeds"]})
         return restored
 
@@ -231,11 +230,11 @@ def motion_test(
 ) -> MotionTest:
     """Runs a booted drive's axis at several speeds and on paths, without and with the model's correction.
 
-    With ``measure`` the response is measured, otherwise the model's own is tested. A filter is kept only if
-    at every speed it leaves no more ripple than no correction, and no larger path error. InputError if no
-    motor order of the model is large enough to measure, if the travel is too short, or if a response to be
-    tested was measured at another cycle. Without an encoder at the load, the ripple is that of the load angle
-    predicted from the motor encoder, and no path is run.
+    With ``measure`` the response is measured, otherwise the model's own is tested. A filter is kept only if,
+    at every speed, the ripple is no larger than without correction, and the path error is not larger either.
+    InputError if no motor order of the model is large enough to measure, if the travel is too short, or if a
+    response to be tested was measured at another cycle. Without an encoder at the load, the ripple is that of
+    the load angle predicted from the motor encoder, and no path is run.
     """
     runner = _Runner(drive, model, progress, interrupted)
     if not measure:
@@ -316,7 +315,7 @@ def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> Mo
 
 @dataclass(frozen=True, slots=True)
 class ServoCheck:
-    """Comparison of the motor's answers with the stored response."""
+    """Comparison of the motor's response with the stored response."""
 
     stored_lag_ms: float
     lag_ms: float
@@ -339,7 +338,7 @@ class ServoCheck:
 def servo_check(
     drive: Drive, model: TransmissionModel, interrupted: Callable[[], bool] = lambda: False
 ) -> ServoCheck:
-    """Runs a booted drive's axis at a few speeds, and compares the motor's answers with the model's response.
+    """Runs a booted drive's axis at a few speeds, and compares the motor's response with that of the model.
 
     InputError if the model has no response or no motor order.
     """
@@ -381,7 +380,7 @@ class _Runner:
         return self._harmonics(self._run(name, model, self.procedure))
 
     def check(self, model: TransmissionModel) -> tuple[tuple[Harmonics, ...], ServoCheck]:
-        """Runs all speeds with a model that has a response; also compares the motor's answers with it."""
+        """Runs all speeds with a model that has a response; also compares the motor's response with it."""
         stored, runs = model.response, self._run("filtered correction", model, self.procedure)
         assert stored is not None
         answers = Answers(stored, self.motor_orders, self.ratio)
@@ -403,7 +402,7 @@ class _Runner:
         return tuple(harmonics(each, self.orders, self.ratio) for each in runs)
 
     def wind_up(self, runs: Sequence[PathRun]) -> InertialWindup | None:
-        """Returns the wind-up in compensated runs; None if it is not significant or the model has it."""
+        """Returns the wind-up in compensated runs; None if it is insignificant or part of the model."""
         if wind_up_of(self._model) is not None:
             return None
         moves = [each for each in runs if not each.skipped]
@@ -421,12 +420,12 @@ class _Runner:
 
 
 def wind_up_of(model: TransmissionModel) -> InertialWindup | None:
-    """Returns the wind-up of the load in acceleration that a model has."""
+    """Returns a model's wind-up of the load in acceleration."""
     return next((each for each in model.effects if isinstance(each, InertialWindup)), None)
 
 
 def predicted_run(run: EvenRun, model: TransmissionModel) -> EvenRun:
-    """Returns a run with the load angle that the motor encoder and the model predict."""
+    """Returns a run with the load angle predicted from the motor encoder and the model."""
     motor_deg = np.array([each.motor_position_deg for each in run.samples])
     load_deg = motor_deg / model.ratio + model.predict(Motion(motor_deg)) / ARCSEC_PER_DEG
     samples = zip(run.samples, load_deg.tolist(), strict=True)

@@ -1,8 +1,8 @@
-"""Path errors: deviation of the load from its path during a move and after it.
+"""Path errors: deviation of the load from its path during and after a move.
 
 The motor's lag and the wind-up of the gear's spring would be the same on a gear without error. They are
 fitted to the runs as responses to the target, and removed. The gear's error depends on the angle, so a
-response to a smooth target cannot reproduce it. The error with wind-up is that against the target delayed by
+response to a smooth target cannot reproduce it. The error with wind-up is relative to the target delayed by
 the following lag.
 """
 
@@ -24,11 +24,11 @@ FloatArray = NDArray[np.float64]
 SETTLED_ARCSEC = 3.0
 """Distance from the rest position within which the load counts as settled."""
 AT_REST_S = 0.2
-"""Length of the final part of the rest over which the rest error is taken."""
+"""Length of the final part of the rest that determines the rest error."""
 
 
 LAGS = (0, 1, 2, 4, 8, 16, 32, 64)
-"""Lags in cycles between which the speed is averaged, for the response of the motor."""
+"""Limits in cycles of the lags over which the speed is averaged, for the response of the motor."""
 WIND_UP_LAGS = LAGS[:6]
 """Lags of the acceleration, for the wind-up; longer ones would absorb the hysteresis."""
 
@@ -41,20 +41,18 @@ class PathError:
     path_arcsec: float
     """Rms over the path."""
     rest_arcsec: float
-    """Mean error at rest after it."""
+    """Mean error at rest after the path."""
     settle_s: float
     """Time from the end of the path until the load has settled."""
     delayed_arcsec: float
-    """Rms over the path, wind-up and the servo's error in acceleration included."""
+    """Rms over the path, including wind-up and the servo's error in acceleration."""
 
 
 def path_errors(variants: Sequence[Sequence[PathRun]], ratio: float, lag_s: float) -> list[list[PathError]]:
-    """Returns the errors of the same paths run with several corrections, the first without one.
+    """Returns the errors of the same paths run with several corrections, the first without correction.
 
-    ``lag_s`` is the following lag of the axis.
-
-    The motor's response is fitted to the motor encoder of the first, and the wind-up to the others, because
-    in the first the hysteresis hides it.
+    ``lag_s`` is the following lag of the axis. The motor's response is fitted to the motor encoder of the
+    first run, and the wind-up to the others, because hysteresis hides it in the first.
     """
     servo = _fit(
         [_servo_columns(run) for run in variants[0]],

@@ -1,4 +1,4 @@
-"""Whole calibration, from a booted drive to a pending model; its result, also read again from its folder."""
+"""Complete calibration, from a booted drive to a pending model, and its result, restored from its folder."""
 
 import json
 import math
@@ -32,7 +32,7 @@ from hdbridge.units import unit_of
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """Decision to offer a model for commit, with its reason."""
+    """Decision on offering a model for commit, with its reason."""
 
     made: bool
     reason: str
@@ -42,14 +42,14 @@ class Offer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """Result of a calibration, or of a fit to recordings alone (then without validation and offer)."""
+    """Result of a calibration, or of a fit to recordings alone (without validation and offer)."""
 
     recordings: tuple[str, ...]
     fit: FitResult
     model: TransmissionModel
     """Model, with its provenance."""
     active: TransmissionModel | None
-    """Model that it is compared with."""
+    """Model for comparison."""
     axis: str | None = None
     date: str | None = None
     """Date and time of the recording, ISO 8601."""
@@ -58,7 +58,7 @@ class Calibration:
     """Parts of the plan that were shortened for this axis, in words."""
     validation: Validation | None = None
     motion: MotionTest | None = None
-    """Motion test, which measures the response; None if the plan has none."""
+    """Motion test, which measures the response; None without one in the plan."""
     drift: tuple[tuple[float, float], ...] = ()
     """Time (s) and error (arcsec, relative to the first) of each visit to the reference pose."""
     offer: Offer | None = None
@@ -133,7 +133,7 @@ class Calibration:
 
 
 def _number(value: float) -> float | None:
-    """Returns the number; None if it is not finite, because JSON has no infinity."""
+    """Returns the number, or None if it is not finite, because JSON has no infinity."""
     return float(value) if math.isfinite(value) else None
 
 
@@ -152,18 +152,18 @@ def calibrate(
     *,
     progress: Progress = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
-    tell: Callable[[str], None] = lambda _: None,
+    notify: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
     """Measures the remaining tasks, fits, validates, and proposes the model to the profile.
 
-    ``profile`` is the folder of axis.yaml; ``tell`` receives a line for each step. A model that does not
-    improve on unseen data, or that makes the axis point worse, is saved in the recording's folder but not
+    ``profile`` is the folder of axis.yaml; ``notify`` receives a line for each step. A model that does not
+    improve on held-out data, or that worsens positioning, is saved in the recording's folder but not
     proposed.
     """
     axis = drive.axis
     measure(drive, journal, progress=progress, interrupted=interrupted)
-    active = active_model(profile, axis, drive, tell)
-    tell("fitting")
+    active = active_model(profile, axis, drive, notify)
+    notify("fitting")
     recording = journal.recording()
     result = conclude({journal.folder: recording}, axis.gear.ratio, active, axis=axis)
     if active and active.response:
@@ -176,16 +176,16 @@ def calibrate(
         result = replace(result, offer=Offer(False, f"not offered for commit: {result.fit.held_out.text}"))
         return _kept(journal.folder, result)
     if remark := cap_remark(axis, result.model):
-        tell(remark)
+        notify(remark)
     if journal.plan.validation.motion:
-        tell("measuring the response in motion")
+        notify("measuring the response in motion")
         try:
             tested = motion_test(drive, result.model, progress=progress, interrupted=interrupted)
         except InputError as problem:
-            tell(f"not tested in motion: {problem}")
+            notify(f"not tested in motion: {problem}")
         else:
             result = replace(result, model=tested.applied(result.model), motion=tested)
-    tell("testing it on the axis, before and after")
+    notify("testing it on the axis, before and after")
     floor = floor_of(axis, recording)
     checked, model = validate(
         drive,
@@ -199,7 +199,7 @@ def calibrate(
     )
     for each in diff(result.model, model):
         if each.changed:
-            tell(f"{each.effect}.{each.parameter} at rest: {each.after:.2f}; fitted {each.before:.2f}")
+            notify(f"{each.effect}.{each.parameter} at rest: {each.after:.2f}; fitted {each.before:.2f}")
     result = replace(result, model=model, validation=checked)
     before, after = (each.pooled.three_sigma_arcsec for each in (checked.before, checked.after))
     if not checked.improves:
@@ -234,9 +234,9 @@ def conclude(
     axis: AxisConfig | None = None,
     independent_zeros: bool = False,
 ) -> Calibration:
-    """Fits recordings in the order given, keyed by their paths; needs no drive.
+    """Fits recordings in the given order, keyed by their paths; requires no drive.
 
-    With ``axis`` the model is bound to it.
+    With ``axis``, the model is bound to it.
     """
     measured = list(recordings.values())
     fit = identify(measured, ratio, active, independent_zeros=independent_zeros)
@@ -295,7 +295,7 @@ def concluded(folder: Path) -> Calibration:
 
 
 def active_model(
-    profile: Path, axis: AxisConfig, drive: Drive | Rig, tell: Callable[[str], None] = lambda _: None
+    profile: Path, axis: AxisConfig, drive: Drive | Rig, notify: Callable[[str], None] = lambda _: None
 ) -> TransmissionModel | None:
     """Returns the profile's active model if it belongs to this axis and drive, else None."""
     path = profile / "model.yaml"
@@ -305,16 +305,16 @@ def active_model(
     try:
         model.check_bound_to(axis, drive.identity)
     except InputError as problem:
-        tell(f"not compared with the active model: {problem}")
+        notify(f"not compared with the active model: {problem}")
         return None
     if model.response and not model.response.fits_cycle(axis.drive.cycle_s):
-        tell("the response in motion of the active model is not used: it was measured at another cycle")
+        notify("the response in motion of the active model is not used: it was measured at another cycle")
         return replace(model, response=None)
     return model
 
 
 def _kept(folder: Path, result: Calibration) -> Calibration:
-    """Saves the result, the new model and the active one next to the recording."""
+    """Saves the result, the new model and the active model next to the recording."""
     with writing():
         result.model.save(folder / MODEL_NAME)
         if result.active:
@@ -335,8 +335,8 @@ def fit(
     """Fits a model to one or several recordings; ``.model`` is the model, ``.as_dict()`` the document.
 
     ``ratio`` (motor turns per load turn) is needed if neither the recordings nor ``axis`` state it; with
-    ``axis`` the model is bound to it. ``active`` is the model to compare with and to fall back on.
-    ``independent_zeros`` means that the encoders lost their zeros between the recordings.
+    ``axis`` the model is bound to it. ``active`` is the model for comparison and the fall-back.
+    ``independent_zeros`` states that the encoders lost their zeros between the recordings.
 
     InputError if a recording cannot be used, belongs to another gear, or does not come from an axis.
     Quantities that the data do not determine are listed in ``.fit.warnings``.

@@ -1,4 +1,4 @@
-"""Validation of a model: the stepping test with the model before and with the new one."""
+"""Validation of a model: the stepping test with the previous and with the new model."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from hdbridge.units import ARCSEC_PER_DEG, figure
 WINDOW_S = 0.06
 """Averaging time of the stepping test at rest."""
 CHANCE = 2.0
-"""Number of standard errors by which a stepping test must be worse to count as worse."""
+"""Number of standard errors above which a stepping test counts as worse."""
 
 
 def worse_ways(before: Stepped, after: Stepped) -> tuple[str, ...]:
-    """Describes each direction in which steps scatter significantly more after than before.
+    """Describes each direction with a significantly larger scatter of steps after than before.
 
-    The pooled scatter may be smaller nevertheless.
+    The pooled scatter may nevertheless be smaller.
     """
     found = []
     for name, one, other, errors in (
@@ -57,7 +57,8 @@ def worse_ways(before: Stepped, after: Stepped) -> tuple[str, ...]:
 def _chance(steps: int) -> float:
     """Returns the ratio above which a standard deviation from this number of steps is significantly larger.
 
-    The relative standard error of one is 1 / sqrt(2 n), that of the ratio of two 1 / sqrt(n).
+    The relative standard error of a standard deviation is 1 / sqrt(2 n), that of the ratio of two 1 /
+    sqrt(n).
     """
     return 1.0 + CHANCE / math.sqrt(max(steps, 1))
 
@@ -71,13 +72,13 @@ class Validation:
     floor: Floor
     accuracy_before: AxisAccuracy | None = None
     accuracy_after: AxisAccuracy | None = None
-    """Accuracy by the positioning test, if the plan has one."""
+    """Accuracy by the positioning test; None without one in the plan."""
     survived: tuple[str, ...] = ()
-    """One line for each run that tolerated faults."""
+    """One line for each run with tolerated faults."""
 
     @property
     def improves(self) -> bool:
-        """True if the axis does not point significantly worse with the new model."""
+        """True if positioning is not significantly worse with the new model."""
         worse = _chance(sum(map(len, self.after.errors_arcsec)))
         return self.after.pooled.three_sigma_arcsec <= worse * self.before.pooled.three_sigma_arcsec
 
@@ -97,7 +98,7 @@ class Validation:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns plain data, which `from_dict` reads."""
+        """Returns plain data for `from_dict`."""
         return {
             "before": self.before.as_dict(),
             "after": self.after.as_dict(),
@@ -115,7 +116,6 @@ class Validation:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Validation:
-        """Restores it from `as_dict`."""
         stepped = TypeAdapter(Stepped).validate_python
         return cls(
             stepped(data["before"]),
@@ -132,13 +132,13 @@ class Floor:
     """Best possible three sigma of a stepping test, with the gear perfectly known; arcsec."""
 
     quantisation_arcsec: float
-    """Share of the motor encoder, because a motor target is a whole number of counts."""
+    """Contribution of the motor encoder, because a motor target is a whole number of counts."""
     noise_arcsec: float
-    """Share of the load encoder: its noise between settled windows, and its resolution."""
+    """Contribution of the load encoder: its noise between settled windows, and its resolution."""
 
     @property
     def three_sigma_arcsec(self) -> float:
-        """Root sum square of both."""
+        """Root sum square of both contributions."""
         return math.hypot(self.quantisation_arcsec, self.noise_arcsec)
 
 
@@ -251,7 +251,7 @@ def record_kept(bench: Bench, path: Path) -> Iterator[None]:
 
 
 def _accuracy(data: dict[str, Any] | None) -> AxisAccuracy | None:
-    """Restores what `AxisAccuracy.as_dict` returned."""
+    """Restores the accuracy from `AxisAccuracy.as_dict`."""
     return (
         AxisAccuracy(**{name.removesuffix("_arcsec"): value for name, value in data.items()})
         if data

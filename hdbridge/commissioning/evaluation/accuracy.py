@@ -25,9 +25,9 @@ class AxisAccuracy:
     accuracy: float
     """A, bi-directional: largest of mean + 2 s minus smallest of mean - 2 s, over both directions."""
     accuracy_forward: float
-    """A (arrow up): the same for the forward approaches."""
+    """A (arrow up): same for the forward approaches."""
     accuracy_backward: float
-    """A (arrow down): the same for the backward approaches."""
+    """A (arrow down): same for the backward approaches."""
     repeatability: float
     """R, bi-directional: largest max(2 s_i forward + 2 s_i backward + |B_i|; 4 s_i of either)."""
     repeatability_forward: float
@@ -48,7 +48,7 @@ class AxisAccuracy:
     """M: largest minus smallest of the bi-directional means (mean of both directions) of the targets."""
     targets: int
     runs: int
-    """Approaches of each target from each direction (the smallest number)."""
+    """Number of approaches to each target from each direction (the minimum)."""
 
     def as_dict(self) -> dict[str, float]:
         """Returns the figures for JSON, with units in the names."""
@@ -68,8 +68,8 @@ def axis_accuracy(
     """Computes the figures from any number of approaches, in any order; arrays of shape (approaches,).
 
     ``deviation_arcsec`` is the actual position minus the target, ``forward`` is True for approaches in the
-    positive direction. Targets closer than ``same_deg`` are one. Raises `InputError` if a target was not
-    approached at least `MINIMUM_RUNS` times from each direction, because a standard deviation needs them.
+    positive direction. Targets closer than ``same_deg`` count as one. Raises `InputError` if a target was
+    approached fewer than `MINIMUM_RUNS` times from either direction, as required for a standard deviation.
     """
     target = np.asarray(target_deg, dtype=np.float64)
     deviation = np.asarray(deviation_arcsec, dtype=np.float64)

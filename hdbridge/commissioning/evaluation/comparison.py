@@ -1,4 +1,4 @@
-"""Stepping test under each compensation scheme, one after the other on one axis."""
+"""Stepping test under each compensation scheme, in sequence on one axis."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -67,10 +67,10 @@ def compare_schemes(
     finished: Callable[[Scheme, Run[SteppingOutcome]], None] = lambda *_: None,
     stopped: Callable[[Scheme, Record], None] = lambda *_: None,
 ) -> Comparison:
-    """Runs the stepping test under each scheme on a booted drive, which is disabled after each.
+    """Runs the stepping test under each scheme on a booted drive, which is disabled after each test.
 
     ``progress`` receives the completed share of the present scheme, ``finished`` each completed run, and
-    ``stopped`` the measurements of an interrupted one, so that nothing measured is lost.
+    ``stopped`` the measurements of an interrupted run, so that no measurement is lost.
     """
     drive.axis.require_load_encoder()
     # All of them first, so that an impossible compensation is refused before anything moves.

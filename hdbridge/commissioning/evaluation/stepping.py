@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Scheme(Enum):
-    """Parts of the model that the compensation uses."""
+    """Parts of the model used by the compensation."""
 
     NONE = "none"
     SYNCHRONOUS = "synchronous"
@@ -72,7 +72,7 @@ class Stepped:
 
     @classmethod
     def of(cls, model: str, outcome: SteppingOutcome) -> Stepped:
-        """Creates it from the procedure's outcome."""
+        """Creates the result from the procedure's outcome."""
         cw, ccw = outcome.cw, outcome.ccw
         return cls(
             model,
@@ -101,14 +101,14 @@ class Stepped:
         return {name: asdict(getattr(self, name)) for name in ("cw", "ccw", "pooled")}
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns plain data, which `hdbridge.commissioning.calibration.Validation.from_dict` reads."""
+        """Returns plain data for `hdbridge.commissioning.calibration.Validation.from_dict`."""
         return {**asdict(self), **self.scatter}
 
 
 def quantisation_floor_arcsec(motor_counts_per_turn: float, ratio: float) -> float:
-    """Returns three sigma at the load of motor targets rounded to whole counts, a uniform error.
+    """Returns three sigma at the load due to rounding motor targets to whole counts (uniform distribution).
 
-    No compensation by motor targets can be more accurate, however good its model.
+    Compensation by motor targets cannot be more accurate, however good its model.
     """
     count = DEG_PER_TURN * ARCSEC_PER_DEG / (motor_counts_per_turn * ratio)
     return 3.0 * count / math.sqrt(12.0)

@@ -14,20 +14,20 @@ from hdbridge.units import DEG_PER_TURN
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extension:
-    """Extended model, and the findings that the compensation corrects."""
+    """Extended model, and the findings corrected by the compensation."""
 
     model: TransmissionModel
     carried: tuple[Finding, ...]
-    """Findings that the compensation corrects."""
+    """Findings corrected by the compensation."""
     left: tuple[str, ...]
     """Findings that are not compensated, each with the reason."""
 
     refused: tuple[str, ...] = ()
-    """Changes within the model that must not be offered, with the reason; they cannot be removed from it."""
+    """Changes within the model that must not be offered and cannot be removed from it, with the reason."""
 
     @property
     def improves(self) -> bool:
-        """True if every change of the model improves held-out data."""
+        """True if every change of the model improves held-out predictions."""
         return bool(self.carried) and not self.refused
 
     def gains(self) -> list[tuple[str, Gain]]:
@@ -42,11 +42,11 @@ def extension_of(
 
     A lost count or the phase of a vibration has no predictive value. Repeatable effects that are not
     compensated (orders of the load of unknown origin) stay in the model, where the user can state their
-    origin. Wear continues from the turns that the motor has run by the end of the record. Findings without a
-    gain on held-out data, or that may be nothing (`Finding.refusal`), are left out.
+    origin. Wear continues from the motor turns at the end of the record. Findings without a gain on held-out
+    data, or with another reason for refusal (`Finding.refusal`), are left out.
 
-    ``rivals`` are the causes from which each is not separated (`further.unseparated`). If one of them must
-    not be compensated, the finding is left out too, because it may be that one.
+    ``rivals`` are the causes from which each finding is not separated (`further.unseparated`). If one of
+    these must not be compensated, the finding is left out too.
     """
     known = {each.name for each in active.effects}
     reasons = {id(each): _why_not(each, (rivals or {}).get(each.cause, ())) for each in diagnosis.findings}
@@ -96,7 +96,7 @@ def _of_its_time(effect: Effect) -> bool:
 
 
 def _why_not(finding: Finding, rivals: Sequence[str]) -> str:
-    """Returns the reason why the compensation does not correct a finding; empty if it does."""
+    """Returns the reason for not compensating a finding; empty if it is compensated."""
     if finding.cause == "unexplained":
         return (
             f"unexplained, depends on the {finding.lives_in or 'time'}: no law of the catalogue to compensate"
@@ -109,7 +109,7 @@ def _why_not(finding: Finding, rivals: Sequence[str]) -> str:
     for rival in rivals:
         if not CATALOGUE[rival].compensable.possible:
             return (
-                f"{finding.cause} is not compensated: not yet distinguished from {rival}, which must not "
+                f"{finding.cause} is not compensated: not yet separated from {rival}, which must not "
                 f"be: {CATALOGUE[rival].compensable.why}"
             )
     return ""

@@ -1,4 +1,4 @@
-"""Further experiments of the axis that separate the causes which a diagnosis cannot separate."""
+"""Further experiments of the axis, for separating causes that a diagnosis cannot separate."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _CLOSER: Final = {
     "torque": "load-turn-at-two-speeds",
     "time": "reference-pose",
 }
-"""Experiment for something unexplained, by the coordinate that it depends on."""
+"""Experiment for an unexplained residual, by the coordinate that it depends on."""
 
 
 def _sweep(speed: float, **length: float) -> dict[str, Any]:
@@ -82,7 +82,7 @@ def machine_plans() -> dict[str, Plan]:
 
 
 def machine_for_unexplained(lives_in: str) -> str:
-    """Returns the name of the experiment in `machine_plans` that investigates something unexplained."""
+    """Returns the name of the experiment in `machine_plans` that investigates an unexplained residual."""
     return _CLOSER[depends_on(lives_in)]
 
 
@@ -94,7 +94,7 @@ class Choice:
     duration_s: float
     """Duration on an ideal axis."""
     separates: tuple[str, ...]
-    """Alternatives that it is predicted to separate, as text."""
+    """Alternatives that the experiment is predicted to separate, as text."""
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the choice as data."""
@@ -111,9 +111,9 @@ def unseparated(
 ) -> dict[str, tuple[str, ...]]:
     """Returns for each cause found the other causes from which it has not been separated.
 
-    These are its aliases in the diagnosis, and those that none of the ``plans`` used for measuring can
-    separate from it: on a short travel a load order is a ramp, and one of the two always fits slightly
-    better.
+    These are its aliases in the diagnosis, and causes that none of the ``plans`` used for measuring can
+    separate from it. On a short travel, for example, a load order is a ramp, and one of the two always fits
+    slightly better.
     """
     reports = [plan_report(each, model, view.limits)["identifiability"] for each in plans]
     rivals: dict[str, tuple[str, ...]] = {}
@@ -139,8 +139,8 @@ def choose(
 ) -> Choice | None:
     """Returns the shortest experiment that separates most causes from their ``rivals`` and is not ``done``.
 
-    If none does but something is unexplained: the experiment that investigates the coordinate it depends on.
-    None if the axis cannot learn more on its own.
+    If none does, returns the experiment for the coordinate of an unexplained residual. None if the axis
+    cannot find out more on its own.
     """
     menu = sorted(
         ((_duration_s(plan, view), plan) for name, plan in machine_plans().items() if name not in done),
@@ -154,12 +154,12 @@ def choose(
     best: Choice | None = None
     for duration_s, plan in menu if pairs else ():
         report = plan_report(plan, model, view.limits)["identifiability"]
-        told = dict.fromkeys(
+        separated = dict.fromkeys(
             f"{one} or {other}" for one, other, peak in pairs if _separates(report, one, other, peak)
         )
-        if len(told) > (len(best.separates) if best else 0):
-            best = Choice(plan, duration_s, tuple(told))
-        if len(told) == len(pairs):
+        if len(separated) > (len(best.separates) if best else 0):
+            best = Choice(plan, duration_s, tuple(separated))
+        if len(separated) == len(pairs):
             break
     if best:
         return best
@@ -184,7 +184,7 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 
 def _separates(report: dict[str, Any], one: str, other: str, peak_arcsec: float) -> bool:
-    """Returns True if the plan alone would detect the cause at its size and not confuse it with the other."""
+    """Returns True if the plan alone would detect the cause at its size and separate it from the other."""
     seen = report[one]
     limit = seen["detection_limit_arcsec"]
     if not seen["detectable"] or limit is None or limit > peak_arcsec:

@@ -33,15 +33,15 @@ from hdbridge.records.recording import ABOUT_NAME, Recording
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """A further experiment that the axis has run."""
+    """Further experiment run by the axis."""
 
     experiment: str
     about: str
     recording: str
     separates: tuple[str, ...]
-    """Alternatives that it was predicted to separate; empty if it existed already."""
+    """Alternatives that the experiment was predicted to separate; empty if it existed already."""
     found: tuple[str, ...]
-    """Findings after it, each with its alternatives."""
+    """Findings after the experiment, each with its alternatives."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,13 +60,13 @@ class Improvement:
     """For each cause found, the other causes from which it has not been separated."""
     rounds: tuple[Round, ...]
     further: Choice | None
-    """Experiment that the axis could run on its own to learn more."""
+    """Experiment from which the axis could find out more on its own."""
     advice: tuple[str, ...]
     """Advice to the user about open questions."""
     trial: Trial | None
     offer: Offer
     survived: tuple[str, ...] = ()
-    """One line for each file that was measured despite tolerated faults."""
+    """One line for each file with tolerated faults."""
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the document of ``--json``: schema ``hdbridge.improvement/1``."""
@@ -103,9 +103,9 @@ class Source:
     """Data for the diagnosis: a plan to be run (its journal), or existing recordings."""
 
     plan: Plan
-    """Plan whose stepping test the trial uses, also for given recordings."""
+    """Plan with the stepping test of the trial, also for given recordings."""
     folder: Path
-    """Folder for everything new."""
+    """Folder for all new files."""
     journal: Journal | None = None
     given: Mapping[Path, Recording] = field(default_factory=dict)
     independent_zeros: bool = False
@@ -123,21 +123,21 @@ def improve(
     rounds: int = 0,
     progress: Progress = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
-    tell: Callable[[str], None] = lambda _: None,
+    notify: Callable[[str], None] = lambda _: None,
 ) -> Improvement:
     """Diagnoses, extends, steps with both models, and proposes the better one to the profile.
 
-    ``profile`` is the folder of axis.yaml, ``active`` its model; ``tell`` receives a line for each step. The
-    axis runs up to ``rounds`` further experiments while causes remain to be separated. Nothing is proposed if
-    nothing is found, if nothing found can be compensated, or if the model does not gain on held-out data and
-    in stepping. Raises `InputError` if model or recordings belong to another axis or drive.
+    ``profile`` is the folder of axis.yaml, ``active`` its model; ``notify`` receives a line for each step.
+    The axis runs up to ``rounds`` further experiments while causes remain to be separated. Proposes nothing
+    without a finding that can be compensated, or without a gain on held-out data and in stepping. Raises
+    `InputError` if model or recordings belong to another axis or drive.
     """
     active.check_bound_to(drive.axis, drive.identity)
     drive.axis.require_load_encoder()
     bench = _Bench(drive, date, progress, interrupted)
     earlier = source.journal is None or bool(source.journal.done)  # measured before the drive was booted
     recordings, apart = _begin(source, bench)
-    tell("diagnosing")
+    notify("diagnosing")
     diagnosis = diagnose(recordings, active, independent_zeros=apart)
     view = axis_view(drive.axis)
     plans = _plans_of(source, recordings.values())
@@ -148,8 +148,8 @@ def improve(
         journal, pairs = _journal(folder, bench, diagnosis, rivals, active, plans)
         if journal is None:
             break
-        tell(diagnosis.verdict())
-        tell(f"round {len(found) + 1}: {journal.plan.about}, to separate {', '.join(pairs) or 'the rest'}")
+        notify(diagnosis.verdict())
+        notify(f"round {len(found) + 1}: {journal.plan.about}, to separate {', '.join(pairs) or 'the rest'}")
         apart = bench.run(journal) or apart or earlier
         recordings[folder] = journal.recording()
         diagnosis = diagnose(recordings, active, independent_zeros=apart)
@@ -175,7 +175,7 @@ def improve(
     )
     if diagnosis.findings:
         whole = Recording.joined(list(recordings.values()))
-        result = _concluded(result, bench, source, profile, whole, tell)
+        result = _concluded(result, bench, source, profile, whole, notify)
     return _kept(source.folder, result)
 
 
@@ -189,7 +189,7 @@ class _Bench:
     interrupted: Callable[[], bool]
 
     def run(self, journal: Journal) -> bool:
-        """Measures what is missing; returns True if an encoder may have lost its zero between tasks."""
+        """Runs the missing measurements; returns True if an encoder may have lost its zero between tasks."""
         measure(self.drive, journal, progress=self.progress, interrupted=self.interrupted)
         return len({each.session for each in tasks_of(journal.recording())}) > 1
 
@@ -205,7 +205,7 @@ def _begin(source: Source, bench: _Bench) -> tuple[dict[Path, Recording], bool]:
 
 
 def _plans_of(source: Source, given: Iterable[Recording]) -> list[Plan]:
-    """Returns the plans used for measuring, as far as they are known."""
+    """Returns the plans used for measuring, as far as known."""
     if source.journal is not None:
         return [source.journal.plan]
     return [Plan.model_validate(each.notes["plan"]) for each in given if "plan" in each.notes]
@@ -231,7 +231,7 @@ def _journal(
     active: TransmissionModel,
     plans: Sequence[Plan],
 ) -> tuple[Journal | None, tuple[str, ...]]:
-    """Returns the journal of the next experiment: one begun earlier, or the most useful one now."""
+    """Returns the journal of the next experiment: one begun earlier, else the most useful experiment now."""
     axis = bench.drive.axis
     if (folder / ABOUT_NAME).exists():
         journal = Journal.open(folder)
@@ -249,9 +249,9 @@ def _concluded(
     source: Source,
     profile: Path,
     recording: Recording,
-    tell: Callable[[str], None],
+    notify: Callable[[str], None],
 ) -> Improvement:
-    """Adds the trial, if it is worth its time, and the offer."""
+    """Adds the trial, if worthwhile, and the offer."""
     extension, drive = result.extension, bench.drive
     if not extension.carried:
         return replace(result, offer=Offer(False, f"nothing proposed: {'; '.join(extension.left)}"))
@@ -259,8 +259,8 @@ def _concluded(
         return replace(result, offer=Offer(False, f"not offered: {'; '.join(extension.refused)}"))
     model = with_provenance(extension.model, _provenance(result, recording))
     if remark := cap_remark(drive.axis, model):
-        tell(remark)
-    tell("stepping with the active and with the extended model, in turns")
+        notify(remark)
+    notify("stepping with the active and with the extended model, in turns")
     floor = floor_of(drive.axis, recording)
     try:
         trial = try_out(
@@ -276,14 +276,14 @@ def _concluded(
     except InputError as problem:
         return replace(result, offer=Offer(False, f"not offered: {problem}"))
     result = replace(result, trial=trial)
-    told = _told(trial)
+    summary = _summary(trial)
     if not trial.improves:
-        return replace(result, offer=Offer(False, f"not offered: the axis does not point better, {told}"))
-    reason = f"improvement {source.folder.name}: {named(extension.carried)}; {told}"
+        return replace(result, offer=Offer(False, f"not offered: the axis does not point better, {summary}"))
+    reason = f"improvement {source.folder.name}: {named(extension.carried)}; {summary}"
     return replace(result, offer=proposed(profile, model, reason, bench.date, drive))
 
 
-def _told(trial: Trial) -> str:
+def _summary(trial: Trial) -> str:
     big = [each.pooled.three_sigma_arcsec for each in (trial.stepping.before, trial.stepping.after)]
     small = [each.pooled.three_sigma_arcsec for each in trial.small]
     figures = (

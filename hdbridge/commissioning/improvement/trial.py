@@ -1,4 +1,4 @@
-"""Trial of an extended model: stepping with both models in turns, to see if positioning improves."""
+"""Trial of an extended model: stepping with both models in turn, to compare their positioning."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -31,7 +31,7 @@ from hdbridge.motion.procedures.small_steps import SmallSteps
 from hdbridge.motion.procedures.stepping import Stepping, SteppingOutcome
 
 PIECES = 4
-"""Parts of the travel; both models step in each, so that a drift affects both equally."""
+"""Number of parts of the travel; both models step in each part, so that a drift affects both equally."""
 SMALL_STEPS = 40
 DEFAULT_WIDTH_DEG = 20.0
 """Reach of the small steps if the model has no hysteresis; motor degrees."""
@@ -55,13 +55,13 @@ class Trial:
 
     @property
     def worse(self) -> tuple[str, ...]:
-        """Descriptions of what got worse in one direction of either test."""
+        """Descriptions of the deterioration in one direction of either test."""
         small = (f"small steps {each}" for each in worse_ways(*self.small))
         return (*self.stepping.worse, *small)
 
     @property
     def of_floor(self) -> float:
-        """Three sigma of stepping with the extended model over the best possible on this axis."""
+        """Three sigma of stepping with the extended model, relative to the best possible on this axis."""
         return self.stepping.after.pooled.three_sigma_arcsec / self.stepping.floor.three_sigma_arcsec
 
     def as_dict(self) -> dict[str, Any]:
@@ -89,10 +89,10 @@ def try_out(
     progress: Callable[[str, float, float], None] = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Trial:
-    """Steps a booted drive's axis with both models in turns, one part of the travel after the other.
+    """Steps a booted drive's axis with both models in turn, one part of the travel after the other.
 
-    Each run's samples go to ``folder``, also if it is interrupted. Raises `InputError`, before anything
-    moves, if the axis lacks a channel that the model's compensation needs.
+    Each run's samples are written to ``folder``, even if it is interrupted. Raises `InputError` before any
+    motion if the axis lacks a channel that the model's compensation needs.
     """
     axis = drive.axis
     compensations = [compensation_for(axis, each) for each in (active, model)]
@@ -158,7 +158,7 @@ def _together(outcomes: Sequence[SteppingOutcome]) -> SteppingOutcome:
 
 
 def _gain(before: Stepped, after: Stepped) -> float:
-    """Returns the decrease of the variance at equal places, in standard errors."""
+    """Returns the decrease of the variance at the same places, in standard errors."""
     squares = []
     for stepped in (before, after):
         errors = np.concatenate([np.asarray(each) for each in stepped.errors_arcsec])

@@ -1,4 +1,4 @@
-"""The application: all routes over one `Bridge`, errors as problem documents, and its own description."""
+"""Application: all routes over one `Bridge`, errors as problem documents, and the API description."""
 
 from http import HTTPStatus
 from typing import Any, Final
@@ -37,7 +37,7 @@ _ABOUT: Final = (
 
 
 def create_app(bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> FastAPI:
-    """Returns the ASGI application; each listener's `guard.py` decides who may reach it."""
+    """Returns the ASGI application; access is decided by the `guard.py` of each listener."""
     app = FastAPI(
         title="hdbridge",
         version=__version__,
@@ -82,7 +82,7 @@ def _add_pages(app: FastAPI, bridge: ServiceBridge, metrics: Metrics, traffic: T
 
     @app.get("/healthz", include_in_schema=False)
     async def get_health() -> Response:
-        """Returns 200 while the control loop turns, else 503."""
+        """Returns 200 while the control loop runs, else 503."""
         alive = bridge.state().cycle.alive
         status = HTTPStatus.OK if alive else HTTPStatus.SERVICE_UNAVAILABLE
         words = "ok\n" if alive else "the control loop does not turn\n"

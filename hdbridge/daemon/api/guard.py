@@ -1,12 +1,12 @@
-"""Policy of a listener, and the guard that lets no request reach a route that breaks it.
+"""Policy of a listener, and the guard that rejects requests that violate it.
 
-A web page from elsewhere can send requests to a server on the user's own machine. So a request is refused if
-its ``Host`` is not a name of this machine (DNS rebinding), or its ``Origin`` is not the address of the
-request (a foreign page). A token alone does not prevent either.
+A web page from elsewhere can send requests to a server on the user's own machine. A request is therefore
+refused if its ``Host`` is not a name of this machine (DNS rebinding), or if its ``Origin`` is not the address
+of the request (a foreign page). A token alone prevents neither.
 
-The guard checks host and origin, token, requests under way, and the size, depth and duration of a body. A
-stop is never refused to an authorised client: it does not count among the requests under way, and its body is
-not waited for. A refusal closes the connection, so that the rest of a refused body is not read.
+The guard checks host and origin, token, number of requests in progress, and the size, depth and duration of a
+body. A stop from an authorised client is never refused: it is not counted, and the guard does not wait for
+its body. A refusal closes the connection, so the rest of a refused body is not read.
 """
 
 import asyncio
@@ -35,7 +35,7 @@ DEPTH_MAXIMUM: Final = 16
 TOKEN_MINIMUM: Final = 16
 SUBPROTOCOL: Final = "hdbridge.v1"
 TOKEN_SUBPROTOCOL: Final = "bearer."
-"""Prefix of the subprotocol that carries the token, because a browser cannot set headers on a WebSocket."""
+"""Prefix of the subprotocol that contains the token, because a browser cannot set headers on a WebSocket."""
 OWN_NAMES: Final = frozenset({"localhost", "hdbridge"})
 _HOST: Final = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^:/@?#\s\[\]]+)(?::(\d{1,5}))?")
 _BRACKETS: Final = re.compile(rb'"(?:[^"\\]|\\.)*"?|[\[{]|[\]}]', re.DOTALL)
@@ -85,7 +85,7 @@ class Policy:
         return True
 
     def knows_origin(self, origin: str | None, host: str, scheme: str) -> bool:
-        """Returns True if a request comes from no web page, or from one loaded from here.
+        """Returns True if a request does not come from a web page, or comes from a page loaded from here.
 
         A page loaded through a reverse proxy has one of the names, over HTTPS.
         """
@@ -96,11 +96,11 @@ class Policy:
         return kind == "https" and match is not None and match[1] in self.names
 
     def needs_token(self, path: str) -> bool:
-        """Returns True if a path returns data or has an effect; static pages need no token."""
+        """Returns True if a path returns data or has an effect; static pages require no token."""
         return self.token is not None and (path == "/metrics" or path.startswith("/api/"))
 
     def admits(self, authorization: str | None, subprotocols: str | None) -> bool:
-        """Returns True if the token was given; compares in constant time."""
+        """Returns True if the token is correct; compares in constant time."""
         if self.token is None:
             return True
         kind, _, shown = (authorization or "").partition(" ")
@@ -114,7 +114,7 @@ class Policy:
 
 
 def too_deep(body: bytes) -> bool:
-    """Returns True if JSON nests deeper than any valid request; a parser would recurse into it."""
+    """Returns True if JSON is nested too deeply for a valid request; a parser would recurse into it."""
     depth = 0
     for match in _BRACKETS.finditer(body):
         first = match[0][:1]
@@ -134,7 +134,7 @@ class Traffic:
     answered: Counter[tuple[str, int]] = field(default_factory=Counter)
     """Number of answers by method and status."""
     open: Counter[str] = field(default_factory=Counter)
-    """Number of requests under way (``http``) and of WebSockets (``websocket``)."""
+    """Number of requests in progress (``http``) and of WebSockets (``websocket``)."""
 
     @contextmanager
     def under_way(self, kind: str) -> Iterator[None]:
@@ -243,7 +243,7 @@ class Guard:
 
 
 async def _read(scope: Scope, receive: Receive) -> tuple[bytes, Problem | None]:
-    """Reads the body; returns it, or the reason why it is refused."""
+    """Reads the body; returns it, or the reason for refusing it."""
     length = _headers(scope).get("content-length", "0")
     too_large = refusal(413, f"the body is larger than {BODY_MAXIMUM >> 10} KiB; send less at a time")
     if not length.isascii() or not length.isdigit() or int(length[:20]) > BODY_MAXIMUM:
@@ -270,7 +270,7 @@ async def _read(scope: Scope, receive: Receive) -> tuple[bytes, Problem | None]:
 
 
 def _replayed(body: bytes, receive: Receive) -> Receive:
-    """Returns a `Receive` that first returns a body already read."""
+    """Returns a `Receive` that first returns a body that was already read."""
     first: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def replay() -> Message:
@@ -287,7 +287,7 @@ async def _answer(problem: Problem, scope: Scope, receive: Receive, send: Send) 
 
 
 def _headers(scope: Scope) -> dict[str, str]:
-    """Returns the headers; repeated ones are joined, so that two hosts match no host."""
+    """Returns the headers; repeated headers are joined, so that two hosts match no host."""
     found: dict[str, str] = {}
     for name, value in scope["headers"]:
         key = name.decode("latin-1").lower()
@@ -297,7 +297,7 @@ def _headers(scope: Scope) -> dict[str, str]:
 
 
 def _about(scope: Scope) -> dict[str, Any]:
-    """Returns peer, method and path for the log; never headers or the query."""
+    """Returns peer, method and path for the log, but neither headers nor the query."""
     client = scope.get("client") or ("unknown", 0)
     path = scope.get("raw_path") or scope["path"].encode()
     return {

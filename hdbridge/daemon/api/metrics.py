@@ -1,6 +1,7 @@
 """`/metrics` for Prometheus: loop timing, faults, axes and API requests.
 
-A sink of the observer: `take` costs a few microseconds per batch. Everything else is read when scraped.
+A sink of the observer, whose `take` costs a few microseconds per batch. Everything else is read on each
+scrape.
 """
 
 from collections import Counter
@@ -25,7 +26,7 @@ _PREFIX: Final = "hdbridge_"
 
 
 class Metrics:
-    """Counts that accumulate between two scrapes."""
+    """Counts accumulated for the scrapes."""
 
     def __init__(self) -> None:
         self.late = Histogram()
@@ -99,9 +100,9 @@ _AXIS: Final = (
         "Time from the other master's SYNC to the drive's first frame with its target, median.",
         "outer.latency_s",
     ),
-    ("outer_latency_99_seconds", "The same, 99 % of them are not longer.", "outer.latency_99_s"),
+    ("outer_latency_99_seconds", "The same, 99th percentile of that time.", "outer.latency_99_s"),
 )
-"""Name, description and field of each metric of an axis."""
+"""Name, description and field of each axis metric."""
 
 
 class _Scrape(Collector):
@@ -116,7 +117,7 @@ class _Scrape(Collector):
         yield metrics.late.family("cycle_late_seconds", "Delay of the start of cycles.")
         yield metrics.busy.family("cycle_busy_seconds", "Duration of cycles.")
         yield _gauge("info", "1.", [((state.name, state.version), 1)], ("machine", "version"))
-        yield _gauge("loop_alive", "1 if the control loop turns.", [((), state.cycle.alive)])
+        yield _gauge("loop_alive", "1 if the control loop is running.", [((), state.cycle.alive)])
         yield _gauge("cycle_period_seconds", "Period of the cycle.", [((), state.cycle.period_s)])
         skipped = [((), state.cycle.skipped)]
         yield _counter("cycles_skipped", "Periods skipped because the loop was late.", skipped)
@@ -148,7 +149,7 @@ class _Scrape(Collector):
 
 
 def _field(state: Any, path: str) -> Any:
-    """Returns a field of a state, such as ``model.age_s``; None without it."""
+    """Returns a field of a state, such as ``model.age_s``, or None."""
     for name in path.split("."):
         state = getattr(state, name, None)
     return state

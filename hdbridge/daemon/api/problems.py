@@ -15,7 +15,7 @@ _log = logging.getLogger(__name__)
 
 
 class UnknownError(InputError):
-    """The object named by the path does not exist."""
+    """The object in the path does not exist."""
 
 
 def refusal(status: int, detail: str, kind: str = "DaemonError", hint: str | None = None) -> Problem:
@@ -48,7 +48,7 @@ async def _of_the_house(request: Request, error: Exception) -> Response:
 
 
 async def _not_valid(request: Request, error: Exception) -> Response:
-    """Answers a request that violates the schema: one complaint per key, without its value."""
+    """Answers a request that violates the schema, with one complaint per key, without its value."""
     assert isinstance(error, RequestValidationError)
     complaints = []
     for each in error.errors()[:COMPLAINTS_MAXIMUM]:
@@ -74,12 +74,12 @@ async def _unexpected(request: Request, error: Exception) -> Response:
     _log.error("failed", {"method": request.method, "path": request.url.path, "error": repr(error)})
     return answer(
         refusal(
-            500, "an error in hdbridge, told in the daemon's log; whether it was done is not known",
-            "HdbridgeError", "look at the state before going on",
+            500, "an error in hdbridge, see the daemon's log; the outcome of the request is unknown",
+            "HdbridgeError", "check the state before continuing",
         )
     )  # fmt: skip
 
 
 def _printable(text: str) -> str:
-    """Escapes unpaired surrogates, which JSON may contain but UTF-8 cannot."""
+    """Escapes unpaired surrogates, which JSON may contain but UTF-8 may not."""
     return text.encode("utf-8", "backslashreplace").decode()[:400]

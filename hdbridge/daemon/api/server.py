@@ -1,8 +1,8 @@
 """Server: uvicorn on open sockets, with one guard per socket.
 
-This module limits uvicorn's own part: number of connections, time to send a request's head, message size,
-silence of a WebSocket. A connection beyond the limit replaces the one that has been idle longest, so idle
-connections keep nobody out.
+This module limits the connections, the time for a request's head, the message size and the silence of a
+WebSocket in uvicorn itself. A connection beyond the limit replaces the connection that has been idle longest,
+so idle connections do not block others.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hdbridge.daemon.api.sockets import BACKLOG, peer_of
 from hdbridge.daemon.service.bridge import ServiceBridge
 
 CONNECTIONS_MAXIMUM: Final = 256
-"""Maximum number of connections per listener. It exceeds the limits of requests and WebSockets under way,
+"""Maximum number of connections per listener. It exceeds the limits of requests and WebSockets in progress,
 whose connections are never closed for others."""
 ACCEPTED_AT_ONCE: Final = 64
 """Connections accepted at once. Fewer than `CONNECTIONS_MAXIMUM`, so that a request that arrives with its
@@ -66,11 +66,11 @@ class ApiServer:
         return all(server.started for server, _ in self._servers)
 
     async def run(self) -> None:
-        """Serves until `stop` or cancellation; open requests get a moment to complete."""
+        """Serves until `stop` or cancellation; open requests have a moment to complete."""
         # At DEBUG the server's libraries log headers, including the token.
         for name in ("uvicorn", "uvicorn.error", "websockets"):
             logging.getLogger(name).setLevel(logging.WARNING)
-        logging.getLogger("uvicorn.error").addFilter(_worth_telling)
+        logging.getLogger("uvicorn.error").addFilter(_worth_logging)
         async with self._group as group:
             for server, listener in self._servers:
                 group.create_task(server.serve(sockets=[listener.socket]))
@@ -104,14 +104,14 @@ class _Server(uvicorn.Server):
             each.listen(BACKLOG)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Ends; aborts connections that clients have left open."""
+        """Ends, aborting connections that clients have left open."""
         await super().shutdown(sockets)
         for each in tuple(self.server_state.connections):
             each.transport.abort()
 
 
 class _Watched(asyncio.Protocol):
-    """Connection that identifies its peer by the kernel, and is checked every `HEAD_S`."""
+    """Connection whose peer is identified by the kernel, checked every `HEAD_S`."""
 
     client: tuple[str, int] | None
     loop: asyncio.AbstractEventLoop
@@ -133,7 +133,7 @@ class _Watched(asyncio.Protocol):
 
 
 class _Connection(_Watched, H11Protocol):
-    """HTTP connection, one of at most `CONNECTIONS_MAXIMUM`."""
+    """HTTP connection, limited to `CONNECTIONS_MAXIMUM`."""
 
     _idle_since_s = 0.0
     _unsent = 0
@@ -185,7 +185,7 @@ class _WebSocket(_Watched, WebSocketsSansIOProtocol):
             super()._check()
 
 
-def _worth_telling(record: logging.LogRecord) -> bool:
+def _worth_logging(record: logging.LogRecord) -> bool:
     """Returns False for records of client errors: a refused WebSocket, a message that is not UTF-8."""
     words = record.getMessage()
     return "without completing handshake" not in words and "Invalid UTF-8" not in words

@@ -1,7 +1,7 @@
 """Listening sockets of the API, bound here and passed to the server as descriptors.
 
-A server that binds a Unix socket itself makes it writable for everybody (uvicorn: 0666). Here it is bound
-with its final mode, so it is never open to others, not even for a moment.
+A server that binds a Unix socket itself makes it writable for all users (uvicorn: 0666). Here the socket is
+bound with its final mode, so it is never open to others, not even for a moment.
 """
 
 import errno
@@ -35,8 +35,8 @@ class Peer(NamedTuple):
 def unix_socket(path: Path, group: str | None = None) -> socket.socket:
     """Returns a listening Unix socket of mode 0660, with ``group`` as its group if given.
 
-    Replaces a socket without a listener. Raises DaemonError if another process listens there, and InputError
-    for a path that is not a socket, too long or not writable, and for an unknown group.
+    Replaces a socket that nobody listens on. Raises DaemonError if another process listens there, and
+    InputError for a path that is not a socket, too long or not writable, and for an unknown group.
     """
     if len(os.fsencode(path)) > PATH_MAXIMUM:
         raise InputError(f"{path}: longer than {PATH_MAXIMUM} bytes, which no Unix socket may be; shorten it")
@@ -60,7 +60,7 @@ def unix_socket(path: Path, group: str | None = None) -> socket.socket:
 
 
 def file_of(path: Path) -> tuple[int, int]:
-    """Returns device and inode of a socket file, which identify the file that was bound."""
+    """Returns device and inode of a socket file, which identify the bound file."""
     found = path.lstat()
     return found.st_dev, found.st_ino
 
@@ -94,7 +94,7 @@ def peer_of(connected: socket.socket) -> Peer | None:
 
 
 def daemon_of(connected: socket.socket) -> int:
-    """Returns the process id of the daemon at the other end of a Unix socket: that of its keeper."""
+    """Returns the process id of the daemon at the other end of a Unix socket, which is that of its keeper."""
     peer = peer_of(connected)
     assert peer is not None
     if "hdbridge.daemon.serve" not in command_line(peer.pid):

@@ -1,4 +1,5 @@
-"""Following: is the model of an axis still valid, and what has drifted? One pass over the loop's samples.
+"""Following: tests whether an axis's model is still valid, and estimates its drift, in one pass over the
+samples.
 
 `follower` is the pass: `health` of the load encoder, `measuring` (samples to observations and their linear
 problem), then `judging` (verdicts for clients) and `adaptation` (by `estimator`). `statefile` has the files

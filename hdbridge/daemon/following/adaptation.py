@@ -1,9 +1,9 @@
 """Adaptation of one axis: observations update an estimate, and the model in use follows it within bounds.
 
 A window of observations is complete once the axis has moved enough (`Excitation`). It is rejected as a whole
-if neither wear nor temperature can cause it, because both are slow and alike everywhere. Then learning is
-frozen until the cause ends, and the updates by the last windows before it are reverted. `EncoderHealth`
-judges every sample; the tests here need the estimate. Pure: observations contain the time.
+if neither wear nor temperature can cause it, because both are slow and similar everywhere. Learning is then
+frozen until the cause ends, and the updates by the last windows before the fault are reverted.
+`EncoderHealth` judges every sample; the tests here need the estimate. Pure: observations contain the time.
 """
 
 import math
@@ -40,18 +40,18 @@ terms."""
 CLEAR_WINDOWS = 3
 """Consecutive plausible windows that end a freeze."""
 REVERTED_WINDOWS = 3
-"""Number of windows before a fault that are reverted."""
+"""Number of windows before a fault whose updates are reverted."""
 RATE_INTERVALS = 2.0
-"""Maximum number of intervals for which a pause permits change."""
+"""Maximum number of update intervals in the rate limit after a pause."""
 LEAST_SHARE = 0.99
-"""Share of the change permitted per interval that is applied however small it is."""
+"""Share of the permitted change per interval from which a change is applied, however small it is."""
 GATE_SIGMAS = 6.0
 TREND_FREE = 4
-"""Degrees of freedom required to fit a trend in a window."""
+"""Degrees of freedom required for fitting a trend to a window."""
 DRIFT_S = 120.0
-"""Time span in which a drift of the zero is searched."""
+"""Time span that is searched for a drift of the zero."""
 DRIFT_WINDOWS = 6
-"""Minimum number of windows to detect a drift."""
+"""Minimum number of windows for detecting a drift."""
 MAX_DRIFT_WINDOWS = 256
 DRIFT_SIGMAS = 3.0
 
@@ -61,12 +61,12 @@ Entry = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Freeze:
-    """Reason why nothing is learned."""
+    """Reason for suspended learning."""
 
     reason: str
-    """The reason in words, with figures."""
+    """Reason in words, with figures."""
     lasting: bool = False
-    """True if it does not end automatically: the zero must be taken again."""
+    """True if the freeze does not end automatically, because the zero must be learned again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class Proposal:
     model: TransmissionModel
     changes: tuple[Change, ...]
     apply: bool
-    """False if it is only reported (``observe``)."""
+    """False if the model is only reported (``observe``)."""
     time_s: float
     """Axis time."""
 
@@ -89,11 +89,11 @@ class Learned(Strict):
     applied: tuple[float, ...]
     windows: int = Field(ge=0)
     response: Response | None = None
-    """Refined response in motion; None if it is that of the committed model."""
+    """Refined response in motion; None for that of the committed model."""
 
 
 class Adaptation:
-    """Adaptation of one axis. Call `take` with its observations in order, from one thread."""
+    """Adaptation of one axis. `take` must be called with its observations in order, from one thread."""
 
     def __init__(
         self,
@@ -103,18 +103,18 @@ class Adaptation:
         log: Callable[[Entry], None] = lambda _: None,
         learned: Learned | None = None,
     ) -> None:
-        """``whole`` is the committed model that the observations refer to; ``sigma_arcsec`` their noise.
+        """``whole`` is the committed model to which the observations refer; ``sigma_arcsec`` their noise.
 
-        ``learned`` is the state of an earlier adaptation of it. Raises InputError if ``settings`` name a
-        parameter that the model does not have.
+        ``learned`` is the state of an earlier adaptation of this model. Raises InputError if ``settings``
+        name a parameter that the model lacks.
         """
         self.settings = settings
         self.mode: Mode = settings.mode
         self.committed = self.model = whole.model
-        """Committed model, and the one that should be in use: the last one proposed to be applied."""
+        """Committed model, and the model that should be in use: the last one proposed for application."""
         self.freeze_reason: Freeze | None = None
         self.windows = 0
-        """Number of windows learned from."""
+        """Number of learned windows."""
         self._drift = drift = DriftModel(whole.model, settings.parameters)
         self._columns = drift.columns_in(whole)
         self._estimator = calibrated_estimator(drift, settings)
@@ -124,17 +124,17 @@ class Adaptation:
         self._now_s = 0.0
         self._nuisances = drift.has_memory.copy()
         self._nuisances[drift.zero :] = True
-        """Columns that may not be mistaken for a drift: the loop, the zero, the load encoder's disc."""
+        """Columns that must not be mistaken for a drift: the loop, the zero, the load encoder's disc."""
         self._zeros: deque[tuple[float, float]] = deque(maxlen=MAX_DRIFT_WINDOWS)
         """Time and zero of the last windows."""
         self._window: list[Observation] = []
         self._zero_arcsec: float | None = None
-        """Zero when it was taken."""
+        """Zero when it was learned."""
         self._cleared = 0
         self._earlier: deque[tuple[FloatArray, FloatArray]] = deque(maxlen=REVERTED_WINDOWS)
         """Estimates and covariances before each of the last windows."""
         self._begun_s: float | None = None
-        """Time since which it has learned without a freeze; None before the first window."""
+        """Time since which learning has not been frozen; None before the first window."""
         self._window_s: float | None = None
         """End of the last window, used or not."""
         self._proposed = self._used = np.zeros(drift.zero)
@@ -147,9 +147,9 @@ class Adaptation:
             self._restore(learned)
 
     def take(self, observations: Sequence[Observation], now_s: float, fault: str = "") -> Proposal | None:
-        """Takes observations in order; returns a proposal when one is due.
+        """Takes observations in order; returns a proposal when due.
 
-        ``fault`` is a reason, such as a fault of the load encoder, why nothing may be learned now.
+        ``fault`` is a reason for not learning now, such as a fault of the load encoder.
         """
         if self.mode == "off":
             return None
@@ -193,12 +193,12 @@ class Adaptation:
 
     @property
     def may_refine(self) -> bool:
-        """False if it is off, frozen, or the last refinement of the response is too recent."""
+        """False if the adaptation is off or frozen, or the last refinement of the response too recent."""
         recent = self._now_s - self._refined_s < self.settings.interval_s
         return not (self.mode == "off" or self.freeze_reason is not None or recent)
 
     def refine(self, response: Response) -> Proposal:
-        """Takes a refined response in motion, which has no rate: a servo is retuned at once."""
+        """Takes a refined response in motion, without a rate limit, because a servo is retuned at once."""
         model, apply = replace(self.model, response=response), self.mode == "on"
         self._refined_s = self._now_s if apply else math.inf  # only observed: reported once
         if apply:
@@ -207,7 +207,7 @@ class Adaptation:
         return Proposal(model, (), apply, self._now_s)
 
     def withdraw(self) -> Proposal:
-        """Restores the committed response after a refinement that leaves more ripple, and freezes."""
+        """Restores the committed response after a refinement that increased the ripple, and freezes."""
         self.model = replace(self.model, response=self.committed.response)
         self.freeze(
             Freeze("the refined response in motion leaves more ripple: it was withdrawn", lasting=True)
@@ -256,11 +256,11 @@ class Adaptation:
 
     @property
     def zero_moved_arcsec(self) -> float | None:
-        """Change of the zero since it was taken; None before. It is reported, never applied."""
+        """Change of the zero since it was learned; None before. It is reported but never applied."""
         return None if self._zero_arcsec is None else self._zero - self._zero_arcsec
 
     def waiting_reason(self, *, path_known: bool) -> str | None:
-        """Returns the reason why it is frozen or waits; None while it follows or is off."""
+        """Returns the reason for a freeze or a wait; None while it learns or is off."""
         if self.mode == "off":
             return None
         if self.freeze_reason is not None:
@@ -270,14 +270,14 @@ class Adaptation:
         return None if self.windows else "not enough motion yet"
 
     def estimated_changes(self) -> dict[str, float]:
-        """Returns the changes of parameters that the load encoder shows now, before rate limits."""
+        """Returns the present changes of parameters by the load encoder, before rate limits."""
         change = self.estimate_arcsec
         estimated = self._drift.changed(change) if np.any(change) else self.committed
         changes = changes_between(self.committed, self.committed, estimated)
         return {each.parameter: difference(each.parameter, each.before, each.after) for each in changes}
 
     def learned(self) -> Learned:
-        """Returns the state to keep over a restart."""
+        """Returns the state to preserve over a restart."""
         estimator = self._estimator
         return Learned(
             estimate=tuple(estimator.estimate.tolist()),
@@ -288,7 +288,7 @@ class Adaptation:
         )
 
     def _restore(self, learned: Learned) -> None:
-        """Continues from an earlier estimate; the zero must be taken again."""
+        """Continues from an earlier estimate; the zero must be learned again."""
         estimator = self._estimator
         estimate, covariance = np.array(learned.estimate), np.array(learned.covariance)
         applied = np.array(learned.applied)
@@ -358,7 +358,7 @@ class Adaptation:
             self._begun_s = window[0].time_s
 
     def _rate_allowance_arcsec(self, window: list[Observation], rows: FloatArray) -> FloatArray:
-        """Returns the change that the rates permit during the time without observations, (n,)."""
+        """Returns the change that the rates permit for the time without observations, (n,)."""
         if self._window_s is None:
             return np.zeros(len(window))
         gap_h = max(window[0].time_s - self._window_s, 0.0) / 3600.0
@@ -381,7 +381,7 @@ class Adaptation:
         return float(self._estimator.estimate[self._drift.zero])
 
     def _take_zero(self, rows: FloatArray, observed: FloatArray) -> None:
-        """Takes the zero as the median of a window, so that only the scatter about it is tested."""
+        """Learns the zero as the median of a window, so that only the scatter about it is tested."""
         at = self._drift.zero
         estimate = self._estimator.estimate.copy()
         estimate[at] = 0.0
@@ -405,7 +405,7 @@ class Adaptation:
         self._estimator.covariance = covariance
 
     def _zero_drifts(self, time_s: float, zero_arcsec: float) -> Freeze | None:
-        """Takes the zero of a window; tests if the last zeros together drift faster than a gear's."""
+        """Records the zero of a window; tests whether the last zeros together drift faster than a gear's."""
         self._zeros.append((time_s, zero_arcsec))
         while self._zeros[0][0] < time_s - DRIFT_S:
             self._zeros.popleft()
@@ -417,9 +417,9 @@ class Adaptation:
     def _drift_of(
         self, time_s: FloatArray, others: FloatArray, values: FloatArray, sigmas: float, *, lasting: bool
     ) -> Freeze | None:
-        """Tests if values (n,) drift faster than a gear's zero may.
+        """Tests whether values (n,) drift faster than a gear's zero can.
 
-        ``others`` (n, m) are columns that may not be mistaken for a drift.
+        ``others`` (n, m) are columns that must not be mistaken for a drift.
         """
         drift = partial_fit((time_s - float(np.mean(time_s))) / 3600.0, others, values)
         most = self.settings.zero_rate_arcsec_per_hour
@@ -497,7 +497,7 @@ def _changes_json(changes: Sequence[Change]) -> dict[str, dict[str, float]]:
 
 
 def _shift(residual_arcsec: FloatArray, gate_arcsec: FloatArray) -> Freeze | None:
-    """Tests if a window's residuals are within the gate, both (n,), which wear and warmth permit."""
+    """Tests whether a window's residuals are within the gate that wear and warmth permit, both (n,)."""
     if np.all(np.abs(residual_arcsec) <= gate_arcsec):
         return None
     shift = float(np.median(residual_arcsec))

@@ -1,12 +1,12 @@
-"""Recursive least squares with directional forgetting, its prior by the calibration, and its limits.
+"""Recursive least squares with directional forgetting, its prior from the calibration, and its limits.
 
-Each batch of observations ``y = H theta + noise`` is reduced to its information ``H' H / sigma^2``, with
-each parameter scaled by its expected range. Its eigenvectors are the directions that the batch observes. A
-direction is *excited* if the batch alone determines it better than that range. Only along excited directions
-does the covariance grow before the update (Cao and Schwartz 2000, *A directional forgetting algorithm based
-on the decomposition of the information matrix*, Automatica 36; here for a batch at a time). So unobserved
-directions are neither learned nor forgotten, and there is no covariance wind-up: the variance grows only
-where the batch reduces it below its scale again.
+Each batch of observations ``y = H theta + noise`` is reduced to its information ``H' H / sigma^2``, with each
+parameter scaled by its expected range. The eigenvectors are the directions that the batch observes. A
+direction is *excited* if the batch alone determines it better than that range. The covariance grows before
+the update only along excited directions (Cao and Schwartz 2000, *A directional forgetting algorithm based on
+the decomposition of the information matrix*, Automatica 36; here for a batch at a time). Unobserved
+directions are therefore neither learned nor forgotten, and there is no covariance wind-up, because the
+variance grows only where the batch reduces it below its scale again.
 
 Parameters may be held: their uncertainty is accounted for, but neither they nor their variance change
 (Schmidt's consider filter). Without forgetting, the result is that of `analysis.linear` for one batch.
@@ -27,13 +27,14 @@ from hdbridge.daemon.following.measuring import DriftModel
 from hdbridge.daemon.machinefile import AdaptationSettings
 
 EXCITED = 1.0
-"""Information of a batch along a direction, in units of 1 / scale^2, above which the direction is excited."""
+"""Information of a batch along a direction, in units of 1 / scale^2, above which the direction counts as
+excited."""
 NOTHING = 1e-12
-"""Eigenvalue, as a share of the largest, below which a direction counts as without information."""
+"""Eigenvalue, as a share of the largest, below which a direction counts as uninformed."""
 DISC_ARCSEC = 10.0
 """Expected size of the load encoder's own errors per turn."""
 ZERO_ARCSEC = 1000.0
-"""Standard deviation of the zero, which is unknown at first."""
+"""Standard deviation of the initially unknown zero."""
 ZERO_SCALE_ARCSEC = 200.0
 """Scale of the zero; it exceeds that of the disc, so that a common shift is attributed to the zero."""
 LEAST_ARCSEC = 1e-3
@@ -42,7 +43,7 @@ STEP_ARCSEC = 1e-4
 """Step of a coefficient for the derivatives of parameters."""
 SIGMAS_AT_BOUND = 3.0
 MAX_CORRELATION = 0.95
-"""Largest correlation of neighbouring residuals that a standard error allows for."""
+"""Largest correlation of neighbouring residuals allowed for in a standard error."""
 
 
 @dataclass(slots=True)
@@ -68,7 +69,7 @@ class Estimator:
         """Updates the estimate with a batch: rows (n, p), observed (n,), noise standard deviation.
 
         Returns the number of excited directions. ``retention`` is the share of the old information that
-        remains along them (1: nothing is forgotten). Parameters in ``held`` (p,) do not change.
+        remains along them (1 without forgetting). Parameters in ``held`` (p,) do not change.
         """
         free = np.ones(len(self.estimate), dtype=bool) if held is None else ~held
         scale = self.scale[free]
@@ -112,9 +113,9 @@ def calibrated_estimator(drift: DriftModel, settings: AdaptationSettings) -> Est
 
 
 def bounds_arcsec(drift: DriftModel, settings: AdaptationSettings) -> FloatArray:
-    """Returns the largest deviation of each coefficient from the committed one, (zero,).
+    """Returns the largest permitted deviation of each coefficient from the committed value, (zero,).
 
-    The share applies to the largest coefficient of the effect, so that a sine that happens to be zero may
+    The share refers to the largest coefficient of the effect, so that a sine that happens to be zero may
     grow.
     """
     bounds = np.empty(drift.zero)
@@ -127,7 +128,7 @@ def bounds_arcsec(drift: DriftModel, settings: AdaptationSettings) -> FloatArray
 def half_widths(effect: Effect, covariance: FloatArray, before: Mapping[str, Any]) -> dict[str, Any]:
     """Returns 95 % half widths of an effect's parameters for the model file, from the covariance.
 
-    Parameters that do not drift keep those of ``before``.
+    Parameters that do not drift keep the half widths of ``before``.
     """
     values = dict(leaves(effect.parameters()))
     found = {name: half for name, half in leaves(dict(before)) if name in values}
@@ -139,7 +140,7 @@ def half_widths(effect: Effect, covariance: FloatArray, before: Mapping[str, Any
 
 
 def _covariance(effect: Effect, uncertainty: Mapping[str, Any], scale: FloatArray) -> FloatArray:
-    """Returns the coefficients' covariance by the parameters' half widths, or the scale without them."""
+    """Returns the coefficients' covariance from the parameters' half widths, else from the scale."""
     halves = dict(leaves(dict(uncertainty)))
     information = np.diag(1.0 / scale**2)
     for name, slope in _slopes(effect).items():
@@ -183,7 +184,7 @@ def changes_between(
 
 
 class Partial(NamedTuple):
-    """Coefficient of one column in a least-squares fit with others."""
+    """Coefficient of one column in a least-squares fit with other columns."""
 
     value: float
     error: float
@@ -193,7 +194,7 @@ class Partial(NamedTuple):
 
 
 def partial_fit(column: FloatArray, others: FloatArray, values: FloatArray) -> Partial:
-    """Fits values (n,) with a column (n,) and others (n, m)."""
+    """Fits values (n,) with a column (n,) and other columns (n, m)."""
     basis = orthonormal(others)
     own = column - basis @ (basis.T @ column)
     rest = values - basis @ (basis.T @ values)

@@ -37,13 +37,13 @@ NEEDED: Final = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN
 SAVE_S: Final = 300.0
 """Maximum interval in axis time between stores of a changing state."""
 LEAST_CHANGE: Final = 0.01
-"""Smallest change of the response in motion that is reported, as a share."""
+"""Smallest reported change of the response in motion, as a share."""
 UNIFORM: Final = 12.0**0.5
 """Range of a uniform distribution, relative to its standard deviation."""
 
 
 class Outcome(NamedTuple):
-    """Results of some samples."""
+    """Results of a number of samples."""
 
     raised: list[Raised]
     proposal: Proposal | None = None
@@ -57,7 +57,7 @@ NOTHING: Final = Outcome([])
 
 
 class Follower:
-    """Follows one axis and one committed model. Call all methods from one thread."""
+    """Follows one axis and one committed model. All methods must be called from one thread."""
 
     def __init__(
         self,
@@ -66,15 +66,14 @@ class Follower:
         index: int = 0,
         settings: AdaptationSettings | None = None,
     ) -> None:
-        """``index`` is that of the axis in a sample; nothing is adapted before `adapt`."""
+        """``index`` is that of the axis in a sample; there is no adaptation before `adapt`."""
         self.model = model
-        """Committed model."""
         self.health = EncoderHealth(axis, model, index)
         self.adaptation: Adaptation | None = None
         self.updated: datetime | None = None
         """Time at which the model in use was last changed."""
         self.unwatched = NO_LOAD_ENCODER if axis.load_encoder.is_motor_encoder else ""
-        """Reason why gear and load encoder are not watched; empty if they are."""
+        """Reason for not watching gear and load encoder; empty if they are watched."""
         self._index = index
         self._settings = settings or AdaptationSettings()
         self._drift = DriftModel(model)
@@ -90,17 +89,17 @@ class Follower:
         self._next_cycle: int | None = None
         self._files: AdaptationFiles | None = None
         self._entries: list[Entry] = []
-        """Lines of the history that are not written yet."""
+        """Lines of the history that have not been written yet."""
         self._saved_windows = 0
         self._saved_s = -math.inf
         self._now_s = 0.0
         self._refined_at: datetime | None = None
 
     def adapt(self, mode: Mode, files: AdaptationFiles | None = None) -> None:
-        """Changes the mode of the adaptation, or starts it, from the state in ``files`` if there is one.
+        """Changes the mode of the adaptation, or starts it, from the state in ``files`` if any.
 
-        Raises InputError if the settings name a parameter that the model does not have or the axis has no
-        encoder at its load, OutputError if the files cannot be written.
+        Raises InputError if the settings name a parameter that the model lacks, or the axis has no encoder at
+        its load, OutputError if the files cannot be written.
         """
         if self.unwatched:
             raise InputError(self.unwatched)
@@ -170,7 +169,7 @@ class Follower:
         self._servo.use(model.response)
 
     def _refinement(self) -> Proposal | None:
-        """Returns the proposal of a refined response, if one is due."""
+        """Returns the proposal of a refined response if due."""
         adaptation = self.adaptation
         assert adaptation is not None
         if adaptation.freeze_reason is not None:
@@ -222,7 +221,7 @@ class Follower:
             self._files.write(entries, adaptation.learned())
 
     def _begin_of_path(self, axis: Any, cycle: Any) -> int:
-        """Returns the first row of the path that is not interrupted by lost cycles or lost power."""
+        """Returns the first row of the path without lost cycles or lost power."""
         driven = in_states(axis, DRIVEN)
         next_cycle = self._next_cycle if self._next_cycle is not None else int(cycle[0])
         gaps = np.diff(cycle, prepend=next_cycle - 1) != 1

@@ -7,11 +7,11 @@ Four faults are detected, each by a sign that a gear cannot produce:
 * noisy: the jitter of a reading is several times its usual value, or readings jump there and back;
 * drifting: the zero moves faster or farther than warming up can move it.
 
-The signs are in the residual: measured minus predicted transmission error. A gear's error depends on its
-motor: it does not jump while the motor hardly moves, does not stay constant while the motor turns, does not
-become noisier within a second, and does not drift while the axis rests. The prediction in a sample is that at
-the motor angle *issued* in its cycle. The encoders are read at its SYNC, when the motor still lags, so the
-prediction is taken from an earlier time, by the mean lag.
+The signs are in the residual, which is measured minus predicted transmission error. A gear's error depends on
+its motor: it does not jump while the motor hardly moves, does not stay constant while the motor turns, does
+not become noisier within a second, and does not drift while the axis rests. The prediction in a sample is
+that at the motor angle *issued* in its cycle. The encoders are read at its SYNC, when the motor still lags,
+so the prediction is taken from an earlier time, by the mean lag.
 
 Jumps, drifts and noise in motion are judged only with a calibrated model, because without its prediction the
 gear's own error looks the same. The other signs are judged on every axis.
@@ -19,8 +19,8 @@ gear's own error looks the same. The other signs are judged on every axis.
 An encoder that drifts as slowly as a gear warms up, or is eccentric, is not separable from the gear by the
 load encoder alone. A reading that freezes at rest is detected at the next motion.
 
-Frozen and noisy end automatically once the reading has been good for a while. After a jump or a drift the
-encoder's zero is unknown: that lasts until `reset`, or until the drive is verified or homed again.
+Frozen and noisy end automatically once the reading has been good for a while. After a jump or a drift, the
+encoder's zero is unknown until `reset`, or until the drive is verified or homed again.
 """
 
 import math
@@ -48,18 +48,18 @@ DRIVEN: Final = (AxisState.ENABLED, AxisState.STOPPING)
 LONGEST_LAG_S: Final = 0.05
 """Largest lag of a motor that follows."""
 SIDE = 5
-"""Samples on either side of a jump; their median ignores two misread ones."""
+"""Number of samples on either side of a jump; their median ignores two misread samples."""
 MEDIAN_ERROR = 1.25
 """Standard deviation of a median of few values, relative to that of their mean."""
 PREDICTED_SHARE = 0.5
 """Share of the predicted change within a window that may appear too early or too late."""
 UNMODELLED_ARCSEC = 20.0
 UNMODELLED_DEG = 36.0
-"""Largest unmodelled change of the gear's error over this or a longer motor travel: an order of 10 per turn
-with an amplitude of 10 arcsec (`effects.motor_order` is at most 3).
-"""
+"""Motor travel of the largest unmodelled change of the gear's error: an order of 10 per turn with an
+amplitude of 10 arcsec (`effects.motor_order` is at most 3)."""
 SHAKE_S = 0.002
-"""Time by which a speed change may show in the error, through wind-up and skew between the encoders."""
+"""Maximum time between a speed change and its effect on the error, through wind-up and skew between the
+encoders."""
 MEDIAN_DIFFERENCE = 1.0 / (0.6745 * np.sqrt(2.0))
 """Standard deviation of Gaussian values, relative to the median difference of neighbours."""
 STEP_ARCSEC = 6.0
@@ -67,11 +67,11 @@ STEP_SIGMAS = 8.0
 STEP_BLOCKS = 20
 """Minimum number of blocks on either side of a step of the zero."""
 STEP_BETTER = 0.6
-"""Largest ratio of the mean squares left by a step and by a trend."""
+"""Maximum ratio of the mean squares left by a step and by a trend."""
 ZERO_UNKNOWN = (AxisState.UNVERIFIED, AxisState.LENT)
 """States after which the encoders' zeros may have changed."""
 TAIL = 64
-"""Samples evaluated again with the next batch."""
+"""Number of samples that are evaluated again with the next batch."""
 BLOCK_S = 0.25
 BLOCK_SAMPLES = 20
 """Minimum number of usable samples in a block."""
@@ -80,13 +80,13 @@ LEARNING_BLOCKS = 40
 MAX_LEARNING_BLOCKS = 480
 """Maximum number of blocks for the usual jitter; later ones might include a slow fault."""
 NOISY_BLOCKS = 3
-"""Consecutive noisy blocks that are a fault; fewer may be a knock against the machine."""
+"""Number of consecutive noisy blocks that count as a fault; fewer may be a knock against the machine."""
 TREND_BLOCKS = 120
-"""Minimum number of blocks for a slow trend; number of blocks for a fast one."""
+"""Minimum number of blocks for a slow trend, and the number of blocks for a fast trend."""
 MAX_TREND_BLOCKS = 720
 TREND_EVERY = 20
 STEP_S = 180.0
-"""Time span, up to now, in which a step of the zero is searched."""
+"""Time span, up to now, that is searched for a step of the zero."""
 UNTESTED_ARCSEC = 3.0
 """Assumed residual of a model without a held-out result."""
 SIGMAS = 8.0
@@ -94,21 +94,20 @@ SIGMAS = 8.0
 NOISE_RATIO = 4.0
 """Ratio of jitter to its usual value; normal is 1, a damaged track gives 10."""
 SPIKES = 3
-"""Number of readings that jump there and back within ten seconds from which they are not chance."""
+"""Minimum number of readings that jump there and back within ten seconds for a fault."""
 FROZEN_ARCSEC = 120.0
 """Load travel within which the reading must change; more than any backlash."""
 FROZEN_COUNTS = 20.0
-"""Minimum of the same, in counts of the load encoder."""
+"""Minimum of that travel, in counts of the load encoder."""
 ZERO_RATE_ARCSEC_MIN = 3.0
-"""Drift rate of the zero. Warming up moves it by 5 to 60 arcsec in 10 to 60 minutes, typically by 1 per
-minute (`effects.zero_drift`).
-"""
+"""Maximum drift rate of the zero. Warming up moves it by 5 to 60 arcsec in 10 to 60 minutes, typically by 1
+per minute (`effects.zero_drift`)."""
 MAX_ZERO_ARCSEC = 60.0
-"""Total drift of the zero."""
+"""Maximum total drift of the zero."""
 RECOVERED_S = 10.0
-"""Time for which a reading must be good before a fault ends."""
+"""Duration of good readings that ends a fault."""
 STANDING_DEG_S = 1e-6
-"""Speed of the load target below which it is at rest."""
+"""Speed of the load target below which the target counts as at rest."""
 
 Residuals = NDArray[np.void]
 """Samples of one axis with the dtype `RESIDUAL`, shape (n,)."""
@@ -165,7 +164,7 @@ def _lag_s(behind_deg: FloatArray, speed_deg_s: FloatArray) -> float:
 
 
 class Jump(NamedTuple):
-    """A step of the residual."""
+    """Step of the residual."""
 
     row: int
     by_arcsec: float
@@ -218,7 +217,7 @@ def local_noise_arcsec(found: Residuals) -> float:
 
 
 def stuck_arcsec(load_deg: FloatArray, motor_deg: FloatArray, ratio: float) -> tuple[int, float]:
-    """Returns the last row at which the load reading changed (0 if none), and the motor travel since.
+    """Returns the last row with a change of the load reading (0 without one), and the motor travel since.
 
     The travel is in arcsec at the load.
     """
@@ -243,7 +242,6 @@ def _median(values: FloatArray) -> FloatArray:
 
 
 def _ranges(width: int, values: FloatArray) -> FloatArray:
-    """Returns the range of the values in each window."""
     windows = _windows(values, width)
     return np.asarray(windows.max(axis=0) - windows.min(axis=0))
 
@@ -274,7 +272,7 @@ def trend(
 def find_step(
     time_s: FloatArray, residual_arcsec: FloatArray, direction: FloatArray, velocity_deg_s: FloatArray
 ) -> tuple[float, Partial] | None:
-    """Returns time and size of a step of the zero in block means, if it fits far better than a trend."""
+    """Returns time and size of a step of the zero in block means, if a step fits far better than a trend."""
     plain = _motion_columns(direction, velocity_deg_s)
     basis = orthonormal(plain)
     rest = residual_arcsec - basis @ (basis.T @ residual_arcsec)
@@ -321,7 +319,7 @@ LATCHED = frozenset({EncoderFault.JUMPED, EncoderFault.DRIFTING})
 
 
 class EncoderStatus(NamedTuple):
-    """State of the load encoder: its fault if any, and the reason in words, with figures."""
+    """State of the load encoder: its fault, if any, and the reason in words, with figures."""
 
     fault: EncoderFault | None = None
     reason: str = ""
@@ -336,7 +334,7 @@ class _Zero:
     )
     """Time, mean residual, direction and speed of each block."""
     new: int = 0
-    """Blocks since the last evaluation."""
+    """Number of blocks since the last evaluation."""
     reference_arcsec: float | None = None
     suspicions: int = 0
 
@@ -355,7 +353,7 @@ class EncoderHealth:
         self._load_count_arcsec = axis.load_encoder.resolution_arcsec
         self._residual_arcsec = held_out_arcsec(model)
         self._predicted = bool(model.effects)
-        """False without a prediction: then the gear's own error may look like an encoder fault."""
+        """False without a prediction, in which case the gear's own error may look like an encoder fault."""
         self._jitters: dict[bool, list[float]] = {True: [], False: []}
         self._learned: dict[bool, float] = {}
         """Usual jitter at rest (True) and in motion (False)."""
@@ -378,7 +376,7 @@ class EncoderHealth:
         self.restart()
 
     def restart(self) -> None:
-        """Learns the zero anew, for example when another model predicts."""
+        """Learns the zero again, for example after a change of the predicting model."""
         self._zero = _Zero()
         self._forget_samples()
 
@@ -427,7 +425,7 @@ class EncoderHealth:
             self.status = EncoderStatus(fault, f"load encoder {fault.value}: {why}")
 
     def _judge_frozen(self, found: Residuals) -> bool:
-        """Raises a frozen reading; also returns True while the reading is suspiciously constant."""
+        """Reports a frozen reading; also returns True while the reading is suspiciously constant."""
         found = found[found["fresh"]]
         if not len(found):
             return False
@@ -532,7 +530,7 @@ class EncoderHealth:
             self._judge_trend(blocks)
 
     def _direction(self, speed_deg_s: float) -> float:
-        """Returns the direction of the present motion, or at rest that of the last one."""
+        """Returns the direction of the present motion, or of the last motion at rest."""
         if abs(speed_deg_s) > 1e-9 or not self._zero.blocks:
             return float(np.sign(speed_deg_s))
         return self._zero.blocks[-1][2]

@@ -51,41 +51,41 @@ RAISE_S: Final = 60.0
 WITHDRAW_S: Final = 300.0
 """Time without evidence after which a verdict is withdrawn."""
 NOISE_RATIO: Final = 1.5
-"""Noise in operation relative to that of a calibration."""
+"""Ratio of the noise in operation to that of a calibration."""
 ORDER_ARCSEC: Final = 0.8
-"""Smallest change of the orders that counts, at the load."""
+"""Smallest relevant change of the orders, at the load."""
 LOOP_ARCSEC: Final = 1.5
 LOOP_SHARE: Final = 3.0 * Scales().calibrated
-"""Smallest change of a hysteresis loop: the larger of `LOOP_ARCSEC` and this share of the loop."""
+"""Smallest relevant change of a hysteresis loop: the larger of `LOOP_ARCSEC` and this share of the loop."""
 ZERO_ARCSEC: Final = 5.0
-"""Smallest change of the zero that counts: the smallest effect of warming up (`effects.zero_drift`)."""
+"""Smallest relevant change of the zero: the smallest effect of warming up (`effects.zero_drift`)."""
 LEFT_ARCSEC: Final = 0.5
-"""Smallest unexplained residual that counts, rms, in addition to the noise."""
+"""Smallest relevant unexplained residual, rms, in addition to the noise."""
 MAX_OBSERVATIONS: Final = 600
-"""Maximum number of observations evaluated together."""
+"""Maximum number of observations that are evaluated together."""
 SPARE: Final = 20
-"""Places required in addition to one per column."""
+"""Number of places required in addition to one per column."""
 CLEARLY: Final = 0.8
-"""Share of a limit below which a value is not near it."""
+"""Share of a limit below which a value is clearly under it."""
 TREND_ARCSEC: Final = 60.0
 """Scale of the zero's trend, from the middle of the observations to one end."""
 REPORTED_SHARE: Final = 0.02
 """Relative change of a parameter above which it is reported."""
 CELL: Final = 0.1
-"""Rounding of the columns; rows that agree after it are one place."""
+"""Rounding of the columns; rows that are equal after rounding count as one place."""
 
 
 class Verdict(Enum):
-    """Verdict of the watch on an axis."""
+    """Verdict on an axis."""
 
     HOLDS = "the model holds"
     RECALIBRATE = "recalibrate"
-    """Parts of the model have changed as by wear, temperature or ageing; a calibration corrects this."""
+    """Parts of the model have changed as by wear, temperature or ageing, which a calibration corrects."""
     SOMETHING_CHANGED = "something changed"
-    """No such change explains the measurements; a diagnosis is needed."""
+    """No such change explains the measurements, so a diagnosis is required."""
     ENCODER = "the load encoder is not believed"
     RETUNED = "measure the response in motion again"
-    """The servo does not answer as when it was measured, so the correction in motion is wrong."""
+    """The servo's response differs from the measured response, so the correction in motion is wrong."""
 
 
 class Raised(NamedTuple):
@@ -102,12 +102,12 @@ class Raised(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """A part of the model that has changed."""
+    """Changed part of the model."""
 
     text: str
     """Description of the change."""
     wear: bool
-    """True if wear, temperature or ageing can cause such a change; else it has another cause."""
+    """True if wear, temperature or ageing can cause such a change."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +119,7 @@ class Evidence:
     rms_arcsec: float
     """Rms difference of measured and predicted error about its zero."""
     allowed_arcsec: float
-    """Upper limit of that by noise and the model's intervals."""
+    """Upper limit of that difference by noise and the model's intervals."""
     left_arcsec: float
     """Rms residual with every part of the model free to change."""
     left_allowed_arcsec: float
@@ -133,7 +133,7 @@ class Evidence:
         return self.left_arcsec > self.left_allowed_arcsec
 
     def verdict(self, before: Verdict) -> Verdict:
-        """Returns the verdict; near a limit the one before."""
+        """Returns the verdict; near a limit, the verdict before."""
         if not self.moved and not self.unexplained:
             clear = self.left_arcsec < CLEARLY * self.left_allowed_arcsec
             return Verdict.HOLDS if clear else before
@@ -142,7 +142,7 @@ class Evidence:
 
     @property
     def text(self) -> str:
-        """The result in words with figures."""
+        """Result in words with figures."""
         moved = "; ".join(each.text for each in self.moved) or "no part of the model moved"
         return (
             f"{moved}. Over {self.places} places the load is {self.rms_arcsec:.2f} arcsec rms off the model "
@@ -173,9 +173,9 @@ class Judge:
         """Probability of a false positive in one test."""
 
     def judge(self, observations: Sequence[Observation], zero: FloatArray | None) -> Evidence | None:
-        """Tests the observations; returns None if they are too few.
+        """Tests the observations; None if they are too few.
 
-        ``zero`` is `Evidence.zero` from when it was learned; None if it is not known yet.
+        ``zero`` is the learned `Evidence.zero`; None if it is not known yet.
         """
         least = self._drift.count + 1 + SPARE
         if len(observations) < least:
@@ -207,7 +207,7 @@ class Judge:
     ) -> tuple[FloatArray, FloatArray]:
         """Fits all parts within their possible range; returns the change and its covariance.
 
-        ``columns`` selects the columns that the rows contain.
+        ``columns`` selects the columns that are present in the rows.
         """
         information = self._information[columns]
         known = np.column_stack([information, np.zeros(len(information))])
@@ -233,7 +233,7 @@ class Judge:
         return float(chdtri(free, self._alpha))
 
     def _moved(self, term: Term, rows: FloatArray, change: FloatArray, spread: FloatArray) -> Moved | None:
-        """Returns the change of an effect, if it exceeds the effect's interval and this fit's errors."""
+        """Returns the change of an effect if it exceeds the effect's interval and the errors of this fit."""
         at = term.columns
         own = change[at]
         variance = self._calibrated[at, at] + spread[at, at]
@@ -253,9 +253,10 @@ class Judge:
         return Moved(_largest_changes(self._drift.model, changed), wear)
 
     def _zero_moved(self, rows: FloatArray, observed: FloatArray, before: FloatArray) -> Moved | None:
-        """Returns the change of the zero against the learned one, if significant.
+        """Returns the significant change of the zero from the learned value.
 
-        The disc is fixed as learned, because over part of a turn it is hardly separable from the zero.
+        The disc is fixed at its learned value, because over part of a turn it is hardly separable from the
+        zero.
         """
         zero, disc = self._drift.zero, slice(self._drift.zero + 1, self._drift.count)
         others = np.delete(np.arange(rows.shape[1]), np.arange(disc.start, disc.stop))
@@ -299,7 +300,7 @@ class Watch:
         self._calibrated = bool(drift.model.effects)
         self._judge = Judge(drift, noise_arcsec)
         self._adopted = self._other = Verdict.HOLDS
-        """Verdict on the gear, and another one that must persist before it is adopted."""
+        """Verdict on the gear, and the different verdict that must persist before it is adopted."""
         self._lasted_s = 0.0
         self._faulty = False
         self._observations: deque[Observation] = deque(maxlen=MAX_OBSERVATIONS)
@@ -309,7 +310,6 @@ class Watch:
 
     @property
     def verdict(self) -> Verdict:
-        """Present verdict."""
         return Verdict.ENCODER if self._faulty else self._adopted
 
     def take(self, observations: Sequence[Observation], status: EncoderStatus, now_s: float) -> list[Raised]:
@@ -319,7 +319,7 @@ class Watch:
             self._faulty = status.fault is not None
             self._observations.clear()
             self._zero = None
-            reason = status.reason or "nothing speaks against the load encoder"
+            reason = status.reason or "no evidence against the load encoder"
             raised.append(Raised(self.verdict, reason))
         self._observations.extend(observations)
         self._new |= bool(observations)
@@ -348,7 +348,7 @@ class Watch:
         return self._adopts(evidence.verdict(self._adopted), passed_s)
 
     def _adopts(self, verdict: Verdict, passed_s: float) -> bool:
-        """Takes the present verdict and the time since the last; returns True when it has persisted."""
+        """Takes the present verdict and the time since the last; returns True once it has persisted."""
         if verdict is self._adopted or verdict is not self._other:
             self._other, self._lasted_s = verdict, 0.0
         if verdict is self._adopted:

@@ -1,8 +1,8 @@
-"""Measuring: samples to observations, and the linear problem that observations pose.
+"""Measuring: converts samples to observations, and provides the linear problem of the observations.
 
 ``observed - committed prediction = columns @ change + nuisances``. The columns come from the effects
-themselves: an effect without memory gives them for any angles; for one with memory, trackers of unit
-coefficients follow the command, which by linearity is equivalent. Nuisance parameters are fitted as well and
+themselves. An effect without memory provides them for any angles. For an effect with memory, trackers of unit
+coefficients follow the command, which by linearity is equivalent. Nuisance parameters are fitted as well but
 never applied: the zero, and the once and twice per turn error of an eccentric or oval load encoder disc.
 
 An observation is the mean over a standstill (its second half) or over a few degrees of slow motion. Fast
@@ -44,38 +44,38 @@ from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 LOAD_ORDERS = (1, 2)
 """Orders per turn of the load: eccentricity and ovality of the encoder's disc."""
 SAME_ARCSEC = 1e-6
-"""The state is known once trackers from either previous direction agree within this."""
+"""Maximum difference of trackers started in either direction once the state counts as known."""
 SETTLE_S = 0.05
-"""Settling time of the load after a fast move, and after a reversal in a slow one."""
+"""Settling time of the load after a fast move, and after a reversal in a slow move."""
 SHORTEST_S = 0.04
 """Minimum duration of a standstill, in addition to the settling time."""
 LONGEST_S = 1.0
-"""Maximum duration of a standstill; each gives at most one observation."""
+"""Maximum duration of a standstill; each provides at most one observation."""
 CELL_DEG = 3.0
 """Motor travel of an observation in slow motion."""
 REVERSAL_DEG = 0.3
-"""Motor travel back that counts as a reversal."""
+"""Reverse motor travel that counts as a reversal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """An effect whose coefficients drift."""
+    """Effect whose coefficients drift."""
 
     effect: Effect
-    """The committed effect."""
+    """Committed effect."""
     number: int
     """Index in the model's effects."""
     columns: slice
     """Columns of its coefficients."""
     memory: bool
-    """True if it has memory, so that only reversals show it."""
+    """True if the effect has memory, so that only reversals show it."""
 
 
 class DriftModel:
-    """Linear model of drift: coefficients that wear or temperature move, zero, load encoder disc."""
+    """Linear model of drift: coefficients that wear or temperature change, zero, load encoder disc."""
 
     def __init__(self, model: TransmissionModel, parameters: Sequence[str] | None = None) -> None:
-        """``parameters`` as in `AdaptationSettings`; InputError for one that the model does not have."""
+        """``parameters`` as in `AdaptationSettings`; InputError for a parameter that the model lacks."""
         self.model = model
         self.terms = _terms(model, parameters)
         self.zero = sum(len(each.effect.coefficients()) for each in self.terms)
@@ -90,14 +90,14 @@ class DriftModel:
             self.has_memory[each.columns] = each.memory
 
     def changed(self, change: FloatArray) -> TransmissionModel:
-        """Returns the committed model with its coefficients changed, (zero,)."""
+        """Returns the committed model with changed coefficients, (zero,)."""
         effects = list(self.model.effects)
         for each in self.terms:
             effects[each.number] = each.effect.fitted(each.effect.coefficients() + change[each.columns])
         return replace(self.model, effects=refreshed(effects), path=None)
 
     def columns_in(self, whole: DriftModel) -> IntArray:
-        """Returns the places of this model's columns in one of more parameters, shape (count,)."""
+        """Returns the places of this model's columns in a model of more parameters, shape (count,)."""
         columns = {each.number: each.columns for each in whole.terms}
         own = [np.arange(whole.count)[columns[each.number]] for each in self.terms]
         return np.concatenate([*own, np.arange(whole.zero, whole.count)])
@@ -149,7 +149,7 @@ class DriftColumns:
 
 
 class _Tracked:
-    """Two trackers of an effect, started in either direction, until both agree."""
+    """Two trackers of an effect, started in either direction, until they agree."""
 
     def __init__(self, effect: Effect) -> None:
         self._tracker = effect.tracker(Start.FORWARD)
@@ -176,7 +176,8 @@ def _terms(model: TransmissionModel, parameters: Sequence[str] | None) -> tuple[
             close = nearest(each, list(offered))
             hint = f"did you mean '{close}'?" if close else f"expected {', '.join(offered) or 'none'}"
             raise InputError(
-                f"adaptation.parameters: '{each}' is nothing that wear or temperature moves in this model; "
+                f"adaptation.parameters: '{each}' is not a parameter that wear or temperature changes in "
+                f"this model; "
                 f"{hint}"
             )
     terms: list[Term] = []
@@ -199,7 +200,7 @@ class Observation(NamedTuple):
     """Observation from one standstill or stretch of slow motion."""
 
     time_s: float
-    """Time at its end."""
+    """Time at the end of the observation."""
     error_arcsec: float
     """Observed transmission error less the committed model's, at the load."""
     row: FloatArray
@@ -218,7 +219,7 @@ class _Reading(NamedTuple):
 
 
 class Measuring:
-    """Measures one axis; `take` gets its samples in order."""
+    """Measures one axis; `take` must receive its samples in order."""
 
     def __init__(self, drift: DriftModel, slow_deg_s: float, channels: tuple[Channel, ...] = ()) -> None:
         """``channels`` are those of the axis file, in the order of the samples' readings."""
@@ -236,7 +237,7 @@ class Measuring:
         self._last: float | None = None
         self._collected: list[_Reading] = []
         self._quiet_s = math.inf
-        """Time since which the command stands, or is slow in one direction."""
+        """Time since which the command has been at rest, or slow in one direction."""
         self._done = True
         """True once this standstill has been used."""
         self._standing = True
@@ -254,7 +255,7 @@ class Measuring:
     def take(self, times_s: FloatArray, axis: NDArray[Any], usable: BoolArray) -> list[Observation]:
         """Takes samples of `AXIS_SAMPLE`, shape (n,); returns the observations that they complete.
 
-        ``usable`` marks samples with a valid load reading; the others only advance the path.
+        ``usable`` marks samples with a valid load reading; all others only advance the path.
         """
         found: list[Observation] = []
         columns = self._columns
@@ -330,7 +331,7 @@ class Measuring:
         return True
 
     def _end_of_stretch(self) -> Observation | None:
-        """Returns the collected samples as an observation, if there are enough."""
+        """Returns the collected samples as an observation if they are sufficient."""
         collected, self._cell_deg = self._collected, 0.0
         enough = len(collected) > 2 and (
             collected[-1].time_s - collected[0].time_s >= SHORTEST_S

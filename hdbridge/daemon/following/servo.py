@@ -1,8 +1,8 @@
-"""Servo watch: does the servo still answer as the model's response in motion says?
+"""Servo watch: tests whether the servo still responds as measured for the model.
 
-Judges runs at constant speed, in which the correction moves the set-points, by the motor encoder's answer to
-them. So neither a change of the gear nor a fault of the load encoder counts. What the load encoder shows in
-these runs refines the response. Uses no clock.
+It judges runs at constant speed, in which the correction moves the set-points, by the motor encoder's
+response. Neither a change of the gear nor a fault of the load encoder therefore has an influence. The load
+encoder's readings in these runs refine the response. Uses no clock.
 """
 
 from statistics import median
@@ -21,27 +21,27 @@ from hdbridge.daemon.memory import SampleFlag
 from hdbridge.units import DEG_PER_TURN
 
 EVEN: Final = 1e-3
-"""Largest relative deviation of a constant speed."""
+"""Maximum relative deviation of a constant speed."""
 TRANSIENT_S: Final = 0.6
 """Time at constant speed before a run begins."""
 RUN_S: Final = 1.0
 RUN_TURNS: Final = 2.0
-"""Minimum duration and motor turns of a run."""
+"""Minimum duration and number of motor turns of a run."""
 MIN_RUNS: Final = 4
 NEEDED: Final = SampleFlag.FRESH | SampleFlag.COMPENSATING
 SPOILT: Final = SampleFlag.CHANGING | SampleFlag.LIMITED
 
 
 class ServoWatch:
-    """Judgement of one axis's servo. A model without a response is never judged."""
+    """Verdict on one axis's servo. A model without a response is never judged."""
 
     def __init__(self, axis: AxisConfig, model: TransmissionModel) -> None:
         self.retuned = False
-        """True while the servo does not answer as when the response was measured."""
+        """True while the servo's response differs from the measured response."""
         self.believed = True
         """False during a fault of the load encoder."""
         self.refinements = 0
-        """Number of responses that have replaced the committed one, one after the other."""
+        """Number of successive responses that have replaced the committed one."""
         self._ratio, self._period_s = model.ratio, axis.drive.cycle_s
         self._orders = motor_orders(model)
         self._limits = Limits.of(axis, model)
@@ -52,11 +52,11 @@ class ServoWatch:
         self._response = response
         self._answers = None if response is None else Answers(response, self._orders, self._ratio, earlier)
         self._before_arcsec2: dict[tuple[int, int], float] = {}
-        """Mean square of each order at each frequency that the committed response left."""
+        """Remaining mean square of each order at each frequency with the committed response."""
         self._run: list[NDArray[Any]] = []
         self._speed_deg_s = 0.0
         self._even = 0
-        """Samples at this speed so far."""
+        """Number of samples at this speed so far."""
 
     def use(self, response: Response | None) -> None:
         """Judges by another response from now on."""
@@ -69,14 +69,14 @@ class ServoWatch:
             self._before_arcsec2 = before
 
     def forget_load(self) -> None:
-        """Discards what the load encoder has shown."""
+        """Discards the load encoder's results."""
         self._before_arcsec2 = {}
         if self._answers is not None:
             self._answers.forget_load()
 
     @property
     def worse(self) -> bool:
-        """True if the response leaves more of the load error than the committed one, at the same places."""
+        """True if the response leaves more load error than the committed response, at the same places."""
         before = self._before_arcsec2
         if self._answers is None or self._response == self._committed:
             return False
@@ -85,7 +85,7 @@ class ServoWatch:
         return sum(now[each] for each in both) > sum(before[each] for each in both)
 
     def refined(self, bound: float) -> Response | None:
-        """Returns a response that leaves less of the load error than the present one; None if uncertain.
+        """Returns a response that leaves less load error than the present one; None if uncertain.
 
         ``bound`` limits the deviation from the committed response, as a share.
         """
@@ -95,7 +95,7 @@ class ServoWatch:
         return self._answers.refined(self._committed, self._limits, bound, retuned=changed)
 
     def take(self, axis: NDArray[Any], *, joined: bool) -> str | None:
-        """Takes the next samples of the axis; returns the evidence if the judgement changes.
+        """Takes the next samples of the axis; returns the evidence if the verdict changes.
 
         ``joined`` is False if cycles are missing before or between them.
         """
@@ -125,7 +125,7 @@ class ServoWatch:
         return self._judge(run, speed)
 
     def _judge(self, run: NDArray[Any], speed_deg_s: float) -> str | None:
-        """Adds a run; returns the evidence if the judgement changes."""
+        """Adds a run; returns the evidence if the verdict changes."""
         stored, answers = self._response, self._answers
         assert stored is not None
         assert answers is not None

@@ -1,7 +1,7 @@
 """Files of an adaptation: its state, which survives a restart, and its history.
 
 ``AXIS.json`` is replaced as a whole, ``AXIS.log.jsonl`` is only appended to. The state belongs to one
-committed model; the adaptation of another model starts without it.
+committed model; the adaptation of another model starts from scratch.
 """
 
 import hashlib
@@ -45,7 +45,7 @@ class AdaptationFiles:
         parameters: tuple[str, ...] | None,
         now: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
-        """Creates the folder if it does not exist. Raises OutputError if it cannot be created."""
+        """Creates the folder if it does not exist; OutputError if this fails."""
         make_folder(folder)
         text = replace(model, provenance={}).dump() + json.dumps(parameters)
         self._fingerprint = hashlib.sha256(text.encode()).hexdigest()
@@ -58,10 +58,10 @@ class AdaptationFiles:
         """Last error of `write`; empty after success."""
 
     def load(self) -> Learned | None:
-        """Returns the stored state of this model; None if there is none or it belongs to another model.
+        """Returns the stored state of this model; None without one.
 
-        If the file cannot be read, this is noted in the history and the result is None. Raises OutputError
-        if the history cannot be written.
+        If the file cannot be read, this is noted in the history and the result is None. Raises OutputError if
+        the history cannot be written.
         """
         try:
             file = _State.model_validate_json(self._state.read_bytes())

@@ -1,1 +1,1 @@
-"""The gateway: a CiA-402 drive on another bus whose position is the load's, in a process of its own."""
+"""Gateway, in its own process: a CiA-402 drive on another bus whose position is that of the load."""

@@ -1,10 +1,10 @@
-"""An ideal axis behind the slave of a gateway: the load is where the demand is. For other people's tests."""
+"""Ideal axis behind the slave of a gateway: the load is exactly at the demand. For tests of other masters."""
 
 from __future__ import annotations
 
 
 class IdealAxis:
-    """A plant (`hdbridge.device.motion.Machine`) without error, delay or friction."""
+    """Plant (`hdbridge.device.motion.Machine`) without error, delay or friction."""
 
     dt_s = 1e-6
     torque_permille = 0
@@ -13,20 +13,20 @@ class IdealAxis:
     def __init__(self, motor_counts_per_load_count: float) -> None:
         self.torque_limit_permille = 0.0
         self.motor_counts = 0
-        """The load, which is the motor of this drive."""
+        """Load position, which is the motor position of this drive."""
         self.velocity_counts_s = 0.0
         self._scale = motor_counts_per_load_count
 
     @property
     def load_counts(self) -> int:
-        """The motor encoder, which is the second encoder of this drive."""
+        """Motor encoder reading, which is that of the second encoder of this drive."""
         return round(self.motor_counts * self._scale)
 
     def follow(self, start_counts: float, end_counts: float, substeps: int) -> None:
-        """The demand moves linearly during ``substeps``."""
+        """Moves linearly to the end of the demand during ``substeps``."""
         self.motor_counts = round(end_counts)
         self.velocity_counts_s = (end_counts - start_counts) / (substeps * self.dt_s)
 
     def coast(self, substeps: int, braked: bool) -> None:
-        """Without power the axis stands."""
+        """Stands still without power."""
         self.velocity_counts_s = 0.0

@@ -1,4 +1,4 @@
-"""The object dictionary of a gateway axis: the device's own, at the scale of the load."""
+"""Object dictionary of a gateway axis: that of the device, at the scale of the load."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hdbridge.daemon.machinefile import GatewaySettings
 
 BRIDGE: Final = 0x2200
-"""Record of what only the bridge knows."""
+"""Record of the bridge's own values."""
 _INT32, _UNSIGNED8 = 0x0004, 0x0005
 BRIDGE_VALUES: Final = (
     ("Error at the load, measured, 0.01 arcsec", _INT32),
@@ -32,7 +32,7 @@ BRIDGE_VALUES: Final = (
     ),
     ("State of the axis in the control loop", _UNSIGNED8),
 )
-"""Name and type of its sub-indices, from 1."""
+"""Name and type of the sub-indices of this record, from 1."""
 _WITHOUT: Final = ("2100", "2101")
 """Objects of the simulated drive's environment."""
 _PDOS: Final[Mapping[str, int | str]] = {
@@ -58,17 +58,18 @@ _PDOS: Final[Mapping[str, int | str]] = {
     "1A02sub1": "0x60410010",
     "1A02sub2": "0x60640020",
 }
-"""The default mapping of CiA 402: the first pair event-driven, mode and position prepared but not valid.
+"""Default mapping of CiA 402: the first pair event-driven, mode and position prepared but not valid.
 
-The statusword also comes every 50 ms, for masters that take it for periodic.
-"""
+The statusword is also sent every 50 ms, for masters that expect it periodically."""
 _MOST: Final = 0xFFFF_FFFF
 _FOLLOWING_TIME_S: Final = 0.2
-"""Share of the highest speed for the default of 6065h."""
+"""Default of 6065h as travel time at the highest speed."""
 
 
 def nameplate(axis: AxisConfig, settings: GatewaySettings) -> Nameplate:
-    """Scales: the load is the motor of this drive, without a gear; the real motor is the second encoder."""
+    """Returns the nameplate: the load is this drive's motor, without a gear; the motor is the second
+    encoder.
+    """
     return Nameplate(
         serial=settings.nodes[axis.name],  # LSS selects an axis by it
         motor_counts_per_turn=settings.counts_per_turn,
@@ -80,11 +81,11 @@ def nameplate(axis: AxisConfig, settings: GatewaySettings) -> Nameplate:
 
 
 def rest_deg(axis: AxisConfig, model: TransmissionModel | None) -> float:
-    """Returns how far from its target the load may rest, degrees.
+    """Returns the maximum distance of the resting load from its target, degrees.
 
-    The motor rests within a count of its own target. To this add three standard deviations of the rounding of
-    both encoders to counts and of the model's residual, as its calibration found it on held-out data. Without
-    a model the error may be as large as the largest correction that the axis file allows.
+    The motor rests within a count of its own target. Three standard deviations of the encoders' rounding to
+    counts, and of the model's residual on held-out data, are added. Without a model, the error may be as
+    large as the largest correction that the axis file permits.
     """
     motor_deg, load_deg = (
         abs(axis.motor_encoder.degrees(1)) / axis.gear.ratio,
@@ -143,7 +144,7 @@ def _defaults(
 
 
 def eds(axis: AxisConfig, settings: GatewaySettings, model: TransmissionModel | None = None) -> str:
-    """The EDS of a gateway axis that is compensated by a model, as text."""
+    """Returns the EDS of a gateway axis that is compensated by a model, as text."""
     made = RawConfigParser(strict=False, delimiters="=")
     made.optionxform = str  # type: ignore[assignment, method-assign]
     made.read_string(BUNDLED.read_text(encoding="utf-8"))

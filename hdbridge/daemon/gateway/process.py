@@ -1,7 +1,7 @@
-"""The gateway process: ``python -m hdbridge.daemon.gateway.process FD``, started by the keeper.
+"""Gateway process: ``python -m hdbridge.daemon.gateway.process FD``, started by the keeper.
 
-It has the outer bus and its end of the shared memory. Nothing in the control process waits for it: without it
-the set-points of its axes end, so they brake and lose their power.
+It has the outer bus and its end of the shared memory. The control process does not wait for it. If the
+gateway process dies, the set-points of its axes end, so the axes brake and lose their power.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ ALIVE_S: Final = 0.1
 
 
 class SimulatedClock:
-    """The virtual clock of simulated drives: its time in the last turn of the loop, plus the time since.
+    """Virtual clock of simulated drives: its time in the last turn of the loop, plus the time since.
 
-    It waits for a loop that is late, but not for one whose process is gone.
+    It waits for a late loop, but not for a loop whose process is gone.
     """
 
     def __init__(self, memory: Memory, speed: float) -> None:
@@ -46,7 +46,7 @@ class SimulatedClock:
         self._latest_s = 0.0
 
     def now(self) -> float:
-        """Seconds on the clock of the control loop; they do not decrease."""
+        """Returns the time on the control loop's clock in seconds, which does not decrease."""
         samples, _ = self._reader.read()
         if len(samples):
             self._turn_s = 1e-9 * int(samples[-1]["time_ns"])
@@ -58,13 +58,13 @@ class SimulatedClock:
         return self._latest_s
 
     def sleep_until(self, deadline_s: float) -> None:
-        """Return at a time of this clock."""
+        """Sleeps until a time of this clock."""
         while (left_s := deadline_s - self.now()) > 0.0:
             time.sleep(min(left_s / self._speed, self._period_s))
 
 
 def serve(start: Start) -> None:
-    """Be the drives of the outer bus until SIGTERM. Raises `BusError` if the bus cannot be opened or read."""
+    """Simulates the drives of the outer bus until SIGTERM. Raises `BusError` if the bus fails."""
     begin_log(start.log)
     machine, terminated = start.machine, when_terminated()
     settings = machine.gateway
@@ -96,13 +96,13 @@ def serve(start: Start) -> None:
         )
         status = memory.status
         status[Cell.GATEWAY_PID] = os.getpid()
-        told_s = 0.0
+        reported_s = 0.0
 
         def should_stop() -> bool:
-            nonlocal told_s
+            nonlocal reported_s
             now_s = time.monotonic()
-            if now_s - told_s > ALIVE_S:
-                told_s = now_s
+            if now_s - reported_s > ALIVE_S:
+                reported_s = now_s
                 status[Cell.GATEWAY_TIME_NS] = time.monotonic_ns()
             return terminated()
 

@@ -1,7 +1,7 @@
-"""The slaves of a gateway: CiA-402 drives on the outer bus in front of the axes of the control loop.
+"""Slaves of a gateway: CiA-402 drives on the outer bus in front of the axes of the control loop.
 
-A slave is the device of `hdbridge.device`. Its plant and power stage are an axis of the loop, seen through
-the shared memory. It writes set-points and asks for power, which the service grants; it has no other access.
+A slave is a device of `hdbridge.device`. Its plant and power stage are an axis of the loop, seen through the
+shared memory. It writes set-points and requests power, which the service grants; it has no other access.
 """
 
 from __future__ import annotations
@@ -41,25 +41,25 @@ BEHAVIOUR: Final = Behaviour.model_validate(
         "fixed_node_id": True,
     }
 )
-"""Reads controlwords as levels, runs with any period of SYNC, and stops if SYNC is lost.
+"""Behaviour of a slave: reads controlwords as levels, runs with any period of SYNC, and stops if SYNC is
+lost.
 
-Its node id is that of the machine file.
-"""
+Its node id is that of the machine file."""
 DEAD_S: Final = 0.3
-"""Time without a turn of the control loop after which it counts as hung or dead."""
+"""Time without a turn after which the control loop counts as hung or dead."""
 POWER_S: Final = 5.0
-"""Longest time for the service and the inner drive to switch power on."""
+"""Time-out of the service and the inner drive for switching power on."""
 VELOCITY_S: Final = 0.02
-"""Time over which the actual velocity is measured."""
+"""Averaging time of the actual velocity."""
 
 TAKEN: Final = 0xFF01
 """Another client of the daemon has the axis."""
 NOT_POWERED: Final = 0xFF02
-"""The inner drive did not get power, or lost it; the log of the daemon has the reason."""
+"""The inner drive did not receive power, or lost it; the daemon's log has the reason."""
 STOPPED: Final = 0xFF03
 """A quick stop by command, or a stop without a code of its own."""
 INNER_BUS: Final = 0x7500
-"""CiA 402: communication, an additional module."""
+"""CiA 402: communication, additional module."""
 ERROR_CODES: Final[Mapping[Fault, int]] = {
     Fault.HANG: 0x6010,
     Fault.OVERRUN: 0x6010,
@@ -89,7 +89,7 @@ ERROR_CODES: Final[Mapping[Fault, int]] = {
 
 
 class LoadAxis(PowerStage):
-    """One axis of the loop as plant (`hdbridge.device.motion.Machine`) and power stage of a slave."""
+    """Axis of the loop as plant (`hdbridge.device.motion.Machine`) and power stage of a slave."""
 
     dt_s = 1e-6
     temperature_c = load_torque_nm = 0.0
@@ -108,10 +108,10 @@ class LoadAxis(PowerStage):
         self.velocity_counts_s = 0.0
         self.torque_permille = 0
         self.sample: SampleArray | None = None
-        """The axis in the newest cycle; None before the first."""
+        """Axis in the newest cycle; None before the first."""
         self._measured = (-math.inf, 0.0)
         self._series = max(self._cells[OuterCell.WANTED], self._cells[OuterCell.GRANTED]) + 1
-        """Number of the next series of set-points; none is used twice, whatever process wrote it."""
+        """Number of the next series of set-points; no number is used twice, by any process."""
         self._wanted = 0
         self._wanted_s = 0.0
         self._begun = False
@@ -122,7 +122,7 @@ class LoadAxis(PowerStage):
     # ---------------------------------------------------------------- the newest cycle
 
     def look(self, newest: SampleArray | None, now_s: float, alive: bool) -> None:
-        """Takes the newest cycle, shape (1,), and looks for errors; ``newest`` is None without a new one."""
+        """Takes the newest cycle, shape (1,), and checks for errors; ``newest``: None without a new cycle."""
         if newest is not None:
             self._take(newest)
         sample = self.sample
@@ -152,7 +152,7 @@ class LoadAxis(PowerStage):
             self._measured = (time_s, motor_deg)
 
     def _judge(self, sample: SampleArray, was_on: bool, now_s: float, alive: bool) -> int:
-        """Error code of a condition that prevents operation, or 0."""
+        """Returns the error code of a condition that prevents operation, or 0."""
         if not alive:
             return ERROR_CODES[Fault.HANG] if self._wanted else 0
         if sample["state"] in STOPPED_STATES:
@@ -191,7 +191,7 @@ class LoadAxis(PowerStage):
         self._cells[OuterCell.RESETS] = self._resets
 
     def publish(self, node: DriveNode) -> None:
-        """Shows the other processes the node as the outer master sees it, and what that asks for."""
+        """Publishes the node as the outer master sees it, and its requests, to the other processes."""
         cells, value, motion = self._cells, node.dictionary.value, node.firmware.motion
         cells[OuterCell.NODE_ID] = node.node_id
         mode = value(0x6061)
@@ -209,7 +209,7 @@ class LoadAxis(PowerStage):
         self._node = node
 
     def follow(self, start_counts: float, end_counts: float, substeps: int) -> None:
-        """A set-point: linear from start to end over this period."""
+        """Writes a set-point: linear motion from start to end over this period."""
         assert self._node is not None
         begins_s = self._node.period_begins_s
         if not self._begun:
@@ -223,12 +223,12 @@ class LoadAxis(PowerStage):
         self._knots.add(OuterKnot(self._wanted, time_s, counts / self._counts_per_deg, received_s))
 
     def coast(self, substeps: int, braked: bool) -> None:
-        """Without power there are no set-points."""
+        """Writes nothing, because there are no set-points without power."""
 
     # ---------------------------------------------------------------- what only the bridge knows
 
     def values(self) -> tuple[Callable[[], int], ...]:
-        """Readers of the sub-indices of `BRIDGE`, from 1."""
+        """Returns the readers of the sub-indices of `BRIDGE`, from 1."""
 
         def arcsec(field: str) -> Callable[[], int]:
             return lambda: 0 if self.sample is None else round(100.0 * float(self.sample[field]))
@@ -243,7 +243,7 @@ class LoadAxis(PowerStage):
         )
 
     def _load_deg(self, sample: SampleArray) -> float:
-        """Returns the load angle; without an encoder at the load, the one by motor encoder and model."""
+        """Returns the load angle; without an encoder at the load, that by motor encoder and model."""
         load_deg = float(sample["load_position_deg"])
         if math.isnan(load_deg):
             predicted_deg = float(sample["predicted_arcsec"]) / ARCSEC_PER_DEG
@@ -282,9 +282,9 @@ class Gateway:
         folder: Path,
         store_of: Callable[[AxisConfig], Path | None] = lambda _: None,
     ) -> None:
-        """``folder`` takes the EDS of each axis, ``store_of`` returns the file of its stored parameters.
+        """``folder`` receives the EDS of each axis, ``store_of`` returns the file of its stored parameters.
 
-        ``clock`` is the loop's.
+        ``clock`` is that of the loop.
         """
         self._bus, self._memory, self._clock = bus, memory, clock
         self._reader = memory.reader()
@@ -316,13 +316,12 @@ class Gateway:
         self._served = tuple(self.nodes.values())
 
     def handle(self, message: can.Message, now_s: float) -> None:
-        """Take in one frame."""
         self._look(now_s)
         for node in self._served:
             node.handle(message, now_s)
 
     def poll(self, now_s: float) -> None:
-        """Take in the frames that have come, and do what is due until ``now_s``."""
+        """Handles the received frames, and runs everything due until ``now_s``."""
         self.run_until(now_s)
         for _ in range(FRAMES_PER_POLL):
             message = self._bus.recv(0)
@@ -334,18 +333,18 @@ class Gateway:
         self.run_until(now_s)
 
     def run_until(self, now_s: float) -> None:
-        """Do what is due until ``now_s`` without looking at the bus."""
+        """Runs everything due until ``now_s`` without reading the bus."""
         self._look(now_s)
         for name, node in self.nodes.items():
             node.run_until(now_s)
             self.axes[name].publish(node)
 
     def next_event_s(self) -> float:
-        """When it must be polled at the latest."""
+        """Returns the latest time of the next poll."""
         return min(node.next_event_s() for node in self._served)
 
     def bus_failed(self) -> None:
-        """The outer interface is down: each axis stops by its 6007h."""
+        """Handles a failure of the outer interface: each axis stops as selected by its 6007h."""
         for node in self._served:
             node.bus_failed()
 

@@ -1,6 +1,6 @@
-"""The other master as the outer bus shows it: what it has configured, what it does, and what it gets wrong.
+"""Trace of the other master on the outer bus: its configuration, its actions and its mistakes.
 
-Pure: frames in, lines out. It sends nothing, so it may look at a bus in operation or at a bus log.
+Pure: frames in, lines out. It sends nothing, so it may observe a bus in operation or read a bus log.
 """
 
 from __future__ import annotations
@@ -28,11 +28,10 @@ _CYCLIC: Final = (7, 8)
 _READY: Final = (State.READY_TO_SWITCH_ON, State.SWITCHED_ON)
 _INVALID: Final = 1 << 31
 _LATE: Final = 1.5
-"""Number of periods from which a SYNC interval counts as a missing SYNC; the gateway stops the axis after
-four.
-"""
+"""Ratio of a SYNC interval to the period above which a SYNC counts as missing; the gateway stops the axis
+after four."""
 _QUIET_S: Final = 1.0
-"""Time without SYNC or heartbeat after which a master that should send them is at fault."""
+"""Time without an expected SYNC or heartbeat after which the master is at fault."""
 _PDO_ADVICE: Final = (
     "to change a PDO: set bit 31 of its identifier, set the number of mapped objects to 0, write the entries "
     "and their number, then the identifier without bit 31"
@@ -53,7 +52,7 @@ _LSS: Final = {
     0x13: ("bit timing", "the bit rate is that of the interface: 'bitrate_bps' in the machine file"),
     0x17: ("store configuration", "the node id that lasts is that of the machine file: change it there"),
 }
-"""Names of LSS services that change something, and the advice if they are refused."""
+"""Names of LSS services with an effect, and the advice if they are refused."""
 _LSS_FOUND: Final = {
     0x44: "LSS: a node is selected by its identity",
     0x4F: "LSS: a node is identified",
@@ -68,11 +67,11 @@ class Line:
     time_s: float
     text: str
     advice: str = ""
-    """Advice to the author of the master; empty if the master has done nothing wrong."""
+    """Advice to the author of the master; empty without a mistake."""
 
 
 class Trace:
-    """The trace of one node. ``od`` is the dictionary of its EDS."""
+    """Trace of one node. ``od`` is the dictionary of its EDS."""
 
     def __init__(self, node_id: int, od: ObjectDictionary) -> None:
         self._node, self._od = node_id, od
@@ -82,7 +81,7 @@ class Trace:
             if isinstance(each.default, int)
         }
         self.written: dict[tuple[int, int], int] = {}
-        """Parameters that the master has written, in the order of the first write."""
+        """Parameters written by the master, in the order of the first write."""
         self._pending: tuple[int, int, bytes | None] | None = None
         self._lss = bytes(8)
         """Last LSS request."""
@@ -96,7 +95,7 @@ class Trace:
         self._sync_s: float | None = None
         self._rpdos_since_sync = 0
         self._heartbeat_s: dict[int, float] = {}
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self.mistakes: Counter[str] = Counter()
         """Number of occurrences of each piece of advice."""
         self._begun_s: float | None = None
@@ -105,7 +104,7 @@ class Trace:
     # ---------------------------------------------------------------- frames
 
     def take(self, frame: Frame) -> list[Line]:
-        """Takes a frame; returns the lines that it gives."""
+        """Takes a frame; returns the resulting lines."""
         self._lines = []
         if self._begun_s is None:
             self._begun_s = frame.time_s
@@ -140,13 +139,13 @@ class Trace:
             self.mistakes[advice] += 1
 
     def _say_once(self, time_s: float, key: str, text: str, advice: str) -> None:
-        """Reports a mistake that lasts once, until `_over`."""
-        if key not in self._told:
-            self._told.add(key)
+        """Reports a lasting mistake once, until `_over`."""
+        if key not in self._reported:
+            self._reported.add(key)
             self._say(time_s, text, advice)
 
     def _over(self, key: str) -> None:
-        self._told.discard(key)
+        self._reported.discard(key)
 
     # ---------------------------------------------------------------- SDO
 
@@ -375,7 +374,7 @@ class Trace:
         self._nmt = state & 0x7F or 0x7F
 
     def _watch(self, time_s: float) -> None:
-        """Looks for what should come and does not."""
+        """Checks for missing frames."""
         assert self._begun_s is not None
         heard_s = self._sync_s if self._sync_s is not None else self._begun_s
         if self._enabled_cyclic and time_s - heard_s > _QUIET_S:
@@ -398,7 +397,7 @@ class Trace:
     # ---------------------------------------------------------------- names and values
 
     def configured(self) -> list[str]:
-        """Returns what the master has configured, one line each."""
+        """Returns the master's configuration, one line per item."""
         lines = [self._assignment(*key, value) for key, value in self.written.items()]
         period_s = self.period_s
         if period_s is not None:

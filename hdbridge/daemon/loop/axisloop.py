@@ -1,8 +1,8 @@
 """One axis in the control loop: its state, the commands it accepts and the events it reports.
 
-`AxisLoop.command` takes the service's commands between two turns. `AxisCycle` asks for a target in each turn
-in which the drive is enabled. The state decides who answers (`_enabling`, `Follower.follow` or nobody), so
-the turn itself decides nothing. `AxisLoop.after` evaluates the result of the turn.
+`AxisLoop.command` takes the service's commands between two turns. `AxisCycle` requests a target in each turn
+in which the drive is enabled. The state determines which function provides it (`_enabling`, `Follower.follow`
+or `_pursue`), so the turn itself decides nothing. `AxisLoop.after` evaluates the result of the turn.
 """
 
 import math
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Final
 
 from hdbridge.control.axiscycle import STILL_CYCLES, AxisCycle
-from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Tell
+from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Report
 from hdbridge.daemon.loop.feeds import KnotFeed, OuterFeed
 from hdbridge.daemon.loop.follower import AxisSetup, Follower
 from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, AxisState, Cause, Happening, refusal, target_of
@@ -43,7 +43,7 @@ _FRESH, _COMPENSATING, _LIMITED, _MEMORY_KNOWN, _CHANGING, _AT_REST, _UNDERRUN, 
 
 
 class AxisLoop:
-    """One axis. It sends nothing and is unverified until the service reports that its drive was verified."""
+    """One axis. It sends nothing and is unverified until the service reports that its drive is verified."""
 
     def __init__(
         self,
@@ -51,13 +51,13 @@ class AxisLoop:
         setup: AxisSetup,
         knots: Queue[Knot],
         slot: SettingSlot,
-        tell: Tell,
+        report: Report,
         followed: Queue[OuterKnot],
         outer: OuterCells,
         due_s: Callable[[], float],
     ) -> None:
-        """``followed`` has the gateway's set-points, ``outer`` its states; ``due_s`` returns when the present
-        turn was due.
+        """``followed`` has the gateway's set-points, ``outer`` its states; ``due_s`` returns the due time of
+        the present turn.
         """
         config = setup.config
         self.index = index
@@ -69,15 +69,15 @@ class AxisLoop:
         self.follower = Follower(setup, self.image)
         self.set_point = self.follower.set_point
         self.group: frozenset[int] = frozenset()
-        """Indices of the axes that began the same stream; they stop when this one does."""
+        """Indices of the axes that began the same stream, which stop together with this axis."""
         self.broken: frozenset[int] = frozenset()
         """Group whose stream this axis left before its end; the controller stops the others."""
 
-        self._slot, self._tell = slot, tell
+        self._slot, self._report = slot, report
         slot.use(0)
         self._feed = KnotFeed(knots, self.set_point)
         self._outer, self._due_s = OuterFeed(followed), due_s
-        self._faults = FaultLog(self.supervision, tell, config.drive.cycle_s)
+        self._faults = FaultLog(self.supervision, report, config.drive.cycle_s)
         self._period_s = config.drive.cycle_s
         self._follow = self.follower.follow
         self._outer_cells = outer
@@ -85,7 +85,7 @@ class AxisLoop:
         encoder = config.load_encoder
         self._load_deg = math.nan if encoder.is_motor_encoder else encoder.degrees(1)
         self._limited = 0
-        """Cycles in which the correction was limited, when the last sample was taken."""
+        """Number of cycles with a limited correction when the last sample was taken."""
         self._changing = self._underrun = self._unfed = False
         self._doubt = ""
         """Last reported states of the compensation change, the stream underrun and the load loop."""
@@ -93,11 +93,11 @@ class AxisLoop:
         self._mode = MotionMode.HOLD
         self._powering_off = False
         self._left = 0
-        """Turns left before the drive's time-out."""
+        """Number of turns left before the drive's time-out."""
         self._why = ""
         """Reason for stopping, if the supervision did not report one."""
         self.stands = True
-        """The axis stands and the stop was reported; False only in QUICK_STOPPED and LATCHED."""
+        """True if the axis stands and the stop was reported; False only in QUICK_STOPPED and LATCHED."""
         self._place = self._still = 0
         """Motor counts in the last turn of a stop, and the number of turns without a change."""
         self._handlers: dict[CommandKind, Callable[[Command], None]] = {
@@ -127,7 +127,7 @@ class AxisLoop:
             self.check(kind)
             self._handlers[kind](command)
         except HdbridgeError as error:
-            self._tell(EventKind.REFUSED, command.id, command.kind, str(error))
+            self._report(EventKind.REFUSED, command.id, command.kind, str(error))
             return
         target = target_of(self.state, kind)
         assert target is not None
@@ -157,13 +157,13 @@ class AxisLoop:
         self.set_point.stop()
 
     def verification_lost(self) -> None:
-        """Handles a bus failure: the drive must be verified again, even if it is lent."""
+        """Handles a bus failure, after which the drive must be verified again, even if lent."""
         self._why = "the bus went down while the axis was lent"
         self._happened(Happening.VERIFICATION_LOST)
 
     def _done(self, id_: int) -> None:
         if id_:
-            self._tell(EventKind.DONE, id_, 0)
+            self._report(EventKind.DONE, id_, 0)
 
     def _happened(self, cause: Cause) -> bool:
         """Makes the transition for ``cause``; returns True if the state changed."""
@@ -188,7 +188,7 @@ class AxisLoop:
             self.stands = False
             self._still = 0
             self._left = self._turns(STOP_TIMEOUT_S)
-        self._tell(EventKind.STATE, 0, state)
+        self._report(EventKind.STATE, 0, state)
         self._answer_waiting(state)
 
     def _answer_waiting(self, state: AxisState) -> None:
@@ -211,7 +211,7 @@ class AxisLoop:
         else:
             id_, self._disable_id = self._disable_id, 0
         if id_:
-            self._tell(EventKind.REFUSED, id_, kind, why)
+            self._report(EventKind.REFUSED, id_, kind, why)
 
     def _stand(self) -> None:
         """Ends all following of set-points."""
@@ -309,7 +309,7 @@ class AxisLoop:
         self.cycle.command = self._pursue
 
     def _pursue(self, feedback: Feedback) -> int | None:
-        """Follow the gateway's set-points of one period ago, because the newest may still be on their way."""
+        """Follows the gateway's set-points of one period ago; the newest may still be on their way."""
         if self.set_point.mode is MotionMode.FOLLOW:
             aim = self._outer.at(self._due_s() - self._period_s)
             if aim is None:
@@ -329,7 +329,7 @@ class AxisLoop:
         self._slot.use(command.i)
         self._changing = self.follower.correction.changing
         if not self._changing:
-            self._tell(EventKind.CHANGED, command.id, 0)
+            self._report(EventKind.CHANGED, command.id, 0)
 
     # ---------------------------------------------------------------- power
 
@@ -367,12 +367,12 @@ class AxisLoop:
         """Prepares the turn: feeds the next knots of a stream to the set-point."""
         refusal_ = self._feed.feed()
         if refusal_ is not None:
-            self._tell(EventKind.STREAM_REFUSED, self._motion_id, 0, refusal_)
+            self._report(EventKind.STREAM_REFUSED, self._motion_id, 0, refusal_)
             self._break_group()
 
     def after(self) -> None:
         """Evaluates the turn: reports faults and ended motions, and makes the resulting transitions."""
-        self._faults.tell()
+        self._faults.report()
         supervision = self.supervision
         if supervision.stop is not None:
             latched = supervision.reaction is Reaction.LATCH
@@ -395,7 +395,7 @@ class AxisLoop:
         mode = set_point.mode
         if mode is not self._mode:
             if mode is MotionMode.HOLD:
-                self._tell(EventKind.MOTION_ENDED, self._motion_id, self._mode)
+                self._report(EventKind.MOTION_ENDED, self._motion_id, self._mode)
             if self._mode is MotionMode.FOLLOW:
                 self.cycle.command = self._follow
             if mode is not MotionMode.STREAM:
@@ -408,20 +408,20 @@ class AxisLoop:
             self._unfed = False
             if not set_point.at_rest:
                 words = "the set-points of the gateway ended in motion; it loses its power"
-                self._tell(EventKind.UNDERRUN, self._motion_id, 0, words)
+                self._report(EventKind.UNDERRUN, self._motion_id, 0, words)
             self._happened(Happening.UNFED)
         if set_point.underrun is not self._underrun:
             self._underrun = set_point.underrun
             if self._underrun:
-                self._tell(EventKind.UNDERRUN, self._motion_id, 0)
+                self._report(EventKind.UNDERRUN, self._motion_id, 0)
         doubt = self.follower.loop_doubt
         if doubt != self._doubt:
             self._doubt = doubt
-            self._tell(EventKind.LOAD_LOOP, 0, int(bool(doubt)), doubt or "it acts again")
+            self._report(EventKind.LOAD_LOOP, 0, int(bool(doubt)), doubt or "it acts again")
         if self._changing and not self.follower.correction.changing:
             self._changing = False
             self.follower.changed()
-            self._tell(EventKind.CHANGED, 0, 0)
+            self._report(EventKind.CHANGED, 0, 0)
 
     def _after_stopping(self) -> None:
         if not self._powering_off:
@@ -446,7 +446,7 @@ class AxisLoop:
         self._happened(Happening.OVERDUE)
 
     def _after_stop(self) -> None:
-        """Reports a stop once the axis stands or the time for stopping has passed."""
+        """Reports a stop once the axis stands or the time-out has passed."""
         if self.supervision.stop is None and self.state is AxisState.QUICK_STOPPED:
             if not self._obeyed():
                 return
@@ -458,7 +458,7 @@ class AxisLoop:
         error = self.cycle.stopped
         explained = error is not None and error.hint == EXPLAINED_HINT
         text = error.text if error is not None else self._why
-        self._tell(EventKind.STOPPED, int(explained), code, text)
+        self._report(EventKind.STOPPED, int(explained), code, text)
 
     def _obeyed(self) -> bool:
         """Returns True if a commanded quick stop is over: the motor stands, or the time-out has passed."""
@@ -530,7 +530,7 @@ class AxisLoop:
 
 
 def _readings(flags: int, readings: tuple[float | None, ...]) -> tuple[int, float, float]:
-    """Returns the flags with those of the known channels added, and both readings (NaN if unknown)."""
+    """Returns the flags including those of the known channels, and both readings (NaN if unknown)."""
     known = [each if each is not None else math.nan for each in (*readings, None)[:2]]
     for value, bit in zip(known, (_KNOWN0, _KNOWN1), strict=True):
         if not math.isnan(value):

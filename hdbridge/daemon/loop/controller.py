@@ -27,9 +27,9 @@ COMMANDS_A_TURN: Final = 8
 REOPEN_EVERY_S: Final = 0.5
 """Interval between attempts to reopen a failed interface."""
 REFUSALS_A_SECOND: Final = 10
-"""Maximum rate at which refused relay frames are reported."""
+"""Maximum rate of reports of refused relay frames."""
 ENDING_TIMEOUT_S: Final = 10.0
-"""Time after which the process ends even if the drives have not confirmed that power is off."""
+"""Time after which the process ends even if the drives have not confirmed power-off."""
 _ALL: Final = -1
 _AT_REST: Final = frozenset({AxisState.UNVERIFIED, AxisState.DISABLED, AxisState.LATCHED})
 _OFF: Final = frozenset({State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON, State.UNKNOWN})
@@ -47,8 +47,8 @@ class Controller:
     ) -> None:
         """``reopen`` reopens the interface after a failure; it returns None while the interface is down.
 
-        Raises InputError if the axes cannot share one bus, or if the shared memory was made for another
-        number of axes.
+        Raises InputError if the axes cannot share one bus, or if the shared memory is for another number of
+        axes.
         """
         if memory.axes != len(setups):
             raise InputError(f"shared memory for {memory.axes} axes, but the machine has {len(setups)}")
@@ -60,7 +60,7 @@ class Controller:
                 setup,
                 memory.knots[index],
                 memory.settings[index],
-                partial(self._tell, index),
+                partial(self._report, index),
                 memory.followed[index],
                 memory.outer[index],
                 lambda: cycle.due_s,
@@ -70,7 +70,7 @@ class Controller:
         for axis in self.axes:
             cycle.join(axis.cycle)
         self.ended = False
-        """True once `end` has switched off power of all axes; no more turns are due."""
+        """True once `end` has switched off the power of all axes; no more turns are due."""
 
         self._reopen = reopen
         self._axis_of_node = {
@@ -99,7 +99,7 @@ class Controller:
     # ---------------------------------------------------------------- a turn
 
     def turn(self) -> None:
-        """Runs one cycle. Raises no error of the bus or the service."""
+        """Runs one cycle. Does not raise errors of the bus or the service."""
         cycle, axes = self.cycle, self.axes
         self._take_commands()
         for axis in axes:
@@ -133,7 +133,7 @@ class Controller:
         self._turns += 1
         self.memory.status.turned(self._turns, time.monotonic_ns())
 
-    def _tell(self, axis: int, kind: EventKind, id_: int = 0, code: int = 0, text: str = "") -> None:
+    def _report(self, axis: int, kind: EventKind, id_: int = 0, code: int = 0, text: str = "") -> None:
         cycle = self.cycle
         time_ns = round(1e9 * cycle.woke_s)
         self.memory.events.append(Event(0, cycle.count, time_ns, axis, kind, id_, code, text))
@@ -156,13 +156,13 @@ class Controller:
             elif command.axis == _ALL and kind in (CommandKind.QUICK_STOP, CommandKind.STOP):
                 for axis in self.axes:
                     axis.command(command._replace(id=0))
-                self._tell(_ALL, EventKind.DONE, command.id)
+                self._report(_ALL, EventKind.DONE, command.id)
             elif self._ending and kind not in (CommandKind.QUICK_STOP, CommandKind.STOP):
                 raise InputError(f"{label(kind)}: the daemon is ending")
             else:
                 self._axis(command.axis).command(command)
         except (HdbridgeError, ValueError) as error:
-            self._tell(command.axis, EventKind.REFUSED, command.id, command.kind, str(error))
+            self._report(command.axis, EventKind.REFUSED, command.id, command.kind, str(error))
 
     def _axis(self, index: int) -> AxisLoop:
         if not 0 <= index < len(self.axes):
@@ -182,10 +182,10 @@ class Controller:
         group = frozenset(axis.index for axis in members) if len(members) > 1 else frozenset()
         for axis in members:
             axis.begin_stream(command, group)
-        self._tell(command.axis, EventKind.DONE, command.id)
+        self._report(command.axis, EventKind.DONE, command.id)
 
     def _stop_group(self, stopped: AxisLoop) -> None:
-        """Brakes the other axes of a group when one of them leaves it."""
+        """Brakes the other axes of a group when one axis leaves it."""
         for index in stopped.broken:
             axis = self.axes[index]
             if axis.group == stopped.broken:
@@ -211,7 +211,7 @@ class Controller:
         second = round(1.0 / self.cycle.period_s)
         if self.cycle.count - self._refusals > second // REFUSALS_A_SECOND:
             self._refusals = self.cycle.count
-            self._tell(_ALL, EventKind.REFUSED, 0, 0, refusal)
+            self._report(_ALL, EventKind.REFUSED, 0, 0, refusal)
         return None
 
     # ---------------------------------------------------------------- the bus
@@ -221,12 +221,12 @@ class Controller:
         cycle = self.cycle
         if cycle.down is None:
             self._down = False
-            self._tell(_ALL, EventKind.BUS_UP)
+            self._report(_ALL, EventKind.BUS_UP)
             return
         if not self._down:
             self._down = True
             self._reopen_in = 0
-            self._tell(_ALL, EventKind.BUS_DOWN, text=cycle.down)
+            self._report(_ALL, EventKind.BUS_DOWN, text=cycle.down)
             self.memory.outgoing.clear()
             for axis in self.axes:
                 axis.verification_lost()
@@ -241,7 +241,7 @@ class Controller:
     # ---------------------------------------------------------------- the end
 
     def end(self, *, at_once: bool = False) -> None:
-        """Stops all axes and switches power off; `ended` becomes True when that is done.
+        """Stops all axes and switches power off; `ended` then becomes True.
 
         Axes are braked to rest, or quick-stopped with ``at_once``. Repeated calls do nothing, except that
         ``at_once`` may follow an ordinary call.
@@ -254,7 +254,7 @@ class Controller:
             return
         self._ending = True
         self._ending_left = round(ENDING_TIMEOUT_S / self.cycle.period_s)
-        self._tell(_ALL, EventKind.ENDING)
+        self._report(_ALL, EventKind.ENDING)
         for axis in self.axes:
             # The service can no longer stop a lent axis; the loop's quick stop overrides it.
             lent = axis.state is AxisState.LENT

@@ -1,4 +1,4 @@
-"""Faults of the supervision as events: one when a fault begins, one when its reaction becomes more severe."""
+"""Faults of the supervision as events: one when a fault begins, one when its reaction gets more severe."""
 
 import math
 from typing import Final, Protocol
@@ -7,7 +7,7 @@ from hdbridge.daemon.memory.layout import EventKind
 from hdbridge.drive.supervision import Fault, Reaction, Supervision
 
 OVER_S: Final = 1.0
-"""Time without a fault after which it is over, and is reported again when it returns."""
+"""Time without a fault after which it counts as over, and is reported again on its return."""
 CODES_KEPT: Final = 64
 FAULT_INDEX: Final = {fault: place for place, fault in enumerate(Fault)}
 """Number of each fault in events and samples."""
@@ -19,7 +19,7 @@ def fault_of(code: int) -> Fault | None:
     return _FAULTS.get(code)
 
 
-class Tell(Protocol):
+class Report(Protocol):
     """Reports an event of one axis to the service."""
 
     def __call__(self, kind: EventKind, id_: int = 0, code: int = 0, text: str = "") -> None: ...
@@ -28,27 +28,27 @@ class Tell(Protocol):
 class FaultLog:
     """Reports the faults of one axis without repeating those that persist."""
 
-    def __init__(self, supervision: Supervision, tell: Tell, period_s: float) -> None:
-        self._supervision, self._tell = supervision, tell
+    def __init__(self, supervision: Supervision, report: Report, period_s: float) -> None:
+        self._supervision, self._report = supervision, report
         self._over = math.ceil(OVER_S / period_s)
         self._noted = supervision.noted
         self._seen: dict[tuple[Fault, str], tuple[int, Reaction]] = {}
         """Last cycle and most severe reported reaction of each fault."""
 
-    def tell(self) -> None:
-        """Reports the faults that are new since the last turn."""
+    def report(self) -> None:
+        """Reports the new faults since the last turn."""
         supervision = self._supervision
         if supervision.noted == self._noted:
             return
         for event in supervision.since(self._noted):
             # Emergency messages with different codes are different faults.
             code = event.detail.partition(",")[0] if event.fault is Fault.EMERGENCY else ""
-            last, told = self._seen.pop((event.fault, code), (-self._over, None))
+            last, reported = self._seen.pop((event.fault, code), (-self._over, None))
             stops = event is supervision.stop or event is supervision.gravest
-            if stops or told is None or event.reaction > told or event.cycle - last >= self._over:
-                told = event.reaction
-                self._tell(EventKind.FAULT, told, FAULT_INDEX[event.fault], event.detail)
-            self._seen[event.fault, code] = event.cycle, told
+            if stops or reported is None or event.reaction > reported or event.cycle - last >= self._over:
+                reported = event.reaction
+                self._report(EventKind.FAULT, reported, FAULT_INDEX[event.fault], event.detail)
+            self._seen[event.fault, code] = event.cycle, reported
             if len(self._seen) > CODES_KEPT:
                 del self._seen[next(iter(self._seen))]
         self._noted = supervision.noted

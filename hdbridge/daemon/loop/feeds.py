@@ -1,4 +1,4 @@
-"""Set-points from the shared memory: the knots of a client's stream, and those of the gateway."""
+"""Set-points from the shared memory: knots of a client's stream, and those of the gateway."""
 
 import math
 from typing import Final
@@ -9,22 +9,22 @@ from hdbridge.errors import InputError
 from hdbridge.motion import SetPoint
 
 KNOTS_A_TURN: Final = 4
-"""Knots handed to the set-point before each turn."""
+"""Number of knots passed to the set-point before each turn."""
 STALE_KNOTS_A_TURN: Final = 64
-"""Knots of other streams discarded before each turn."""
+"""Number of knots of other streams discarded before each turn."""
 OUTER_KNOTS_A_TURN: Final = 64
 LONGEST_SPACING_S: Final = 0.05
 BRIDGED: Final = 0.2
 """Time for which a moving axis keeps its speed without a set-point, as a share of the time-out at rest."""
 FIRST_KNOT_S: Final = 2.0
-"""Longest time from the begin to the first set-point."""
+"""Maximum time from the beginning to the first set-point."""
 
 
 class KnotFeed:
     """Knot feed of one axis; idle until a stream begins.
 
-    Stream numbers increase. Knots of a stream that is over are discarded. Those of a later stream wait until
-    it begins, because they may be handed over shortly before the present one ends.
+    Stream numbers increase. Knots of an ended stream are discarded. Knots of a later stream wait until it
+    begins, because they may be passed on shortly before the present stream ends.
     """
 
     def __init__(self, knots: Queue[Knot], set_point: SetPoint) -> None:
@@ -38,7 +38,7 @@ class KnotFeed:
         """Follows the knots of this stream from the next turn on.
 
         Raises InputError if the axis is in motion, the time-out is invalid, or the number is not above the
-        last one.
+        last number.
         """
         if stream <= self._stream:
             raise InputError(
@@ -49,15 +49,15 @@ class KnotFeed:
         self._stream, self._following, self._ending = stream, True, False
 
     def end(self) -> None:
-        """Announces that no more knots come; the stream ends at the last one."""
+        """Announces the end of the knots; the stream ends at the last knot."""
         self._ending = True
 
     def leave(self) -> None:
-        """Stops following the stream; its waiting knots are discarded."""
+        """Leaves the stream and discards its waiting knots."""
         self._following = False
 
     def feed(self) -> str | None:
-        """Hands over the next knots. If one is refused, brakes the axis and returns the reason; else None."""
+        """Passes on the next knots. If one is refused, brakes the axis and returns the reason; else None."""
         knots, set_point, stream = self._knots, self._set_point, self._stream
         taken = 0
         for _ in range(STALE_KNOTS_A_TURN):
@@ -83,7 +83,7 @@ class KnotFeed:
 
 
 class OuterFeed:
-    """Set-points of the outer master for one axis. Between two of them the position is linear (CiA 402).
+    """Set-points of the outer master for one axis, with linear motion between them (CiA 402).
 
     A late set-point is bridged at the speed of the last two, because the gateway process has no real-time
     priority. An axis at rest waits for longer. Set-points of another series are dropped, so none from before
@@ -95,7 +95,7 @@ class OuterFeed:
         self._series = 0
         self._patience_s = 0.0
         self.received_s = math.nan
-        """When the newest set-point was received; NaN before the first."""
+        """Time of reception of the newest set-point; NaN before the first."""
         self.spacing_s = 0.0
         """Time between the last two set-points, at most `LONGEST_SPACING_S`."""
         self._first = True
@@ -103,14 +103,14 @@ class OuterFeed:
         """Time and position of the last set-point, the velocity to it, and the time at which they end."""
 
     def begin(self, series: int, patience_s: float, time_s: float, position_deg: float) -> None:
-        """Begin at rest; ``patience_s``: longest time without a set-point at rest."""
+        """Begins at rest; ``patience_s`` is the maximum time at rest without a set-point."""
         self._series, self._patience_s, self.received_s = series, patience_s, math.nan
         self._first, self._last_deg, self._rate_deg_s, self.spacing_s = True, position_deg, 0.0, 0.0
         self._last_s = -math.inf
         self._end_s = time_s + FIRST_KNOT_S
 
     def at(self, time_s: float) -> float | None:
-        """The position at a time that never decreases; None once the set-points have ended."""
+        """Returns the position at a time that never decreases; None once the set-points have ended."""
         for _ in range(OUTER_KNOTS_A_TURN):
             if self._last_s >= time_s:
                 break

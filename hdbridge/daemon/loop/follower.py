@@ -1,8 +1,8 @@
 """Target of an enabled axis in each turn: set-point, load loop, compensation, motor counts.
 
-    load target -> + load loop -> inverse of the model -> motor counts -> checked against the last ones
+load target -> + load loop -> inverse of the model -> motor counts -> checked against the last counts
 
-`Follower.begin` starts all of it at the actual position. `Follower.follow` is called once per turn.
+`Follower.begin` starts all of these at the actual position. `Follower.follow` is called once per turn.
 """
 
 import math
@@ -26,7 +26,7 @@ from hdbridge.motion import SetPoint
 from hdbridge.units import ARCSEC_PER_DEG
 
 ROUNDING_COUNTS: Final = 2
-"""Margin of the step check; both ends of a step are rounded to counts."""
+"""Margin of the step check, because both ends of a step are rounded to counts."""
 _AT_REST: Final = Moment()
 
 
@@ -50,7 +50,7 @@ class Follower:
         self.set_point = SetPoint(view.limits, config.drive.cycle_s)
         self.correction = Correction(setup.compensation)
         self.compensating = setup.compensating
-        """True if the correction is faded in or being faded in."""
+        """True if the correction is faded in or fading in."""
         self.target_deg = 0.0
         """Load target of the last turn, without the load loop's correction."""
         self.loop_arcsec = 0.0
@@ -76,7 +76,7 @@ class Follower:
             self.correction.disengage()
 
     def use(self, setting: CompensationSetting, *, moving: bool) -> None:
-        """Compensates by a setting from now on; ramps to it if the axis moves, else switches at once.
+        """Compensates by a setting from now on, with a ramp if the axis moves, else at once.
 
         Raises InputError and changes nothing if the setting does not fit the axis.
         """
@@ -161,7 +161,7 @@ class Follower:
 
     @property
     def loop_doubt(self) -> str:
-        """Reason why the load loop does not act; empty while it may."""
+        """Reason why the load loop does not act; empty while it may act."""
         return self._load_loop.doubt if self._load_loop is not None else ""
 
     def _trimmed(self, load_loop: LoadLoop, target_deg: float, feedback: Feedback) -> float:
@@ -182,7 +182,7 @@ class Follower:
 
 
 def fastest_counts(setup: AxisSetup) -> int:
-    """Returns the largest step of the target in one cycle that the velocity and slew limits allow; counts."""
+    """Returns the largest step of the target in one cycle within the velocity and slew limits; counts."""
     config = setup.config
     slew_arcsec_s = config.compensation.slew_arcsec_s
     if setup.load_loop is not None:

@@ -27,21 +27,21 @@ from hdbridge.drive.manners import USUAL_MASTER, Ear, listening_s
 from hdbridge.errors import BusError, HdbridgeError
 
 _POLLS: Final = 256
-"""Frames read to test whether an opened interface works."""
+"""Number of frames read to test whether an opened interface works."""
 AT_ONCE: Final = 2
 """Value of ``STOP_ASKED`` that requests an end by quick stop."""
 SIMULATED_BITRATE_BPS: Final = 1_000_000
 
 
 class Interface(ExitStack):
-    """Opens the bus of a machine file. The interface's lock is held by the keeper, which outlives this."""
+    """Opens the bus of a machine file. The keeper, which outlives this process, holds the lock."""
 
     def __init__(self, settings: BusConfig, clock: Clock) -> None:
         super().__init__()
         self._settings, self._clock = settings, clock
 
     def open(self) -> Link:
-        """Opens the bus and returns a link; raises BusError if that fails."""
+        """Opens the bus and returns a link; raises BusError on failure."""
         self.close()
         bus = self.enter_context(open_bus(self._settings, shared=True))
         return Link(bus, self._clock)
@@ -62,13 +62,12 @@ class Interface(ExitStack):
         return link
 
     def close(self) -> None:
-        """Closes the bus."""
         with suppress(HdbridgeError):
             super().close()
 
 
 def listen(link: Link, axes: tuple[AxisConfig, ...]) -> None:
-    """Listens for another master before the first SYNC; raises BusInUseError if there is one."""
+    """Listens for another master before the first SYNC; raises BusInUseError if one is heard."""
     if link.private:
         return
     masters = {axis.drive.master_node_id for axis in axes} | {USUAL_MASTER}

@@ -29,7 +29,7 @@ def incoming_ids(nodes: Iterable[int]) -> frozenset[int]:
 
 
 def why_refused(can_id: int, data: bytes, states: dict[int, AxisState]) -> str | None:
-    """Returns the reason why a frame of the service must not be sent; None if it may be.
+    """Returns the reason for not sending a frame of the service; None if it may be sent.
 
     ``states`` maps each node of the machine to its axis's state.
     """

@@ -1,11 +1,11 @@
 """State table of an axis in the control loop.
 
-This module holds the states, the rows and what follows from them alone: which commands are accepted, the text
-of a refusal, the diagram. It uses no bus, clock or drive. The drive has its own power states
-(`hdbridge.drive.states`); these states say what the loop may do with the axis. A command without a row is
-refused and changes nothing.
+This module contains the states, the rows, and the functions that follow from them alone: the accepted
+commands, the text of a refusal, the diagram. It uses no bus, clock or drive. The drive has its own power
+states (`hdbridge.drive.states`); these states determine what the loop may do with the axis. A command without
+a row is refused and changes nothing.
 
-Only an ENABLE command leads to ENABLING, and only ENABLING leads to ENABLED. So no axis is enabled
+Only an ENABLE command leads to ENABLING, and only ENABLING leads to ENABLED. No axis is therefore enabled
 automatically, nor after a stop before its latch is released.
 """
 
@@ -16,7 +16,7 @@ from hdbridge.daemon.memory.layout import CommandKind
 
 
 class AxisState(IntEnum):
-    """State of an axis. The numbers are part of the shared memory: add, never renumber."""
+    """State of an axis. The numbers are part of the shared memory, so they may be added but not changed."""
 
     UNVERIFIED = 0
     """The drive was not verified. No RPDO is sent; received TPDOs are evaluated."""
@@ -59,7 +59,7 @@ Cause = CommandKind | Happening
 
 
 class Transition(NamedTuple):
-    """One row: in ``source``, ``cause`` leads to ``target``, which may be the same state."""
+    """Row of the table: in ``source``, ``cause`` leads to ``target``, which may be the same state."""
 
     source: AxisState
     cause: Cause

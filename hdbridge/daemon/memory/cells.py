@@ -1,4 +1,4 @@
-"""Shared memory, the numbers in it that one process writes and others monitor, and an axis's setting."""
+"""Shared memory, numbers in it that one process writes and others monitor, and an axis's setting."""
 
 import fcntl
 import mmap
@@ -15,10 +15,10 @@ _STRIDE: Final = LINE // 8
 
 
 class Region:
-    """A mapped memfd, as bytes and as cells.
+    """Mapped memfd, as bytes and as cells.
 
-    It has no name in any file system: no other process can open it, and it is freed with the last process
-    that holds it, however that one dies. It is sealed against shrinking, so that no access can fail later.
+    It has no name in any file system, so no other process can open it, and it is freed with the last process
+    that holds it, however that process ends. It is sealed against shrinking, so no access can fail later.
     """
 
     def __init__(self, fd: int, size: int, *, checked: bool) -> None:
@@ -72,15 +72,16 @@ class Cell(IntEnum):
     GATEWAY_TIME_NS = 7
     GATEWAY_PID = 8
     BUS_WANTED = 9
-    """Service: 1 while it waits for the bus to be released to another program."""
+    """Service: 1 while it waits for the release of the bus to another program."""
     BUS_LENT = 10
-    """Keeper: when it released the interface to another program (``time.monotonic_ns``); 0 if it did not."""
+    """Keeper: time at which it released the interface to another program (``time.monotonic_ns``); 0 if not
+    lent."""
 
 
 class Cells:
-    """Integers by the members of an enumeration, each in its own cache line; access to one is atomic.
+    """Integers by the members of an enumeration, each in its own cache line; access to each is atomic.
 
-    Each has one writer, except ``STOP_ASKED``, which any process may raise.
+    Each has one writer, except ``STOP_ASKED``, which any process may set.
     """
 
     def __init__(self, region: Region, offset: int, kind: type[IntEnum]) -> None:
@@ -101,7 +102,7 @@ class Status(Cells):
 
     @property
     def loop_count(self) -> int:
-        """Turns of the loop, over all control processes so far."""
+        """Number of turns of the loop, over all control processes so far."""
         return self[Cell.LOOP_COUNT]
 
     @property
@@ -121,7 +122,7 @@ _LOOP_TIME: Final = Cell.LOOP_TIME_NS * _STRIDE
 
 
 class OuterCells(Cells):
-    """Cells of one axis that gateway process and service share, by `OuterCell`."""
+    """Cells of one axis that the gateway process shares with the service, by `OuterCell`."""
 
     def __init__(self, region: Region, place: Place) -> None:
         super().__init__(region, place.offset, OuterCell)
@@ -132,19 +133,18 @@ class OuterCells(Cells):
         self._buffer[self._at : self._at + OUTER_VIEW.size] = OUTER_VIEW.pack(*view)
 
     def values(self) -> tuple[float, ...]:
-        """Returns the fields of `OuterView`; in the cycle of the control process, so as a plain tuple."""
+        """Returns the fields of `OuterView` as a plain tuple, for the cycle of the control process."""
         return OUTER_VIEW.unpack_from(self._buffer, self._at)
 
     @property
     def view(self) -> OuterView:
-        """The view of the outer master."""
         return OuterView._make(self.values())
 
 
 class SettingSlot:
     """Slot of one axis with both ends. It contains the last setting sent, under its number.
 
-    It outlives both processes: a starting service reads the setting that an earlier one sent.
+    It outlives both processes: a starting service reads the setting of an earlier one.
     """
 
     def __init__(self, region: Region, place: Place) -> None:
@@ -156,16 +156,16 @@ class SettingSlot:
 
     @property
     def number(self) -> int:
-        """Number of the setting in the slot; 0 before the first, negative while one is being written."""
+        """Number of the setting in the slot; 0 before the first, negative during a write."""
         return int(self._sent[0])
 
     @property
     def in_use(self) -> int:
-        """Number of the setting that the loop uses; 0 if it has taken none since it started."""
+        """Number of the setting that the loop uses; 0 if it has used none since its start."""
         return int(self._used[0])
 
     def put(self, data: bytes) -> int:
-        """Store a setting; returns its number, which is the argument of CHANGE. InputError if too large."""
+        """Stores a setting; returns its number, which is the argument of CHANGE. InputError if too large."""
         if len(data) > self._capacity:
             raise InputError(
                 f"the compensation takes {len(data)} bytes, the control process takes at most "
@@ -180,7 +180,7 @@ class SettingSlot:
         return number
 
     def get(self, number: int) -> bytes:
-        """Returns the setting with this number. Raises InputError if the slot does not contain all of it."""
+        """Returns the setting with this number. Raises InputError if it is not completely in the slot."""
         length: int = self._sent[1]
         data = bytes(self._view[self._offset : self._offset + min(max(length, 0), self._capacity)])
         whole = len(data) == length and zlib.crc32(data) == self._sent[2]
@@ -189,5 +189,5 @@ class SettingSlot:
         return data
 
     def use(self, number: int) -> None:
-        """Acknowledges, at the loop's end, that this setting is in use from now on."""
+        """Acknowledges, at the loop's end, that this setting is now in use."""
         self._used[0] = number

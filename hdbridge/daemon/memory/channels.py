@@ -1,11 +1,11 @@
 """Channels for one producer and one consumer, without locks that a dying process could hold.
 
-A *ring* never waits: new slots overwrite the oldest, and a slow reader gets the number it lost. A *queue* is
-bounded: it refuses its producer when full. In both, a producer fills the slot and then advances the counter
-in one aligned store.
+A *ring* never waits: new slots overwrite the oldest, and a slow reader receives the number lost. A *queue* is
+bounded: it refuses items when full. In both, a producer fills the slot and then advances the counter in one
+aligned store.
 
-No reader gets a torn slot. It copies the slot and then checks that the producer did not overwrite it
-meanwhile. A slot begins and ends with its sequence number. On processors that may reorder stores it also has
+Readers never see a torn slot. A reader copies the slot and then checks that the producer did not overwrite it
+meanwhile. A slot begins and ends with its sequence number. On processors that may reorder stores, it also has
 a checksum. `Format` converts between items and slots.
 """
 
@@ -44,9 +44,9 @@ from hdbridge.errors import HdbridgeError
 SampleArray = npt.NDArray[np.void]
 """Samples with the dtype `sample_dtype`, shape (n,)."""
 RETRIES: Final = 3
-"""Attempts to copy the new slots before a reader counts incomplete ones as lost."""
+"""Number of attempts to copy the new slots before a reader counts incomplete slots as lost."""
 MISSES: Final = 100
-"""Times that a consumer finds the next slot of a queue incomplete before it skips it."""
+"""Number of times that a consumer finds the next slot of a queue incomplete before skipping it."""
 _CHECK: Final = struct.Struct("@I")
 _KINDS: Final = {int(kind): kind for kind in EventKind}
 
@@ -74,7 +74,7 @@ def _unpack_event(sequence: int, values: tuple[Any, ...]) -> Event:
 
 
 EVENTS: Final[Format[Event]] = Format(EVENT, _pack_event, _unpack_event)
-"""Events; a long text is truncated."""
+"""Format of events; a long text is truncated."""
 FRAMES: Final[Format[RelayedFrame]] = Format(
     FRAME,
     lambda frame: (frame.time_ns, frame.can_id, len(frame.data), frame.data),
@@ -122,21 +122,20 @@ class _Slots(Generic[T]):
 
 
 class Ring(_Slots[T]):
-    """The producer's end of a ring; `RingReader` is a consumer's."""
+    """Producer's end of a ring; `RingReader` is a consumer's end."""
 
     def __init__(self, region: Region, place: Place, form: Format[T]) -> None:
         super().__init__(region, place, form)
         self._sequence: int = self._head[0]
 
     def append(self, item: T) -> None:
-        """Adds an item."""
         sequence = self._sequence + 1
         self._fill(sequence, item)
         self._head[0] = self._sequence = sequence
 
 
 class RingReader(_Slots[T]):
-    """Reads the items appended since it was created, or since its last `read`."""
+    """Reads the items appended since its creation or its last `read`."""
 
     def __init__(self, region: Region, place: Place, form: Format[T]) -> None:
         super().__init__(region, place, form)
@@ -159,7 +158,7 @@ class RingReader(_Slots[T]):
     def rows(self) -> tuple[npt.NDArray[np.uint8], int]:
         """Returns copies of the new slots, shape (n, size), and the number lost before them.
 
-        Items are lost if they are overwritten before they are read.
+        Items that are overwritten before they are read are lost.
         """
         first = self._next
         end: int = self._head[0]
@@ -239,7 +238,7 @@ class Queue(_Slots[T]):
         return added
 
     def peek(self) -> T | None:
-        """Returns the next item, at the consumer's end; None if there is none (yet)."""
+        """Returns the next item, at the consumer's end, or None."""
         sequence: int = self._tail[0] + 1
         if sequence > self._head[0]:
             return None
@@ -269,7 +268,7 @@ class Queue(_Slots[T]):
         self._tail[0] += 1
 
     def take(self) -> T | None:
-        """Removes and returns the next item; None if there is none."""
+        """Removes and returns the next item, or None."""
         item = self.peek()
         if item is not None:
             self._misses = 0
@@ -277,12 +276,12 @@ class Queue(_Slots[T]):
         return item
 
     def clear(self) -> None:
-        """Discards waiting items, at the consumer's end; they were meant for an earlier loop."""
+        """Discards waiting items, at the consumer's end, because they were meant for an earlier loop."""
         self._tail[0] = self._head[0]
 
 
 class MailboxFullError(HdbridgeError):
-    """The command was not posted, because the loop has not taken the waiting ones."""
+    """The command was not posted, because the loop has not taken the waiting commands."""
 
 
 class Mailbox(Queue[Command]):

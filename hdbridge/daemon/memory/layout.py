@@ -39,7 +39,7 @@ KNOT_SLOTS: Final = 8192
 FOLLOWED_SLOTS: Final = 1024
 SETTING_BYTES: Final = 1 << 18
 TEXT_BYTES: Final = 400
-"""Maximum length of an event's text, bytes of UTF-8; longer ones are truncated."""
+"""Maximum length of an event's text, bytes of UTF-8; longer texts are truncated."""
 NO_FAULT: Final = 255
 """Value of ``fault`` in a sample without a latched fault."""
 
@@ -48,7 +48,7 @@ class SampleFlag(IntFlag):
     """Bits of ``flags`` of an axis in a sample."""
 
     FRESH = 1
-    """Feedback of this cycle arrived and is plausible; else the values are the last good ones."""
+    """Feedback of this cycle arrived and is plausible; otherwise, the values are the last good values."""
     COMPENSATING = 2
     """The correction is engaged."""
     LIMITED = 4
@@ -68,7 +68,7 @@ class SampleFlag(IntFlag):
 
 
 class CommandKind(IntEnum):
-    """Command from the service to the loop. The docstring of each describes its fields."""
+    """Command from the service to the loop; the docstrings describe the fields."""
 
     VERIFIED = 1
     """i motor counts, j load counts, k statusword. The drive is verified; its RPDO may be sent."""
@@ -95,7 +95,7 @@ class CommandKind(IntEnum):
     STREAM_BEGIN = 12
     """a time-out s, i mask of the axes that begin in the same cycle, j stream number."""
     STREAM_END = 13
-    """Announces the end of the knots: the axis rests at the last one, or brakes."""
+    """Announces the end of the knots: the axis comes to rest at the last knot, or brakes."""
     CHANGE = 14
     """Changes the compensation; i is the number of the setting."""
     DRIVE_FAULT_RESET = 15
@@ -108,9 +108,9 @@ class EventKind(IntEnum):
     """Event from the loop to the service."""
 
     DONE = 1
-    """The command ``id`` was carried out, or has begun if another event reports its end."""
+    """The command ``id`` was carried out or, if another event reports its end, has begun."""
     REFUSED = 2
-    """The command ``id`` was refused and changed nothing; ``text`` is the reason. id 0: a relayed frame."""
+    """The command ``id`` was refused and changed nothing; ``text`` is the reason. Id 0 is a relayed frame."""
     STATE = 3
     """``code`` is the new `AxisState`."""
     FAULT = 4
@@ -156,7 +156,7 @@ class Event(NamedTuple):
     """Index of the axis; -1 is the machine."""
     kind: EventKind
     id: int = 0
-    """Id of the command that it answers; 0 for none."""
+    """Id of the answered command; 0 for none."""
     code: int = 0
     text: str = ""
 
@@ -177,7 +177,7 @@ class Command(NamedTuple):
 
 
 class RelayedFrame(NamedTuple):
-    """A data frame with an 11-bit identifier, from the service's SDO to the loop's bus or back."""
+    """Data frame with an 11-bit identifier, from the service's SDO to the loop's bus or back."""
 
     time_ns: int
     """Time of reception or queuing, on the loop's clock."""
@@ -189,7 +189,7 @@ class Knot(NamedTuple):
     """Point of a streamed path."""
 
     stream: int
-    """Number of its stream; knots of earlier streams are discarded."""
+    """Number of the stream; knots of earlier streams are discarded."""
     time_s: float
     """Time since the stream began."""
     position_deg: float
@@ -197,20 +197,20 @@ class Knot(NamedTuple):
 
 
 class OuterKnot(NamedTuple):
-    """Set-point of the gateway: the load's position at a time, reached linearly from the one before."""
+    """Set-point of the gateway: the load's position at a time, with linear motion from the one before."""
 
     series: int
-    """Number of its series; set-points of other series are discarded."""
+    """Number of the series; set-points of other series are discarded."""
     time_s: float
-    """Time at which it is due, on the loop's clock."""
+    """Due time, on the loop's clock."""
     position_deg: float
     """NaN ends the series."""
     received_s: float
-    """Time of the outer SYNC (else of the slave's own period) that made it effective."""
+    """Time of the outer SYNC (else of the slave's own period) that put the set-point into effect."""
 
 
 class OuterView(NamedTuple):
-    """The node of an axis as the outer master sees it, with what that master asks for."""
+    """Node of an axis as the outer master sees it, with that master's requests."""
 
     target_deg: float
     controlword: int
@@ -222,32 +222,32 @@ class OuterView(NamedTuple):
 
 OUTER_VIEW: Final = struct.Struct("@dHHHBB")
 NO_OUTER: Final = OuterView(math.nan, 0, 0, 0, 0, 0)
-"""No gateway process shows this axis to another master."""
+"""View without a gateway process."""
 
 
 class OuterCell(IntEnum):
-    """Cells that gateway process and service share about one axis, each with one writer."""
+    """Cells of one axis that gateway process and service share, each with one writer."""
 
     WANTED = 0
-    """Gateway: number of the series of set-points for which power is wanted; 0: no power."""
+    """Gateway: number of the series of set-points for which power is wanted; 0 for no power."""
     GRANTED = 1
     """Service: number of the series that the loop follows."""
     REFUSED = 2
     """Service: number of the last series that was refused."""
     RESETS = 3
-    """Gateway: number of fault resets that were asked for."""
+    """Gateway: number of requested fault resets."""
     RESETS_DONE = 4
-    """Service: number of fault resets that are over, with or without success."""
+    """Service: number of completed fault resets, with or without success."""
     PERIOD_NS = 5
-    """Gateway: period of the outer SYNC; 0: none comes."""
+    """Gateway: period of the outer SYNC; 0 without SYNC."""
     HELD = 6
     """Service: 1 while the outer master holds the lease."""
     JITTER_NS = 7
     """Gateway: mean deviation of the outer SYNC from its regular time."""
     NODE_ID = 8
-    """Gateway: node id in use; 255 if LSS took it away."""
+    """Gateway: node id in use; 255 if LSS removed it."""
     VIEW = 9
-    """Gateway: `OuterView`, packed; the control process puts it in its samples."""
+    """Gateway: packed `OuterView`, which the control process copies to its samples."""
 
 
 class Axis(NamedTuple):
@@ -278,9 +278,9 @@ class Axis(NamedTuple):
     issued_deg: float
     """Target sent in this cycle (607Ah) in motor degrees; NaN if none was sent."""
     outer_received_s: float
-    """When the newest set-point of the other master in this target was received; NaN without one."""
+    """Time of reception of the other master's newest set-point in this target; NaN without one."""
     outer_target_deg: float
-    """Load angle that the other master asks for (607Ah; 60C1h in IP mode); NaN without a gateway."""
+    """Load angle requested by the other master (607Ah; 60C1h in IP mode); NaN without a gateway."""
     outer_controlword: int
     outer_statusword: int
     outer_error_code: int
@@ -310,7 +310,7 @@ TAIL_BYTES: Final = 16
 
 
 def sample_struct(axes: int) -> struct.Struct:
-    """Returns the struct by which the writer packs a sample of ``axes`` axes."""
+    """Returns the struct for packing a sample of ``axes`` axes."""
     return struct.Struct(f"@{_HEAD_CODE}{_AXIS_CODE * axes}{TAIL_CODE}")
 
 
@@ -318,7 +318,7 @@ def sample_dtype(axes: int) -> np.dtype[Any]:
     """Returns the dtype of samples: ``sequence, cycle, time_ns, late_us, busy_us, bus_load, skipped, axes``.
 
     ``time_ns`` is the monotonic clock at SYNC (virtual time on a virtual clock), ``bus_load`` a share,
-    ``axes`` an array of `AXIS_SAMPLE`, shape (axes,). The fields after it belong to the slot.
+    ``axes`` an array of `AXIS_SAMPLE`, shape (axes,). The fields after ``axes`` belong to the slot.
     """
     return np.dtype([*_HEAD, ("axes", AXIS_SAMPLE, (axes,)), *_TAIL])
 

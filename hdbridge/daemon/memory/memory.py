@@ -1,4 +1,4 @@
-"""Shared memory of the daemon's processes: created by one, passed to others as a descriptor."""
+"""Shared memory of the daemon's processes, created by one and passed to the others as a descriptor."""
 
 import os
 import platform
@@ -33,7 +33,7 @@ from hdbridge.errors import InputError
 
 _STRONGLY_ORDERED: Final = frozenset({"x86_64", "amd64", "i386", "i586", "i686"})
 ORDERED: Final = platform.machine().lower() in _STRONGLY_ORDERED
-"""True if other processors see the stores of one in program order."""
+"""True if all processors see the stores of one processor in program order."""
 
 
 class Memory:
@@ -46,7 +46,7 @@ class Memory:
     """
 
     def __init__(self, region: Region, layout: Layout, period_ns: int) -> None:
-        """Use `create` or `attach` instead."""
+        """For internal use; call `create` or `attach` instead."""
         self._region = region
         self._layout = layout
         self.axes = layout.axes
@@ -112,7 +112,7 @@ class Memory:
         return cls(Region(fd, size, checked=bool(checked)), layout, period_ns)
 
     def forget_gateway(self) -> None:
-        """No gateway process shows the axes to another master."""
+        """Marks all axes as not shown to another master."""
         for cells in self.outer:
             cells.show(NO_OUTER)
 
@@ -123,15 +123,14 @@ class Memory:
 
     @property
     def period_s(self) -> float:
-        """Period of the cycle."""
         return self.period_ns / 1e9
 
     def reader(self) -> SampleReader:
-        """Returns a reader of the samples from now on."""
+        """Returns a reader of samples from now on."""
         return SampleReader(self._region, self._layout.samples, self.axes)
 
     def event_reader(self) -> RingReader[Event]:
-        """Returns a reader of the events from now on."""
+        """Returns a reader of events from now on."""
         return RingReader(self._region, self._layout.events, EVENTS)
 
     def incoming_reader(self) -> RingReader[RelayedFrame]:
@@ -143,11 +142,9 @@ class Memory:
         self._region.close()
 
     def __enter__(self) -> Self:
-        """Returns itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Calls `close`."""
         self.close()
 
 

@@ -1,7 +1,7 @@
-"""The live page: a browser's view of the daemon, with buttons that need the lease.
+"""Live page: a browser's view of the daemon, with buttons that require the lease.
 
-It consists of static files; all data comes over the API. Nothing is loaded from elsewhere: the charts use
-uPlot, which the reports include already, and `POLICY` forbids the browser to load anything from outside.
+It consists of static files; all data comes over the API. The charts use uPlot, which is already part of the
+reports, and `POLICY` forbids the browser to load anything from elsewhere.
 """
 
 from functools import cache
@@ -34,5 +34,5 @@ def page_files() -> dict[str, tuple[bytes, str]]:
 
 
 def page_file(name: str) -> tuple[bytes, str] | None:
-    """Returns content and content type of one file; None if there is no such file."""
+    """Returns content and content type of one file; None if it does not exist."""
     return page_files().get(name)

@@ -1,1 +1,1 @@
-"""The flight recorder: a ring of MCAP files on disk."""
+"""Flight recorder: a ring of MCAP files on disk."""

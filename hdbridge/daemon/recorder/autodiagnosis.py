@@ -39,7 +39,7 @@ class AutoDiagnosis:
     """Runs one diagnosis at a time, in a thread that waits for its process."""
 
     def __init__(self, folder: Path, wall_ns: Callable[[], int] = time.time_ns) -> None:
-        """``folder`` is the flight recorder's."""
+        """``folder`` is that of the flight recorder."""
         self._folder = folder
         self._wall_ns = wall_ns
         self._last_ns: dict[str, int] = {}
@@ -98,7 +98,7 @@ class AutoDiagnosis:
         return f"{summary(found)}; {folder}"
 
     def _command(self, folder: Path, *arguments: object) -> None:
-        """Runs one hdbridge command to its end, at the lowest priority."""
+        """Runs one hdbridge command to completion, at the lowest priority."""
         line = [sys.executable, "-m", "hdbridge", *map(str, arguments)]
         with (folder / "log.txt").open("ab") as log:
             process = subprocess.Popen(
@@ -125,7 +125,7 @@ class AutoDiagnosis:
 
 
 def summary(found: dict[str, Any]) -> str:
-    """Returns a diagnosis in one line."""
+    """Summarises a diagnosis in one line."""
     findings: Sequence[dict[str, Any]] = found["findings"]
     baseline, floor = found["baseline"]["rms_arcsec"], found["noise_floor_arcsec"]
     named = ", ".join(

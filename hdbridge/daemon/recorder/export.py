@@ -4,8 +4,8 @@ The columns are those of the bench: time is the cycle number times the period, t
 drive's demand. Cycles without fresh feedback are omitted, because their values were not measured.
 
 Cycles in which the axis was not enabled are omitted unless requested. A gap of more than `GAP_CYCLES` cycles
-(lost, skipped, not fresh or not enabled) begins a new part, because the path in it is unknown. Shorter gaps
-stay within a part, and time continues over them.
+(lost, skipped, not fresh or not enabled) begins a new part, because the path in the gap is unknown. Shorter
+gaps stay within a part, and time continues across them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ ENABLED: Final = (AxisState.ENABLED, AxisState.STOPPING)
 UNSEATED: Final = (AxisState.UNVERIFIED, AxisState.LENT)
 """States after which the encoders' zeros may have changed: the drive was booted or homed."""
 OUTER: Final = ("outer_target_deg", "outer_controlword", "outer_statusword", "outer_error_code")
-"""Columns of an axis with a gateway: what its other master asked for and saw."""
+"""Columns of an axis with a gateway: requests and view of its other master."""
 MEASURED: Final = ("motor_target_deg", "motor_position_deg", "load_position_deg", "motor_torque_nm")
 SAME_RUN_S: Final = 0.5
 Columns = Mapping[str, NDArray[Any]]
@@ -37,7 +37,7 @@ _NS: Final = 1e9
 
 
 def axis_of(about: About, name: str | None, where: Path) -> tuple[int, AxisAbout]:
-    """Returns index and description of the named or only axis; InputError lists the names otherwise."""
+    """Returns index and description of the named or only axis; else InputError lists the names."""
     names = [each.name for each in about.axes]
     if name is None and len(names) == 1:
         return 0, about.axes[0]
@@ -57,7 +57,7 @@ def exported(
 ) -> Recording:
     """Exports one axis of recordings in chronological order; ``start_ns`` and ``end_ns`` are times of day.
 
-    Raises InputError if the recordings lack the axis, have different gear ratios, or no sample is left.
+    Raises InputError if the recordings lack the axis, or have different gear ratios or no sample.
     """
     if not flights:
         raise InputError("no flight recording; expected at least one")
@@ -123,7 +123,7 @@ def _joined(parts: Sequence[Columns]) -> Columns:
 def _cuts(rows: Columns, period_s: float) -> tuple[NDArray[np.intp], int]:
     """Returns the first rows of new parts, and the number of cycles missing within parts.
 
-    Cycle numbers continue from file to file and restart with the control process; the clock reveals a
+    Cycle numbers continue from file to file and restart with the control process; the clock reveals such a
     restart.
     """
     steps = np.diff(rows["cycle"])

@@ -1,9 +1,9 @@
-"""A file of the flight recorder: MCAP, complete up to its last flush in any event.
+"""File of the flight recorder: MCAP, always complete up to its last flush.
 
 Messages collect in a chunk in memory; `flush` writes the chunk and syncs it to the disk. An unfinished file
-has all its chunks but no index: `mend` rewrites it as a finished one. Until it is finished its name ends in
-``.part``, and its writer holds a lock on it. Each file is complete by itself: it has the description of the
-machine (`About`) and the models in use.
+has all its chunks but no index; `mend` rewrites it as a finished file. Until it is finished, its name ends in
+``.part`` and its writer holds a lock on it. Each file is complete by itself: it contains the description of
+the machine (`About`) and the models in use.
 """
 
 import fcntl
@@ -28,12 +28,12 @@ from hdbridge.records.recording import versions_here
 
 FORMAT: Final = "hdbridge.flight/1"
 MACHINE_NAME: Final = "hdbridge"
-"""Name of the machine's metadata record; that of an axis is ``axis/NAME``."""
+"""Name of the machine's metadata record; the name of an axis record is ``axis/NAME``."""
 PART: Final = ".part"
 KEPT: Final = "kept"
 """Subfolder for recordings that contain a fault."""
 CHUNK_BYTES: Final = 64 << 20
-"""Maximum size of a chunk. It exceeds a second's data, so that chunks end at flushes."""
+"""Maximum size of a chunk. It exceeds a second's data, so chunks end at flushes."""
 EVENTS: Final = "/events"
 MODEL: Final = "/model"
 MACHINE_TOPIC: Final = "/machine"
@@ -183,7 +183,7 @@ class _Stream:
         return self._written + len(self._waiting)
 
     def flush(self) -> None:
-        """Does nothing: the MCAP writer flushes at will, but only `commit` writes."""
+        """Does nothing, because the MCAP writer flushes at will but only `commit` may write."""
 
     @property
     def waiting(self) -> int:
@@ -241,7 +241,7 @@ class FlightFile:
 
     @property
     def behind(self) -> int:
-        """Bytes that the last flush could not write."""
+        """Number of bytes that the last flush could not write."""
         return self._stream.waiting
 
     def add_samples(self, samples: SampleArray) -> None:
@@ -253,11 +253,10 @@ class FlightFile:
             self._add(channel, times, numbers, axis_messages(samples, place))
 
     def add_event(self, event: Event) -> None:
-        """Adds an event of the loop."""
         axes = self._about.axes
         name = axes[event.axis].name if 0 <= event.axis < len(axes) else self._about.machine
         kind = EventKind(event.kind)
-        self._tell(
+        self._add_note(
             event.time_ns,
             name,
             kind.name,
@@ -268,19 +267,19 @@ class FlightFile:
 
     def note(self, time_ns: int, kind: str, text: str, level: int = logging.INFO) -> None:
         """Adds a note of the recorder or a client; ``level`` is that of a log record."""
-        self._tell(time_ns, self._about.machine, kind, text, level)
+        self._add_note(time_ns, self._about.machine, kind, text, level)
 
     def add_model(self, time_ns: int, axis: str, version: str, text: str) -> None:
         """Adds the model that an axis uses from now on."""
         self._put(self._models, time_ns, {"axis": axis, "version": version, "text": text})
 
     def flush(self) -> None:
-        """Writes new messages and syncs them to the disk. After an OSError they wait for a retry."""
+        """Writes new messages and syncs them to the disk. After an OSError, they wait for a retry."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._stream.commit()
 
     def finish(self) -> None:
-        """Writes the index and renames the file. After an OSError it stays a part, to be mended."""
+        """Writes the index and renames the file. After an OSError, it stays a part that can be mended."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         try:
             self._stream.commit()
@@ -289,12 +288,12 @@ class FlightFile:
             self.abandon()
 
     def abandon(self) -> None:
-        """Closes the file as it is."""
+        """Closes the file without finishing it."""
         if self._stream.descriptor >= 0:
             os.close(self._stream.descriptor)
             self._stream.descriptor = -1
 
-    def _tell(
+    def _add_note(
         self, time_ns: int, name: str, kind: str, text: str, level: int, event: Event | None = None
     ) -> None:
         seconds, rest = divmod(time_ns + self._about.offset_ns, 1_000_000_000)

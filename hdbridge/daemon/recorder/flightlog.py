@@ -7,9 +7,9 @@
 Names begin with the date in UTC, so they sort by time.
 
 Once a second, new data is written as one chunk and synced, so a kill loses at most the last second. Free
-space is checked first: while the disk is full, data is dropped and counted, and the begin and end of this
-are reported. A fault or a client's mark moves the files around its time aside, where the ring does not
-remove them.
+space is checked first. While the disk is full, data is dropped and counted, and the beginning and end of this
+condition are reported. A fault or a client's mark moves the files around its time to a place from which the
+ring does not remove them.
 """
 
 import logging
@@ -43,7 +43,7 @@ _NS: Final = 1_000_000_000
 
 
 class Batch(NamedTuple):
-    """Data received from the observer at once."""
+    """Data received from the observer in one call."""
 
     samples: SampleArray | None
     events: tuple[Event, ...] = ()
@@ -88,7 +88,7 @@ def free_bytes(folder: Path) -> int:
 
 
 class FlightLog:
-    """Recorder without a thread: its owner calls `put` and, once a second, `flush`."""
+    """Recorder without a thread; its owner calls `put` and, once a second, `flush`."""
 
     def __init__(
         self,
@@ -96,21 +96,21 @@ class FlightLog:
         settings: RecorderSettings,
         about: About,
         *,
-        tell: Callable[[str], None] = lambda _: None,
+        notify: Callable[[str], None] = lambda _: None,
         wall_ns: Callable[[], int] = time.time_ns,
         free: Callable[[Path], int] = free_bytes,
     ) -> None:
-        """``tell`` reports events of the recording to the user; ``wall_ns`` returns the time of day.
+        """``notify`` reports events of the recording to the user; ``wall_ns`` returns the time of day.
 
         Raises OSError if the folder cannot be created.
         """
         self.folder, self._settings, self._about, self._free = folder, settings, about, free
-        self._tell = tell
+        self._notify = notify
         self._wall_ns = wall_ns
         self._file: FlightFile | None = None
         self._begun_ns = 0
         self._files: list[tuple[Path, int, int]] = []
-        """Finished files of the ring, with their time spans, that a fault may still require."""
+        """Finished files of the ring, with their time spans, that may still be kept for a fault."""
         self._spans: list[tuple[int, int]] = []
         """Time spans around faults; ns of the samples' clock."""
         self._models: dict[str, ModelUse] = {}
@@ -119,14 +119,14 @@ class FlightLog:
         self._trouble = ""
         self._refused_now = 0
         self._behind = 0
-        """Cycles in a chunk that is not yet on the disk."""
+        """Number of cycles in a chunk that is not yet on the disk."""
         self.counts = Counts()
         folder.mkdir(parents=True, exist_ok=True)
 
     def mend(self) -> None:
-        """Mends files of a process that died, and keeps those that contain a fault."""
-        for path in mend_folder(self.folder, self._tell):
-            self._tell(f"{path.name}: was not finished; it is whole up to its last second")
+        """Mends the files of a dead process, and keeps those that contain a fault."""
+        for path in mend_folder(self.folder, self._notify):
+            self._notify(f"{path.name}: was not finished; it is whole up to its last second")
             with suppress(InputError, OSError):
                 if any(each.kind in _KEPT_NAMES for each in overview(path).events):
                     self._move_aside(path)
@@ -214,13 +214,13 @@ class FlightLog:
         self._refused_now += cycles
         words = problem.strerror or str(problem)
         if not self._trouble:
-            self._tell(f"{self.folder}: nothing is recorded: {words}; free some space")
+            self._notify(f"{self.folder}: nothing is recorded: {words}; free some space")
         self._trouble = words
 
     def _recovered(self) -> None:
         if not self._trouble:
             return
-        self._tell(f"{self.folder}: recorded again; {self._refused_now} cycles were not ({self._trouble})")
+        self._notify(f"{self.folder}: recorded again; {self._refused_now} cycles were not ({self._trouble})")
         if self._file is not None:
             self._file.note(
                 self._newest_ns,
@@ -244,7 +244,7 @@ class FlightLog:
             ]
 
     def _cut(self) -> None:
-        """Begins another file once this one is large or old enough, or a span to keep is over."""
+        """Begins a new file once this one is large or old enough, or a span to keep is over."""
         file, settings = self._file, self._settings
         if file is None:
             return
@@ -269,7 +269,7 @@ class FlightLog:
         self._remove_old()
 
     def _keep(self) -> None:
-        """Moves files aside that a fault requires, and forgets those that none can require any more."""
+        """Moves files with a fault aside, and forgets files that can no longer contain one."""
         horizon_ns = self._newest_ns - int(self._settings.before_s * _NS)
         left = []
         for path, begin_ns, end_ns in self._files:
@@ -302,19 +302,19 @@ class FlightLog:
         path.rename(kept / path.name)
 
     def _remove_old(self, writing: int = 0) -> None:
-        """Removes files over the limits; ``writing`` is the size of the file being written."""
+        """Removes files over the limits; ``writing`` is the size of the open file."""
         limits, now_s = self._settings, self._wall_ns() / _NS
         _trim(self.folder, limits.size_mb * _MB - writing, now_s - limits.age_days * _DAY_S)
         gone = _trim(self.folder / KEPT, limits.kept_mb * _MB, -1.0)
         if gone:
-            self._tell(
+            self._notify(
                 f"{self.folder}: what is kept of faults is over {limits.kept_mb:g} MB; removed: "
                 f"{', '.join(each.name for each in gone)}"
             )
 
 
 def _trim(folder: Path, most: float, oldest_s: float) -> list[Path]:
-    """Removes files beyond ``most`` bytes in all or older than ``oldest_s``, oldest first; returns them."""
+    """Removes files beyond ``most`` bytes in total or older than ``oldest_s``, oldest first; returns them."""
     files: list[tuple[Path, os.stat_result]] = []
     for path in sorted(folder.glob(f"*{SUFFIX}")):
         with suppress(FileNotFoundError):  # removed by a user

@@ -20,7 +20,7 @@ CHUNK_BYTES: Final = 1 << 20
 def mend_folder(folder: Path, say: Callable[[str], None] = lambda _: None) -> list[Path]:
     """Mends every unfinished file of a folder that is not being written; returns the mended files.
 
-    Removes files without a complete chunk. Reports files that cannot be mended and leaves them unchanged.
+    Removes files without a complete chunk. Reports files that cannot be mended, without changing them.
     """
     mended = []
     for leftover in sorted(folder.glob(f".*{MENDING}")):
@@ -41,7 +41,7 @@ def mend_folder(folder: Path, say: Callable[[str], None] = lambda _: None) -> li
 def mend(path: Path) -> Path | None:
     """Mends one file; returns its new name, or None if it had no complete chunk and was removed.
 
-    Leaves a finished file unchanged. Raises InputError if the file is being written, `GoneError` if it no
+    Does not change a finished file. Raises InputError if the file is being written, `GoneError` if it no
     longer exists, OutputError if there is no space.
     """
     target = path.with_name(path.name.removesuffix(PART))
@@ -81,7 +81,7 @@ def mend(path: Path) -> Path | None:
 
 
 def _copied(path: Path, file: BinaryIO, out: BinaryIO) -> tuple[int, bool]:
-    """Copies every complete record; returns the number of messages and if the file was finished."""
+    """Copies every complete record; returns the number of messages, and whether the file was finished."""
     writer = Writer(out, chunk_size=CHUNK_BYTES)
     schemas: dict[int, int] = {0: 0}
     channels: dict[int, int] = {}

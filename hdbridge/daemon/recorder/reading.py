@@ -1,6 +1,6 @@
 """Reading of flight recordings, finished or not, up to their last complete chunk.
 
-The recorder may be active in the same folder: it renames a file when it is finished or kept, and removes old
+The recorder may be active in the same folder. It renames a file when it is finished or kept, and removes old
 files. A recording is found under its present name as long as it exists.
 """
 
@@ -35,7 +35,7 @@ class GoneError(InputError):
     """The recording no longer exists: the recorder or a user removed it."""
 
 
-class Told(NamedTuple):
+class LoggedEvent(NamedTuple):
     """Event of a recording."""
 
     time_ns: int
@@ -47,7 +47,7 @@ class Told(NamedTuple):
 
 
 class ModelUsed(NamedTuple):
-    """Model that an axis used from a time on."""
+    """Model used by an axis from a given time."""
 
     time_ns: int
     axis: str
@@ -60,17 +60,17 @@ class Flight:
     """Content of one file, or its summary."""
 
     path: Path
-    """Its present name."""
+    """Present name."""
     about: About
     finished: bool
-    """True if it has its index; else it was cut off or is being written."""
+    """True if the file has its index; else it was cut off or is being written."""
     first_ns: int
     """Times of day of the first and the last message, ns."""
     last_ns: int
     size: int
     """Bytes."""
     cycles: int
-    events: tuple[Told, ...]
+    events: tuple[LoggedEvent, ...]
     axes: Mapping[str, Mapping[str, NDArray[Any]]] = field(default_factory=dict)
     """Requested sample fields as columns, by axis."""
     machine: Mapping[str, NDArray[Any]] = field(default_factory=dict)
@@ -78,9 +78,9 @@ class Flight:
 
 
 def flight_files(paths: Sequence[Path]) -> list[Path]:
-    """Returns the given files, and for each folder its recordings by date, kept ones included.
+    """Returns the given files, and the recordings of each folder by date, including kept ones.
 
-    Raises InputError if a folder has none.
+    Raises InputError for a folder without recordings.
     """
     found: list[Path] = []
     for path in paths:
@@ -130,26 +130,26 @@ def each_flight(paths: Sequence[Path], look: Callable[[Path], T]) -> Iterator[T]
 
 
 def records_of(file: BinaryIO, where: Path) -> Iterator[McapRecord]:
-    """Yields every record up to the last complete chunk; the last is a `Footer` only if the file is finished.
+    """Yields every record up to the last complete chunk; the last is a `Footer` only in a finished file.
 
-    Raises InputError if it is not an MCAP file.
+    Raises InputError if the file is not MCAP.
     """
     try:
         yield from StreamReader(file, validate_crcs=True).records
     except (InvalidMagic, struct.error) as problem:
         if file.tell() > 16:
             return
-        raise InputError(f"{where}: is no MCAP file; expected a flight recording") from problem
+        raise InputError(f"{where}: is not an MCAP file; expected a flight recording") from problem
     except TORN:
         return
 
 
 def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
-    """Reads a file; ``axes`` selects the axes with samples (None: all). InputError names the file."""
+    """Reads a file; ``axes`` selects the axes with samples (None for all). InputError names the file."""
     topics: dict[int, str] = {}
     messages: dict[str, list[bytes]] = defaultdict(list)
     metadata: dict[str, Mapping[str, str]] = {}
-    events: list[Told] = []
+    events: list[LoggedEvent] = []
     models: list[ModelUsed] = []
     times: list[int] = []
     finished = False
@@ -161,7 +161,7 @@ def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
             if isinstance(record, Message):
                 topic = topics.get(record.channel_id, "")
                 if topic == EVENTS:
-                    events.append(_told(record))
+                    events.append(_logged_event(record))
                 elif topic == MODEL:
                     models.append(ModelUsed(record.log_time, **json.loads(record.data)))
                 elif wanted is None or topic in wanted:
@@ -187,7 +187,7 @@ def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
 
 
 def overview(path: Path) -> Flight:
-    """Returns the summary of a finished file without reading its samples; reads an unfinished one in full."""
+    """Returns the summary of a finished file without reading its samples; reads others in full."""
     path, opened = _opened(path)
     with opened as file:
         try:
@@ -196,7 +196,7 @@ def overview(path: Path) -> Flight:
             if summary is None or summary.statistics is None:
                 raise EndOfFile
             metadata = {each.name: each.metadata for each in reader.iter_metadata()}
-            events = tuple(_told(message) for _, _, message in reader.iter_messages(EVENTS))
+            events = tuple(_logged_event(message) for _, _, message in reader.iter_messages(EVENTS))
         except (*TORN, OSError):
             return replace(read(path, ()), finished=False)
         size = os.fstat(file.fileno()).st_size
@@ -224,6 +224,6 @@ def _opened(path: Path) -> tuple[Path, BinaryIO]:
     raise GoneError(f"{path}: there is no such file or folder; expected a flight recording")
 
 
-def _told(message: Message) -> Told:
+def _logged_event(message: Message) -> LoggedEvent:
     content = json.loads(message.data)
-    return Told(message.log_time, content["name"], content["kind"], content["text"])
+    return LoggedEvent(message.log_time, content["name"], content["kind"], content["text"])

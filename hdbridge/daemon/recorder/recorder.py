@@ -1,7 +1,7 @@
-"""The flight recorder: all samples and events of the loop, on disk within a second.
+"""Flight recorder: all samples and events of the loop, on disk within a second.
 
-`FlightRecorder` is a sink of the observer. It never blocks and uses bounded memory: data that its thread is
-too slow for is dropped, counted and reported. `flightlog` does the thread's work.
+`FlightRecorder` is a sink of the observer. It never blocks and uses bounded memory. Data that arrives faster
+than its thread can process is dropped, counted and reported. `flightlog` does the thread's work.
 """
 
 import logging
@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 class FlightRecorder:
     """Sink that passes everything to its thread; another thread mends files of earlier processes.
 
-    If the folder cannot be created, it records nothing and reports that.
+    If the folder cannot be created, it records nothing and reports the failure.
     """
 
     def __init__(
@@ -38,23 +38,23 @@ class FlightRecorder:
         about: About,
         settings: RecorderSettings | None = None,
         *,
-        tell: Callable[[str], None] = lambda _: None,
+        notify: Callable[[str], None] = lambda _: None,
         in_use: Callable[[], Mapping[str, CompensationSetting]] = dict,
         free: Callable[[Path], int] = free_bytes,
     ) -> None:
-        """``in_use`` returns the setting that compensates each axis. The recorder's threads call ``tell``."""
+        """``in_use`` returns the setting that compensates each axis. Its threads call ``notify``."""
         self.folder = folder
         self.flight: FlightLog | None = None
         """None if the folder could not be created."""
-        self._tell_user, self._in_use = tell, in_use
+        self._notify_user, self._in_use = notify, in_use
         self._note: str | None = None
-        self._told: dict[str, CompensationSetting] = {}
+        self._recorded: dict[str, CompensationSetting] = {}
         self._queue: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self._threads: list[threading.Thread] = []
         try:
-            flight = FlightLog(folder, settings or RecorderSettings(), about, tell=self._tell, free=free)
+            flight = FlightLog(folder, settings or RecorderSettings(), about, notify=self._notify, free=free)
         except OSError as problem:
-            self._tell(f"{folder}: cannot be made: {problem.strerror}; nothing is recorded")
+            self._notify(f"{folder}: cannot be made: {problem.strerror}; nothing is recorded")
             return
         self.flight = flight
         # The duration of the mending does not matter: each file is mended completely or not at all.
@@ -66,8 +66,8 @@ class FlightRecorder:
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
         """Takes samples and events from the observer; never waits."""
         for axis, setting in self._in_use().items():
-            if self._told.get(axis) is not setting:
-                self._told[axis] = setting
+            if self._recorded.get(axis) is not setting:
+                self._recorded[axis] = setting
                 version = str(setting.version) if setting.version is not None else ""
                 self.put(ModelUse(axis, version, setting.compensating.dump()))
         if self.flight is None:
@@ -76,16 +76,16 @@ class FlightRecorder:
             self._queue.put(Batch(samples if len(samples) else None, tuple(events), lost))
             return
         if not self.flight.counts.dropped:
-            self._tell("the recorder is too slow: cycles are dropped")
+            self._notify("the recorder is too slow: cycles are dropped")
         self.flight.counts.dropped += len(samples)
 
     def put(self, item: ModelUse | Note) -> None:
-        """Records a change of model or a note. They are rare, and never dropped."""
+        """Records a change of model or a note. Both are rare and never dropped."""
         if self.flight is not None:
             self._queue.put(item)
 
     def mark(self, text: str = "") -> None:
-        """Records a mark and keeps the time around it, as around a fault."""
+        """Records a mark and keeps the time around it, like that around a fault."""
         self.put(Note(MARK, text))
 
     def state(self) -> messages.RecorderState:
@@ -99,15 +99,15 @@ class FlightRecorder:
         )
 
     def close(self) -> None:
-        """Finishes the file; returns when it is on the disk."""
+        """Finishes the file; returns once it is on the disk."""
         self._queue.put(None)
         for thread in self._threads:
             thread.join()
 
-    def _tell(self, text: str) -> None:
+    def _notify(self, text: str) -> None:
         self._note = text
         _log.warning("recorder", {"text": text})
-        self._tell_user(text)
+        self._notify_user(text)
 
     def _mend(self, flight: FlightLog) -> None:
         try:
@@ -117,7 +117,7 @@ class FlightRecorder:
 
     def _run(self, flight: FlightLog) -> None:
         due_s = time.monotonic() + FLUSH_S
-        told = 0
+        reported = 0
         going = True
         while going:
             with suppress(queue.Empty):
@@ -126,14 +126,14 @@ class FlightRecorder:
                     going = False
                 else:
                     flight.put(item)
-            dropped = flight.counts.dropped - told
+            dropped = flight.counts.dropped - reported
             if dropped:
                 flight.put(Note("DROPPED", f"{dropped} cycles were dropped: the recorder was too slow"))
-                told += dropped
+                reported += dropped
             if time.monotonic() < due_s and going:
                 continue
             due_s = time.monotonic() + FLUSH_S
             try:
                 flight.flush() if going else flight.close()
             except Exception:
-                _log.exception("the recorder failed; it goes on")
+                _log.exception("the recorder failed; it continues")

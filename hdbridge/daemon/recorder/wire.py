@@ -1,8 +1,8 @@
 """Encoding of samples as Protocol Buffers messages, one batch at a time.
 
 Foxglove, PlotJuggler and all MCAP tools decode protobuf by the schema in the file. If all fields of a message
-are present and of fixed width, its bytes have one layout: tag, value, tag, value. So a batch is a numpy array
-of that layout, filled column by column, without encoding each message.
+are present and of fixed width, its bytes have a fixed layout: tag, value, tag, value. A batch is therefore a
+numpy array of that layout, filled column by column, without encoding each message.
 
 One table of fields (`AXIS_FIELDS`, `MACHINE_FIELDS`) defines both schema and layout.
 """
@@ -43,7 +43,7 @@ class Field(NamedTuple):
 
     name: str
     kind: str
-    """A numpy type, or ``enum`` for a byte."""
+    """Numpy type, or ``enum`` for a byte."""
     values: Mapping[int, str] | None = None
     """Names of an enum's values."""
 
@@ -61,7 +61,7 @@ _ENUMS: Final[Mapping[str, Mapping[int, str]]] = {
     "outer_mode": {0: "NONE", 1: "PP", 6: "HM", 7: "IP", 8: "CSP"},
 }
 _WIDE: Final = {"u2": "u4"}
-"""Wider types for those that protobuf lacks."""
+"""Wider types in place of types that protobuf lacks."""
 _AXIS_NAMES: Final = AXIS_SAMPLE.names or ()
 AXIS_FIELDS: Final = (
     Field("cycle", "i8"),

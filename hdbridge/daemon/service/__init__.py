@@ -1,1 +1,1 @@
-"""The service process's work for clients: lease, motion queue, SDO access, loan of the bus."""
+"""Work of the service process for clients: lease, motion queue, SDO access, loan of the bus."""

@@ -1,8 +1,8 @@
 """One axis, for clients: power, motion, compensation and objects of the drive.
 
 The drive is booted and verified by SDO before the control process sends it anything. It is prepared by SDO
-each time before power is switched on, and verified again after it restarted or the bus was down. An axis is
-never enabled automatically.
+each time before power is switched on, and verified again after a restart or a bus failure. An axis is never
+enabled automatically.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from hdbridge.daemon.setting import CompensationSetting
 
 CHANGE_S: Final = 120.0
-"""Time in which another compensation is faded in, however slow its ramp."""
+"""Time-out for fading in another compensation, however slow its ramp."""
 POWER_S: Final = 20.0
-"""Time-out for ENABLE and DISABLE, braking included."""
+"""Time-out for ENABLE and DISABLE, including braking."""
 FAULT_RESET_S: Final = 2.0
 
 
@@ -53,13 +53,13 @@ class ServiceAxis:
         self.commissioning = Commissioning(axis.config, core)
         self.models = AxisModels(axis, core.memory.settings[index])
         self.is_prepared = False
-        """True if all SDO work that precedes power is done, and no SDO transfer has followed."""
+        """True if all SDO work before power is done, and no SDO transfer has followed."""
         self.motion = AxisMotion(self.link, self.check_may)
         self._report = report
         self._work = core.timing.work
         self._changing = asyncio.Lock()
         self._doing = ""
-        """Client request that has exclusive use of the drive, in words; empty if none."""
+        """Client request with exclusive use of the drive, in words; empty without one."""
         self._drive = asyncio.Lock()
         """Held during exclusive use of the drive, also by the service's own work, for which clients wait."""
 
@@ -97,7 +97,7 @@ class ServiceAxis:
     # ---------------------------------------------------------------- power
 
     async def enable(self, holder: str) -> None:
-        """Switches power on, at rest; boots and verifies the drive first if that was not done."""
+        """Switches power on, at rest; first boots and verifies the drive if this was not done."""
         self.check_may(holder)
         async with self._alone("the axis is being enabled"):
             self.motion.replace(None, "the axis was enabled anew")
@@ -122,7 +122,7 @@ class ServiceAxis:
                 raise
 
     async def prepare(self) -> None:
-        """Prepares the drive by SDO, so that the next `enable` needs none. Raises as `enable` does."""
+        """Prepares the drive by SDO, so that the next `enable` requires none. Raises like `enable`."""
         self.check_free()
         async with self._drive:
             if self.link.state is AxisState.DISABLED:
@@ -254,13 +254,13 @@ class ServiceAxis:
         return not self.models.settled
 
     async def settle(self) -> None:
-        """Has the control process compensate by the chosen setting, if it does not."""
+        """Makes the control process compensate by the chosen setting if it does not."""
         async with self._changing:
             if not self.models.settled:
                 await self._use(self.models.chosen)
 
     async def follow(self, model: TransmissionModel) -> None:
-        """Compensates with the adapted parameters of the chosen model, which keeps its version."""
+        """Compensates with the adapted parameters of the chosen model, whose version does not change."""
         async with self._changing:
             await self._use(await self._work(self.models.moved, model))
 

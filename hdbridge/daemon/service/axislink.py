@@ -30,22 +30,22 @@ class Kind(Enum):
 
 
 ENDS_WITH_LEASE = frozenset({Kind.JOG, Kind.QUEUE, Kind.STREAM})
-"""Activities that are stopped when the lease under which they began ends. Moves end on their own."""
+"""Activities that are stopped when the lease under which they began ends. Moves complete on their own."""
 
 
 @dataclass(slots=True, eq=False)
 class Activity:
-    """One activity; it is over when another replaces it or when it has completed."""
+    """One activity; it is over when it has completed or been replaced."""
 
     kind: Kind
     holder: str
-    """Token of the lease under which it began."""
+    """Token of the lease under which the activity began."""
     command_id: int = 0
     """Id of the command to the control process that began this motion."""
     since: int = 0
-    """Number of the newest log entry before it began; later entries report its outcome."""
+    """Number of the newest log entry before the activity; later entries report its outcome."""
     over: str = ""
-    """Reason for its end; empty while it lasts."""
+    """Reason for the end; empty while the activity lasts."""
 
     def end(self, why: str) -> None:
         """Ends the activity; only the first reason counts."""
@@ -80,7 +80,7 @@ class AxisLink:
         return _POWER[int(self.value("power"))] if newest is not None else State.UNKNOWN
 
     def seeds(self) -> Arguments:
-        """Counts of both encoders and statusword, as ENABLE has them."""
+        """Counts of both encoders and statusword, as arguments of ENABLE."""
         encoder = self.config.load_encoder
         motor = round(self.value("motor_position_deg") / self.config.motor_encoder.degrees(1))
         load = (
@@ -93,7 +93,7 @@ class AxisLink:
     async def do(
         self, kind: CommandKind, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
     ) -> Event:
-        """Runs `Core.do`, then waits until the newest sample is later than the answer."""
+        """Runs `Core.do`, then waits for a sample later than the answer."""
         answer = await self.core.do(kind, self.index, within_s, **arguments)
         observer = self.core.observer
         await self.until(lambda: observer.cycle > answer.cycle, ANSWER_S)
@@ -115,9 +115,9 @@ class AxisLink:
     async def arrival(self, activity: Activity, waiting: Activity | None = None) -> None:
         """Waits until a motion has ended.
 
-        ``waiting`` is the activity that waits for it, if it is another one; the wait ends when it is over.
-        Raises SafetyStop if the supervision stopped the motion, RefusedError if another activity replaced
-        it, InputError if one of its set-points was refused, and DaemonError if the control process is gone.
+        ``waiting`` is the activity that waits, if it is a different one; the wait ends with it. Raises
+        SafetyStop if the supervision stopped the motion, RefusedError if another activity replaced it,
+        InputError if one of its set-points was refused, and DaemonError if the control process is gone.
         """
         stopping = False
         while True:
@@ -135,13 +135,13 @@ class AxisLink:
             await self.core.timing.sleep(POLL_S)
 
     def look(self, activity: Activity) -> None:
-        """Checks a motion without waiting; raises as `arrival` does."""
+        """Checks a motion without waiting; raises like `arrival`."""
         done, _ = self._look(activity, stopping=False)
         if done or activity.over:
             raise RefusedError(f"{self.name}: {activity.over}")
 
     def _look(self, activity: Activity, stopping: bool) -> tuple[bool, bool]:
-        """Returns (motion has ended, axis is stopping for a reason that is yet to be reported)."""
+        """Returns (motion has ended, axis is stopping for a reason not yet reported)."""
         self.core.observer.poll()
         log = self.core.log
         newest = log.newest
@@ -159,7 +159,7 @@ class AxisLink:
         return False, stopping
 
     def _ended(self, event: Event, activity: Activity) -> bool:
-        """Returns True if an event reports that the motion ended; raises if it ended early."""
+        """Returns True if an event reports the end of the motion; raises if it ended early."""
         if event.kind is EventKind.STREAM_REFUSED:
             activity.end(event.text)
             raise InputError(f"{self.name}: {event.text}; the axis brakes")

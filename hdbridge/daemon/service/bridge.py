@@ -1,10 +1,10 @@
-"""The machine as the API sees it: axes, lease, coordinated moves, loan of the bus, state and events.
+"""Machine as seen by the API: axes, lease, coordinated moves, loan of the bus, state and events.
 
     async with ServiceBridge(machine, memory, timing) as bridge:
         ...
 
-All of it runs in one event loop. An axis holds its position without this process: if the process dies, the
-axes complete the commands they have, and the next service process takes them over as they are.
+Everything runs in one event loop. The axes do not depend on this process. If it dies, they complete their
+present commands, and the next service process takes them over in their present state.
 
 Angles are load angles in degrees, speeds in deg/s. ``holder`` is the lease token. All coroutines of machine
 and axes raise an `HdbridgeError` whose text is one line with the cause and the remedy:
@@ -48,15 +48,15 @@ if TYPE_CHECKING:
     from hdbridge.daemon.service.lease import Lease
 
 VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
-"""Pauses before each attempt to verify a drive that did not answer; the last one repeats."""
+"""Pauses before successive attempts to verify a drive that did not answer; the last pause repeats."""
 SETTLE_AGAIN_S: Final = (0.0, 0.5)
-"""Pauses before each attempt to send a compensation that is not acknowledged."""
-EVENTS_TOLD: Final = 1000
+"""Pauses before successive attempts to send an unacknowledged compensation."""
+EVENTS_RETURNED: Final = 1000
 _log = logging.getLogger(__name__)
 
 
 class ServiceBridge:
-    """The machine, for the API."""
+    """Machine, for the API."""
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class ServiceBridge:
         simulated: bool = False,
         forced: bool = False,
     ) -> None:
-        """``forced`` says that the daemon does not hold the lock of its interface."""
+        """``forced`` states that the daemon does not hold the lock of its interface."""
         self.machine = machine
         self.core = Core(memory, timing, machine.lease_s)
         against = "the daemon was started with --force and does not hold the interface" if forced else ""
@@ -99,7 +99,7 @@ class ServiceBridge:
         self.core.lease.doing = self._doing
 
     def _doing(self) -> str:
-        """Returns the present motions in words, for a client without the lease."""
+        """Describes the present motions for a client without the lease."""
         states = [axis.state() for axis in self.axes.values()]
         return "; ".join(
             f"axis '{each.name}' is in motion ({each.mode})" for each in states if each.mode != "hold"
@@ -107,7 +107,7 @@ class ServiceBridge:
 
     @property
     def lease(self) -> Lease:
-        """The lease, which is the right to move."""
+        """Lease, which is the right to move."""
         return self.core.lease
 
     # ---------------------------------------------------------------- begin and end
@@ -115,7 +115,7 @@ class ServiceBridge:
     async def __aenter__(self) -> Self:
         """Takes over every axis in its present state and monitors all of them from now on.
 
-        Returns when the control process compensates each axis by its setting, or does not answer.
+        Returns once the control process compensates each axis by its setting, or does not answer.
         """
         self._loop_pid = self.core.memory.status.loop_pid
         self._start(self._watch())
@@ -137,7 +137,7 @@ class ServiceBridge:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Stops monitoring; the axes complete the commands they have."""
+        """Stops monitoring; the axes complete their present commands."""
         for task in tuple(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -189,7 +189,7 @@ class ServiceBridge:
         await self._persist(axis, lambda: axis.unsettled, axis.settle, SETTLE_AGAIN_S, what)
 
     async def _verify(self, axis: ServiceAxis) -> None:
-        """Boots and verifies the drive whenever that is not done. The axis stays disabled."""
+        """Boots and verifies the drive whenever necessary. The axis stays disabled."""
 
         def is_due() -> bool:
             return axis.link.state in UNKNOWN and self._bus_up
@@ -204,7 +204,7 @@ class ServiceBridge:
         pauses_s: Sequence[float],
         failure: str,
     ) -> None:
-        """Repeats an attempt while it is due, until cancelled; notes an error when it is another one."""
+        """Repeats an attempt while it is due, until cancelled; notes each different error."""
         timing, attempts, noted = self.core.timing, 0, ""
         while True:
             if not is_due():
@@ -295,10 +295,10 @@ class ServiceBridge:
             )
         elif not core.observer.alive:
             warnings.append(
-                "the control process does not turn: it hangs or is gone, and is started again by itself"
+                "the control process does not turn: it hangs or is gone, and is restarted automatically"
             )
         if not self._bus_up:
-            warnings.append("the bus is down: bring the interface up; it is opened again by itself")
+            warnings.append("the bus is down: bring the interface up; it is reopened automatically")
         if core.observer.lost:
             warnings.append(
                 f"{core.observer.lost} cycles were lost before they were read: this machine is too busy"
@@ -306,12 +306,12 @@ class ServiceBridge:
         return warnings
 
     def events(self, since: int = 0) -> messages.Events:
-        """Returns at most the newest `EVENTS_TOLD` events after number ``since``, oldest first."""
-        told = self.core.log.told(since)[-EVENTS_TOLD:]
-        newest = told[-1].number if told else self.core.log.newest_told
+        """Returns at most the newest `EVENTS_RETURNED` events after number ``since``, oldest first."""
+        events = self.core.log.public(since)[-EVENTS_RETURNED:]
+        newest = events[-1].number if events else self.core.log.newest_public
         return messages.Events(
-            events=[reports.event_message(each, self._names) for each in told],
-            lost=max(newest - since - len(told), 0),
+            events=[reports.event_message(each, self._names) for each in events],
+            lost=max(newest - since - len(events), 0),
             newest=newest,
         )
 
@@ -337,12 +337,12 @@ class ServiceBridge:
     ) -> None:
         """Moves several axes so that all begin and end together; ``speed`` is a share of the limits."""
         if not moves:
-            raise InputError("a coordinated move of no axis; expected a target for at least one")
+            raise InputError("a coordinated move without an axis; expected a target for at least one")
         axes = [self._axis(name) for name in moves]
         await run_together(holder, axes, moves, speed, wait=wait)
 
     def followed(self, holder: str, name: str) -> Following:
-        """Returns the adaptation of an axis, to change it."""
+        """Returns the adaptation of an axis for a change."""
         self.core.lease.check(holder)
         if name not in self.following:
             raise InputError(

@@ -1,8 +1,8 @@
 """SDO access to one axis's drive through the control process: boot, verify, prepare, home, read, write.
 
-All methods block and run in worker threads. A drive serves one request at a time; a request that finds it
-busy waits for `BUSY_S`. Other masters were listened for before the control process sent its first frame, so
-nothing here listens for them. The SDO clients and the boot-up run unchanged on `RelayBus`.
+All methods block and run in worker threads. A drive serves one request at a time; a request to a busy drive
+waits for `BUSY_S`. The control process has listened for other masters before its first frame, so this module
+does not. The SDO clients and the boot-up run unchanged on `RelayBus`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from hdbridge.drive.values import Object, Value, find_object
 from hdbridge.errors import DaemonError, InputError, RefusedError
 
 POLL_S: Final = 0.001
-"""Interval between checks for a frame; shorter than any cycle."""
+"""Interval between checks for a frame, shorter than any cycle."""
 _FUNCTION: Final = 0x780
 _NODE: Final = 0x7F
 _FROM_NODES: Final = frozenset({objects.COB_EMCY, objects.COB_SDO_ANSWER, objects.COB_HEARTBEAT})
@@ -36,14 +36,14 @@ BUSY_S = 3.0
 
 
 class RelayBus(can.BusABC):
-    """The bus of one axis for blocking code, relayed by the control process; `recv` waits on its clock.
+    """Bus of one axis for blocking code, relayed by the control process; `recv` waits on its clock.
 
     It rejects frames that only the control process may send: SYNC, set-points and the master's heartbeat. The
     control process sends at most one relayed frame per cycle, and refuses NMT commands and SDO downloads to
     an enabled axis.
 
-    ``nodes`` are those of the axis: the drive, and an encoder with its own node. One thread uses it;
-    `interrupt` may be called from any.
+    ``nodes`` are those of the axis: the drive, and an encoder with its own node. Used by one thread;
+    `interrupt` may be called from any thread.
     """
 
     def __init__(self, core: Core, nodes: Container[int], name: str) -> None:
@@ -64,7 +64,7 @@ class RelayBus(can.BusABC):
         self._interrupted.set()
 
     def begin(self) -> None:
-        """Begins another operation; discards an interruption of the one before."""
+        """Begins another operation, discarding an interruption of the last one."""
         self._interrupted.clear()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
@@ -115,7 +115,7 @@ class RelayBus(can.BusABC):
 
 
 class Commissioning:
-    """The drive of one axis, as the service sees it."""
+    """Drive of one axis, as seen by the service."""
 
     def __init__(self, axis: AxisConfig, core: Core) -> None:
         source = axis.load_encoder.source.node
@@ -132,20 +132,20 @@ class Commissioning:
 
     @property
     def identity(self) -> Identity:
-        """Identity that the drive reported, else the one that the axis file expects."""
+        """Identity that the drive reported, else the identity in the axis file."""
         return self._drive.identity
 
     def verify(self) -> Arguments:
         """Boots the drive and compares it with the axis file; power is off afterwards.
 
-        Raises as `Drive.boot` does.
+        Raises like `Drive.boot`.
         """
         with self._asked("it is being booted"):
             self._drive.boot()
             return self._seeds(self._drive.read_positions())
 
     def take_over(self) -> None:
-        """Compares a drive under control of the control process with the axis file; writes nothing."""
+        """Compares a drive under control of the control process with the axis file, without writing."""
         with self._asked("it is being compared with its axis file"):
             self._drive.take_over()
 
@@ -157,7 +157,7 @@ class Commissioning:
             self._drive.disable()
 
     def prepare(self) -> Arguments:
-        """Prepares the drive to be enabled by the control process. Raises as `Drive.enable` does."""
+        """Prepares the drive for being enabled by the control process. Raises like `Drive.enable`."""
         with self._asked("it is being made ready"):
             return self._seeds(self._drive.prepare())
 
@@ -175,7 +175,7 @@ class Commissioning:
     def home(self, run: messages.Home) -> tuple[Positions, Arguments]:
         """Homes a drive that the control process has lent; power is off afterwards.
 
-        Raises as `Drive.home` does; even then the axis stops and its power is off, if the drive answers.
+        Raises like `Drive.home`; even then, the axis stops and its power is off if the drive answers.
         """
         with self._asked("it is being homed"):
             try:
@@ -193,7 +193,7 @@ class Commissioning:
         """Reads an object by its number or its EDS name."""
         wanted = find_object(object_, self._drive.sdo.od)
         if not wanted.readable:
-            raise InputError(f"{wanted}: is write-only by the EDS")
+            raise InputError(f"{wanted}: is write-only in the EDS")
         with self._asked(f"{object_} is being read"):
             return wanted, wanted.decode(self._drive.sdo.read_bytes(wanted.index, wanted.sub))
 
@@ -201,7 +201,7 @@ class Commissioning:
         """Writes an object; the control process refuses this while the axis is enabled."""
         wanted = find_object(object_, self._drive.sdo.od)
         if not wanted.writable:
-            raise InputError(f"{wanted}: can only be read, by the EDS")
+            raise InputError(f"{wanted}: is read-only in the EDS")
         data = wanted.encode(text)
         with self._asked(f"{object_} is being written"):
             self._drive.sdo.write_bytes(wanted.index, wanted.sub, data)
@@ -217,7 +217,7 @@ class Commissioning:
         self.bus.shutdown()
 
     def _seeds(self, positions: Positions) -> Arguments:
-        """Returns counts and statusword as arguments of VERIFIED, UNLEND and ENABLE."""
+        """Returns counts and statusword, the arguments of VERIFIED, UNLEND and ENABLE."""
         self._drive.state()
         statusword = self._drive.image.statusword or 0
         return Arguments(i=positions.motor_counts, j=positions.load_counts, k=statusword)

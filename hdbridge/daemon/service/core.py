@@ -1,4 +1,4 @@
-"""Parts that the whole service shares: control process, event log, samples, clock and lease."""
+"""Shared parts of the service: control process, event log, samples, clock and lease."""
 
 from collections.abc import Callable
 from itertools import count
@@ -12,9 +12,8 @@ from hdbridge.daemon.service.timing import POLL_S, Timing
 from hdbridge.errors import DaemonError, RefusedError
 
 ANSWER_S: Final = 5.0
-"""Time-out of an answer. The control process normally answers within a few cycles, but ENABLE and DISABLE
-only when they are complete.
-"""
+"""Time-out of an answer. The control process normally answers within a few cycles, but to ENABLE and DISABLE
+only on completion."""
 
 
 class Arguments(TypedDict, total=False):
@@ -40,7 +39,7 @@ class Core:
         self.observer = Observer(memory, self.log, timing.clock)
         self.lease = Lease(lease_s, timing.clock.now)
         self.refuse: Callable[[CommandKind | None], None] = lambda _: None
-        """Raises RefusedError if no command (None: no frame) can be sent, because the bus is lent."""
+        """Raises RefusedError if the bus is lent and no command (None: no frame) can be sent."""
         # From the present time on, so that the streams of an earlier service have other numbers.
         self._streams = count(int(1000.0 * timing.clock.now()) + 1)
 
@@ -51,7 +50,7 @@ class Core:
     async def do(
         self, kind: CommandKind, axis: int = -1, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
     ) -> Event:
-        """Posts a command and returns the event that reports that it was carried out or has begun.
+        """Posts a command and returns the event that reports its completion or beginning.
 
         Raises RefusedError with the control process's reason if nothing was done, and DaemonError if it
         does not answer within ``within_s``.
@@ -78,7 +77,7 @@ class Core:
             if self.timing.clock.now() >= deadline_s:
                 raise DaemonError(
                     f"the control process did not answer {kind.name} within {within_s:g} s: it hangs or is "
-                    "gone; it is started again by itself, with every axis disabled"
+                    "gone; it is restarted automatically, with every axis disabled"
                 )
             await self.timing.sleep(POLL_S)
         if answer.kind is EventKind.REFUSED:

@@ -1,8 +1,8 @@
 """Event log: the control process's events and the service's notes, in two bounded lists. Thread-safe.
 
-One list has every entry, for the service itself. Clients see the other one, which omits routine entries
-(`_routine`): a calibration ends thousands of legs, which must not displace yesterday's stop. Each list has
-its own numbering. `Journal` writes the log lines of the control process, which writes none itself.
+One list has every entry, for the service itself. Clients see the other list, which omits routine entries
+(`_routine`), because a calibration ends thousands of legs, which must not displace yesterday's stop. Each
+list has its own numbering. `Journal` writes the log lines of the control process, which itself writes none.
 """
 
 import logging
@@ -40,15 +40,15 @@ class Entry(NamedTuple):
 
 
 class EventLog:
-    """The newest `KEPT` entries, and the answers to the newest commands."""
+    """Newest `KEPT` entries, and the answers to the newest commands."""
 
     def __init__(self, reader: RingReader[Event]) -> None:
         self._reader = reader
         self._lock = threading.Lock()
         self._entries: deque[Entry] = deque(maxlen=KEPT)
-        self._told: deque[Entry] = deque(maxlen=KEPT)
+        self._public: deque[Entry] = deque(maxlen=KEPT)
         self._answers: dict[int, Event] = {}
-        self._number = self._told_number = 0
+        self._number = self._public_number = 0
         self.lost = 0
         """Events lost because they were not read in time."""
 
@@ -58,9 +58,9 @@ class EventLog:
         return self._number
 
     @property
-    def newest_told(self) -> int:
+    def newest_public(self) -> int:
         """Number of the newest entry for clients; 0 before the first."""
-        return self._told_number
+        return self._public_number
 
     def poll(self) -> None:
         """Reads new events of the control process."""
@@ -80,7 +80,7 @@ class EventLog:
             self._add(axis, None, text, hint)
 
     def answer(self, command_id: int) -> Event | None:
-        """Returns the DONE or REFUSED event of a command; None until it comes."""
+        """Returns the DONE or REFUSED event of a command; None until it arrives."""
         return self._answers.get(command_id)
 
     def since(self, number: int) -> list[Entry]:
@@ -88,10 +88,10 @@ class EventLog:
         with self._lock:
             return _newest(self._entries, self._number - number)
 
-    def told(self, number: int) -> list[Entry]:
-        """Returns the entries for clients after their ``number``, oldest first."""
+    def public(self, number: int) -> list[Entry]:
+        """Returns the entries for clients after ``number``, oldest first."""
         with self._lock:
-            return _newest(self._told, self._told_number - number)
+            return _newest(self._public, self._public_number - number)
 
     def of_axis(self, axis: int, since: int) -> list[Event]:
         """Returns the control process's events of one axis and of the machine after number ``since``."""
@@ -103,8 +103,8 @@ class EventLog:
         self._number += 1
         self._entries.append(Entry(self._number, date, axis, event, text, hint))
         if event is None or not _routine(event):
-            self._told_number += 1
-            self._told.append(Entry(self._told_number, date, axis, event, text, hint))
+            self._public_number += 1
+            self._public.append(Entry(self._public_number, date, axis, event, text, hint))
 
 
 def _newest(entries: deque[Entry], count: int) -> list[Entry]:
@@ -113,19 +113,18 @@ def _newest(entries: deque[Entry], count: int) -> list[Entry]:
 
 
 def _routine(event: Event) -> bool:
-    """Returns True for a completed command and the end of a stream, which only their client needs."""
+    """Returns True for a completed command and the end of a stream, which concern only their client."""
     stream = event.kind is EventKind.MOTION_ENDED and event.code == MotionMode.STREAM
     return stream or event.kind is EventKind.DONE
 
 
 class Journal:
-    """A sink of the observer that logs one line per event, with the name of its axis."""
+    """Sink of the observer that logs one line per event, with the name of its axis."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """Takes samples and events from the observer."""
         if lost:
             _log.warning("cycles lost", {"cycles": lost})
         for event in events:

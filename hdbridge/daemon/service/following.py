@@ -1,4 +1,4 @@
-"""Following in the service: each axis's samples go to a thread of its own; its verdicts and models come back.
+"""Following in the service: passes each axis's samples to its own thread, and uses its verdicts and models.
 
 The committed model and its version stay in use. The control process compensates with the adapted parameters,
 whatever the scheme. Watch and adaptation restart when another model is committed.
@@ -26,7 +26,7 @@ from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.errors import HdbridgeError
 
 MAX_BATCHES: Final = 500
-"""Maximum number of batches that wait for the thread: ten seconds. Later ones are dropped."""
+"""Maximum number of batches waiting for the thread (ten seconds). Later batches are dropped."""
 DIAGNOSED: Final = frozenset({Verdict.RECALIBRATE, Verdict.SOMETHING_CHANGED})
 """Verdicts that start a diagnosis."""
 _log = logging.getLogger(__name__)
@@ -47,14 +47,15 @@ class Following:
         recorder: FlightRecorder | None = None,
         diagnosis: AutoDiagnosis | None = None,
     ) -> None:
-        """``index`` is that of the axis in a sample, ``folder`` contains state and history of its adaptation.
+        """``index`` is that of the axis in a sample, ``folder`` contains state and history of its
+        adaptation.
 
-        ``worker`` has one thread. Verdicts are noted in ``recorder``, bad ones start ``diagnosis``.
+        ``worker`` has one thread. Verdicts are noted in ``recorder``; bad verdicts start ``diagnosis``.
         """
         self.state = messages.AdaptationState(mode=messages.AdaptationMode(settings.mode))
         """State of the adaptation."""
         self.advice: list[str] = []
-        """Present verdict of the watch unless the model holds, and what is not watched."""
+        """Present verdict of the watch unless the model is valid, and what is not watched."""
         self._index, self._axis = index, axis
         self._settings, self._folder = settings, folder
         self._worker, self._recorder, self._diagnosis = worker, recorder, diagnosis
@@ -67,7 +68,7 @@ class Following:
         self._problem = ""
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """Takes samples from the observer. Lost ones show as a gap in the cycle numbers."""
+        """Takes samples from the observer. Lost samples appear as a gap in the cycle numbers."""
         model = self._axis.models.chosen.model
         if model is not self._model:
             self._model = model
@@ -87,7 +88,7 @@ class Following:
         await self.apply()
 
     async def apply(self) -> None:
-        """Has the control process compensate with the adapted model, if it does not yet."""
+        """Makes the control process compensate with the adapted model if it does not yet."""
         chosen, follower = self._axis.models.chosen, self._follower
         if follower is None or follower.adaptation is None or chosen.model is not follower.model:
             return
@@ -107,7 +108,7 @@ class Following:
             _log.info("adaptation applied", {"axis": self._axis.name})
 
     def close(self) -> None:
-        """Stores the adaptation's state, after the waiting samples."""
+        """Stores the adaptation's state, after processing the waiting samples."""
         self._do(self._save).result()
 
     def _do(

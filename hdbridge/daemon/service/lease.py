@@ -1,8 +1,8 @@
-"""The lease: only one client at a time may move axes. Pure: the clock is passed in.
+"""Lease: only one client at a time may move axes. Pure: the clock is passed in.
 
-A client takes the lease and receives a token, which every request that moves an axis must carry. The lease
-expires when its holder has made no request during the time-out, so that a dead client does not block the
-machine. Reading, stopping and quick-stopping require no lease.
+A client takes the lease and receives a token, which is required in every request that moves an axis. The
+lease expires when its holder has made no request during the time-out, so that a dead client does not block
+the machine. Reading, stopping and quick-stopping require no lease.
 """
 
 import math
@@ -23,15 +23,14 @@ class Holder:
     """Holder of the lease."""
 
     client: str
-    """Name of the client."""
     taken_s: float
     """Time at which it was taken; lease's clock."""
     expires_s: float
-    """Time at which it expires unless the holder makes a request before; infinite for the gateway."""
+    """Time at which the lease expires without a further request; infinite for the gateway."""
 
 
 class Lease:
-    """The lease. Not thread-safe: use it from one thread."""
+    """Lease of a machine. Not thread-safe: to be used from one thread."""
 
     def __init__(self, timeout_s: float, now: Callable[[], float]) -> None:
         """``now`` returns the seconds of a monotonic clock."""
@@ -42,7 +41,7 @@ class Lease:
         self._taken_s = self._heard_s = 0.0
         self._lasts = False
         self.doing: Callable[[], str] = lambda: ""
-        """Returns what the machine does at present and how to end it, in words, for refusals."""
+        """Returns the present activity of the machine and how to end it, in words, for refusals."""
 
     @property
     def holder(self) -> Holder | None:
@@ -56,10 +55,11 @@ class Lease:
         )
 
     def take(self, client: str, *, force: bool = False, lasts: bool = False) -> str:
-        """Takes the lease and returns its token. ``force`` takes it from another holder. One that ``lasts``
+        """Takes the lease and returns its token. ``force`` takes it from another holder; one that ``lasts``
         does not expire.
 
-        Raises LeaseError if another client holds it, InputError if the client's name is empty or too long.
+        Raises LeaseError if another client holds the lease, InputError if the client's name is empty or too
+        long.
         """
         if not client.strip() or len(client) > LONGEST_NAME:
             raise InputError(
@@ -81,7 +81,7 @@ class Lease:
         return self._token
 
     def release(self, token: str) -> None:
-        """Releases the lease. Raises LeaseError as `check` does, so that only its holder can release it."""
+        """Releases the lease. Raises LeaseError like `check`, so only its holder can release it."""
         self.check(token)
         self._token = None
 
@@ -89,7 +89,7 @@ class Lease:
         """Raises LeaseError unless ``token`` is the present holder's; extends the lease by its time-out."""
         holder = self.holder
         if holder is None:
-            raise LeaseError("nobody holds the right to move, or it has run out: take the lease first")
+            raise LeaseError("the lease is free or has expired: take it first")
         assert self._token is not None
         if not compare_digest(token.encode(), self._token.encode()):
             raise LeaseError(

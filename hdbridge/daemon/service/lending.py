@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from hdbridge.daemon.service.core import Core
 
 LEND_S: Final = 40.0
-"""Longest time until the axes are at rest, without power, and the control process has ended."""
+"""Maximum time until the axes are at rest without power and the control process has ended."""
 SIGNAL_AGAIN_S: Final = 1.0
-"""Interval between stop signals to the borrower; its third signal would end it at once."""
+"""Interval between stop signals to the borrower, whose third signal would end it at once."""
 _STOPS: Final = frozenset({CommandKind.STOP, CommandKind.QUICK_STOP})
 
 
 class Lending:
-    """The bus of a machine, as a thing to lend."""
+    """Bus of a machine, as an object to lend."""
 
     def __init__(self, core: Core, bus: BusConfig, reason_against: str) -> None:
         """``reason_against`` explains why the bus cannot be lent; empty if it can."""
@@ -49,7 +49,7 @@ class Lending:
 
     @property
     def lent_s(self) -> float | None:
-        """Seconds since the bus was lent; None if it is not."""
+        """Seconds since the bus was lent; None if not lent."""
         since_ns = self._status[Cell.BUS_LENT]
         return 1e-9 * (time.monotonic_ns() - since_ns) if since_ns else None
 

@@ -1,8 +1,8 @@
-"""Model that compensates an axis: the one that clients chose and the one that the control process uses.
+"""Model that compensates an axis: the model chosen by clients and the model used by the control process.
 
-They differ after a restart of the control process. `AxisModels.in_use` follows the
-acknowledgement of the control process, so clients never see a model that is not in effect. While
-`AxisModels.settled` is False, the service sends the chosen setting again.
+They differ after a restart of the control process. `AxisModels.in_use` follows the acknowledgement of the
+control process, so clients never see a model that is not in effect. While `AxisModels.settled` is False, the
+service sends the chosen setting again.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 
 class AxisModels:
-    """The models of one axis."""
+    """Models of one axis."""
 
     def __init__(self, axis: Axis, slot: SettingSlot) -> None:
-        """Adopts the setting that an earlier service sent; else chooses the active model."""
+        """Adopts the setting sent by an earlier service, else chooses the active model."""
         self._axis = axis
         self._slot = slot
         self._sent: dict[int, CompensationSetting] = {}
@@ -60,7 +60,7 @@ class AxisModels:
         self.chosen.model.check_bound_to(self._axis.config, identity)
 
     def with_scheme(self, scheme: Scheme) -> CompensationSetting:
-        """Returns the chosen setting with another scheme. Raises InputError if there is no model."""
+        """Returns the chosen setting with another scheme. Raises InputError without a model."""
         if scheme is Scheme.EXTENDED and not self.chosen.model.effects:
             raise InputError(
                 f"{self._axis.name}: there is no model to compensate with; calibrate first, or use 'none'"
@@ -68,7 +68,7 @@ class AxisModels:
         return self._checked(replace(self.chosen, scheme=scheme))
 
     def with_load_loop(self, on: bool) -> CompensationSetting:
-        """Returns the chosen setting with the load loop on or off. Raises InputError if the axis has none."""
+        """Returns the chosen setting with the load loop on or off; InputError if the axis lacks one."""
         if self._axis.load_loop is None:
             raise InputError(f"{self._axis.name}: has no load loop; give the axis one in the machine file")
         return replace(self.chosen, load_loop=on)
@@ -76,7 +76,7 @@ class AxisModels:
     def found(self, version: int | Literal["pending", "active"], identity: Identity) -> CompensationSetting:
         """Returns the setting of another model of the profile, with the present scheme.
 
-        Raises InputError if there is no such model, or it belongs to another axis, drive or gear.
+        Raises InputError if the model does not exist, or belongs to another axis, drive or gear.
         """
         found = store.find(self._axis.profile.folder, str(version))
         found.content.check_bound_to(self._axis.config, identity)

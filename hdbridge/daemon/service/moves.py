@@ -1,8 +1,8 @@
 """Motion of one axis for clients: moves, jogs, streams and a queue of way points.
 
-The newest request wins: a move replaces any present motion and clears the queue. The control process decides
-if a motion is possible, before the present one changes. In a coordinated move, several axes follow one plan,
-as streams that begin in the same cycle.
+The newest request takes precedence: a move replaces any present motion and clears the queue. The control
+process decides whether a motion is possible, before the present motion changes. In a coordinated move,
+several axes follow one plan, as streams that begin in the same cycle.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ ROOM_POLL_S: Final = 0.05
 
 
 class AxisMotion:
-    """The present motion of one axis and its queue. Every method that begins a motion requires the lease."""
+    """Present motion of one axis and its queue. Every method that begins a motion requires the lease."""
 
     def __init__(self, link: AxisLink, check: Callable[[str], None]) -> None:
-        """``check`` raises if the holder of this token may not move the axis."""
+        """``check`` raises if the holder of a token may not move the axis."""
         self._link, self._check = link, check
         self.activity: Activity | None = None
         self._points: deque[QueueItem] = deque()
@@ -50,12 +50,12 @@ class AxisMotion:
         return len(self._points)
 
     def busy(self, *kinds: Kind) -> bool:
-        """Returns True if an activity of one of these kinds is under way."""
+        """Returns True if an activity of one of these kinds is in progress."""
         activity = self.activity
         return activity is not None and not activity.over and activity.kind in kinds
 
     def replace(self, activity: Activity | None, why: str) -> None:
-        """Replaces the present activity by another or none, and clears the queue."""
+        """Replaces the present activity by another or by none, and clears the queue."""
         if self.activity is not None:
             self.activity.end(why)
         self._points.clear()
@@ -69,9 +69,9 @@ class AxisMotion:
         acceleration_deg_s2: float | None = None,
         wait: bool = True,
     ) -> None:
-        """Moves to ``target_deg``, or redirects a present motion there; with ``wait`` returns at rest there.
+        """Moves to ``target_deg``, or redirects a present motion; with ``wait``, returns at rest there.
 
-        Raises RefusedError if another command replaced this one before its end.
+        Raises RefusedError if another command replaced this move before its end.
         """
         self._check(holder)
         self._check_target(target_deg)
@@ -93,9 +93,9 @@ class AxisMotion:
             self.replace(activity, "a jog took its place")
 
     async def stream(self, holder: str, timeout_s: float = 0.5) -> ServiceStream:
-        """Opens a stream of set-points. It begins at rest, with the first set-points that are put.
+        """Opens a stream of set-points, which begins at rest with the first set-points.
 
-        If none come for ``timeout_s`` and all are used up, the axis brakes to rest.
+        If none arrive for ``timeout_s`` and all are used up, the axis brakes to rest.
         """
         self._check(holder)
         activity = Activity(Kind.STREAM, holder)
@@ -108,10 +108,10 @@ class AxisMotion:
         return stream
 
     async def queue(self, holder: str, points: Sequence[QueueItem]) -> int:
-        """Appends all or none of these moves, each begun when the one before has ended.
+        """Appends all or none of these moves, each begun at the end of the one before.
 
         Returns the number of waiting moves. Raises InputError for an invalid point, RefusedError if another
-        motion is under way or the queue is full.
+        motion is in progress or the queue is full.
         """
         self._check(holder)
         name = self._link.name
@@ -214,7 +214,7 @@ class AxisMotion:
         if not (math.isfinite(target_deg) and limits.contains(target_deg)):
             raise InputError(
                 f"{self._link.name}: a target of {target_deg!r} deg; the position limits are "
-                f"{limits.position_min_deg:g} and {limits.position_max_deg:g} deg; nothing of it was begun"
+                f"{limits.position_min_deg:g} and {limits.position_max_deg:g} deg; nothing was begun"
             )
 
     def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
@@ -229,7 +229,7 @@ async def run_together(
     """Plans a move from the present targets and begins it on all axes in one cycle; ``wait`` awaits its end.
 
     Raises InputError for targets outside the limits, and RefusedError for an axis that is in motion or not
-    enabled; none has moved then.
+    enabled; in both cases before any motion.
     """
     for axis in axes:
         axis.check_may(holder)
@@ -263,7 +263,7 @@ async def run_together(
 
 
 def _heard(future: asyncio.Future[None]) -> None:
-    """Retrieves the result of a move that nobody waits for; the event log contains it."""
+    """Retrieves the unawaited result of a move, which is in the event log."""
     if not future.cancelled():
         future.exception()
 
@@ -276,14 +276,14 @@ async def _follow(waiting: dict[ServiceAxis, list[Knot]], activities: Mapping[Se
     except BaseException:
         for axis, activity in activities.items():
             if not activity.over:
-                activity.end("another axis of a coordinated move did not go on")
+                activity.end("another axis of a coordinated move did not continue")
                 with suppress(HdbridgeError):
                     await axis.link.do(CommandKind.STOP)
         raise
 
 
 async def _feed(waiting: dict[ServiceAxis, list[Knot]], activities: Mapping[ServiceAxis, Activity]) -> None:
-    """Hands over the remaining knots as the queues empty, then ends the streams."""
+    """Passes on the remaining knots as the queues empty, then ends the streams."""
     core = next(iter(waiting)).core
     while any(waiting.values()):
         await core.timing.sleep(ROOM_POLL_S)

@@ -14,12 +14,12 @@ from hdbridge.daemon.service.eventlog import EventLog
 
 PERIOD_S = 0.02
 GONE_S = 3.0
-"""Time without a turn after which the control process is considered hung or gone."""
+"""Time without a turn after which the control process counts as hung or dead."""
 _log = logging.getLogger(__name__)
 
 
 class Sink(Protocol):
-    """Receiver of samples and events. It must not block; slow work needs a thread and a bounded queue."""
+    """Receiver of samples and events. It must not block; slow work requires a thread and a bounded queue."""
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
         """Takes the samples and events since the last call, oldest first, and the number of lost cycles."""
@@ -40,18 +40,15 @@ class Observer:
         self._sinks: list[Sink] = []
         self._broken: set[int] = set()
         self.none: SampleArray = np.empty(0, sample_dtype(memory.axes))
-        """Empty array of samples."""
         self.newest: SampleArray | None = None
         """Newest sample, shape (1,); None before the first."""
         self.lost = 0
         """Cycles lost because this process was too slow."""
 
     def add(self, sink: Sink) -> None:
-        """Adds a sink."""
         self._sinks.append(sink)
 
     def remove(self, sink: Sink) -> None:
-        """Removes a sink."""
         self._sinks.remove(sink)
 
     @property
@@ -89,7 +86,7 @@ class Observer:
 
 
 class Batch(NamedTuple):
-    """Samples delivered to a subscriber at once."""
+    """Samples delivered to a subscriber together."""
 
     samples: SampleArray
     """One row per cycle, with the fields of `hdbridge.daemon.memory.sample_dtype`."""
@@ -98,9 +95,9 @@ class Batch(NamedTuple):
 
 
 class Subscription:
-    """Buffer of one live client: the newest samples until they are fetched. An asynchronous iterator.
+    """Buffer of one live client, an asynchronous iterator: the newest samples until they are fetched.
 
-    A client that is too slow loses samples; each batch contains the number lost.
+    A slow client loses samples; each batch contains the number lost.
     """
 
     def __init__(self, observer: Observer, most: int) -> None:
@@ -133,7 +130,7 @@ class Subscription:
         return self
 
     async def __anext__(self) -> Batch:
-        """Returns the next batch; waits until there is one."""
+        """Returns the next batch, waiting if necessary."""
         await self._came.wait()
         self._came.clear()
         samples = list(self._samples)
@@ -143,5 +140,4 @@ class Subscription:
         return batch
 
     def close(self) -> None:
-        """Ends the subscription."""
         self._observer.remove(self)

@@ -1,8 +1,8 @@
-"""The outer master of a gateway as a client of the daemon, with the right to move until another takes it.
+"""Outer master of a gateway as a client of the daemon, with the right to move until another client takes it.
 
-The gateway process asks in cells of the shared memory; this grants. It prepares each drive as soon as the
-axis is disabled, so power follows a request without further SDO. When the service dies, a granted axis still
-follows its set-points, and the next service takes it as it is.
+The gateway process requests power in cells of the shared memory, and this module grants it. It prepares each
+drive as soon as the axis is disabled, so power follows a request without further SDO. If the service dies, a
+granted axis still follows its set-points, and the next service takes it over unchanged.
 """
 
 from __future__ import annotations
@@ -32,22 +32,21 @@ _log: Final = logging.getLogger(__name__)
 _OWN: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED})
 _STOPPED: Final = frozenset({AxisState.UNVERIFIED, AxisState.QUICK_STOPPED, AxisState.LATCHED})
 SETTLES_S: Final = 2.0
-"""Longest time for an axis to brake and lose its power before a reset or the next enable."""
+"""Maximum time for an axis to brake and lose its power before a reset or the next enable."""
 PREPARE_AGAIN_S: Final = 2.0
-"""Pause after a drive could not be prepared."""
+"""Pause after a failed preparation of a drive."""
 
 LATENCIES_KEPT: Final = 1000
 
 
 class Latency:
-    """Time from the reception of an outer SYNC to the end of the first cycle whose frame has its target."""
+    """Time from the reception of an outer SYNC to the end of the first cycle that sends its target."""
 
     def __init__(self, axes: int) -> None:
         self._found: list[deque[float]] = [deque(maxlen=LATENCIES_KEPT) for _ in range(axes)]
         self._newest_s = [math.nan] * axes
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """Takes samples from the observer."""
         if not len(samples):
             return
         sent_s = 1e-9 * samples["time_ns"] + 1e-6 * samples["busy_us"]
@@ -60,7 +59,7 @@ class Latency:
                 found.clear()  # the axis no longer follows
 
     def of(self, place: int) -> tuple[float, float] | None:
-        """Returns median and 99 % of an axis; None while it follows nothing."""
+        """Returns median and 99th percentile of an axis; None while it follows nothing."""
         found = self._found[place]
         if not found:
             return None
@@ -72,7 +71,7 @@ class OuterMaster:
     """Holds the lease for the gateway and serves its axes."""
 
     def __init__(self, core: Core, settings: GatewaySettings, mark: Callable[[str, int], None]) -> None:
-        """``mark`` reports a fault and has the recorder keep the time around it."""
+        """``mark`` reports a fault and makes the recorder keep the time around it."""
         self._core, self._mark = core, mark
         self._patience_s = 1e-3 * settings.timeout_ms
         self._name = f"the master on {settings.bus.interface}:{settings.bus.channel}"
@@ -87,7 +86,7 @@ class OuterMaster:
             await self._core.timing.sleep(POLL_S)
 
     async def serve(self, axis: ServiceAxis) -> None:
-        """Do what the gateway asks for one axis, until cancelled."""
+        """Grants the gateway's requests for one axis, until cancelled."""
         cells = self._core.memory.outer[axis.link.index]
         timing = self._core.timing
         prepare_s = timing.clock.now()
@@ -133,7 +132,7 @@ class OuterMaster:
                     self._core.log.note(f"for {self._name}: {error}", axis.link.index)
 
     def _is_left(self, axis: ServiceAxis, cells: OuterCells) -> bool:
-        """Returns True if the axis has power by a request that is over, of this or an earlier process."""
+        """Returns True if the axis has power from a request that is over, of this or an earlier process."""
         granted = cells[OuterCell.GRANTED]
         return axis.link.state in _OWN and granted != 0 and cells[OuterCell.WANTED] != granted
 
@@ -141,7 +140,7 @@ class OuterMaster:
         link, token = axis.link, self._token
 
         def is_withdrawn() -> bool:
-            """The lease may have been taken meanwhile, even if it is free again."""
+            """Returns True if the lease may have been taken meanwhile, even if it is free again."""
             return not self._core.lease.holds(token) or cells[OuterCell.WANTED] != series
 
         try:

@@ -104,7 +104,7 @@ def lease_state(lease: Lease, now_s: float) -> messages.LeaseState:
 
 
 def model_in_use(in_use: CompensationSetting) -> messages.ModelInUse | None:
-    """Returns the model in use and its age; None if there is no model."""
+    """Returns the model in use and its age; None without a model."""
     if not in_use.model.effects:
         return None
     date = _date(in_use.model.provenance.get("date"))
@@ -122,9 +122,10 @@ def model_in_use(in_use: CompensationSetting) -> messages.ModelInUse | None:
 def outer_state(
     cells: OuterCells, node_id: int, alive_ns: int, latency_s: tuple[float, float] | None
 ) -> messages.OuterState:
-    """An axis as the other master sees it; ``alive_ns``: when the gateway process was last seen alive.
+    """Returns an axis as seen by the other master; ``alive_ns`` is the last sign of life of the gateway
+    process.
 
-    ``latency_s``: median and 99 % of the time from a set-point to the frame that carries it.
+    ``latency_s`` holds median and 99th percentile of the time from a set-point to the frame that contains it.
     """
     view, (median_s, most_s) = cells.view, latency_s or (None, None)
     period_s = 1e-9 * cells[OuterCell.PERIOD_NS]
@@ -226,7 +227,7 @@ def _fault(axis: ServiceAxis, stopped: Entry | None) -> messages.Fault | None:
 
 
 def _date(value: object) -> datetime | None:
-    """Returns a date of a provenance; None if it is not a date."""
+    """Returns a date of a provenance; None if invalid."""
     if isinstance(value, datetime):
         return value if value.tzinfo is not None else value.replace(tzinfo=UTC)
     try:

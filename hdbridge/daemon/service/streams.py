@@ -1,8 +1,8 @@
 """Streams: set-points of a client, sent to the control process as knots with velocities.
 
-A point without a velocity gets the slope between its neighbours, so it waits for the next point; the last
-point of a stream is at rest. The stream begins once it has `LEAD_S` of path or its end, so that the client
-may lag by that time.
+A point without a velocity takes the slope between its neighbours, so it waits for the next point; the last
+point of a stream is at rest. The stream begins once it has `LEAD_S` of path or its end, so the client may lag
+by that time.
 """
 
 from collections.abc import Sequence
@@ -34,10 +34,10 @@ class Knots:
         self._before: StreamPoint | None = None
         """Last point with a knot."""
         self._held: StreamPoint | None = None
-        """Newest point, if its velocity is not known yet."""
+        """Newest point while its velocity is unknown."""
 
     def add(self, points: Sequence[StreamPoint]) -> list[Knot]:
-        """Returns the knots that these points complete; InputError if any is invalid, and none is taken."""
+        """Returns the knots that these points complete. InputError if any is invalid; none is then used."""
         newest = self._held or self._before
         chain = [*([newest] if newest else []), *points]
         self._check(points, chain)
@@ -82,13 +82,14 @@ class Knots:
                 )
             if first.time_s == 0.0 and first.velocity_deg_s:
                 raise InputError(
-                    f"a stream begins with {first.velocity_deg_s:g} deg/s, but the axis stands: begin at rest"
+                    f"a stream begins with {first.velocity_deg_s:g} deg/s, but the axis is at rest: begin "
+                    f"at rest"
                 )
         for one, next_ in pairwise(chain):
             if not next_.time_s > one.time_s:
                 raise InputError(
                     f"a set-point at {next_.time_s:g} s after one at {one.time_s:g} s: each must be later "
-                    "than the one before; none of these was taken"
+                    "than the one before; none of these was accepted"
                 )
 
 
@@ -97,7 +98,7 @@ def _slope(one: StreamPoint, other: StreamPoint) -> float:
 
 
 class ServiceStream:
-    """An open stream of set-points. An asynchronous context manager: the stream ends with the block."""
+    """Open stream of set-points, an asynchronous context manager; the stream ends with the block."""
 
     def __init__(self, link: AxisLink, activity: Activity, timeout_s: float) -> None:
         """The stream belongs to ``activity`` and ends with it."""
@@ -113,7 +114,7 @@ class ServiceStream:
         self._ended = False
 
     async def put(self, points: Sequence[StreamPoint]) -> None:
-        """Hands over set-points; waits while the buffer is full. Raises if the stream has ended."""
+        """Passes on set-points; waits while the buffer is full. Raises if the stream has ended."""
         self._check_open()
         if self._knots is None:
             await self._link.until(lambda: True, 0.0)
@@ -123,7 +124,7 @@ class ServiceStream:
             await self._begin()
 
     async def end(self) -> None:
-        """Ends the stream; returns when the axis has followed it and is at rest."""
+        """Ends the stream; returns once the axis has followed it and is at rest."""
         self._check_open()
         if self._knots is None:
             self._ended = True
@@ -162,7 +163,7 @@ class ServiceStream:
             self._link.look(self._activity)
         if self._activity.over or self._ended:
             why = self._activity.over or "it was ended"
-            raise RefusedError(f"{self._link.name}: the stream is over: {why}")
+            raise RefusedError(f"{self._link.name}: the stream has ended: {why}")
 
     async def __aenter__(self) -> Self:
         return self
@@ -170,9 +171,9 @@ class ServiceStream:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Calls `end`, unless the stream is over or the block failed.
+        """Calls `end` unless the stream is over or the block failed.
 
-        After a failure the axis brakes once the buffer is used up.
+        After a failure, the axis brakes once the buffer is used up.
         """
         if error is None and not (self._activity.over or self._ended):
             await self.end()

@@ -17,18 +17,18 @@ POLL_S = 0.005
 
 
 CREDIT_S: Final = 0.25
-"""Maximum simulated time that can be saved up, because the clock is read between turns of the loop."""
+"""Maximum simulated time that can accumulate, because the clock is read between turns of the loop."""
 STEP_S: Final = 0.1
-"""Longest interval between two readings that counts; beyond it the service itself was suspended."""
+"""Maximum interval between two readings that counts; beyond it, the service itself was suspended."""
 HANG_S: Final = 5.0
-"""Time without a turn after which the loop is considered hung or gone, and real time passes."""
+"""Time without a turn after which the loop counts as hung or dead, and real time passes."""
 SHORTEST_WAIT_S: Final = 0.001
 
 
 class SimulatedClock:
     """Clock of a service with simulated drives: no faster than their control loop, nor than real time.
 
-    On a busy computer the loop of simulated drives is late, and its virtual time with it. Time-outs on this
+    On a busy computer the loop of simulated drives is late, and so is its virtual time. Time-outs on this
     clock are delayed equally, so they do not expire early. Thread-safe.
     """
 
@@ -69,10 +69,10 @@ class SimulatedClock:
 
 
 class Timing:
-    """Clock that runs in real time, and a pool of threads. Close it when the service ends."""
+    """Clock that runs in real time, and a pool of threads. To be closed when the service ends."""
 
     def __init__(self, threads: int, clock: Clock | None = None) -> None:
-        """``threads`` blocking calls can run at the same time; further ones wait.
+        """Up to ``threads`` blocking calls run at the same time; others wait.
 
         ``clock`` defaults to the computer's monotonic clock.
         """

@@ -13,7 +13,7 @@ from hdbridge.daemon.machine import Machine
 from hdbridge.errors import InputError
 
 MARKER: Final = "# Written by 'hdbridge install-service'; 'hdbridge install-service --remove' removes it."
-"""First line of each file; a file without it is not ours."""
+"""First line of each file; a file without it was not written by this program."""
 _SYSTEM_UNITS: Final = Path("/etc/systemd/system")
 _NETWORKS: Final = Path("/etc/systemd/network")
 _HOMES: Final = (Path("/home"), Path("/root"), Path("/run/user"))
@@ -43,9 +43,9 @@ class ServiceFile:
 def service_files(machine: Machine, *, user: bool = False, account: str | None = None) -> list[ServiceFile]:
     """Returns the unit of a machine's daemon, and for SocketCAN with a bit rate the interface's network file.
 
-    ``user``: for the user's own service manager, which cannot configure interfaces. ``account``: user under
-    which the system's manager runs the daemon; the default is the machine file's owner, or a dynamic user if
-    that is root.
+    ``user`` selects the user's own service manager, which cannot configure interfaces. ``account`` is the
+    user under which the system's manager runs the daemon, by default the machine file's owner, or a dynamic
+    user if the owner is root.
     """
     unit = f"hdbridge-{machine.name}.service"
     about = _about(machine)
@@ -88,7 +88,7 @@ def _render(template: str, about: dict[str, object]) -> str:
 
 
 def _quoted(word: Path | str) -> str:
-    """Quotes a word for systemd, with specifiers and variables taken literally."""
+    """Quotes a word for systemd, with literal specifiers and variables."""
     text = str(word).replace("\\", "\\\\").replace("%", "%%").replace("$", "$$").replace('"', '\\"')
     return f'"{text}"' if any(each.isspace() or each in "\"';\\" for each in text) else text
 
@@ -102,7 +102,7 @@ def _folders(machine: Machine) -> list[Path]:
 
 
 def _home(machine: Machine) -> str:
-    """Returns the value of ProtectHome: files and interpreter may be in home folders."""
+    """Returns the value of ProtectHome, because files and interpreter may be in home folders."""
     needed = [*_folders(machine), Path(sys.executable), Path(sys.prefix), Path(__file__)]
     inside = any(home in each.parents for each in needed for home in _HOMES)
     return "read-only" if inside else "yes"

@@ -8,17 +8,16 @@ from hdbridge.motion.procedures.moves import AxisView, Move, MoveTo, Procedure, 
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """Procedures run one after the other; the outcome is the last one's.
+    """Procedures in sequence; the outcome is that of the last.
 
-    ``acceleration_deg_s2`` (at the load) limits every move. Acceleration winds the gear's spring up, and a
-    calibration measures the gear without that.
+    ``acceleration_deg_s2`` (at the load) limits every move, because acceleration winds up the gear's spring,
+    which a calibration must exclude.
     """
 
     parts: tuple[Procedure[object], ...]
     acceleration_deg_s2: float | None = None
 
     def moves(self, axis: AxisView) -> Steps[object]:
-        """Yields the moves of each procedure."""
         outcome: object = None
         for part in self.parts:
             steps = part.moves(axis)

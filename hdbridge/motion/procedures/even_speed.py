@@ -9,7 +9,8 @@ from hdbridge.motion.procedures.moves import AxisView, MoveTo, Sample, Steps
 from hdbridge.units import DEG_PER_TURN
 
 SHARES = (0.95, 0.8, 0.64, 0.5, 0.38, 0.28, 0.18, 0.08)
-"""Speeds of the default test, as shares of the limit. At the limit a drive would clip the correction."""
+"""Speeds of the default test, as shares of the limit. At the limit itself a drive would clip the
+correction."""
 WINDOW_S = 1.0
 TURNS = 3.0
 """Minimum motor turns of a run."""

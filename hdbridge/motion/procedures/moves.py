@@ -1,7 +1,7 @@
 """Moves of the load target, each a path over time: the vocabulary of all procedures.
 
 A procedure is a generator that yields moves and receives the samples taken during each. It does not depend on
-buses, drives or clocks, so the same generator runs on a simulated and on a real axis, and in a test without
+buses, drives or clocks, so the same generator runs on a simulated axis, on a real axis, and in a test without
 either.
 """
 
@@ -37,12 +37,12 @@ class MotionLimits:
 
 @dataclass(frozen=True, slots=True)
 class AxisView:
-    """Properties of the axis that a procedure may use."""
+    """Axis properties available to a procedure."""
 
     ratio: float
     limits: MotionLimits
     motor_count_deg: float = 0.0
-    """Count of the motor encoder."""
+    """One count of the motor encoder."""
 
 
 class Sample(NamedTuple):
@@ -55,11 +55,11 @@ class Sample(NamedTuple):
     load_position_deg: float
     motor_torque_nm: float
     readings: tuple[float | None, ...] = ()
-    """Last good reading of each channel of the axis file; None if there is none."""
+    """Last good reading of each channel of the axis file; None without one."""
 
 
 class Path(NamedTuple):
-    """Load target over the time since the move began."""
+    """Load target over the time since the start of the move."""
 
     duration_s: float
     at: Callable[[float], float]
@@ -80,7 +80,7 @@ class Move(Protocol):
         ...
 
     def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
-        """Returns True to end the leg; called each cycle after the path's duration."""
+        """Returns True to end the leg; called in each cycle after the path's duration."""
         ...
 
 
@@ -98,10 +98,9 @@ class Procedure(Protocol[Outcome]):
 
 
 class _Timed:
-    """A leg that ends with its path."""
+    """Leg that ends with its path."""
 
     def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
-        """Returns True."""
         return True
 
 
@@ -113,7 +112,7 @@ class MoveTo(_Timed):
     velocity_deg_s: float | None = None
     kind: str = "move"
     acceleration_deg_s2: float | None = None
-    """A lower acceleration winds the gear's spring up less."""
+    """Lower limit of the acceleration, which winds up the gear's spring less."""
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
         """Returns the time-optimal path within the limits (ruckig)."""
@@ -162,7 +161,6 @@ class Dwell(_Timed):
     kind: str = "standstill"
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """Returns a path without motion."""
         return Path(self.duration_s, lambda _: start_deg, start_deg, start_deg)
 
 
@@ -172,8 +170,8 @@ class Settle:
 
     Settled means that over the last ``window_s`` the means of the load's two halves agree within
     ``drift_arcsec``, and that the mean of the motor is within ``drift_arcsec`` or half a count of its target.
-    Friction can hold a motor beside its target until the servo's integrator releases it. Means are used
-    instead of extremes, so that encoder noise does not prevent settling.
+    Friction can hold a motor off its target until the servo's integrator releases it. Means are used rather
+    than extremes, so that encoder noise does not prevent settling.
     """
 
     window_s: float = 0.06
@@ -183,7 +181,6 @@ class Settle:
     kind: str = "settle"
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """Returns a path without motion."""
         return Path(max(self.minimum_s, self.window_s), lambda _: start_deg, start_deg, start_deg)
 
     def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
@@ -215,7 +212,7 @@ class Settle:
 class Sine(_Timed):
     """``amplitude cos(2 pi f t)`` about a centre; starts and ends at the upper extreme, at rest.
 
-    It starts at the extreme because the velocity is zero there.
+    The velocity is zero at the extreme.
     """
 
     centre_deg: float

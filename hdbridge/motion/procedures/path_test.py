@@ -1,4 +1,4 @@
-"""Path test: moves at the axis's limits, there and back, and a sine; each with the rest that follows."""
+"""Path test: moves at the axis's limits, there and back, and a sine, each followed by a rest."""
 
 import math
 from dataclasses import dataclass
@@ -7,9 +7,8 @@ from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Sample, Si
 from hdbridge.units import DEG_PER_TURN
 
 PRECONDITION_TURNS = 2.0
-"""Motor turns before each path, in its direction: more than the gear's hysteresis is wide, so that every path
-begins in the same state of the gear.
-"""
+"""Motor turns before each path, in its direction: more than the width of the gear's hysteresis, so that
+every path begins in the same state of the gear."""
 SHORT_TURNS = 1.5
 """Motor turns of the short moves."""
 EVEN_S = 0.3
@@ -24,13 +23,13 @@ KIND = "path"
 
 @dataclass(frozen=True, slots=True)
 class PathRun:
-    """One path: its samples, and those of the rest after it."""
+    """Samples of one path, and of the rest after it."""
 
     name: str
     samples: tuple[Sample, ...]
     rest: tuple[Sample, ...]
     skipped: int = 0
-    """Samples at the beginning that are not judged."""
+    """Number of initial samples that are not evaluated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +37,7 @@ class PathTest:
     """A long and a short move there and back, and a sine, about the middle of the travel."""
 
     def moves(self, axis: AxisView) -> Steps[tuple[PathRun, ...]]:
-        """Each path after a run-up in its own direction."""
+        """Yields each path after a run-up in its own direction."""
         limits = axis.limits
         travel_deg = limits.position_max_deg - limits.position_min_deg
         middle = limits.position_min_deg + 0.5 * travel_deg

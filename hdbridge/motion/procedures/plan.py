@@ -1,10 +1,10 @@
 """Plans: the procedures of a calibration, as data.
 
 A plan uses units that suit every axis (load turns, motor degrees, motor turns per second). `Plan.tasks`
-adapts it to the ratio, permitted travel and speed of one axis, and reports what had to be shortened.
+adapts it to the ratio, permitted travel and speed of one axis, and reports reductions.
 
 Every task starts at the plan's reference pose, approached by a pre-conditioning move. The elastic state is
-thus known wherever a recording is interrupted and resumed, and the recurring pose shows drift.
+therefore known wherever a recording is interrupted and resumed, and the recurring pose shows drift.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from hdbridge.units import DEG_PER_TURN
 SPEED_SHARE = 0.95
 """Maximum share of the axis's velocity limit that a plan uses."""
 SMALLEST_TRAVEL_DEG = 90.0
-"""Minimum travel on either side of the middle, motor degrees, below which no procedure is useful."""
+"""Minimum travel on either side of the middle, motor degrees; below it, no procedure is useful."""
 
 
 class StandstillEntry(Strict):
@@ -85,8 +85,8 @@ class SinesEntry(Strict):
     periods: float = Field(2.0, ge=0.5, le=1000, description="periods per amplitude")
 
     def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
-        """Yields the sines, with amplitudes shortened to the travel and the frequency lowered to the
-        permitted speed.
+        """Yields the sines, with amplitudes reduced to the travel and the frequency to the permitted
+        speed.
         """
         amplitudes = tuple(
             dict.fromkeys(
@@ -141,7 +141,7 @@ class _Context(dict[str, Any]):
 
 
 def _named(entry: Any) -> str | None:
-    """Returns the procedure that an entry names; None if there is none of that name."""
+    """Returns the procedure named by an entry; None without one of that name."""
     name = entry.get("procedure") if isinstance(entry, dict) else getattr(entry, "procedure", None)
     return name if name in PROCEDURES else None
 
@@ -162,7 +162,7 @@ Entry = Annotated[
 
 
 class ValidationEntry(Strict):
-    """Stepping test that judges a new model, with and without it."""
+    """Stepping test that evaluates a new model, with and without it."""
 
     count: int = Field(120, ge=2, le=100_000, description="steps each way")
     step_deg: float = Field(43.56, gt=0, le=36_000, description="step at the motor")
@@ -193,7 +193,7 @@ class ValidationEntry(Strict):
 class Plan(Strict):
     """A plan file."""
 
-    schema_: Literal["hdbridge.plan/1"] = Field(alias="schema", description="kind and version of this file")
+    schema_: Literal["hdbridge.plan/1"] = Field(alias="schema", description="schema and version of this file")
     name: str = Field(
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name: letters, digits, '.', '_', '-'"
     )
@@ -219,7 +219,7 @@ class Plan(Strict):
 
     @classmethod
     def load(cls, name: str) -> Self:
-        """Loads a bundled plan by its name, else a plan file; raises `InputError` with the bundled names."""
+        """Loads a bundled plan by name, else a plan file; raises `InputError` with the bundled names."""
         bundled = bundled_folder("profiles") / "plans"
         known = sorted(each.stem for each in bundled.glob("*.yaml"))
         path = bundled / f"{name}.yaml" if name in known else Path(name)
@@ -232,11 +232,11 @@ class Plan(Strict):
         return read_yaml(path).validate(cls)
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns plain data that can be validated again."""
+        """Returns plain data that passes validation again."""
         return self.model_dump(by_alias=True, exclude_none=True, mode="json")
 
     def tasks(self, axis: AxisView) -> Tasks:
-        """Returns the tasks for one axis; raises `InputError` if its travel is too small for anything."""
+        """Returns the tasks for one axis; raises `InputError` if its travel is too short for any task."""
         room = Room(axis, self.precondition_deg)
         prelude = (
             Precondition(room.pose_deg, self.precondition_deg / axis.ratio),
@@ -256,7 +256,7 @@ class Plan(Strict):
         return room.stepping("validation", self.validation.count, self.validation.step_deg)
 
     def positioning(self, axis: AxisView) -> Positioning | None:
-        """Returns the positioning test of the validation for one axis; None if the plan has none."""
+        """Returns the positioning test of the validation for one axis; None without one in the plan."""
         if not self.validation.cycles:
             return None
         room = Room(axis, self.precondition_deg)
@@ -280,7 +280,7 @@ class Tasks:
 
     tasks: tuple[Task, ...]
     notes: tuple[str, ...]
-    """Descriptions of what had to be shortened or slowed."""
+    """Descriptions of the reductions."""
 
 
 class Room:
@@ -303,7 +303,7 @@ class Room:
             )
 
     def half(self, name: str, what: str, wanted_deg: float) -> float:
-        """Returns half the travel about the middle, load degrees, reduced to the permitted one."""
+        """Returns half the travel about the middle, load degrees, reduced to the permitted half."""
         if wanted_deg <= self._half_deg:
             return wanted_deg
         self.notes.append(
@@ -313,7 +313,7 @@ class Room:
         return self._half_deg
 
     def speed(self, name: str, motor_deg_s: float) -> float:
-        """Returns a speed at the load, deg/s, reduced to the permitted one."""
+        """Returns a speed at the load, deg/s, reduced to the permitted speed."""
         top = SPEED_SHARE * self._axis.limits.velocity_deg_s
         wanted = motor_deg_s / self.ratio
         if wanted > top:
@@ -321,7 +321,7 @@ class Room:
         return min(wanted, top)
 
     def stepping(self, name: str, count: int, step_deg: float) -> Stepping:
-        """Returns centred upward steps: ``count`` of them, or as many as the travel permits."""
+        """Returns centred upward steps: ``count`` steps, or as many as the travel permits."""
         step = step_deg / self.ratio
         possible = max(int(2.0 * self._half_deg / step), 2)
         if count > possible:

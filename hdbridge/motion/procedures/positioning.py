@@ -1,4 +1,4 @@
-"""Positioning test for machine tools (ISO 230-2): repeated approaches of targets from both sides."""
+"""Positioning test for machine tools (ISO 230-2): repeated approaches to targets from both sides."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 @dataclass(frozen=True, slots=True)
 class Approach:
-    """One approach of a target."""
+    """One approach to a target."""
 
     target_deg: float
     forward: bool
@@ -25,7 +25,7 @@ class Positioning:
     """Load angles, ascending."""
     cycles: int = 5
     overrun_deg: float = 2.0
-    """Travel beyond the first and the last target, at the load; larger than the width of any hysteresis."""
+    """Travel beyond the first and the last target, at the load; more than the width of any hysteresis."""
     settle: Settle = Settle()
 
     def moves(self, axis: AxisView) -> Steps[tuple[Approach, ...]]:
@@ -50,8 +50,8 @@ class Positioning:
 def targets(low_deg: float, high_deg: float, axis: AxisView) -> tuple[float, ...]:
     """Returns as many targets over a travel as ISO 230-2 requires of a rotary axis (at least 3, 5 or 8).
 
-    Within their spacing they are distributed over the motor turn by the golden ratio, so that an error that
-    repeats with the motor turn is sampled at different phases.
+    Within their spacing, the targets are distributed over the motor turn by the golden ratio, so that an
+    error that repeats with each motor turn is sampled at different phases.
     """
     travel = high_deg - low_deg
     count = 3 if travel <= 90.0 else 5 if travel <= 180.0 else 8

@@ -1,4 +1,4 @@
-"""Rehearsal of a procedure on an ideal axis before anything moves: duration, extent, number of legs."""
+"""Rehearsal of a procedure on an ideal axis before any motion: duration, extent, number of legs."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ class Rehearsal:
     """Requirements of a procedure."""
 
     duration_s: float
-    """Duration on an ideal axis; a real one takes longer to settle."""
+    """Duration on an ideal axis; a real axis takes longer to settle."""
     lowest_deg: float
     highest_deg: float
     legs: int
@@ -20,7 +20,7 @@ class Rehearsal:
 def rehearse(procedure: Procedure[object], axis: AxisView, start_deg: float = 0.0) -> Rehearsal:
     """Rehearses the procedure; raises `InputError` if it would violate the limits.
 
-    Every leg's path is computed as the bench will compute it, so a refused leg never reaches the axis.
+    Every leg's path is computed as on the bench, so a refused leg never reaches the axis.
     """
     duration, legs = 0.0, 0
     lowest = highest = start_deg

@@ -1,4 +1,4 @@
-"""Nested reversals: first-order reversal curves, which show if a gear has return-point memory."""
+"""Nested reversals: first-order reversal curves, which show whether a gear has return-point memory."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,8 @@ from hdbridge.motion.procedures.moves import AxisView, MoveTo, Steps
 
 @dataclass(frozen=True, slots=True)
 class Reversals:
-    """For each depth: back by it, forward by half of it, back again, then forward until all is forgotten.
+    """For each depth: back by the depth, forward by half of it, back again, then forward until all is
+    forgotten.
 
     ``depths_deg`` are motor degrees; ``reach_deg`` must exceed the width of the hysteresis.
     """

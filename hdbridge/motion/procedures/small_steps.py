@@ -15,8 +15,8 @@ class SmallSteps:
     """``count`` targets within ``reach_deg`` (motor degrees) on either side of a centre, in mixed order.
 
     A stepping test with steps longer than the width of the hysteresis ends saturated each time and cannot
-    show its width, shape or memory; these steps can. Each outcome is classified by the direction of its last
-    move: ``cw`` upwards.
+    show its width, shape or memory; these steps can. Outcomes are classified by the direction of the last
+    move; ``cw`` is upwards.
     """
 
     centre_deg: float = 0.0
@@ -24,7 +24,7 @@ class SmallSteps:
     reach_deg: float = 20.0
     count: int = 40
     precondition_deg: float = 2.0
-    """Load degrees; larger than the width of any hysteresis."""
+    """Load degrees; more than the width of any hysteresis."""
     settle: Settle = Settle()
 
     def moves(self, axis: AxisView) -> Steps[SteppingOutcome]:

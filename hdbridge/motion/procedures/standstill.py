@@ -1,4 +1,4 @@
-"""Standstill: encoder readings without motion are noise."""
+"""Standstill: encoder readings without motion, which show the noise."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,6 @@ class Precondition:
     back_deg: float = 2.0
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """Yields the two moves."""
         yield MoveTo(self.load_deg - self.back_deg, kind="precondition")
         yield MoveTo(self.load_deg, kind="precondition")
 
@@ -29,7 +28,6 @@ class Standstill:
     duration_s: float = 10.0
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """Yields the move and the standstill."""
         yield MoveTo(self.load_deg)
         yield Dwell(0.5, kind="move")
         yield Dwell(self.duration_s)
@@ -37,13 +35,12 @@ class Standstill:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Standstill at a recurring pose, approached from the same side each time, so that changes are drift."""
+    """Standstill at a recurring pose, always approached from the same side, so that changes are drift."""
 
     load_deg: float = 0.0
     duration_s: float = 1.5
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """Yields the move, the settling and the standstill."""
         yield MoveTo(self.load_deg)
         yield Dwell(0.5, kind="move")
         yield Dwell(self.duration_s, kind="reference")

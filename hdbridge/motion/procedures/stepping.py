@@ -17,7 +17,7 @@ class Standing:
     error_arcsec: float
     """Load encoder minus target, mean over the settled window, arcsec."""
     settle_s: float
-    """Time from the end of the move until the load stood still."""
+    """Time from the end of the move to standstill of the load."""
 
     @property
     def load_deg(self) -> float:
@@ -30,9 +30,9 @@ class SteppingOutcome:
     """All steps of both directions."""
 
     cw: tuple[Standing, ...]
-    """The first pass, towards positive angles."""
+    """Steps of the first pass, towards positive angles."""
     ccw: tuple[Standing, ...]
-    """The steps back."""
+    """Steps of the pass back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class Stepping:
     """``count`` steps of ``step_deg`` at the motor one way, then back.
 
     It starts with a pre-conditioning move (back by ``precondition_deg`` and forward again), so that the
-    gear's elastic state is that of an axis that last moved forward.
+    gear's elastic state is that after a forward motion.
     """
 
     count: int = 240
@@ -48,7 +48,7 @@ class Stepping:
     start_deg: float = 0.0
     """Load angle of the start."""
     precondition_deg: float = 2.0
-    """Load degrees; larger than the width of any hysteresis."""
+    """Load degrees; more than the width of any hysteresis."""
     settle: Settle = Settle()
 
     def __post_init__(self) -> None:
@@ -73,7 +73,7 @@ class Stepping:
 
 
 def standing(target_deg: float, samples: Sequence[Sample], settle: Settle) -> Standing:
-    """Returns the result at a target: the mean over the settled window."""
+    """Returns the result at a target, with means over the settled window."""
     window = settle.window(samples)
     mean = sum(each.load_position_deg - target_deg for each in window) / len(window)
     return Standing(target_deg, mean * ARCSEC_PER_DEG, samples[-1].time_s - samples[0].time_s)

@@ -16,7 +16,7 @@ GRID_S = 0.001
 """Sampling period of a function; no drive's cycle is much shorter."""
 MOST_POINTS = 1_000_000
 UNITS = {"velocity_deg_s": "deg/s", "acceleration_deg_s2": "deg/s2", "jerk_deg_s3": "deg/s3"}
-"""Limits that a trajectory must respect, in order of the derivative."""
+"""Limits of a trajectory with their units, by order of the derivative."""
 ROUNDING = 1e-6
 """Share of a limit by which finite differences may exceed it."""
 
@@ -33,10 +33,10 @@ class Followed:
 class Trajectory:
     """Evenly spaced load angles, followed as one smooth path.
 
-    The axis first moves to the first angle, jerk-limited, and comes to rest at the last. Speed, acceleration
-    and jerk, rest before and after included, must be within the axis's limits: `rehearse` refuses the
-    trajectory (`InputError`) before anything moves. Between two set-points the path is a cubic, with the
-    slope of its neighbours.
+    The axis makes a jerk-limited move to the first angle, and comes to rest at the last. Speed, acceleration
+    and jerk must be within the axis's limits, including the transitions from and to rest; otherwise
+    `rehearse` rejects the trajectory (`InputError`) before any motion. Between two set-points the path is a
+    cubic whose slopes follow from the neighbours.
     """
 
     load_deg: FloatArray
@@ -45,9 +45,7 @@ class Trajectory:
     """Time between two angles."""
 
     def __post_init__(self) -> None:
-        """Raises `InputError` for an invalid path: too few points, a non-finite value, or a period that is
-        not positive.
-        """
+        """Raises `InputError` for too few points, a non-finite value, or a period that is not positive."""
         points = np.array(self.load_deg, dtype=np.float64)
         points.flags.writeable = False
         object.__setattr__(self, "load_deg", points)
@@ -67,7 +65,7 @@ class Trajectory:
 
     @classmethod
     def of(cls, load_deg: Callable[[float], float], duration_s: float) -> Self:
-        """Samples a function of time that returns the load angle in degrees, in seconds after the start."""
+        """Samples a function of time, in seconds after the start, that returns the load angle in degrees."""
         if not (math.isfinite(duration_s) and duration_s > 0.0):
             raise InputError(f"a trajectory of {duration_s!r} s; expected a duration above 0")
         count = min(math.ceil(duration_s / GRID_S), MOST_POINTS)
@@ -85,7 +83,7 @@ class Trajectory:
 
 
 class Follow:
-    """Leg that follows set-points; everything slow is prepared at construction."""
+    """Leg that follows set-points; slow computations are done at construction."""
 
     kind = "trajectory"
 
@@ -116,7 +114,7 @@ class Follow:
         )
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """Returns the path; raises `InputError` if it starts elsewhere than the axis or violates a limit."""
+        """Returns the path; raises `InputError` if it starts off the axis's position or violates a limit."""
         if abs(start_deg - self._points[0]) > 1e-9:
             raise InputError(
                 f"a trajectory begins at {self._points[0]:g} deg, but the axis stands at {start_deg:g}: move "

@@ -1,4 +1,4 @@
-"""Moves from one load angle to the next, holding the last."""
+"""Moves between load angles, holding the axis at the last."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,12 +16,11 @@ class Hold:
     def __init__(self, duration_s: float = math.inf, released: Callable[[], bool] = lambda: False) -> None:
         """``released`` is called in each cycle."""
         self.begun = False
-        """True once the axis stands there."""
+        """True once the axis stands at its position."""
         self._duration_s, self._released = duration_s, released
         self._since_s = 0.0
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """Returns a path without motion."""
         return Path(0.0, lambda _: start_deg, start_deg, start_deg)
 
     def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
@@ -43,7 +42,7 @@ class WayPoints:
     settle: Settle = Settle()
 
     def moves(self, axis: AxisView) -> Steps[tuple[Standing, ...]]:
-        """Yields a move and a settle for each way point; the outcome is where the load then stood."""
+        """Yields a move and a settle for each way point; the outcome is the load's position at each."""
         stands: list[Standing] = []
         for target_deg in self.targets_deg:
             yield MoveTo(target_deg, self.velocity_deg_s)

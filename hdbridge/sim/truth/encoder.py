@@ -44,12 +44,14 @@ class TrueSignals(Strict):
     sine_offset: float = Field(0.0, ge=-0.5, le=0.5, description="offset of the sine, of its amplitude")
     cosine_offset: float = Field(0.0, ge=-0.5, le=0.5, description="offset of the cosine, of its amplitude")
     gain_mismatch: float = Field(
-        0.0, ge=-0.5, le=0.5, description="how much larger the sine is than the cosine"
+        0.0, ge=-0.5, le=0.5, description="relative excess of the sine's amplitude over the cosine's"
     )
     phase_mismatch_deg: float = Field(
-        0.0, ge=-45, le=45, description="how much less than 90 degrees lie between them"
+        0.0, ge=-45, le=45, description="deficit of their phase difference from 90 degrees"
     )
-    third_harmonic: float = Field(0.0, ge=-0.3, le=0.3, description="third harmonic of both")
+    third_harmonic: float = Field(
+        0.0, ge=-0.3, le=0.3, description="third harmonic of both, relative to the amplitude"
+    )
 
 
 class TrueLoss(Strict):
@@ -67,10 +69,8 @@ class TrueEncoder(Strict):
     zero_counts: int = Field(
         0, ge=-(2**31), le=2**31 - 1, description="reading at the angle zero, where the axis is switched on"
     )
-    disc: TrueDisc | None = Field(None, description="how the disc sits on its shaft; without it: true")
-    late_ms: float = Field(
-        0.0, ge=0, le=100, description="age of what is reported, against the other encoder"
-    )
+    disc: TrueDisc | None = Field(None, description="mounting of the disc on its shaft; without it: true")
+    late_ms: float = Field(0.0, ge=0, le=100, description="age of the reading relative to the other encoder")
     losses: tuple[TrueLoss, ...] = Field((), description="counts lost, each at its time")
 
 
@@ -95,18 +95,22 @@ class TrueCoupling(Strict):
 class TrueCable(Strict):
     """Cable of the encoder: taut beyond an angle, where it turns the encoder's body."""
 
-    taut_from_deg: float = Field(ge=-36_000, le=36_000, description="load angle from which it is taut")
-    arcsec_per_deg: float = Field(ge=-3_600, le=3_600, description="turn of the body per degree beyond")
+    taut_from_deg: float = Field(
+        ge=-36_000, le=36_000, description="load angle above which the cable is taut"
+    )
+    arcsec_per_deg: float = Field(
+        ge=-3_600, le=3_600, description="rotation of the body per degree above that angle"
+    )
     drag: float = Field(
-        0.0, ge=0, le=1, description="part by which it pulls more outwards and less on the return"
+        0.0, ge=0, le=1, description="relative difference of the pull between outward and return motion"
     )
 
 
 class TrueSensorWarming(Strict):
-    """Warming of the encoder itself, by the square of its speed; no temperature channel shows it."""
+    """Warming of the encoder by the square of its speed, which no temperature channel shows."""
 
     arcsec_at_10_deg_s: float = Field(
-        ge=-3_600, le=3_600, description="shift that long motion at 10 degrees per second ends at"
+        ge=-3_600, le=3_600, description="final shift in long motion at 10 degrees per second"
     )
     time_constant_s: float = Field(gt=0, le=1e6, description="time constant of the warming")
 

@@ -12,7 +12,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 
 class TrueStiffening(Strict):
-    """Later stages of the spring: beyond each torque it is stiffer (or softer) than before."""
+    """Further stages of the spring, which is stiffer (or softer) beyond each torque than before."""
 
     first_torque_nm: float = Field(gt=0, le=1e6, description="torque T1 at which the first stage ends")
     second_stiffness_nm_per_rad: float = Field(gt=0, le=1e9, description="stiffness K2 beyond T1")
@@ -30,7 +30,7 @@ class TrueStiffening(Strict):
 
 
 class TrueFlank(Strict):
-    """Other flank of the teeth, which carries after a reversal, with a shifted tooth error."""
+    """Other flank of the teeth, which carries the load after a reversal, with a shifted tooth error."""
 
     shift_deg: float = Field(
         ge=-90,
@@ -45,7 +45,7 @@ class TrueRate(Strict):
 
     growth_per_decade: float = Field(ge=-1, le=5, description="growth of the loop per decade of motor speed")
     from_deg_s: float = Field(gt=0, le=1e5, description="motor speed at which the growth sets in")
-    time_constant_s: float = Field(0.05, gt=0, le=1e4, description="time that the friction takes to follow")
+    time_constant_s: float = Field(0.05, gt=0, le=1e4, description="time constant of the friction")
 
 
 class TrueWear(Strict):
@@ -60,13 +60,11 @@ class TrueWear(Strict):
 class TrueAgeing(Strict):
     """Gradual change over hours of work, linear from switch-on, then constant."""
 
-    duration_s: float = Field(gt=0, le=1e8, description="time that it takes")
+    duration_s: float = Field(gt=0, le=1e8, description="duration of the ageing")
     hysteresis_growth: float = Field(
         0.0, ge=-0.95, le=10, description="growth of the elastic hysteresis by then"
     )
-    motor_orders: tuple[TrueOrder, ...] = Field(
-        (), description="tooth error by motor angle that has been added by then"
-    )
+    motor_orders: tuple[TrueOrder, ...] = Field((), description="tooth error over motor angle added by then")
 
 
 class TrueCreep(Strict):
@@ -74,45 +72,43 @@ class TrueCreep(Strict):
 
     time_constant_s: float = Field(gt=0, le=1e6, description="time constant of the element")
     amplitude_arcsec: float = Field(
-        0.0, ge=-3_600, le=3_600, description="how far it yields, in time, to the teeth's drag in motion"
+        0.0, ge=-3_600, le=3_600, description="final yield to the teeth's drag in motion"
     )
-    arcsec_per_nm: float = Field(
-        0.0, ge=0, le=3_600, description="how far it yields, in time, to the torque at the load"
-    )
+    arcsec_per_nm: float = Field(0.0, ge=0, le=3_600, description="final yield to the torque at the load")
 
 
 class TrueJump(Strict):
-    """Jump of teeth, which remains in the output."""
+    """Jump of teeth that remains in the output."""
 
     time_s: float = Field(ge=0, le=1e8, description="time since the axis was switched on")
-    teeth: int = Field(ge=-100, le=100, description="teeth that the output jumps forward by")
-    duration_s: float = Field(0.1, gt=0, le=10, description="time that the jump takes")
+    teeth: int = Field(ge=-100, le=100, description="number of teeth by which the output jumps forward")
+    duration_s: float = Field(0.1, gt=0, le=10, description="duration of the jump")
 
 
 class TrueDamage(Strict):
     """Damaged tooth: a bump of the output at one load angle."""
 
-    at_deg: float = Field(ge=-360, le=360, description="load angle of its middle")
+    at_deg: float = Field(ge=-360, le=360, description="load angle of its centre")
     width_deg: float = Field(gt=0, le=180, description="width from foot to foot, of the load")
-    height_arcsec: float = Field(ge=-36_000, le=36_000, description="height in its middle")
+    height_arcsec: float = Field(ge=-36_000, le=36_000, description="height at its centre")
 
 
 class TrueRoller(Strict):
     """Roller on the motor's hub, pressed on at some load angles more than at others."""
 
-    order: float = Field(gt=0, le=512, description="its turns per motor turn, not a whole number")
+    order: float = Field(gt=0, le=512, description="turns of the roller per motor turn, not a whole number")
     amplitude_arcsec: float = Field(ge=0, le=36_000, description="amplitude where it is pressed on most")
     phase_deg: float = Field(0.0, ge=-360, le=360, description="phase at the motor angle zero")
     pressed_at_deg: float = Field(0.0, ge=-360, le=360, description="load angle where it is pressed on most")
-    sharpness: float = Field(1.0, gt=0, le=50, description="how soon the pressure falls off from there")
+    sharpness: float = Field(1.0, gt=0, le=50, description="sharpness of the pressure's fall-off from there")
 
 
 class TrueSeat(Strict):
-    """Bearing ring that sticks in its seat, is carried along, and slips at random angles."""
+    """Bearing ring that sticks in its seat, is dragged along, and slips at random angles."""
 
-    slip_arcsec: float = Field(gt=0, le=36_000, description="how far it is carried at most; it slips before")
-    travel_deg: float = Field(gt=0, le=1e6, description="motor travel that carries it as far as that")
-    seed: int = Field(0, ge=0, description="seed of where it slips")
+    slip_arcsec: float = Field(gt=0, le=36_000, description="maximum drag distance, before which it slips")
+    travel_deg: float = Field(gt=0, le=1e6, description="motor travel for that drag distance")
+    seed: int = Field(0, ge=0, description="seed of the slip positions")
 
 
 class TrueGear(Strict):

@@ -44,7 +44,7 @@ class SlipElement(Strict):
 
 
 class MaxwellSlip(Strict):
-    """Parallel elasto-plastic elements; a reversal is remembered until a larger one wipes it out."""
+    """Parallel elasto-plastic elements; a reversal is remembered until a larger one erases it."""
 
     law: Literal["maxwell_slip"] = Field(description="Maxwell slip, Prandtl-Ishlinskii; return-point memory")
     elements: tuple[SlipElement, ...] = Field(
@@ -53,7 +53,7 @@ class MaxwellSlip(Strict):
 
 
 class BoucWen(Strict):
-    """Bouc-Wen law: a differential equation in the motor's travel, not in time."""
+    """Bouc-Wen law: a differential equation in the motor's travel rather than in time."""
 
     law: Literal["bouc_wen"] = Field(description="Bouc-Wen, the smooth law")
     offset_arcsec: float = Field(ge=0, le=36_000, description="error after long motion in one direction")

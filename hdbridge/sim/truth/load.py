@@ -18,7 +18,7 @@ class TrueGravity(Strict):
 
 
 class TrueStribeck(Strict):
-    """Friction at the load that is higher near rest."""
+    """Friction at the load that rises near rest."""
 
     breakaway_nm: float = Field(
         ge=0, le=1e6, description="friction at rest, in place of the Coulomb friction"
@@ -34,7 +34,7 @@ class TrueThinning(Strict):
 
 
 class TrueVibration(Strict):
-    """Machine nearby that shakes the load."""
+    """Nearby machine that shakes the load."""
 
     frequency_hz: float = Field(gt=0, le=500, description="frequency")
     torque_nm: float = Field(ge=0, le=1e6, description="amplitude of the torque on the load")
@@ -64,7 +64,7 @@ class TrueLoad(Strict):
     gravity: TrueGravity | None = Field(None, description="a mass on the axis; without it: balanced")
     vibration: tuple[TrueVibration, ...] = Field((), max_length=16, description="shaking from outside")
     torque_sense: Literal[1, -1] = Field(
-        1, description="of the torque that is told: 1 pushes the load forward, -1 is what the gear delivers"
+        1, description="sign of the reported torque: 1 pushes the load forward, -1 is what the gear delivers"
     )
     encoder: TrueLoadEncoder = Field(description="encoder at the load")
 

@@ -9,7 +9,7 @@ from hdbridge.strictness import Strict
 
 
 class TrueMotorStribeck(Strict):
-    """Friction on the motor's shaft that is higher near rest, before a lubricant film forms."""
+    """Friction on the motor's shaft that rises near rest, before a lubricant film forms."""
 
     rise: float = Field(
         ge=0, le=10, description="share of the Coulomb friction by which it is higher at rest"
@@ -50,7 +50,7 @@ class TrueNotch(Strict):
 
 
 class TrueObserver(Strict):
-    """Disturbance observer: the lagged difference between the torque and what accelerates the inertia."""
+    """Disturbance observer: lagged difference between the torque and that which accelerates the inertia."""
 
     frequency_hz: float = Field(gt=0, le=500, description="corner frequency of the estimate")
     share: float = Field(ge=0, le=1, description="part of the estimate that is added to the torque")
@@ -58,7 +58,7 @@ class TrueObserver(Strict):
 
 
 class TrueResponse(Strict):
-    """Measured response in addition to the loops, by cycle: the latest one first."""
+    """Measured response in addition to the loops, by cycle, latest first."""
 
     cycle_ms: float = Field(gt=0, le=1_000, description="control cycle of the responses")
     demand_ms: tuple[float, ...] = Field(

@@ -42,7 +42,7 @@ class Resonance:
     def stiffest_nm_per_rad(self, rad_s: float) -> float:
         """Returns the spring stiffness for a resonance at this frequency, with the same sliders.
 
-        Not positive if the sliders alone exceed it.
+        Not positive if the sliders alone exceed this frequency.
         """
         left = rad_s**2 - self.held_nm_per_rad / self.inertia_kg_m2
         return left / (1.0 / self.inertia_kg_m2 + 1.0 / self.reflected_kg_m2)

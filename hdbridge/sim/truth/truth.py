@@ -1,8 +1,8 @@
 """Truth file: the true values of all parameters of the simulated axis.
 
-A calibration does not read this file; it must find the values. docs/ci.md describes each key, and
-`profiles/article/truth.yaml` is the article's bench. Angles and torques of the gear are at the load.
-Other modules of this package define the sections.
+A calibration must find these values without reading the file. docs/ci.md describes each key, and
+`profiles/article/truth.yaml` is the article's bench. Angles and torques of the gear are at the load. Other
+modules of this package define the sections.
 """
 
 import math
@@ -53,14 +53,16 @@ class TrueTemperature(Strict):
 
     @property
     def unchanged_c(self) -> float:
-        """Temperature at which nothing has grown."""
+        """Temperature at which no parameter has changed."""
         return self.ambient_c if self.reference_c is None else self.reference_c
 
 
 class Truth(Strict):
     """Truth of the simulated axis."""
 
-    schema_: Literal["hdbridge.truth/1"] = Field(alias="schema", description="kind and version of this file")
+    schema_: Literal["hdbridge.truth/1"] = Field(
+        alias="schema", description="schema and version of this file"
+    )
     name: str = Field(
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name: letters, digits, '.', '_', '-'"
     )
@@ -82,17 +84,17 @@ class Truth(Strict):
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Reads a truth file, or the one in a profile's folder; InputError with file:line:column."""
+        """Reads a truth file, or that of a profile's folder; InputError with file:line:column."""
         path = Path(path)
         return read_yaml(path / "truth.yaml" if path.is_dir() else path).validate(cls)
 
     @classmethod
     def from_text(cls, text: str, path: Path | str = "truth.yaml") -> Self:
-        """Reads a truth file's text; ``path`` names it in error messages."""
+        """Reads the text of a truth file; ``path`` names it in error messages."""
         return document_from_text(text, path).validate(cls)
 
     def changed(self, **sections: Mapping[str, Any]) -> Self:
-        """Returns a truth that differs in some keys of these sections; InputError if it would be wrong."""
+        """Returns a truth with changed keys in some sections; InputError if the result is invalid."""
         data = self.model_dump(mode="json", by_alias=True, exclude_unset=True)
         for name, keys in sections.items():
             data[name] = {**data.get(name, {}), **keys}
@@ -110,7 +112,6 @@ class Truth(Strict):
 
     @property
     def resonance(self) -> Resonance:
-        """Fastest resonance."""
         return Resonance(
             self.gear.stiffest_nm_per_rad,
             math.degrees(self.load_.presliding_nm_per_deg),

@@ -14,7 +14,7 @@ def place(tmp_path_factory):
 
 @pytest.fixture
 def api(place):
-    """The machine as it comes up, nobody holding the lease."""
+    """Machine after its start, with a free lease."""
     place.bridge.__init__()
     return place
 

@@ -1,7 +1,7 @@
-"""Requests made from the API's own description: never a 5xx, and nothing moves without the lease.
+"""Requests generated from the API's own description: never a 5xx, and no motion without the lease.
 
-FUZZ_EXAMPLES=200 makes so many of each operation and every value at the bounds of the schema,
-HYPOTHESIS_PROFILE=random others in every run.
+FUZZ_EXAMPLES=200 sets the number of requests per operation and tests every value at the bounds of the schema;
+HYPOTHESIS_PROFILE=random uses different requests in every run.
 """
 
 import os

@@ -27,7 +27,7 @@ def connected(api, over: str) -> socket.socket:
 
 @contextmanager
 def held(api, over: str, sent: str) -> Iterator[None]:
-    """So many connections, each of which has sent this and goes on holding."""
+    """Opens this number of connections, which send these bytes and stay open."""
     with ExitStack() as stack:
         for _ in range(HELD):
             raw = stack.enter_context(connected(api, over))

@@ -60,5 +60,5 @@ def test_only_requested_parameters_are_followed():
     ]
     with pytest.raises(InputError, match=r"did you mean 'hysteresis.offset_arcsec'\?"):
         DriftModel(MODEL, ["hysteresis.ofset_arcsec"])
-    with pytest.raises(InputError, match=r"nothing that wear or temperature moves"):
+    with pytest.raises(InputError, match=r"not a parameter that wear or temperature changes"):
         DriftModel(MODEL, ["hysteresis.width_deg"])

@@ -78,7 +78,7 @@ def test_enabling_moves_nothing_and_a_move_arrives(daemon: SteppedDaemon) -> Non
     assert set(moved["state"]) == {S.ENABLED}
     assert {MotionMode.HOLD, MotionMode.GOTO} == set(moved["mode"])
     assert (moved["velocity_deg_s"] <= 20.0 * (1 + 1e-9)).all()
-    (end,) = [each for each in daemon.told(E.MOTION_ENDED) if each.id == id_]
+    (end,) = [each for each in daemon.reported(E.MOTION_ENDED) if each.id == id_]
     assert end.code == MotionMode.GOTO
 
 
@@ -164,10 +164,10 @@ def test_quick_stop_is_latched_until_reset(enabled: SteppedDaemon) -> None:
     enabled.turn(2)
     assert enabled.axes[0].image.power.state is State.QUICK_STOP_ACTIVE
     assert "still stopping" in enabled.order(K.RESET).text
-    assert enabled.told(E.STOPPED) == []
+    assert enabled.reported(E.STOPPED) == []
     enabled.run(1.0)
     assert {word for word, _ in sent} == {0x02}
-    (stopped,) = enabled.told(E.STOPPED)
+    (stopped,) = enabled.reported(E.STOPPED)
     assert "quick stop by command" in stopped.text
     for kind in (K.ENABLE, K.MOVE, K.VERIFIED, K.LEND):
         assert enabled.order(kind).kind is E.REFUSED
@@ -191,13 +191,13 @@ def test_knots_of_an_earlier_stream_are_discarded(enabled: SteppedDaemon) -> Non
     begin = enabled.axes[0].set_point.position_deg
     enabled.memory.knots[0].put([Knot(0, 0.0, 300.0, 0.0)] * 200)
     enabled.stream({0: [(t, begin + p, v) for t, p, v in quintic(0.4, 1.0)]}, timeout_s=0.1)
-    enabled.until(lambda: bool(enabled.told(E.MOTION_ENDED)))
-    assert enabled.told(E.STREAM_REFUSED) == []
+    enabled.until(lambda: bool(enabled.reported(E.MOTION_ENDED)))
+    assert enabled.reported(E.STREAM_REFUSED) == []
     assert enabled.axes[0].set_point.position_deg == pytest.approx(begin + 1.0)
 
 
 def test_early_knots_of_the_next_stream_are_kept(enabled: SteppedDaemon) -> None:
-    """A leg's end is told, and the next one is handed over within the same period."""
+    """The end of a leg is reported and the next leg handed over within the same period."""
     begin = enabled.axes[0].set_point.position_deg
     enabled.stream({0: [(t, begin + p, v) for t, p, v in quintic(0.4, 1.0)]}, timeout_s=10.0)
     enabled.until(lambda: enabled.axes[0].set_point.position_deg == pytest.approx(begin + 1.0))
@@ -207,7 +207,7 @@ def test_early_knots_of_the_next_stream_are_kept(enabled: SteppedDaemon) -> None
     enabled.run(0.1)
     assert enabled.axes[0].set_point.mode is MotionMode.HOLD
     assert enabled.order(K.STREAM_BEGIN, 0, a=0.1, j=2).kind is E.DONE
-    enabled.until(lambda: len(enabled.told(E.MOTION_ENDED)) == 2)
+    enabled.until(lambda: len(enabled.reported(E.MOTION_ENDED)) == 2)
     assert enabled.axes[0].set_point.position_deg == pytest.approx(begin + 2.0)
     assert enabled.order(K.STREAM_BEGIN, 0, a=0.1, j=2).kind is E.REFUSED
 
@@ -227,7 +227,7 @@ def test_axes_stream_together_or_not_at_all(pair: SteppedDaemon) -> None:
     paths[1] = [(t, begins[1] + p, v) for t, p, v in quintic(1.0, 4.0)]
     pair.samples.read()
     assert pair.stream(paths).kind is E.DONE
-    pair.until(lambda: len(pair.told(E.MOTION_ENDED)) >= 3)
+    pair.until(lambda: len(pair.reported(E.MOTION_ENDED)) >= 3)
     samples, _ = pair.samples.read()
     both = samples["axes"]["load_target_deg"]
     moving = (samples["axes"]["mode"] == MotionMode.STREAM).all(axis=1)
@@ -248,7 +248,7 @@ def test_a_fault_stops_coordinated_axes_in_order(pair: SteppedDaemon) -> None:
     samples, _ = pair.samples.read()
     velocity = samples["axes"]["velocity_deg_s"][:, 1]
     assert np.abs(np.diff(velocity)).max() <= 200.0 * 0.004 * 1.06
-    assert not pair.told(E.UNDERRUN)
+    assert not pair.reported(E.UNDERRUN)
 
 
 def test_a_model_of_another_axis_is_refused(enabled: SteppedDaemon) -> None:
@@ -325,14 +325,14 @@ def test_the_load_loop_removes_the_remaining_error_and_fades_out() -> None:
         axis = record(daemon)
         assert axis["flags"][-1] & SampleFlag.LOOP_DOUBTED
         assert axis["loop_arcsec"][-1] == 0.0
-        (event,) = daemon.told(E.LOAD_LOOP)
+        (event,) = daemon.reported(E.LOAD_LOOP)
         assert (event.code, event.axis) == (1, 0)
         assert "moved by" in event.text
         daemon.nodes[0].faults.load_jump_counts = 0
         daemon.run(9.0)
         axis = record(daemon)
         assert not axis["flags"][-1] & SampleFlag.LOOP_DOUBTED
-        assert [each.code for each in daemon.told(E.LOAD_LOOP)] == [1, 0]
+        assert [each.code for each in daemon.reported(E.LOAD_LOOP)] == [1, 0]
         assert abs(7.3 - axis["load_position_deg"][-20:].mean()) < 0.3 * abs(left)
         assert np.abs(np.diff(axis["loop_arcsec"])).max() <= 40.0 * 0.004 * (1 + 1e-9)
         assert daemon.states == [S.ENABLED]
@@ -355,7 +355,7 @@ def test_a_sound_load_encoder_raises_no_doubt() -> None:
             daemon.run(0.7)
         daemon.done(K.STOP)
         daemon.run(6.0)
-        assert daemon.told(E.LOAD_LOOP) == []
+        assert daemon.reported(E.LOAD_LOOP) == []
         axis = record(daemon)
         assert not np.any(axis["flags"] & SampleFlag.LOOP_DOUBTED)
         assert 1.0 < np.abs(axis["loop_arcsec"]).max() <= maximum_arcsec

@@ -29,7 +29,7 @@ def test_all_axes_brake_in_order_and_lose_power(pair: SteppedDaemon) -> None:
     driven = samples["axes"][(samples["axes"]["state"] == S.STOPPING).all(axis=1)]
     assert np.abs(np.diff(driven["velocity_deg_s"], axis=0)).max() <= 200.0 * 0.004 * (1 + 1e-6)
     assert {axis.image.power.state for axis in pair.axes} == {State.SWITCH_ON_DISABLED}
-    assert len(pair.told(E.ENDING)) == 1
+    assert len(pair.reported(E.ENDING)) == 1
 
 
 def test_nothing_starts_during_shutdown(pair: SteppedDaemon) -> None:
@@ -52,7 +52,7 @@ def test_at_once_by_a_quick_stop(pair: SteppedDaemon) -> None:
     pair.turn()
     pair.controller.end(at_once=True)
     ended(pair)
-    assert S.QUICK_STOPPED in {each.code for each in pair.told(E.STATE, 0)}
+    assert S.QUICK_STOPPED in {each.code for each in pair.reported(E.STATE, 0)}
     assert {axis.image.power.state for axis in pair.axes} == {State.SWITCH_ON_DISABLED}
 
 

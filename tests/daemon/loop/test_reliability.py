@@ -50,7 +50,7 @@ def check(bench: DaemonBench, row: Row, character: Character) -> None:
             assert bench.states[axis] is STATES[bench.daemon.axes[axis].supervision.reaction]
         bench.stay_stopped(*concerned)
     for axis in concerned:
-        (stopped,) = bench.daemon.told(EventKind.STOPPED, axis)
+        (stopped,) = bench.daemon.reported(EventKind.STOPPED, axis)
         assert stopped.code == FAULT_INDEX[row.fault]
         assert row.fault.value in stopped.text
     bench.mend()

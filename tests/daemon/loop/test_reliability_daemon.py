@@ -126,11 +126,11 @@ def test_the_service_verifies_drives_when_the_bus_returns(bench: DaemonBench) ->
     daemon.run(1.3)
     daemon.bus.down = None
     turns = 0
-    while not daemon.told(E.BUS_UP):
+    while not daemon.reported(E.BUS_UP):
         daemon.turn()
         turns += 1
     bench.stay_stopped(0)
-    (down,) = daemon.told(E.BUS_DOWN)
+    (down,) = daemon.reported(E.BUS_DOWN)
     assert "No such device" in down.text
     bench.leads_back()  # the service verifies, and it stays disabled until it is enabled
     further("the interface comes back").show(turns)
@@ -181,7 +181,7 @@ def test_nan_in_a_stream_brakes(bench: DaemonBench) -> None:
     daemon.run(0.1)
     daemon.memory.knots[0].put([Knot(1, 0.3, math.nan, 0.0)])
     daemon.turn()
-    assert daemon.told(E.STREAM_REFUSED)
+    assert daemon.reported(E.STREAM_REFUSED)
     daemon.run(0.5)
     assert daemon.axes[0].set_point.at_rest
     assert abs(daemon.axes[0].set_point.position_deg - here) < 0.3
@@ -199,10 +199,10 @@ def test_a_mailbox_full_of_nonsense_is_refused(moving: DaemonBench) -> None:
             posted += 1
     assert 100 < posted < 10_000
     turns = 0
-    while len(daemon.told(E.REFUSED)) < posted:
+    while len(daemon.reported(E.REFUSED)) < posted:
         daemon.turn()
         turns += 1
-    assert not daemon.told(E.DONE)
+    assert not daemon.reported(E.DONE)
     assert moving.moves_on(0)
     assert moving.moves_on(1)
     further("a mailbox full of invalid commands").show(turns)
@@ -219,7 +219,7 @@ def test_the_service_cannot_write_restart_or_command_a_moving_drive(moving: Daem
     passed = set(frames[:3]) & set(sent)
     assert not passed
     assert sum(1 for can_id, _ in sent if can_id == 0x080) == 25  # one SYNC a cycle and no more
-    assert daemon.told(E.REFUSED)
+    assert daemon.reported(E.REFUSED)
     assert moving.moves_on(0)
     further("an SDO write, an NMT reset, a set-point from the service in motion").show(len(passed))
 
@@ -288,7 +288,7 @@ def test_a_jog_runs_out_when_the_service_dies(moving: DaemonBench) -> None:
 
 def test_a_full_disk_does_not_disturb_the_loop(moving: DaemonBench, tmp_path: Path) -> None:
     told: list[str] = []
-    recorder = FlightRecorder(tmp_path / "flights", about(2), tell=told.append, free=lambda _: 0)
+    recorder = FlightRecorder(tmp_path / "flights", about(2), notify=told.append, free=lambda _: 0)
 
     async def story() -> None:
         async with moving.service.bridge() as bridge:

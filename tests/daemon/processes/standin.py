@@ -14,7 +14,7 @@ from hdbridge.daemon.start import Start, begin_child
 
 
 def say(line: str) -> None:
-    """In one piece, whatever the other process says at the same time."""
+    """Writes a line in one piece, whatever other processes write at the same time."""
     os.write(1, f"{line}\n".encode())
 
 

@@ -18,7 +18,7 @@ PROGRAM = Path(__file__).with_name("standin_keeper.py")
 
 
 class Kept:
-    """A keeper in a process of its own, and what it and its children say."""
+    """Keeper in a process of its own, with its output and that of its children."""
 
     def __init__(self, folder: Path, **environment: str) -> None:
         self.manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -69,7 +69,7 @@ class Kept:
         return self.pids(kind)[-1]
 
     def until_told(self, line: str) -> None:
-        """The service manager has been told this."""
+        """Waits until the service manager has received this message."""
         self.until(lambda: line in self.told, line)
 
     def until_ended(self) -> int:
@@ -147,7 +147,7 @@ with InterfaceLock("socketcan", "can0", Path(sys.argv[1])):
 
 
 def test_a_lent_bus_returns_however_its_borrower_ends(keeper: Callable[..., Kept], tmp_path: Path) -> None:
-    """The borrower is killed; the service is killed meanwhile, too. Nothing runs on the bus beside it."""
+    """The borrower is killed, and meanwhile the service as well. Nothing else runs on the bus."""
     kept = keeper()
     kept.until_told("READY=1")
     os.kill(kept.until_begun("service"), signal.SIGUSR1)

@@ -28,7 +28,7 @@ LISTENING = ("scan", "--listen", 600, "--borrow")
 
 @contextmanager
 def started(folder: Path, *arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """Runs ``hdbridge`` beside the daemon, with the daemon's runtime folder."""
+    """Runs ``hdbridge`` next to the daemon, with the daemon's runtime folder."""
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder)}
     process = subprocess.Popen(
         [sys.executable, "-m", "hdbridge", *map(str, arguments)],

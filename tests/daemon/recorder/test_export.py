@@ -211,7 +211,7 @@ def test_bad_input_is_one_line_and_status_2(worked, tmp_path):
         ((str(worked),), "--out is missing"),
         ((str(worked), "--out", str(full)), "not an empty folder"),
         ((str(tmp_path / "nowhere"), "--out", str(tmp_path / "x")), "no such file or folder"),
-        ((str(tmp_path / "no.mcap"), "--out", str(tmp_path / "x")), "is no MCAP file"),
+        ((str(tmp_path / "no.mcap"), "--out", str(tmp_path / "x")), "is not an MCAP file"),
         ((str(full), "--out", str(tmp_path / "x")), "no .mcap file in this folder"),
         ((str(worked), "--from", "noon", "--out", str(tmp_path / "x")), "--from: found 'noon'"),
         ((str(worked), "--to", "2020-01-01", "--out", str(tmp_path / "x")), "nothing was recorded between"),

@@ -132,7 +132,7 @@ def test_a_finished_file_is_unchanged(tmp_path):
 def test_the_next_start_mends_files_and_keeps_those_with_faults(killed, tmp_path):
     copied(killed, tmp_path)
     said = []
-    recorder = FlightRecorder(tmp_path, about(), tell=said.append)
+    recorder = FlightRecorder(tmp_path, about(), notify=said.append)
     recorder.take(samples(100), [event(0.1)], 0)
     recorder.put(ModelUse("demo", "3", "text"))
     recorder.close()
@@ -145,11 +145,11 @@ def test_the_next_start_mends_files_and_keeps_those_with_faults(killed, tmp_path
 
 
 def test_the_recorder_never_blocks_its_caller(tmp_path, monkeypatch):
-    """Its queue is full at once here: what does not fit is dropped and counted."""
+    """Its queue is full at once here; excess data are dropped and counted."""
     monkeypatch.setattr("hdbridge.daemon.recorder.recorder.QUEUE_BATCHES", 1)
     monkeypatch.setattr(FlightRecorder, "_run", lambda *_: None)
     said = []
-    recorder = FlightRecorder(tmp_path, about(), tell=said.append)
+    recorder = FlightRecorder(tmp_path, about(), notify=said.append)
     for each in range(4):
         recorder.take(samples(5, 1 + 5 * each), [], 0)
     assert recorder.flight.counts.dropped == 15

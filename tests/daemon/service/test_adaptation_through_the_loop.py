@@ -25,7 +25,7 @@ QUICK = AdaptationSettings(mode="on", interval_s=3.0, rate_arcsec_per_hour=7200.
 
 @pytest.fixture
 def service(tmp_path: Path):
-    """An axis whose loop is a tenth higher than its model says."""
+    """Axis whose loop is a tenth higher than that of its model."""
     truth = tmp_path / "truth.yaml"
     grown = truth_of(1e-3, growth=0.1, second_order_arcsec=0.0)
     truth.write_text(yaml.safe_dump(grown.model_dump(mode="json", by_alias=True, exclude_none=True)))
@@ -89,7 +89,7 @@ async def test_the_model_in_the_loop_is_adapted_and_reverted(service: Service) -
         changed = np.abs(np.diff(samples["correction_arcsec"]))[stands[1:] & stands[:-1]]
         assert 0.0 < float(np.max(changed)) < 0.5  # a cycle: four arcsec are faded in, never at once
         assert offset_arcsec(bridge) == pytest.approx(44.0, abs=1.0)
-        assert service.daemon.told(EventKind.CHANGED)
+        assert service.daemon.reported(EventKind.CHANGED)
         state = bridge.axis_state("axis1").adaptation
         assert state.mode == messages.AdaptationMode.ON
         assert state.frozen is None
@@ -126,4 +126,4 @@ async def test_an_impossible_adaptation_does_not_block_the_axis(service: Service
         await work(bridge, token, 1)
         frozen = bridge.axis_state("axis1").adaptation.frozen
         assert frozen is not None
-        assert "'backlash.gap_arcsec' is nothing that wear or temperature moves" in frozen
+        assert "'backlash.gap_arcsec' is not a parameter that wear or temperature changes" in frozen

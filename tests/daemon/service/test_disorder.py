@@ -166,7 +166,7 @@ class Disorder(RuleBasedStateMachine):
 
     @rule()
     def nobody_is_left(self) -> None:
-        """Once the lease has ended nothing goes on but a move, which has its end."""
+        """After the end of the lease, only a move continues, until its end."""
         self.wait(LEASE_S + 0.1)
         assert self.bridge.lease.holder is None
         self.wait(8.0)

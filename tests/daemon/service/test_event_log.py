@@ -3,13 +3,13 @@
 from support.service import Service
 
 from hdbridge.daemon.memory import Event, EventKind
-from hdbridge.daemon.service.bridge import EVENTS_TOLD
+from hdbridge.daemon.service.bridge import EVENTS_RETURNED
 from hdbridge.daemon.service.eventlog import KEPT, EventLog
 from hdbridge.motion import MotionMode
 
 
-class Told:
-    """A reader of events that a test has told."""
+class EventReader:
+    """Reader of events supplied by a test."""
 
     def __init__(self) -> None:
         self.events: list[Event] = []
@@ -24,17 +24,17 @@ def event(kind: EventKind, code: int = 0, text: str = "") -> Event:
 
 
 def test_routine_events_do_not_displace_stops() -> None:
-    reader = Told()
+    reader = EventReader()
     log = EventLog(reader)
     reader.events = [event(EventKind.STOPPED, text="cycle 1: lost")]
     leg = [event(EventKind.DONE), event(EventKind.MOTION_ENDED, MotionMode.STREAM)]
     reader.events += leg * KEPT
     reader.events.append(event(EventKind.MOTION_ENDED, MotionMode.GOTO))
     log.poll()
-    assert [(each.number, each.text) for each in log.told(0)] == [(1, "cycle 1: lost"), (2, "")]
-    assert log.newest_told == 2
-    assert log.told(1)[0].event == event(EventKind.MOTION_ENDED, MotionMode.GOTO)
-    assert log.told(2) == log.told(99) == []
+    assert [(each.number, each.text) for each in log.public(0)] == [(1, "cycle 1: lost"), (2, "")]
+    assert log.newest_public == 2
+    assert log.public(1)[0].event == event(EventKind.MOTION_ENDED, MotionMode.GOTO)
+    assert log.public(2) == log.public(99) == []
     assert log.newest == 2 * KEPT + 2  # the service itself sees all
     assert log.answer(7) is not None
 
@@ -42,11 +42,11 @@ def test_routine_events_do_not_displace_stops() -> None:
 async def test_the_newest_events_are_returned_and_the_others_counted(service: Service) -> None:
     async with service.ready() as bridge:
         before = bridge.events(0).newest
-        for number in range(EVENTS_TOLD + 5):
+        for number in range(EVENTS_RETURNED + 5):
             bridge.mark(f"remark {number}")
         found = bridge.events(before)
-        assert found.events[-1].text.endswith(f"remark {EVENTS_TOLD + 4}")
-        assert len(found.events) == EVENTS_TOLD
+        assert found.events[-1].text.endswith(f"remark {EVENTS_RETURNED + 4}")
+        assert len(found.events) == EVENTS_RETURNED
         assert found.lost == 5
         assert bridge.events(found.newest).events == []
         bridge.mark("one more")

@@ -42,7 +42,7 @@ async def verified(bridge: ServiceBridge) -> None:
 
 @pytest.mark.parametrize("slower", [1, 5000], ids=["idle", "busy"])
 def test_many_concurrent_requests(tmp_path: Path, slower: int) -> None:
-    """Also on a computer that takes so many times as long for everything."""
+    """Must also pass on a computer that is this many times slower."""
 
     async def story(service: Service) -> None:
         memory = service.daemon.memory

@@ -14,7 +14,7 @@ from hdbridge.errors import HdbridgeError, RefusedError, SafetyStop
 
 
 def said_once(bridge: ServiceBridge, fault: messages.Fault | None, *more: str) -> None:
-    """Whatever a person reads about a stop says once what to do about it."""
+    """Checks that each text about a stop states the remedy exactly once."""
     assert fault is not None
     (event,) = [each for each in bridge.events().events if each.kind == "stopped"]
     assert event.hint == fault.hint

@@ -61,7 +61,7 @@ def refusals(statuses: tuple[int, ...]) -> dict[int | str, dict[str, Any]]:
 
 
 def port(bridge: ServiceBridge, axis: str) -> ServiceAxis:
-    """Returns the axis of this name; raises UnknownError (404) if there is none."""
+    """Returns the axis of this name; raises UnknownError (404) if it does not exist."""
     found = bridge.axes.get(axis)
     if found is None:
         raise UnknownError(f"there is no axis {axis[:80]!a}; expected one of: {', '.join(bridge.axes)}")
@@ -81,7 +81,7 @@ async def _found(bridge: Bridge, axis: AxisName) -> ServiceAxis:
 
 
 FoundAxis = Annotated[ServiceAxis, Depends(_found)]
-"""Axis that the path names."""
+"""Axis in the path."""
 
 
 async def _kept(bridge: Bridge, request: Request, holder: Holder = "") -> AsyncIterator[str]:

@@ -1,6 +1,6 @@
 """WebSockets for live samples and for streamed set-points.
 
-A slow client does not slow down the daemon: it gets the newest samples and the number lost, and its
+A slow client does not slow down the daemon. It receives the newest samples and the number lost, and its
 set-points are accepted only as the buffer empties.
 """
 
@@ -40,7 +40,7 @@ _REASON_MAXIMUM: Final = 120
 """Maximum length in bytes of a WebSocket's close reason; RFC 6455 permits 123."""
 _NOT_VALID: Final = 1008
 _NEWEST: Final = 2**62
-"""Number later than any event."""
+"""Number greater than that of any event."""
 _NORMAL: Final = 1000
 _GONE: Final = 1006
 
@@ -60,7 +60,7 @@ async def live(bridge: Bridge, websocket: WebSocket) -> None:
     options = LiveOptions()
 
     async def listen() -> None:
-        """Receives the client's options until it disconnects; raises InputError for invalid ones."""
+        """Receives the client's options until it disconnects; raises InputError for invalid options."""
         nonlocal options
         while True:
             wanted = await _receive(websocket, LiveOptions)
@@ -68,8 +68,8 @@ async def live(bridge: Bridge, websocket: WebSocket) -> None:
                 port(bridge, each)
             options = wanted
 
-    async def tell() -> None:
-        """Sends batches; while one is being sent, the subscription keeps only the newest samples."""
+    async def send() -> None:
+        """Sends batches; during a transmission, the subscription keeps only the newest samples."""
         lost, known = 0, bridge.events(_NEWEST).newest
         async for batch in bridge.subscribe():
             lost += batch.lost
@@ -81,7 +81,7 @@ async def live(bridge: Bridge, websocket: WebSocket) -> None:
                 lost = 0
             await asyncio.sleep(BATCH_S)  # collects samples, so that messages are fewer and larger
 
-    sides = asyncio.ensure_future(listen()), asyncio.ensure_future(tell())
+    sides = asyncio.ensure_future(listen()), asyncio.ensure_future(send())
     await asyncio.wait(sides, return_when=asyncio.FIRST_COMPLETED)
     for each in sides:
         each.cancel()
@@ -132,7 +132,7 @@ async def _accept(websocket: WebSocket) -> None:
 
 
 async def _receive(websocket: WebSocket, kind: type[M]) -> M:
-    """Returns the next message; raises InputError if it is not of this kind."""
+    """Returns the next message; raises InputError if it is of another kind."""
     try:
         text = await websocket.receive_text()
     except KeyError:
