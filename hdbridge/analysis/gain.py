@@ -100,8 +100,7 @@ STRETCHES = 64
 
 
 def repeats(estimator: Estimator) -> tuple[IntArray, str]:
-    """Numbers the points (m,) by repetition (recordings, else moves, else stretches of time); also returns
-    its name.
+    """Returns the number of each point's repetition, (m,): recordings, else moves, else stretches of time.
 
     Errors that a repetition shares with another are not evidence.
     """
@@ -134,10 +133,11 @@ def of_written(
     others: Iterable[Collection[int]],
     written: Collection[int],
 ) -> list[Gain | None]:
-    """Returns the gain of the written model for each finding.
+    """Returns the gain of the written model for each finding, over the ``given`` one with the other findings.
 
-    Both are places of effects in the fit. Neither is fitted again, so a fresh record can repeat the
-    comparison; the written one also leaves what its fit loses in repetitions that it has not seen.
+    ``others``, for each finding, and ``written`` are places of effects in the fit. No model is fitted again,
+    so a fresh record can repeat the comparison. The squares of the written model include the loss of its fit
+    in repetitions that are left out.
     """
     others = [*others]
     parts = _Parts.of(estimator, fitted.count())
