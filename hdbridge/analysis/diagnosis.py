@@ -28,7 +28,7 @@ from hdbridge.analysis.findings import (
 from hdbridge.analysis.gain import held_out, of_written
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.identifiability import identifiability
-from hdbridge.analysis.linear import Nuisances, unknown
+from hdbridge.analysis.linear import Nuisances
 from hdbridge.analysis.parameters import confounded, covariance, parameters_of, precisely
 from hdbridge.analysis.prepared import Observed, gather
 from hdbridge.analysis.probability import Context, Prior, weighed
@@ -101,7 +101,7 @@ def diagnose(
     )
     scales = scales or Scales()
     progress("searching for causes")
-    between = between_samples(data.full, model.effects, data.period_s)
+    between = between_samples(data.full, model.effects, data.period_s, scales)
     swing = seen_swing(data.full, model.effects, between, scales)
     search, found = _searched(data, model, scales, between, swing)
     if swing is None:  # a larger cause may hide it; wind-up in acceleration is its slow part
@@ -118,19 +118,15 @@ def _searched(
     data: Observed, model: TransmissionModel, scales: Scales, between: Nuisances, swing: Swing | None
 ) -> tuple[Search, Fitted]:
     """Returns the search and its result on the data less the swing."""
-    nothing = unknown(np.empty((len(data.full), 0)), ())
-    soft = swing is not None and swing.soft
     if swing is not None:
         data = without(data, swing)
-    search = _search(data, model, scales, nothing if soft else between)
-    if not soft:
-        begun = search.begun()
-        if (
-            between.strain(begun.nuisances) > scales.enter
-        ):  # a load that is too stiff for the sampling does less
-            between = nothing
-            begun = _search(data, model, scales, between).begun()
-        search = _search(settled(search.estimator, begun, swing), model, scales, between)
+    if swing is not None and swing.soft:
+        search = _search(
+            data, model, scales, replace(between, columns=between.columns[:, :0], names=(), prior=())
+        )
+    else:
+        search = _search(data, model, scales, between)
+        search = _search(settled(search.estimator, search.begun(), swing), model, scales, between)
     estimator = search.estimator
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)

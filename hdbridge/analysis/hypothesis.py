@@ -93,11 +93,6 @@ class Fitted:
     _solution: Solution = field(repr=False)
     _weight: FloatArray = field(repr=False)
 
-    @property
-    def nuisances(self) -> FloatArray:
-        """Coefficients of the nuisance columns after the zeros, those of every hypothesis first."""
-        return self._solution.nuisances[len(self.zeros) :]
-
     def having(self, effects: tuple[Effect, ...]) -> Fitted:
         """Returns the fit with other effects at the same places."""
         return replace(self, hypothesis=replace(self.hypothesis, effects=effects))
@@ -239,28 +234,19 @@ class Estimator:
         return self.weighted(np.column_stack(columns))
 
     def turned(self, effects: Sequence[Effect], start: Start) -> tuple[IntArray, FloatArray]:
-        """Returns the turning points and what their errors change in each sample, arcsec, shape (n,).
-
-        The errors of stops are among them.
-        """
+        """Returns the turning points and what their errors change in each sample, arcsec, shape (n,)."""
         full, loops = self.data.full, with_memory(effects)
         change = np.zeros(len(full))
         if not loops:
             return np.empty(0, dtype=np.intp), change
         turning, signs = branches(full.motor_deg, start)
         turns = np.array(turning[1:-1], dtype=np.intp)
-        if not signs:
-            return turns, change
         count = full.reading.resolution_deg if full.commanded else CHATTER_COUNTS * full.reading.unaided_deg
         beyond = (COUNTS * count + missed_deg(full.motor_deg, turns)) * np.array(signs[:-1])
-        later, earlier, over = (full.motor_deg.copy() for _ in range(3))
+        later, earlier = full.motor_deg.copy(), full.motor_deg.copy()
         later[turns] += beyond
         earlier[turns - 1] = full.motor_deg[turns] + beyond
-        # A motor that overshoots a stop by less than chatter turns twice, unseen.
-        stops = np.flatnonzero(np.diff((full.speed_deg_s == 0.0).astype(np.int8)) > 0) + 1
-        leg = np.clip(np.searchsorted(turning, stops) - 1, 0, len(signs) - 1)
-        over[stops] += COUNTS * CHATTER_COUNTS * full.reading.resolution_deg * np.array(signs)[leg]
-        for moved in (later, earlier, over):
+        for moved in (later, earlier):
             motion = replace(full.motion, motor_deg=moved)
             moved_by = sum(each.predict(motion, start) - each.predict(full.motion, start) for each in loops)
             change = np.where(np.abs(moved_by) > np.abs(change), moved_by, change)

@@ -193,14 +193,6 @@ class Nuisances:
     names: tuple[str, ...]
     prior: tuple[Prior, ...]
 
-    def strain(self, coefficients: FloatArray) -> float:
-        """Returns the squared distance of the coefficients from their priors, standard deviations squared.
-
-        Further coefficients belong to other columns.
-        """
-        pairs = zip(self.prior, coefficients.tolist(), strict=False)
-        return float(sum(each.information * (value - each.mean) ** 2 for each, value in pairs))
-
     def and_also(self, other: Nuisances) -> Nuisances:
         """Returns these columns followed by others."""
         return Nuisances(

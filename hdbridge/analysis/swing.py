@@ -9,7 +9,7 @@ subtracted. Samples in which the uncertainty of the swing is too large are left 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.linalg import solve_banded
+from scipy.linalg import solve_banded, solve_triangular
 from scipy.linalg.blas import dtbsv
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import minimize
@@ -158,14 +158,16 @@ def slow_base(full: Samples, error: FloatArray, fast: Sequence[_Fast]) -> FloatA
     return np.asarray(base)
 
 
-def between_samples(full: Samples, effects: Sequence[Effect], period_s: float) -> Nuisances:
+def between_samples(full: Samples, effects: Sequence[Effect], period_s: float, scales: Scales) -> Nuisances:
     """Returns the swing that depends on the motion between samples, for each sample, arcsec, shape (n, k).
 
     A drive that follows its command in straight lines, or with a ripple of its own, accelerates between
     samples as no spline through them shows. The load's response at the samples is a filter of their second
-    differences: one column for a steady acceleration, and one for each other of `LAGS` less that.
+    differences: one column for a steady acceleration, and one for each other of `LAGS` less that. Without
+    columns if they explain little of the residual of the given model, or more than such a load can.
     """
-    base = slow_base(full, best_error(full, effects), [*_fast_waves(full, effects, period_s)])
+    error = best_error(full, effects)
+    base = slow_base(full, error, [*_fast_waves(full, effects, period_s)])
     even = np.abs(np.diff(full.time_s) / period_s - 1.0) < UNEVEN
     columns = np.zeros((len(full), len(LAGS)))
     for rows in (each.rows for each in full.chains if each.rows.stop - each.rows.start > 2):
@@ -174,9 +176,36 @@ def between_samples(full: Samples, effects: Sequence[Effect], period_s: float) -
         columns[rows] = sliding_window_view(np.pad(bend, (-LAGS.start, LAGS.stop - 1)), len(LAGS))
     now = LAGS.index(0)
     columns[:, np.arange(len(LAGS)) != now] -= columns[:, [now]]
+    sizes = np.array([UNRESOLVED if each else STATIC_S2 / period_s**2 for each in LAGS])
     names = tuple(f"between samples {each}" for each in LAGS)
-    sizes = [STATIC_S2 / period_s**2 if each == 0 else UNRESOLVED for each in LAGS]
-    return Nuisances(columns, names, tuple(Prior(0.0, each**-2) for each in sizes))
+    nothing = Nuisances(columns[:, :0], (), ())
+    found = Nuisances(columns, names, tuple(Prior(0.0, each**-2) for each in sizes.tolist()))
+    every, left = slice(0, len(full)), full.error_arcsec - error
+    (whole, _), (rest, sought) = (_beside(full, each, every)(left) for each in (nothing, found))
+    strain = float(np.sum((sought / sizes) ** 2))  # of a load that is not too stiff for the sampling
+    return found if _seen(whole, rest, len(names), scales) and strain < scales.enter else nothing
+
+
+def _beside(
+    full: Samples, nuisances: Nuisances, rows: slice
+) -> Callable[[FloatArray], tuple[float, FloatArray]]:
+    """Returns a function of a residual: its chi square in some rows after a fit, and the nuisances."""
+    root = np.sqrt(full.usable[rows]) / full.sigma_arcsec[rows]
+    columns = zeros(full.zero[rows], full.zeros).and_also(replace(nuisances, columns=nuisances.columns[rows]))
+    held = np.diag(np.sqrt([each.information for each in columns.prior]))
+    q, r = np.linalg.qr(np.vstack([root[:, np.newaxis] * columns.columns, held]))
+
+    def fitted(left_arcsec: FloatArray) -> tuple[float, FloatArray]:
+        left = root * left_arcsec
+        moment = q[: len(root)].T @ left
+        found = solve_triangular(r, moment)
+        return float(left @ left - moment @ moment), found[full.zeros :]
+
+    return fitted
+
+
+def _seen(whole: float, rest: float, parameters: int, scales: Scales) -> bool:
+    return whole - rest >= max(scales.enter + parameters * scales.penalty, LEAST_SEEN * whole)
 
 
 def seen_swing(full: Samples, effects: Sequence[Effect], between: Nuisances, scales: Scales) -> Swing | None:
@@ -184,7 +213,6 @@ def seen_swing(full: Samples, effects: Sequence[Effect], between: Nuisances, sca
 
     It has to explain what ``between``, the motion between samples, does not.
     """
-    weight = full.usable / full.sigma_arcsec**2
     step_s, parts = np.maximum(np.diff(full.time_s), 1e-9), [each.rows for each in full.chains]
     residual = full.error_arcsec - best_error(full, effects)
     fast = [*_fast_waves(full, effects, float(np.median(step_s)))]
@@ -194,28 +222,20 @@ def seen_swing(full: Samples, effects: Sequence[Effect], between: Nuisances, sca
     rows = slice(begin, min(begin + LONGEST, len(full)))
     first = [0, *(each.start - begin for each in parts if rows.start < each.start < rows.stop)]
     inside = [each.within(rows) for each in fast]
-    root = np.sqrt(weight[rows])
-    others = zeros(full.zero[rows], full.zeros).and_also(replace(between, columns=between.columns[rows]))
-    held = np.diag(np.sqrt([each.information for each in others.prior]))
-    explained = np.linalg.qr(np.vstack([root[:, np.newaxis] * others.columns, held]))[0][: len(root)]
-
-    def cost(left: FloatArray) -> float:
-        left = root * left
-        return float(left @ left - np.sum((explained.T @ left) ** 2))
+    beside = _beside(full, between, rows)
 
     def tried(hertz: float, damping: float) -> float:
         damping = min(damping, MOST_DAMPED)
         one = swing(bend[rows], step_s[rows.start : rows.stop - 1], first, hertz, damping)
         for each in inside:
             one.does_arcsec[each.rows] += each.does(hertz, damping).real
-        return cost(residual[rows] - one.does_arcsec)
+        return beside(residual[rows] - one.does_arcsec)[0]
 
     start = min(product(HERTZ.tolist(), DAMPING), key=lambda each: tried(*each))
     found = minimize(
         lambda x: tried(*np.exp(x).tolist()), np.log(start), method="Nelder-Mead", options={"maxfev": REFINED}
     )
-    whole = cost(residual[rows])
-    if whole - found.fun < max(scales.enter + 2.0 * scales.penalty, LEAST_SEEN * whole):
+    if not _seen(beside(residual[rows])[0], found.fun, 2, scales):
         return None
     hertz, damping = np.exp(found.x).tolist()
     damping = min(damping, MOST_DAMPED)

@@ -140,7 +140,7 @@ async def test_a_stream_follows_its_set_points(service: Service) -> None:
         times = service.daemon.period_s * np.arange(len(moving))
         wanted = np.interp(times, [each.time_s for each in points], [each.position_deg for each in points])
         assert np.max(np.abs(moving - wanted)) < 0.01  # the cubic is not the chord
-        with pytest.raises(RefusedError, match="over"):
+        with pytest.raises(RefusedError, match="ended"):
             await stream.put([point(9.0, 0.0)])
 
 
