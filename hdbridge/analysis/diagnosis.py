@@ -40,7 +40,7 @@ from hdbridge.analysis.search import (
     waves_alike,
     with_measured,
 )
-from hdbridge.analysis.swing import Swing, between_samples, seen_swing, settled, without
+from hdbridge.analysis.swing import Base, Swing, between_samples, seen_swing, settled, without
 from hdbridge.analysis.unexplained import (
     Rest,
     is_unexplained,
@@ -101,12 +101,13 @@ def diagnose(
     )
     scales = scales or Scales()
     progress("searching for causes")
-    between = between_samples(data.full, model.effects, data.period_s, scales)
-    swing = seen_swing(data.full, model.effects, between, scales)
+    base = Base.of(data, model.effects)
+    between = between_samples(base, scales)
+    swing = seen_swing(base, between, scales)
     search, found = _searched(data, model, scales, between, swing)
     if swing is None:  # a larger cause may hide it; wind-up in acceleration is its slow part
         others = [each for each in found.hypothesis.effects if each.channels != {Channel.ACCELERATION}]
-        swing = seen_swing(data.full, others, between, scales)
+        swing = seen_swing(Base.of(data, others), between, scales)
         if swing is not None:
             search, found = _searched(data, model, scales, between, swing)
     progress("judging what was found")
@@ -121,9 +122,7 @@ def _searched(
     if swing is not None:
         data = without(data, swing)
     if swing is not None and swing.soft:
-        search = _search(
-            data, model, scales, replace(between, columns=between.columns[:, :0], names=(), prior=())
-        )
+        search = _search(data, model, scales, between.without(lambda _: True))
     else:
         search = _search(data, model, scales, between)
         search = _search(settled(search.estimator, search.begun(), swing), model, scales, between)
@@ -142,8 +141,7 @@ def _search(data: Observed, model: TransmissionModel, scales: Scales, between: N
         model.effects, model.uncertainty, lambda effect: estimator.columns(effect, Start.VIRGIN), scales
     )
     between = replace(between, columns=estimator.at_points(between.columns))
-    begins = estimator.begins_of(model.effects)
-    estimator.unknown = between if begins is None else between.and_also(begins)
+    estimator.unknown = estimator.unknown.and_also(between).and_also(estimator.begins_of(model.effects))
     return Search(estimator, model.effects)
 
 
@@ -160,8 +158,8 @@ def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Judged:
-    judged: Fitted
-    """Fit with the effects of the findings."""
+    whole: Fitted
+    """Fit with any free-form loop."""
     fitted: Fitted
     """Fit without a free-form loop."""
     findings: list[Finding]
@@ -197,7 +195,7 @@ class _Judge:
             if not lost:
                 break
             self.considered.extend(f"{each.cause}: {LOSES}" for each in lost)
-            fitted = self._without(judged.judged, lost)
+            fitted = self._without(judged.whole, lost)
         known = {each.cause for each in findings} | {each.split(":")[0] for each in self.considered}
         refused = self.search.reported_refusals(judged.fitted)
         self.considered.extend(each for each in refused if each.split(":")[0] not in known)
@@ -357,14 +355,14 @@ class _Judge:
         findings.sort(key=lambda each: -each.robust)
         excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
         # A model cannot contain a free-form loop, so the figures exclude it.
-        judged, fitted = fitted, estimator.fit(replace(fitted.hypothesis, nuisances=None))
+        whole, fitted = fitted, estimator.fit(replace(fitted.hypothesis, nuisances=None))
         left = rest(estimator, fitted)
         unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
         context = Context(left.arcsec, excess, unknown)
         findings = weighed(findings, context, estimator.scales, self.prior)
         if estimator.data.reversals < 2:  # speed, torque, place and time are correlated
             findings = [self._one_way(each) for each in findings]
-        return _Judged(judged, fitted, findings, left, context)
+        return _Judged(whole, fitted, findings, left, context)
 
     def _one_way(self, finding: Finding) -> Finding:
         """Limits the probability of a cause seen in one direction only."""

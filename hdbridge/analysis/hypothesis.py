@@ -154,8 +154,8 @@ class Estimator:
         """Sign of the loop's offset; -1 if the load lags."""
         self.calibrated: tuple[CalibratedPart, ...] = ()
         """Priors from the calibration for the first effects of each hypothesis."""
-        self.unknown: Nuisances | None = None
-        """Nuisance columns of every hypothesis: motion between samples, elastic states at the start."""
+        self.unknown: Nuisances = zeros(self.zero, data.full.zeros)
+        """Nuisances of every hypothesis: zeros, motion between samples, elastic states at the start."""
 
     @property
     def motion(self) -> Motion:
@@ -275,8 +275,8 @@ class Estimator:
             result[rows] = np.minimum(begun[rows], begun[first] - begun[rows])
         return result
 
-    def begins_of(self, effects: Sequence[Effect]) -> Nuisances | None:
-        """Returns a column for the elastic state at the start of each part; None without a loop.
+    def begins_of(self, effects: Sequence[Effect]) -> Nuisances:
+        """Returns a column for the elastic state at the start of each part; none without a loop.
 
         The state lies anywhere between saturation in one direction and in the other.
         """
@@ -286,10 +286,9 @@ class Estimator:
                 column = np.zeros(len(change))
                 column[chain.rows] = change[chain.rows]
                 columns.append(self.at_points(column))
-        if not columns:
-            return None
         names = tuple(f"state {each}" for each in range(len(columns)))
-        return Nuisances(np.stack(columns, axis=1), names, (Prior(0.0, 1.0),) * len(names))
+        found = np.array(columns).reshape(len(columns), len(self.index)).T
+        return Nuisances(found, names, (Prior(0.0, 1.0),) * len(names))
 
     def free_loop(self, start: Start) -> Nuisances:
         """Returns a free-form hysteresis: stop operators of `STOPS_DEG`, which form any loop shape."""
@@ -382,11 +381,9 @@ class Estimator:
         )
 
     def _nuisances(self, hypothesis: Hypothesis) -> Nuisances:
-        """Returns the columns of the zeros and of the hypothesis's own nuisances."""
-        own = zeros(self.zero, self.data.full.zeros)
-        if self.unknown is not None:
-            own = own.and_also(self.unknown)
-        return own if hypothesis.nuisances is None else own.and_also(hypothesis.nuisances)
+        """Returns the columns of every hypothesis and this hypothesis's own nuisances."""
+        own = hypothesis.nuisances
+        return self.unknown if own is None else self.unknown.and_also(own)
 
     def _sign(self, effect: Effect) -> float:
         """Returns the sign required of an effect's coefficients; 0 for either sign."""

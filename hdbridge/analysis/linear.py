@@ -122,7 +122,7 @@ def sandwich(influence: FloatArray, number: IntArray) -> FloatArray:
 
 
 def about_zeros(left_arcsec: FloatArray, zero: IntArray, weight: FloatArray) -> FloatArray:
-    """Subtracts the weighted mean of each absolute zero from a residual (n,); 0 without weight."""
+    """Subtracts the weighted mean of each absolute zero from a residual (n,); unchanged without weight."""
     total, weights = np.bincount(zero, weight * left_arcsec), np.bincount(zero, weight)
     return np.asarray(left_arcsec - (total / np.maximum(weights, 1e-300))[zero])
 
@@ -203,7 +203,7 @@ class Nuisances:
 
     def without(self, left_out: Callable[[str], bool]) -> Nuisances:
         """Returns the columns for whose names ``left_out`` returns False."""
-        keep = np.array([not left_out(each) for each in self.names])
+        keep = np.array([not left_out(each) for each in self.names], dtype=np.bool_)
         return Nuisances(
             self.columns[:, keep], tuple(compress(self.names, keep)), tuple(compress(self.prior, keep))
         )

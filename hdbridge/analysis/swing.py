@@ -137,28 +137,40 @@ def bend_of(base_arcsec: FloatArray, step_s: FloatArray, parts: Sequence[slice])
     return np.asarray(solve_banded((1, 1), band, right, check_finite=False))
 
 
-def best_error(full: Samples, effects: Sequence[Effect]) -> FloatArray:
-    """Returns the error of the effects from the elastic start that fits best, arcsec, shape (n,)."""
-    weight = full.usable / full.sigma_arcsec**2
+@dataclass(frozen=True, slots=True, eq=False)
+class Base:
+    """Base of the spring: the motor behind the ratio, and the error of effects."""
 
-    def cost(error: FloatArray) -> float:
-        return float(weight @ about_zeros(full.error_arcsec - error, full.zero, weight) ** 2)
+    full: Samples
+    period_s: float
+    residual_arcsec: FloatArray
+    """Measured error less that of the effects, shape (n,)."""
+    slow_arcsec: FloatArray
+    """Angle of the base, load arcsec, without the waves too fast for a spline, shape (n,)."""
+    fast: tuple[_Fast, ...]
 
-    errors = (
-        sum((each.predict(full.motion, start) for each in effects), np.zeros(len(full))) for start in Start
-    )
-    return np.asarray(min(errors, key=cost))
+    @classmethod
+    def of(cls, data: Observed, effects: Sequence[Effect]) -> Base:
+        """Returns the base of these effects, from the elastic start that fits best."""
+        full = data.full
+        weight = full.usable / full.sigma_arcsec**2
+
+        def cost(error: FloatArray) -> float:
+            return float(weight @ about_zeros(full.error_arcsec - error, full.zero, weight) ** 2)
+
+        errors = (
+            sum((each.predict(full.motion, start) for each in effects), np.zeros(len(full)))
+            for start in Start
+        )
+        error = min(errors, key=cost)
+        fast = tuple(_fast_waves(full, effects, data.period_s))
+        slow = ARCSEC_PER_DEG / full.ratio * full.motor_deg + error
+        for each in fast:
+            slow[each.rows] -= each.phasor.real
+        return cls(full, data.period_s, full.error_arcsec - error, slow, fast)
 
 
-def slow_base(full: Samples, error: FloatArray, fast: Sequence[_Fast]) -> FloatArray:
-    """Returns the base of the spring, load arcsec, shape (n,), without the waves too fast for a spline."""
-    base = ARCSEC_PER_DEG / full.ratio * full.motor_deg + error
-    for each in fast:
-        base[each.rows] -= each.phasor.real
-    return np.asarray(base)
-
-
-def between_samples(full: Samples, effects: Sequence[Effect], period_s: float, scales: Scales) -> Nuisances:
+def between_samples(base: Base, scales: Scales) -> Nuisances:
     """Returns the swing that depends on the motion between samples, for each sample, arcsec, shape (n, k).
 
     A drive that follows its command in straight lines, or with a ripple of its own, accelerates between
@@ -166,22 +178,22 @@ def between_samples(full: Samples, effects: Sequence[Effect], period_s: float, s
     differences: one column for a steady acceleration, and one for each other of `LAGS` less that. Without
     columns if they explain little of the residual of the given model, or more than such a load can.
     """
-    error = best_error(full, effects)
-    base = slow_base(full, error, [*_fast_waves(full, effects, period_s)])
-    even = np.abs(np.diff(full.time_s) / period_s - 1.0) < UNEVEN
+    full = base.full
+    even = np.abs(np.diff(full.time_s) / base.period_s - 1.0) < UNEVEN
     columns = np.zeros((len(full), len(LAGS)))
     for rows in (each.rows for each in full.chains if each.rows.stop - each.rows.start > 2):
         alike = even[rows.start : rows.stop - 1]
-        bend = np.pad(np.diff(base[rows], 2) * (alike[1:] & alike[:-1]), 1)
+        bend = np.pad(np.diff(base.slow_arcsec[rows], 2) * (alike[1:] & alike[:-1]), 1)
         columns[rows] = sliding_window_view(np.pad(bend, (-LAGS.start, LAGS.stop - 1)), len(LAGS))
     now = LAGS.index(0)
     columns[:, np.arange(len(LAGS)) != now] -= columns[:, [now]]
-    sizes = np.array([UNRESOLVED if each else STATIC_S2 / period_s**2 for each in LAGS])
+    sizes = np.array([UNRESOLVED if each else STATIC_S2 / base.period_s**2 for each in LAGS])
     names = tuple(f"between samples {each}" for each in LAGS)
-    nothing = Nuisances(columns[:, :0], (), ())
     found = Nuisances(columns, names, tuple(Prior(0.0, each**-2) for each in sizes.tolist()))
-    every, left = slice(0, len(full)), full.error_arcsec - error
-    (whole, _), (rest, sought) = (_beside(full, each, every)(left) for each in (nothing, found))
+    nothing, every = found.without(lambda _: True), slice(0, len(full))
+    (whole, _), (rest, sought) = (
+        _beside(full, each, every)(base.residual_arcsec) for each in (nothing, found)
+    )
     strain = float(np.sum((sought / sizes) ** 2))  # of a load that is not too stiff for the sampling
     return found if _seen(whole, rest, len(names), scales) and strain < scales.enter else nothing
 
@@ -208,20 +220,19 @@ def _seen(whole: float, rest: float, parameters: int, scales: Scales) -> bool:
     return whole - rest >= max(scales.enter + parameters * scales.penalty, LEAST_SEEN * whole)
 
 
-def seen_swing(full: Samples, effects: Sequence[Effect], between: Nuisances, scales: Scales) -> Swing | None:
-    """Fits the swing to the residual of the given model; None if nothing of it is seen.
+def seen_swing(base: Base, between: Nuisances, scales: Scales) -> Swing | None:
+    """Fits the swing to the residual of the base's effects; None if no swing is seen.
 
     It has to explain what ``between``, the motion between samples, does not.
     """
+    full, residual = base.full, base.residual_arcsec
     step_s, parts = np.maximum(np.diff(full.time_s), 1e-9), [each.rows for each in full.chains]
-    residual = full.error_arcsec - best_error(full, effects)
-    fast = [*_fast_waves(full, effects, float(np.median(step_s)))]
-    bend = bend_of(slow_base(full, full.error_arcsec - residual, fast), step_s, parts)
+    bend = bend_of(base.slow_arcsec, step_s, parts)
     size = np.concatenate([[0.0], np.cumsum(bend**2)])
     begin = int(np.argmax(size[LONGEST:] - size[:-LONGEST])) if len(full) > LONGEST else 0
     rows = slice(begin, min(begin + LONGEST, len(full)))
     first = [0, *(each.start - begin for each in parts if rows.start < each.start < rows.stop)]
-    inside = [each.within(rows) for each in fast]
+    inside = [each.within(rows) for each in base.fast]
     beside = _beside(full, between, rows)
 
     def tried(hertz: float, damping: float) -> float:
@@ -240,7 +251,7 @@ def seen_swing(full: Samples, effects: Sequence[Effect], between: Nuisances, sca
     hertz, damping = np.exp(found.x).tolist()
     damping = min(damping, MOST_DAMPED)
     seen = swing(bend, step_s, [each.start for each in parts], hertz, damping)
-    for each in fast:
+    for each in base.fast:
         does = each.does(hertz, damping)
         seen.does_arcsec[each.rows] += does.real
         seen.waves_arcsec2[each.rows] += np.abs(does) ** 2
