@@ -62,6 +62,7 @@ class MotorOrders:
     _flanked: bool
     _growth_per_nm: float
     _orders: Orders
+    _rad_per_deg: float
     _turns: float
 
     def __init__(
@@ -74,6 +75,7 @@ class MotorOrders:
     ) -> None:
         self._orders = Orders(orders)
         self._turns = turns
+        self._rad_per_deg = math.radians(turns)
         self._growth_per_nm = growth_per_nm
         self._flanked = flank is not None
         self._flank = Flank(flank if flank is not None else TrueFlank(shift_deg=0.0, travel_deg=1.0))
@@ -87,7 +89,7 @@ class MotorOrders:
         size = 1.0
         for factor in self._factors:
             size *= factor.factor(now)
-        error, slope = self._orders.at(angle_deg * math.radians(self._turns))
+        error, slope = self._orders.at(angle_deg * self._rad_per_deg)
         grown = self._growth_per_nm * abs(now.torque_nm)
         # The energy stored by torque T in an error that grows with it is half of that product; see `plant`.
         now.slope_arcsec += slope * self._turns * (1.0 + 0.5 * grown) * size

@@ -4,8 +4,8 @@ The blocks in order: moving average and two lags of the demand, position P, velo
 (whose integral may sum the position error instead: PIV), feed-forwards, disturbance observer, notch, torque
 filter, limit.
 
-Like real drives of this class, it closes its loops on an interpolated encoder, so a settled motor stands in
-the middle of the commanded count rather than anywhere within it.
+Like real drives of this class, it closes its loops on an interpolated encoder, so a settled motor is in the
+middle of the commanded count and not anywhere within it.
 """
 
 import math
