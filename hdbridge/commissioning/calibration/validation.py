@@ -190,14 +190,11 @@ def validate(
         ("after", "the new model"),
     ):
         pace.begin(f"stepping {name}")
-        compensation = compensation_for(axis, model)
-        bench = bench_on(drive, compensation, interrupted=pace.interrupted)
+        bench = bench_on(drive, compensation_for(axis, model), interrupted=pace.interrupted)
         with record_kept(bench, folder / f"stepping-{name}.csv.gz"):
             run = bench.run(stepping)
             results.append(Stepped.of(words, run.outcome))
             survived.append((f"stepping {name}", run.survived))
-        if name == "before":
-            after = at_rest(after, run)
         if positioning:
             pace.begin(f"positioning {name}")
             with record_kept(bench, folder / f"positioning-{name}.csv.gz"):
@@ -211,10 +208,11 @@ def validate(
                     [each.forward for each in approaches],
                 )
             )
-        model = after
+        if name == "before":
+            model = at_rest(after, run)
     accurate = (accuracies[0], accuracies[1]) if accuracies else (None, None)
     validation = Validation(results[0], results[1], floor, accurate[0], accurate[1], tuple(lines(survived)))
-    return validation, after
+    return validation, model
 
 
 def at_rest(model: TransmissionModel, run: Run[SteppingOutcome]) -> TransmissionModel:
