@@ -94,8 +94,8 @@ class Driven(NamedTuple):
     speed_deg_s: FloatArray
     acceleration_deg_s2: FloatArray
     rested_deg: FloatArray
-    """Motor angle on the assumption that the resting motor stands in the middle of its counts rather than as
-    close to the command as the counts allow. Without a command, the plain angle."""
+    """Motor angle if a resting motor is in the middle of its count, not as close to the command as the count
+    allows. Without a command, the plain angle."""
 
 
 def reading_of_all(angle_deg: FloatArray, parts: Sequence[slice]) -> Reading:

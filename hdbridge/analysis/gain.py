@@ -160,7 +160,7 @@ def of_written(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Parts:
-    """What repeats in a record, and is left out in turn."""
+    """Repetitions in a record, each of which is left out in turn."""
 
     estimator: Estimator
     stretch: IntArray

@@ -366,8 +366,8 @@ class Answers:
     """Motor and load responses to the filtered correction in runs at constant speed, relative to the stored
     response.
 
-    They are kept by order and nearest frequency of the response, so many slow runs do not displace a few fast
-    ones.
+    They are stored by order and nearest frequency of the response, so that a few fast runs are not displaced
+    by many slow runs.
     """
 
     def __init__(

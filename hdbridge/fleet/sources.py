@@ -198,7 +198,7 @@ def _marks_of(paths: Collection[str], timeout_s: float) -> dict[str, str]:
 def _listing(place: str, timeout_s: float) -> dict[str, str]:
     """Returns all files at or below a place (folder, glob, file or URL), each with its mark: size and times.
 
-    InputError if there are none.
+    InputError if no file is found.
     """
     if "://" not in place:
         place = os.path.abspath(place)  # noqa: PTH100 - workers run in another folder

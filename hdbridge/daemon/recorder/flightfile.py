@@ -2,7 +2,7 @@
 
 Messages collect in a chunk in memory; `flush` writes the chunk and syncs it to the disk. An unfinished file
 has all its chunks but no index; `mend` rewrites it as a finished file. Until it is finished, its name ends in
-``.part`` and its writer holds a lock on it. Each file is complete by itself: it contains the description of
+``.part`` and its writer holds a lock on it. Each file is self-contained, with the description of
 the machine (`About`) and the models in use.
 """
 
