@@ -131,7 +131,7 @@ def test_most_likely_key_is_reported_first(
         f"{key}: found {said[(RATIO, MOTOR_COUNTS, LOAD_COUNTS).index(key)]}, expected {expected} "
         in (verdict.remedies[0])
     )
-    assert len(verdict.remedies) == 3  # the others are told as well
+    assert len(verdict.remedies) == 3  # the others are reported as well
 
 
 @given(factor=st.floats(0.05, 20.0))
@@ -220,9 +220,9 @@ def test_checks_run_in_order_with_their_prerequisites() -> None:
         Check("d", "D", lambda _: failed("bad", "do this"), ("a",), moves=True),
         Check("e", "E", lambda _: passed("never"), moves=True),
     ]
-    told: list[str] = []
-    rows = run_checks(None, checks, notify=lambda row: told.append(row.check.name))
-    assert told == list("abcde")
+    reported: list[str] = []
+    rows = run_checks(None, checks, notify=lambda row: reported.append(row.check.name))
+    assert reported == list("abcde")
     assert [row.verdict.outcome.value for row in rows] == ["pass", "fail", "not possible", "fail", "pass"]
     assert rows[1].verdict.measured == "no answer"
     assert "'B'" in rows[2].verdict.measured

@@ -202,7 +202,7 @@ def cell(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
         yield cell
 
 
-def told(cell: Cell) -> str:
+def described(cell: Cell) -> str:
     """Returns the hidden cause and the findings, for the message of a failure."""
     hidden = "; ".join(each.text for each in cell.hidden) or "nothing"
     findings = cell.diagnosis.findings
@@ -220,10 +220,10 @@ def test_only_hidden_causes_are_named(cell: Cell) -> None:
     there = hidden.union(*(each.brings for each in cell.hidden))
     named = [{each.cause, *each.aliases} for each in cell.diagnosis.findings]
     for cause in hidden:
-        assert any(cause in each for each in named), told(cell)
+        assert any(cause in each for each in named), described(cell)
     for finding in named:
-        assert finding & there, told(cell)
-    assert len(named) <= len(there), told(cell)
+        assert finding & there, described(cell)
+    assert len(named) <= len(there), described(cell)
 
 
 @pytest.mark.parametrize("cell", of(SINGLE | PAIRS), indirect=True)
@@ -232,18 +232,18 @@ def test_the_extended_model_restores_accuracy_or_explains(cell: Cell) -> None:
     left = {each.cause for each in cell.hidden if not CATALOGUE[each.cause].compensable.possible}
     for cause in left:
         reason = f"{cause} is not compensated: {CATALOGUE[cause].compensable.why}"
-        assert reason in extension.left, told(cell)
+        assert reason in extension.left, described(cell)
     if left:
         return
     residual, floor = cell.step(extension.model), cell.floor_arcsec
     most = MOST_OF_FLOOR_WORN if any(each.cause == "wear" for each in cell.hidden) else MOST_OF_FLOOR
-    assert residual < most * floor, f"{residual:.2f} over a floor of {floor:.2f}; {told(cell)}"
+    assert residual < most * floor, f"{residual:.2f} over a floor of {floor:.2f}; {described(cell)}"
 
 
 @pytest.mark.xfail(reason="unexplained 0.93 leads in place of zero_drift; cause not found yet")
 @pytest.mark.parametrize("cell", of(LAGGING), indirect=True)
 def test_a_zero_that_follows_its_sensor_slowly_is_named_with_its_lag(cell: Cell) -> None:
-    assert [each.cause for each in cell.diagnosis.findings] == ["zero_drift"], told(cell)
+    assert [each.cause for each in cell.diagnosis.findings] == ["zero_drift"], described(cell)
     lag = cell.diagnosis.findings[0].parameters["tau_s"]
     assert lag.low < 60.0 < lag.high
 
@@ -260,7 +260,7 @@ def test_the_command_says_the_same_of_the_recording_folder(cell: Cell, tmp_path:
 
 @pytest.mark.parametrize("cell", of(NONE), indirect=True)
 def test_nothing_is_found_if_nothing_is_hidden(cell: Cell) -> None:
-    assert not cell.diagnosis.findings, told(cell)
+    assert not cell.diagnosis.findings, described(cell)
     extension = extension_of(cell.diagnosis, TransmissionModel.load(cell.model))
     assert cell.step(extension.model) < MOST_OF_FLOOR * cell.floor_arcsec
 
@@ -268,14 +268,14 @@ def test_nothing_is_found_if_nothing_is_hidden(cell: Cell) -> None:
 @pytest.mark.parametrize("cell", of(OTHER_LAW), indirect=True)
 def test_another_law_of_the_loop_is_called_that_and_nothing_else(cell: Cell) -> None:
     named = {each.cause for each in cell.diagnosis.findings}
-    assert named & {"hysteresis_parameters", "hysteresis_memory", "unexplained"}, told(cell)
-    assert not named - {"hysteresis_parameters", "hysteresis_memory", "unexplained"}, told(cell)
+    assert named & {"hysteresis_parameters", "hysteresis_memory", "unexplained"}, described(cell)
+    assert not named - {"hysteresis_parameters", "hysteresis_memory", "unexplained"}, described(cell)
 
 
 @pytest.mark.parametrize("cell", of(UNKNOWN), indirect=True)
 def test_unknown_causes_are_unexplained_with_their_coordinate(cell: Cell) -> None:
     findings = cell.diagnosis.findings
-    assert [each.cause for each in findings] == ["unexplained"], told(cell)
+    assert [each.cause for each in findings] == ["unexplained"], described(cell)
     assert findings[0].lives_in
 
 

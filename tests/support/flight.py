@@ -64,10 +64,12 @@ class Clock:
         return self.ns
 
 
-def flight_log(folder: Path, told: list[str] | None = None, free: Any = None, axes: int = 1, **limits: float):
+def flight_log(
+    folder: Path, reported: list[str] | None = None, free: Any = None, axes: int = 1, **limits: float
+):
     """Returns the recorder without its thread, and its clock."""
     clock = Clock()
     settings = RecorderSettings(**{"free_mb": 0.0, **limits})
-    notify = told.append if told is not None else (lambda _: None)
+    notify = reported.append if reported is not None else (lambda _: None)
     free = free or (lambda _: ROOM)
     return FlightLog(folder, settings, about(axes), notify=notify, wall_ns=clock, free=free), clock

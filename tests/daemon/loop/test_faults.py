@@ -89,24 +89,24 @@ def test_a_fault_is_one_event_and_not_one_per_cycle(
 ) -> None:
     moving(enabled)
     happens(enabled)
-    told = [each.id for each in enabled.reported(E.FAULT) if each.code == FAULT_INDEX[fault]]
-    assert told == reactions
+    reported = [each.id for each in enabled.reported(E.FAULT) if each.code == FAULT_INDEX[fault]]
+    assert reported == reactions
     enabled.run(1.5)
     if enabled.states == [S.QUICK_STOPPED]:
         enabled.done(K.RESET)
         enabled.until(lambda: enabled.states == [S.DISABLED])
     happens(enabled)
     again = [each.id for each in enabled.reported(E.FAULT) if each.code == FAULT_INDEX[fault]]
-    assert again[: len(told)] == told
-    assert again[len(told) :] == reactions
+    assert again[: len(reported)] == reported
+    assert again[len(reported) :] == reactions
 
 
 def test_emergencies_with_different_codes_are_all_reported(enabled: SteppedDaemon) -> None:
     for number in range(200):
         enabled.interfere(0x081, struct.pack("<HBB4x", (0x3110, 0x4210, 0x8110)[number % 3], 1, number))
         enabled.turn()
-    told = [each.text for each in enabled.reported(E.FAULT) if each.code == FAULT_INDEX[Fault.EMERGENCY]]
-    assert [each[5:10] for each in told] == ["3110h", "4210h", "8110h"]
+    reported = [each.text for each in enabled.reported(E.FAULT) if each.code == FAULT_INDEX[Fault.EMERGENCY]]
+    assert [each[5:10] for each in reported] == ["3110h", "4210h", "8110h"]
     assert enabled.states == [S.ENABLED]
 
 

@@ -279,7 +279,7 @@ def test_a_jog_runs_out_when_the_service_dies(moving: DaemonBench) -> None:
     daemon.done(K.JOG, 0, a=10.0 * direction, b=0.5)
     turns = 0
     while not axis.set_point.at_rest:
-        daemon.controller.turn()  # nobody reads what is told, nobody posts
+        daemon.controller.turn()  # nobody reads events, nobody posts
         turns += 1
     daemon.run(0.5)
     assert daemon.states[0] is S.ENABLED
@@ -287,8 +287,8 @@ def test_a_jog_runs_out_when_the_service_dies(moving: DaemonBench) -> None:
 
 
 def test_a_full_disk_does_not_disturb_the_loop(moving: DaemonBench, tmp_path: Path) -> None:
-    told: list[str] = []
-    recorder = FlightRecorder(tmp_path / "flights", about(2), notify=told.append, free=lambda _: 0)
+    reported: list[str] = []
+    recorder = FlightRecorder(tmp_path / "flights", about(2), notify=reported.append, free=lambda _: 0)
 
     async def story() -> None:
         async with moving.service.bridge() as bridge:
@@ -298,7 +298,7 @@ def test_a_full_disk_does_not_disturb_the_loop(moving: DaemonBench, tmp_path: Pa
 
     play(story())
     recorder.close()
-    assert any("nothing is recorded" in each for each in told)
+    assert any("nothing is recorded" in each for each in reported)
     assert recorder.flight.counts.refused >= 200
     assert moving.moves_on(0)
     samples, lost = moving.daemon.samples.read()
