@@ -20,9 +20,9 @@ memory = Memory.attach(int(sys.argv[1]))
 cycle = 0
 while True:
     cycle += 1
+    memory.outer[0].show(OuterView(*(1 + cycle % 2,) * 6))
     # Every number of a sample is the same: a torn one shows.
     memory.samples.append((cycle, cycle, 0.0, 0.0, 0.0, 0, *(0,) * 6, *(float(cycle),) * 15, *(0,) * 5))
-    memory.outer[0].show(OuterView(*(1 + cycle % 2,) * 6))
     if cycle % 16 == 0:
         memory.events.append(Event(0, cycle, cycle, 0, EventKind.DONE, cycle, 0, str(cycle)))
 """
