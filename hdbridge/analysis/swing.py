@@ -201,16 +201,22 @@ def between_samples(base: Base, scales: Scales) -> Nuisances:
 def _beside(
     full: Samples, nuisances: Nuisances, rows: slice
 ) -> Callable[[FloatArray], tuple[float, FloatArray]]:
-    """Returns a function of a residual: its chi square in some rows after a fit, and the nuisances."""
+    """Returns a function of a residual: its chi square in some rows after a fit, and the nuisances.
+
+    A zero without a usable sample in these rows is left out.
+    """
     root = np.sqrt(full.usable[rows]) / full.sigma_arcsec[rows]
     columns = zeros(full.zero[rows], full.zeros).and_also(replace(nuisances, columns=nuisances.columns[rows]))
     held = np.diag(np.sqrt([each.information for each in columns.prior]))
-    q, r = np.linalg.qr(np.vstack([root[:, np.newaxis] * columns.columns, held]))
+    stacked = np.vstack([root[:, np.newaxis] * columns.columns, held])
+    seen = np.any(stacked, axis=0)
+    q, r = np.linalg.qr(stacked[:, seen])
 
     def fitted(left_arcsec: FloatArray) -> tuple[float, FloatArray]:
         left = root * left_arcsec
         moment = q[: len(root)].T @ left
-        found = solve_triangular(r, moment)
+        found = np.zeros(len(seen))
+        found[seen] = solve_triangular(r, moment)
         return float(left @ left - moment @ moment), found[full.zeros :]
 
     return fitted

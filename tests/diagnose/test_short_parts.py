@@ -12,6 +12,7 @@ from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.axis.effects import USUAL_LOOP, Motion, Start, Synchronous
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record, concatenate
+from hdbridge.records.recording import Recording, Segment
 from hdbridge.units import ARCSEC_PER_DEG
 
 
@@ -22,6 +23,23 @@ def test_a_part_of_one_sample_is_accepted(
     record = concatenate([whole, whole.rows(0, 1)])
     result = diagnose(record, model, independent_zeros=True)
     assert result.noise_floor_arcsec > 0.0
+
+
+def test_a_part_that_ends_in_its_fast_move_is_accepted(
+    columns: Callable[..., dict[str, Any]], model: TransmissionModel
+) -> None:
+    """Samples of moves are not used; a run that was interrupted in the first one consists of nothing else."""
+    parts = [
+        Record({name: np.asarray(each)[rows] for name, each in columns({}).items()})
+        for rows in (slice(0, 1500), slice(1500, 1520))
+    ]
+    record = concatenate(parts)
+    fast = Segment(kind="move", start_s=record.time_s[1500], end_s=record.time_s[-1])
+    found, whole = (
+        diagnose(each, model, independent_zeros=True) for each in (Recording(record, (fast,)), parts[0])
+    )
+    assert [each.cause for each in found.findings] == [each.cause for each in whole.findings]
+    assert found.noise_floor_arcsec == pytest.approx(whole.noise_floor_arcsec, rel=0.05)
 
 
 @pytest.mark.parametrize("back_deg", [3.0, 1.5])
