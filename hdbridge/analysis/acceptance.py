@@ -44,20 +44,27 @@ def robust_chi_square(
     rows: BoolArray | slice = slice(None),
     only: int | None = None,
     laws: FloatArray | None = None,
+    free: bool = False,
 ) -> float:
     """Returns the block-robust chi square of an effect's coefficients against zero.
 
-    Leaves out incidental coefficients and refits all other parameters. ``nuisances`` are further
-    weighted columns; ``rows`` restricts the points, ``only`` the coefficients to one number. ``laws`` are
-    weighted columns of one standard deviation each of the errors of other laws.
+    Leaves out incidental coefficients and refits all other parameters. Its own shape, which has no meaning
+    without the effect, is refitted only if ``free``: that tests if the record determines the coefficients.
+    ``nuisances`` are further weighted columns; ``rows`` restricts the points, ``only`` the coefficients to
+    one number. ``laws`` are weighted columns of one standard deviation each of the errors of other laws.
     """
-    own = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
+    own = fitted.places(place)
+    shape = [i for i in own if fitted.parameters[i].shape and not free]
     effect = fitted.hypothesis.effects[place]
     asked = evident(effect) if only is None else [only]
-    own, coefficients = [own[each] for each in asked], effect.coefficients()[asked]
-    columns = fitted.tangent if nuisances is None else np.hstack([fitted.tangent, nuisances])
+    kept = np.setdiff1d(np.arange(fitted.count()), shape)
+    coefficients = effect.coefficients()[asked]
+    own = np.searchsorted(kept, [i for i in own if not fitted.parameters[i].shape])[asked].tolist()
+    columns = side_by_side(
+        [fitted.tangent[:, kept], *([] if nuisances is None else [nuisances])], len(fitted.residual)
+    )
     known = np.zeros((columns.shape[1], 2))
-    known[: fitted.count()] = fitted.linearised.known
+    known[: len(kept)] = fitted.linearised.known[kept]
     fit = Linearised(columns[rows], fitted.residual[rows], known)
     return block_robust(estimator, fit, own, coefficients, rows, laws)
 
@@ -90,13 +97,16 @@ def block_robust(
 def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
     """Tests one finding."""
     effect = fitted.hypothesis.effects[place]
-    needed = estimator.scales.robust + estimator.scales.robust_more * (len(evident(effect)) - 1)
+    shapes = sum(fitted.parameters[each].shape for each in fitted.places(place))
+    needed = estimator.scales.robust + estimator.scales.robust_more * (len(evident(effect)) + shapes - 1)
     laws = law_discrepancies(estimator, fitted.hypothesis.without(place))
     robust = robust_chi_square(estimator, fitted, place, laws=laws)
     if robust < needed:
         if robust_chi_square(estimator, fitted, place) < needed:
             return Gate(robust, needed, "not seen in enough independent stretches")
         return Gate(robust, needed, "may be an error in the law of another cause")
+    if robust_chi_square(estimator, fitted, place, laws=laws, free=True) < needed:
+        return Gate(robust, needed, "the record does not determine its size and shape")
     if effect.tracker().memory_deg > 0.0:
         others = fitted.hypothesis.without(place)
         laws = np.hstack([laws, estimator.turn_discrepancy(others.effects, others.start)])

@@ -105,10 +105,13 @@ def diagnose(
     between = between_samples(base, scales)
     swing = seen_swing(base, between, scales)
     search, found = _searched(data, model, scales, between, swing)
-    if swing is None:  # a larger cause may hide it; wind-up in acceleration is its slow part
+    if swing is None or not between.names:  # a larger cause may hide them
+        # Wind-up in acceleration is the slow part of both.
         others = [each for each in found.hypothesis.effects if each.channels != {Channel.ACCELERATION}]
-        swing = seen_swing(Base.of(data, others), between, scales)
-        if swing is not None:
+        base, before = Base.of(data, others), (between.names, swing)
+        between = between if between.names else between_samples(base, scales)
+        swing = swing or seen_swing(base, between, scales)
+        if (between.names, swing) != before:
             search, found = _searched(data, model, scales, between, swing)
     progress("judging what was found")
     diagnosis = _Judge(search, model, prior).of(found)
@@ -125,7 +128,8 @@ def _searched(
         search = _search(data, model, scales, between.without(lambda _: True))
     else:
         search = _search(data, model, scales, between)
-        search = _search(settled(search.estimator, search.begun(), swing), model, scales, between)
+        calm = settled(search.estimator, search.begun(), model.effects, swing)
+        search = _search(calm, model, scales, between)
     estimator = search.estimator
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from hdbridge.analysis.readings import MOST_JITTER_DEG, Reading, quantum_deg, reading_of, third_deviation
+from hdbridge.analysis.readings import MOST_JITTER_DEG, Reading, quantum_deg, reading_of, trimmed_deviation
 from hdbridge.axis.effects import FloatArray
 
 REVERSAL_DEG = 0.3
@@ -165,15 +165,46 @@ def _driving(
         line = line + uniform_filter1d(rest, 2 * window + 1, mode="nearest")
     # A line that misses its cell says nothing about the place in it: the mean, weighted by their variances.
     read = noise**2 + count**2 / 12.0
-    outside = np.abs(lag - line) > 0.5 * count + noise
+    cell = max(0.5 * count, 3.0 * noise)
+    outside = np.abs(lag - line) > cell
     missed = uniform_filter1d(np.where(outside, (lag - line) ** 2, 0.0), 2 * window + 1, mode="nearest")
     line = lag + (read / (read + missed) if read else 1.0) * (line - lag)
     # A motor that sticks at a reversal or overshoots a stop is where its encoder says.
-    cell = max(0.5 * count, 3.0 * noise)
     line = np.clip(line, lag - cell, lag + cell)
+    mean, flickers = _at_rest(lag, _resting(target, window), window, count, math.sqrt(read))
+    line = np.where(flickers, mean, line)
     # The path may cross its cell without reversing, and the cell moves with a noisy reading.
     band = max(CHATTER_COUNTS * reading.resolution_deg, 4.0 * cell)
     return steadied(target + line, target + line, band)
+
+
+def _at_rest(
+    reading: FloatArray, resting: BoolArray, window: int, count: float, error: float
+) -> tuple[FloatArray, BoolArray]:
+    """Returns the mean reading of each rest, (n,), and a mask of the rests whose reading flickers.
+
+    A rest begins when the reading stays within half a count and three standard ``error`` of the mean of the
+    second half; later, single readings may be farther. Where a resting encoder flickers, the mean is the
+    angle. The largest of its readings would look like a reversal.
+    """
+    mean, flickers = reading.copy(), np.zeros(len(reading), dtype=np.bool_)
+    length = 2 * window + 1
+    edges = np.flatnonzero(np.diff(resting, prepend=False, append=False))
+    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        rows = slice(max(first - window, 0), end + window)  # as long as the command is constant
+        off = reading[rows] - np.mean(reading[(first + end) // 2 : end])
+        smooth = uniform_filter1d(off, length, mode="nearest")
+        settled = _after_last(np.abs(smooth) > 0.5 * count + 4.0 * error / math.sqrt(length))
+        begin = rows.start + _after_last(np.abs(off[:settled]) > 0.5 * count + 3.0 * error)
+        rest = reading[begin : rows.stop]
+        if np.any(rest != rest[:1]):
+            mean[begin : rows.stop], flickers[begin : rows.stop] = np.mean(rest), True
+    return mean, flickers
+
+
+def _after_last(mask: BoolArray) -> int:
+    """Returns the index after the last True."""
+    return int(np.flatnonzero(mask)[-1]) + 1 if np.any(mask) else 0
 
 
 def _noise(lag: FloatArray, target: FloatArray, count: float) -> float:
@@ -188,9 +219,9 @@ def _noise(lag: FloatArray, target: FloatArray, count: float) -> float:
         return 0.0
     moved = np.abs(np.diff(target)) > 0.0
     still = ~(moved[2:] | moved[1:-1] | moved[:-2])
-    noise = min(third_deviation(third), MOST_JITTER_DEG)
+    noise = min(trimmed_deviation(third), MOST_JITTER_DEG)
     if np.count_nonzero(still) >= LEAST_STILL:
-        noise = min(noise, third_deviation(third[still]))
+        noise = min(noise, trimmed_deviation(third[still]))
     elif count:
         noise = 0.0
     return math.sqrt(max(noise**2 - count**2 / 12.0, 0.0))

@@ -181,8 +181,13 @@ class _Parts:
         return np.asarray(np.bincount(self.stretch, left_arcsec**2))
 
     def unseen(self, fitted: Fitted) -> FloatArray:
-        """Returns the squares of each stretch, as predicted by a fit without its fold."""
-        fit, fold = fitted.linearised, self.stretch % FOLDS
+        """Returns the squares of each stretch, as predicted by a fit without its fold.
+
+        Nuisances, such as zeros and the elastic state at the start, belong to the record. They keep their
+        values, because no model predicts them.
+        """
+        predicted = np.arange(len(self.estimator.unknown.names), fitted.count())
+        fit, fold = fitted.linearised.of(predicted), self.stretch % FOLDS
         left = fit.residual.copy()
         steps = steps_without(fit, fold, lambda rows: White(np.ones(np.count_nonzero(rows))))
         for number, step in enumerate(steps):

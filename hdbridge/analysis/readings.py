@@ -98,11 +98,19 @@ def jitter_deg(angle_deg: FloatArray) -> float:
     second = first[1:] - first[:-1]
     third = np.abs(second[1:] - second[:-1])
     changed = first != 0.0
-    third = third[changed[:-2] | changed[1:-1] | changed[2:]]
+    return trimmed_deviation(third[changed[:-2] | changed[1:-1] | changed[2:]])
+
+
+def trimmed_deviation(third: FloatArray) -> float:
+    """Returns the standard deviation of noise from its third differences, without the largest.
+
+    The median of whole counts is a whole count, however large the noise; their mean square is not.
+    """
     if not len(third):
         return 0.0
-    middle = float(np.median(third))
-    kept = third[third <= 4.0 * middle] if middle > 0.0 else third[third <= np.quantile(third, 0.75)]
+    size = np.abs(third)
+    middle = float(np.median(size))
+    kept = size[size <= 4.0 * middle] if middle > 0.0 else size[size <= np.quantile(size, 0.75)]
     return float(np.sqrt(np.mean(kept**2)) / _THIRD)
 
 

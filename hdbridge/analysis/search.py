@@ -444,7 +444,7 @@ def with_measured(search: Search, fitted: Fitted) -> Fitted:
                     continue
                 start = trial.hypothesis.start
                 lost = sum(estimator.channel_noise(each, start) @ each.coefficients() ** 2 for each in driven)
-                if trial.chi_square - fitted.chi_square < scales.enter + scales.noisy * float(lost):
+                if search.cost(trial) - search.cost(fitted) < scales.enter + scales.noisy * float(lost):
                     return trial
                 break
     return fitted

@@ -305,15 +305,15 @@ def without(data: Observed, found: Swing) -> Observed:
     return data.having(replace(full, error_arcsec=full.error_arcsec - does))
 
 
-def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observed:
+def settled(estimator: Estimator, fitted: Fitted, effects: Sequence[Effect], found: Swing | None) -> Observed:
     """Returns the data without the samples in which the uncertainty of the swing is too large.
 
     The error of a ``found`` swing is proportional to the wind-up and to waves too fast for the sampling. Its
     share is found by regression on the squares of the residual in motion. The noise of a sample contains this
-    error and that of the turning points. The calmest samples are always kept.
+    error and that of the turning points under the given ``effects``, because the ``fitted`` loop may have
+    changed to imitate it. The calmest samples are always kept.
     """
     data, weight, unknown = estimator.data, estimator.weight, np.zeros(len(estimator.data.full))
-    effects = fitted.hypothesis.effects
     if found is not None:
         wind_up = _accelerated(data.full, data.period_s) / (math.tau * found.frequency_hz) ** 2
         moving = (data.points.speed_deg_s != 0.0)[estimator.index]

@@ -240,7 +240,6 @@ def test_the_extended_model_restores_accuracy_or_explains(cell: Cell) -> None:
     assert residual < most * floor, f"{residual:.2f} over a floor of {floor:.2f}; {described(cell)}"
 
 
-@pytest.mark.xfail(reason="unexplained 0.93 leads in place of zero_drift; cause not found yet")
 @pytest.mark.parametrize("cell", of(LAGGING), indirect=True)
 def test_a_zero_that_follows_its_sensor_slowly_is_named_with_its_lag(cell: Cell) -> None:
     assert [each.cause for each in cell.diagnosis.findings] == ["zero_drift"], described(cell)

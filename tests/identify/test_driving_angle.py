@@ -109,6 +109,32 @@ def test_a_motor_that_rests_and_continues_in_the_same_direction_does_not_turn(co
     assert turns(driving_angle(command, measured)) == 0
 
 
+@given(
+    flicker=st.floats(0.1, 0.5),
+    rate_hz=st.sampled_from([62.5, 100.0, 250.0, 500.0]),
+    seed=st.integers(0, 2**31),
+)
+@settings(max_examples=60, deadline=None, derandomize=True)
+def test_a_flickering_reading_at_rest_is_averaged(flicker, rate_hz, seed):
+    """Moves to and fro; friction stops the motor a little before the command, anywhere within a count."""
+    rng = np.random.default_rng(seed)
+    count = 0.045
+    command, motor = [np.zeros(100)], [np.zeros(100)]
+    for sign in (1.0, -1.0) * 6:
+        way = 0.5 * (1.0 - np.cos(np.pi * np.linspace(0.0, 1.0, int(0.4 * rate_hz))))
+        for path, short in ((command, 0.0), (motor, rng.uniform(0.0, 2.0) * count)):
+            far = np.round(sign * 30.0 / count) * count - sign * short
+            path += [path[-1][-1] + (far - path[-1][-1]) * way, np.full(int(0.8 * rate_hz), far)]
+    command, motor = np.concatenate(command), np.concatenate(motor)
+    measured = np.round(motor / count + flicker * rng.standard_normal(len(motor))) * count
+    path = driving_angle(command, measured, 1.0 / rate_hz)
+    rests = np.flatnonzero(np.diff(motor) == 0.0)
+    for rest in np.split(rests, np.flatnonzero(np.diff(rests) > 1) + 1)[1:]:
+        settled = path[rest[len(rest) // 4] : rest[-len(rest) // 8]]
+        assert np.ptp(settled) < 0.1 * count
+        assert abs(settled[0] - motor[rest[-1]]) < 1.1 * count
+
+
 @pytest.mark.parametrize("rate_hz", [25.0, 50.0, 100.0, 250.0])
 def test_acceleration_effects_are_independent_of_the_sampling_rate(rate_hz: float) -> None:
     """Moves with half-cosine acceleration in 0.25 s, recorded in whole counts."""
