@@ -113,7 +113,7 @@ def test_motor_motion_within_a_count_at_rest_is_not_creep(
     base = estimator.fit(Hypothesis(model.effects, Start.FORWARD)).hypothesis
     creep = Creep(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=0.3),), build_up=0.1)
     found = gate(estimator, estimator.fit(base.plus(creep)), len(model.effects))
-        assert found.reason
+    assert found.reason
 
 
 def test_turning_short_by_a_count_is_not_a_changed_loop(
