@@ -68,6 +68,7 @@ class Observed:
     nominal_inertia_kg_m2: float
     tracking_time_ms: float
     """Time constant of the back-calculation at the torque limit."""
+    velocity_feedforward: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ _PARAMETERS = [
 _STATE = [
     "before", "speed", "active", "integral", "first", "second", "command", "n1", "n2", "filtered", "q",
     "estimate", "estimated_speed", "estimated_disturbance", "reference", "reference_speed", "torque_nm",
-    "actual_nm",
+    "actual_nm", "velocity_offset", "torque_offset",
 ]
 # fmt: on
 PARAMETERS = np.dtype(
@@ -202,6 +203,7 @@ def loops_of(servo: Servo) -> Loops:
         p["observer_rad_s"] = math.tau * law.observer_hz
         p["observer_share"] = -math.expm1(-math.tau * law.observer_hz * period)
         p["tracking_rate"] = 1000.0 / law.tracking_time_ms
+        p["velocity_ff"] = law.velocity_feedforward
     delay = np.zeros((max(1, round(servo.dead_time_ms / servo.period_ms)), 3))
     delay = delay if servo.dead_time_ms > 0.0 else np.zeros((0, 3))
     return Loops(record, np.zeros(1, LOOPS), delay, np.zeros(average), np.zeros(5))
@@ -269,7 +271,7 @@ def _pi_notch(loops, position, target, limit_nm):
     command = ring.mean()
     forward = p.velocity_ff * (command - s.command) / p.period_s
     s.command = command
-    wanted_speed = p.gain * (command - position) + forward
+    wanted_speed = p.gain * (command - position) + forward + s.velocity_offset
     error = min(p.speed_limit, max(-p.speed_limit, wanted_speed)) - s.speed
     raw = p.speed_gain * (error + s.integral)
     if abs(s.filtered) < limit_nm or error * s.filtered < 0.0:
@@ -278,15 +280,15 @@ def _pi_notch(loops, position, target, limit_nm):
     s.n1 = p.b1 * raw - p.a1 * notched + s.n2
     s.n2 = p.b2 * raw - p.a2 * notched
     s.filtered += p.torque_share * (notched - s.filtered)
-    return s.filtered
+    return s.filtered + s.torque_offset
 
 
 @njit(cache=True)
 def _piv(p, s, position, target, target_speed, target_acceleration, limit_nm):
     error = target - position
-    wanted_speed = p.gain * error + s.integral + p.velocity_ff * target_speed
+    wanted_speed = p.gain * error + s.integral + p.velocity_ff * target_speed + s.velocity_offset
     wanted_speed = min(p.speed_limit, max(-p.speed_limit, wanted_speed))
-    wanted = p.speed_gain * (wanted_speed - s.speed) + p.inertia_ff * target_acceleration
+    wanted = p.speed_gain * (wanted_speed - s.speed) + p.inertia_ff * target_acceleration + s.torque_offset
     if abs(wanted) < limit_nm or error * wanted < 0.0:
         s.integral += s.active * p.period_s * p.integral_rate * error
     return wanted
@@ -295,11 +297,13 @@ def _piv(p, s, position, target, target_speed, target_acceleration, limit_nm):
 @njit(cache=True)
 def _observed(p, s, position, target, limit_nm):
     s.first += p.first_share * (target - s.first)
+    before = s.second
     s.second += p.second_share * (s.first - s.second)
-    wanted_speed = p.gain * (s.second - position)
+    forward = p.velocity_ff * (s.second - before) / p.period_s
+    wanted_speed = p.gain * (s.second - position) + forward + s.velocity_offset
     error = min(p.speed_limit, max(-p.speed_limit, wanted_speed)) - s.speed
     momentum = p.observer_rad_s * p.inertia * s.speed
-    wanted = p.speed_gain * (error + s.integral) + p.observer_gain * (s.q - momentum)
+    wanted = p.speed_gain * (error + s.integral) + p.observer_gain * (s.q - momentum) + s.torque_offset
     given = min(limit_nm, max(-limit_nm, wanted))
     give_way = p.tracking_rate * (given - wanted) / p.speed_gain
     s.integral += s.active * p.period_s * (p.integral_rate * error + give_way)
@@ -314,8 +318,9 @@ def _state_feedback(p, s, position, target, limit_nm):
     before = s.reference_speed
     s.reference_speed = min(p.speed_limit, max(-p.speed_limit, before + period * acceleration))
     s.reference += period * s.reference_speed
-    wanted = p.inertia_ff * (s.reference_speed - before) / period - s.estimated_disturbance
-    wanted += p.k1 * (s.reference - s.estimate) + p.k2 * (s.reference_speed - s.estimated_speed)
+    wanted = p.inertia_ff * (s.reference_speed - before) / period - s.estimated_disturbance + s.torque_offset
+    wanted += p.k1 * (s.reference - s.estimate)
+    wanted += p.k2 * (s.reference_speed + s.velocity_offset - s.estimated_speed)
     given = min(limit_nm, max(-limit_nm, wanted))
     miss, estimated_speed = position - s.estimate, s.estimated_speed
     s.estimate += period * (estimated_speed + p.l1 * miss)
