@@ -30,11 +30,15 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from hdbridge.analysis.linear import Linearised
 from hdbridge.analysis.scales import Scales
 from hdbridge.axis.effects import FloatArray, IntArray
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.daemon.following.estimator import bounds_arcsec, calibrated_estimator, changes_between
+from hdbridge.daemon.following.estimator import (
+    bounds_arcsec,
+    calibrated_estimator,
+    changes_between,
+    ranged_fit,
+)
 from hdbridge.daemon.following.health import EncoderStatus
 from hdbridge.daemon.following.measuring import DriftModel, Observation, Term
 from hdbridge.daemon.machinefile import AdaptationSettings
@@ -209,10 +213,7 @@ class Judge:
 
         ``columns`` selects the columns that are present in the rows.
         """
-        information = self._information[columns]
-        known = np.column_stack([information, np.zeros(len(information))])
-        fit = Linearised(rows / self._noise, observed / self._noise, known)
-        return fit.directions @ fit.slack, fit.directions @ fit.directions.T
+        return ranged_fit(rows, observed, self._noise, self._information[columns])
 
     def _as_calibrated(self, rows: FloatArray, observed: FloatArray) -> tuple[float, float]:
         """Returns the rms about zero and disc, and its upper limit by the model's intervals."""

@@ -128,10 +128,16 @@ def test_at_rest_nothing_moves():
     windows = axis.adaptation.windows
     _, samples = axis.measures(MODEL, axis.path[-1:])
     standing = np.repeat(samples[-1:], 30_000)
-    standing["load_position_deg"] += np.linspace(0.0, 0.02, 30_000)  # whatever the load encoder says
-    axis.takes(axis.time_s + PERIOD_S * np.arange(30_000), standing)
+    warm = standing.copy()
+    warm["load_position_deg"] += np.linspace(0.0, 0.0005, 30_000)  # 54 arcsec an hour
+    axis.takes(axis.time_s + PERIOD_S * np.arange(30_000), warm)
     assert axis.adaptation.windows <= windows + 1
     assert state_of(axis) == before
+    standing["load_position_deg"] += np.linspace(0.0005, 0.02, 30_000)  # as no gear's
+    axis.takes(axis.time_s + PERIOD_S * np.arange(30_000), standing)
+    assert axis.adaptation.windows <= windows + 1
+    assert axis.adaptation.used_arcsec.tolist() == before[2]
+    assert axis.frozen.startswith("load encoder drifting: its zero moves by +")
 
 
 def test_without_reversals_the_hysteresis_estimate_is_unchanged():
