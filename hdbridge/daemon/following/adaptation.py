@@ -236,16 +236,6 @@ class Adaptation:
         return self._estimator.estimate[: self._drift.zero].copy()
 
     @property
-    def covariance(self) -> FloatArray:
-        """Covariance of the adapted coefficients, (f, f)."""
-        return self._estimator.covariance[: self._drift.zero, : self._drift.zero].copy()
-
-    @property
-    def used_arcsec(self) -> FloatArray:
-        """Changes of the adapted coefficients in the model in use, (f,)."""
-        return self._used.copy()
-
-    @property
     def zero_moved_arcsec(self) -> float | None:
         """Change of the zero since it was learned; None before. It is reported but never applied."""
         return None if self._zero_arcsec is None else self._zero - self._zero_arcsec

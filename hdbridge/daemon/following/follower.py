@@ -166,7 +166,7 @@ class Follower:
         if moved is not None:
             status = self.health.accuse(*moved)
         settled = [each for each in observations if each.settled]
-        raised = [*self.watch.take(settled, status, self._now_s), *raised]
+        raised = [*self.watch.take(settled, status, self._zero.moved, self._now_s), *raised]
         proposal = None
         if self.adaptation is not None:
             fault = "the supervision has stopped the axis" if np.any(stopped) else status.reason

@@ -39,7 +39,7 @@ RATE_ARCSEC_MIN: Final = 3.0
 per minute (`effects.zero_drift`)."""
 MAX_ARCSEC: Final = 60.0
 """Maximum total change of a gear's zero."""
-REFERENCE_MIN: Final = 0.5
+LEARNED_MIN: Final = 0.5
 """Minutes of observations from which the zero is learned."""
 FREE_COLUMNS: Final = 4
 """Number of columns without a known range: time, step, zero, and one for the speed."""
@@ -61,14 +61,20 @@ class Rate(NamedTuple):
     arcsec_min: float
     error: float
     """Standard error of the rate."""
-    zero_arcsec: float
-    """Zero in the middle of the span."""
     minutes: float
     """Length of the span."""
 
     def exceeds(self, limit_arcsec_min: float) -> bool:
         """Returns True if the rate exceeds a limit by more than its error allows."""
         return abs(self.arcsec_min) - SIGMAS * self.error > limit_arcsec_min
+
+
+class Displacement(NamedTuple):
+    """Change of the zero since it was learned, in the middle of the longest span."""
+
+    arcsec: float
+    error: float
+    """Standard error."""
 
 
 class Zero:
@@ -78,6 +84,8 @@ class Zero:
         """``sigma_arcsec`` is the standard deviation of a single sample by the encoders' counts."""
         self.rates: list[Rate] = []
         """Rates at the last judgement, one per span with enough observations."""
+        self.moved: Displacement | None = None
+        """Displacement at the last judgement; None until the zero is learned."""
         self._judged = bool(drift.model.effects)
         """False without a prediction, because the gear's own error may look like a moving zero."""
         self._sigma_arcsec = COUNTS_SHARE * sigma_arcsec
@@ -87,12 +95,13 @@ class Zero:
         self._recent: deque[Observation] = deque()
         self._judged_s = 0.0
         self._suspicions = 0
-        self._reference_arcsec: float | None = None
+        self._learned: tuple[Displacement, FloatArray] | None = None
+        """Zero, and coefficients of the disc, when they were learned."""
 
     def restart(self) -> None:
         """Learns the zero again, because the drive was verified or homed."""
         self.forget()
-        self._reference_arcsec = None
+        self._learned = self.moved = None
 
     def forget(self) -> None:
         """Forgets the observations, but not the zero that was learned."""
@@ -117,18 +126,19 @@ class Zero:
         rows = self._rows(time_s)
         error_arcsec = np.array([each.error_arcsec for each in recent])
         self.rates = [
-            self._rate(time_s[span], rows[span], error_arcsec[span])
-            for span in spans
-            if np.count_nonzero(span) >= LEAST
+            self._rate(rows[span], error_arcsec[span]) for span in spans if np.count_nonzero(span) >= LEAST
         ]
+        if not self.rates:
+            return None
+        self._displaced(rows, error_arcsec)
         return self._stepped(time_s, rows, error_arcsec) or self._drifts()
 
     def _rows(self, time_s: FloatArray) -> FloatArray:
-        """Returns minutes up to now, share of the highest speed, and the columns of `DriftModel`."""
+        """Returns minutes from the middle, share of the highest speed, and the columns of `DriftModel`."""
         speed = np.array([each.speed_deg_s for each in self._recent])
         columns = np.array([each.row for each in self._recent])
         share = speed / max(float(np.max(np.abs(speed))), 1e-9)
-        return np.column_stack([(time_s - time_s[-1]) / 60.0, share, columns])
+        return np.column_stack([(time_s - 0.5 * (time_s[0] + time_s[-1])) / 60.0, share, columns])
 
     def _fit(
         self, rows: FloatArray, error_arcsec: FloatArray, information: FloatArray
@@ -143,12 +153,32 @@ class Zero:
         errors = np.sqrt(np.diag(covariance) * correlated(left))
         return change, errors, float(left @ left) / len(left)
 
-    def _rate(self, time_s: FloatArray, rows: FloatArray, error_arcsec: FloatArray) -> Rate:
-        rows = rows.copy()
-        rows[:, 0] -= 0.5 * (rows[0, 0] + rows[-1, 0])
+    def _rate(self, rows: FloatArray, error_arcsec: FloatArray) -> Rate:
         change, errors, _ = self._fit(rows, error_arcsec, self._information)
-        minutes = float(time_s[-1] - time_s[0]) / 60.0
-        return Rate(float(change[0]), float(errors[0]), float(change[self._at]), minutes)
+        return Rate(float(change[0]), float(errors[0]), float(rows[-1, 0] - rows[0, 0]))
+
+    def _displaced(self, rows: FloatArray, error_arcsec: FloatArray) -> None:
+        """Learns the zero, or determines how far it has moved since.
+
+        The disc is fixed at its learned value, because over part of a turn it is hardly separable from the
+        zero.
+        """
+        own, disc = rows[:, : self._at + 1], rows[:, self._at + 1 :]
+        if self._learned is None:
+            if rows[-1, 0] - rows[0, 0] < LEARNED_MIN:
+                return
+            change, *_ = self._fit(rows, error_arcsec, self._information)
+            coefficients = change[self._at + 1 :]
+        else:
+            coefficients = self._learned[1]
+        change, errors, _ = self._fit(
+            own, error_arcsec - disc @ coefficients, self._information[: self._at + 1]
+        )
+        zero = Displacement(float(change[self._at]), float(errors[self._at]))
+        if self._learned is None:
+            self._learned = zero, coefficients
+        before, _ = self._learned
+        self.moved = Displacement(zero.arcsec - before.arcsec, float(np.hypot(zero.error, before.error)))
 
     def _stepped(
         self, time_s: FloatArray, rows: FloatArray, error_arcsec: FloatArray
@@ -180,12 +210,7 @@ class Zero:
 
     def _drifts(self) -> tuple[EncoderFault, str] | None:
         """Returns a drift that is too fast or too far for a gear, once it has lasted."""
-        if not self.rates:
-            return None
-        slow = self.rates[-1]
-        if self._reference_arcsec is None and slow.minutes >= REFERENCE_MIN:
-            self._reference_arcsec = slow.zero_arcsec
-        away = 0.0 if self._reference_arcsec is None else slow.zero_arcsec - self._reference_arcsec
+        away = 0.0 if self.moved is None else self.moved.arcsec
         drifts = any(each.exceeds(RATE_ARCSEC_MIN) for each in self.rates)
         self._suspicions = self._suspicions + 1 if drifts or abs(away) > MAX_ARCSEC else 0
         if self._suspicions < LASTING:
