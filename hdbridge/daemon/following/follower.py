@@ -147,8 +147,7 @@ class Follower:
         cycle, times_s = samples["cycle"], 1e-9 * samples["time_ns"].astype(np.float64)
         self._now_s = float(times_s[-1])
         joined = self._next_cycle in {None, int(cycle[0])} and int(cycle[-1] - cycle[0]) == len(cycle) - 1
-        self._servo.believed = status.fault is None
-        servo = self._servo.take(axis, joined=joined)
+        servo = self._servo.take(axis, joined=joined, believed=status.fault is None)
         first = self._begin_of_path(axis, cycle)
         raised: list[Raised] = []
         if servo is not None:
@@ -198,10 +197,9 @@ class Follower:
         return None if refined is None else adaptation.refine(refined)
 
     def state(self) -> messages.AdaptationState:
-        """Returns the state of the adaptation for clients."""
+        """Returns the state of the adaptation, which has begun, for clients."""
         adaptation = self.adaptation
-        if adaptation is None:
-            return messages.AdaptationState(mode=messages.AdaptationMode(self._settings.mode))
+        assert adaptation is not None
         return messages.AdaptationState(
             mode=messages.AdaptationMode(adaptation.mode),
             frozen=adaptation.waiting_reason(path_known=self._measuring.known),

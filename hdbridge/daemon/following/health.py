@@ -191,23 +191,6 @@ def misread(found: Residuals, noise_arcsec: float, count_arcsec: float) -> int:
     return int(np.count_nonzero((away > allowed) & np.all(_windows(found["usable"], SIDE), axis=0)))
 
 
-def local_noise_arcsec(found: Residuals) -> float:
-    """Returns the standard deviation of one reading, by the median difference of neighbours."""
-    steps = np.abs(found["residual_arcsec"][1:] - found["residual_arcsec"][:-1])
-    return float(MEDIAN_DIFFERENCE * np.median(steps)) if len(steps) else 0.0
-
-
-def stuck_arcsec(load_deg: FloatArray, motor_deg: FloatArray, ratio: float) -> tuple[int, float]:
-    """Returns the last row with a change of the load reading (0 without one), and the motor travel since.
-
-    The travel is in arcsec at the load.
-    """
-    changed = np.flatnonzero(np.diff(load_deg) != 0.0)
-    since = int(changed[-1]) + 1 if len(changed) else 0
-    travel = np.max(np.abs(motor_deg[since:] - motor_deg[since])) / ratio * ARCSEC_PER_DEG
-    return since, float(travel)
-
-
 _Any = TypeVar("_Any", np.bool_, np.float64)
 
 
@@ -268,8 +251,7 @@ class EncoderHealth:
         self._predicted = bool(model.effects)
         """False without a prediction, in which case the gear's own error may look like an encoder fault."""
         self._jitters: dict[bool, list[float]] = {True: [], False: []}
-        self._learned: dict[bool, float] = {}
-        """Usual jitter at rest (True) and in motion (False)."""
+        """Jitter of the first good blocks at rest (True) and in motion (False)."""
         self._spikes: deque[float] = deque()
         self._noisy_blocks = 0
         self._bad_s = -math.inf
@@ -308,24 +290,20 @@ class EncoderHealth:
         frozen = self._judge_frozen(found[old:])
         if self._predicted and not frozen:
             self._judge_steps(found[max(old - 2 * SIDE + 1, 0) :])
-        self._gather(found[old:])
+        self._judge_noise(found[old:])
         passing = self.status.fault is not None and self.status.fault not in LATCHED
         if passing and self._now_s - self._bad_s >= RECOVERED_S:
             self.status = EncoderStatus()
         return self.status
 
     def _usual(self, *, standing: bool) -> float:
-        return self._learned.get(standing, self._residual_arcsec)
-
-    def _learn(self, jitter_arcsec: float, *, standing: bool) -> None:
+        """Returns the usual jitter at rest or in motion, arcsec."""
         known = self._jitters[standing]
-        if len(known) >= MAX_LEARNING_BLOCKS:
-            return
-        known.append(jitter_arcsec)
-        if len(known) >= LEARNING_BLOCKS:
-            # In motion the load vibrates more at some speeds, so a high quantile counts as usual.
-            typical = np.median(known) if standing else np.quantile(known, 0.9)
-            self._learned[standing] = max(float(typical), 0.3 * self._load_count_arcsec)
+        if len(known) < LEARNING_BLOCKS:
+            return self._residual_arcsec
+        # In motion the load vibrates more at some speeds, so a high quantile counts as usual.
+        typical = float(np.quantile(known, 0.5 if standing else 0.9))
+        return max(typical, 0.3 * self._load_count_arcsec)
 
     def accuse(self, fault: EncoderFault, why: str) -> EncoderStatus:
         """Reports a fault and returns the state; a fault that lasts replaces one that passes."""
@@ -343,7 +321,9 @@ class EncoderHealth:
         held = self._held
         if held is not None and load[0] == held[0]:
             load, motor = np.append(held[0], load), np.append(held[1], motor)
-        since, gone = stuck_arcsec(load, motor, self._ratio)
+        changed = np.flatnonzero(np.diff(load) != 0.0)
+        since = int(changed[-1]) + 1 if len(changed) else 0
+        gone = float(np.max(np.abs(motor[since:] - motor[since]))) / self._ratio * ARCSEC_PER_DEG
         self._held = (float(load[since]), float(motor[since]))
         allowed = max(FROZEN_ARCSEC, FROZEN_COUNTS * self._load_count_arcsec)
         if gone > allowed:
@@ -355,7 +335,10 @@ class EncoderHealth:
         return gone > 2.0 * self._count_arcsec and gone > 3.0 * self._load_count_arcsec
 
     def _judge_steps(self, found: Residuals) -> None:
-        noise = max(self._usual(standing=bool(np.all(_standing(found)))), local_noise_arcsec(found))
+        noise = self._usual(standing=bool(np.all(_standing(found))))
+        if len(found) > 1:
+            steps = np.abs(np.diff(found["residual_arcsec"]))
+            noise = max(noise, MEDIAN_DIFFERENCE * float(np.median(steps)))
         jump = find_jump(found, noise, self._count_arcsec)
         # A frozen reading ends with a jump.
         if jump is not None and self.status.fault is not EncoderFault.FROZEN:
@@ -376,16 +359,13 @@ class EncoderHealth:
                 EncoderFault.NOISY, f"{len(self._spikes)} readings of the last 10 s jumped there and back"
             )
 
-    def _gather(self, found: Residuals) -> None:
+    def _judge_noise(self, found: Residuals) -> None:
         """Collects samples into blocks of `BLOCK_S` or more and judges each complete block."""
         self._pending.append(found)
         if sum(map(len, self._pending)) < max(BLOCK_S / self._period_s, BLOCK_SAMPLES):
             return
         block = np.concatenate(self._pending)
         self._pending = []
-        self._judge_noise(block)
-
-    def _judge_noise(self, block: Residuals) -> None:
         enough = np.count_nonzero(block["fresh"]) >= max(BLOCK_SAMPLES, 0.9 * len(block))
         if not enough or not np.any(block["usable"]):
             return
@@ -406,8 +386,8 @@ class EncoderHealth:
                 f"its readings jitter by {jitter:.2f} arcsec {'at rest' if standing else 'in motion'}, "
                 f"usually by {usual:.2f} (at most {NOISE_RATIO:g} times as much is allowed)",
             )
-        elif not noisy and self.status.fault is None:
-            self._learn(jitter, standing=standing)
+        elif not noisy and self.status.fault is None and len(self._jitters[standing]) < MAX_LEARNING_BLOCKS:
+            self._jitters[standing].append(jitter)
 
 
 def _standing(found: Residuals) -> BoolArray:

@@ -155,10 +155,35 @@ class Evidence:
         )
 
 
-class Judge:
-    """Tests one model; ``noise_arcsec`` is the standard deviation of an observation."""
+def _largest_changes(before: TransmissionModel, after: TransmissionModel) -> str:
+    """Describes the four largest relative changes of parameters."""
+    changes = changes_between(before, before, after)
+    by = {each: abs(each.after - each.before) / max(abs(each.before), 1e-9) for each in changes}
+    most = [each for each in sorted(changes, key=lambda each: -by[each]) if by[each] > REPORTED_SHARE]
+    return ", ".join(f"{each.parameter} {each.before:.4g} to {each.after:.4g}" for each in most[:4])
+
+
+def _places(observations: Sequence[Observation]) -> tuple[FloatArray, FloatArray]:
+    """Returns columns and mean error of each place; the last column is time from -1 to 1."""
+    rows = np.array([each.row for each in observations])
+    time_s = np.array([each.time_s for each in observations])
+    error = np.array([each.error_arcsec for each in observations])
+    _, place, count = np.unique(np.round(rows / CELL), axis=0, return_inverse=True, return_counts=True)
+    place = place.reshape(-1)
+    middle, half = 0.5 * (time_s[0] + time_s[-1]), 0.5 * float(np.ptp(time_s)) or 1.0
+    rows = np.column_stack([rows, (time_s - middle) / half])
+    means = np.zeros((len(count), rows.shape[1]))
+    np.add.at(means, place, rows)
+    return means / count[:, np.newaxis], np.bincount(place, error) / count
+
+
+class Watch:
+    """Verdicts on one axis and its model."""
 
     def __init__(self, drift: DriftModel, noise_arcsec: float) -> None:
+        """``noise_arcsec`` is the standard deviation of an observation."""
+        self.evidence: Evidence | None = None
+        """Last evidence; None until enough observations exist."""
         self._drift = drift
         self._noise = NOISE_RATIO * noise_arcsec
         settings = AdaptationSettings()
@@ -174,8 +199,71 @@ class Judge:
         tests = (len(drift.terms) + 2) * DAY_S / EVERY_S
         self._alpha = FALSE_ALARMS_PER_DAY / tests
         """Probability of a false positive in one test."""
+        self._adopted = self._other = Verdict.HOLDS
+        """Verdict on the gear, and the different verdict that must persist before it is adopted."""
+        self._lasted_s = 0.0
+        self._faulty = False
+        self._observations: deque[Observation] = deque(maxlen=MAX_OBSERVATIONS)
+        self._new = False
+        self._judged_s = -EVERY_S
 
-    def judge(self, observations: Sequence[Observation], zero: Displacement | None) -> Evidence | None:
+    @property
+    def verdict(self) -> Verdict:
+        return Verdict.ENCODER if self._faulty else self._adopted
+
+    def take(
+        self,
+        observations: Sequence[Observation],
+        status: EncoderStatus,
+        zero: Displacement | None,
+        now_s: float,
+    ) -> list[Raised]:
+        """Takes observations, state and zero of the load encoder; returns new verdicts."""
+        raised: list[Raised] = []
+        if (status.fault is not None) != self._faulty:
+            self._faulty = status.fault is not None
+            self._observations.clear()
+            reason = status.reason or "no evidence against the load encoder"
+            raised.append(Raised(self.verdict, reason))
+        self._observations.extend(observations)
+        self._new |= bool(observations)
+        passed_s = now_s - self._judged_s
+        if not 0.0 <= passed_s < EVERY_S:
+            self._judged_s = now_s
+            if self._test(zero, now_s, min(passed_s, 2.0 * EVERY_S)) and self.evidence is not None:
+                raised.append(Raised(self.verdict, self.evidence.text))
+        return raised
+
+    def _test(self, zero: Displacement | None, now_s: float, passed_s: float) -> bool:
+        """Tests the recent observations; returns True if the verdict changes."""
+        recent = self._observations
+        while recent and not 0.0 <= now_s - recent[0].time_s <= WINDOW_S:
+            recent.popleft()
+        # An axis at rest gives no new evidence, and an uncalibrated one has no model to test.
+        if not self._new or self._faulty or not self._drift.model.effects:
+            return False
+        self._new = False
+        evidence = self._evidence(recent, zero)
+        if evidence is None:
+            return False
+        self.evidence = evidence
+        return self._adopts(evidence.verdict(self._adopted), passed_s)
+
+    def _adopts(self, verdict: Verdict, passed_s: float) -> bool:
+        """Takes the present verdict and the time since the last; returns True once it has persisted."""
+        if verdict is self._adopted or verdict is not self._other:
+            self._other, self._lasted_s = verdict, 0.0
+        if verdict is self._adopted:
+            return False
+        self._lasted_s += passed_s
+        if self._lasted_s < (WITHDRAW_S if verdict is Verdict.HOLDS else RAISE_S):
+            return False
+        self._adopted, self._lasted_s = verdict, 0.0
+        return True
+
+    # ------------------------------------------------------------------ the tests
+
+    def _evidence(self, observations: Sequence[Observation], zero: Displacement | None) -> Evidence | None:
         """Tests the observations; None if they are too few. ``zero`` is None if it is not known yet."""
         least = self._drift.count + 1 + SPARE
         if len(observations) < least:
@@ -244,97 +332,3 @@ class Judge:
         if abs(zero.arcsec) < max(ZERO_ARCSEC, math.sqrt(self._chi_square(1)) * zero.error):
             return None
         return Moved(f"zero: by {zero.arcsec:+.1f} arcsec", abs(zero.arcsec) <= self._zero_bound)
-
-
-def _largest_changes(before: TransmissionModel, after: TransmissionModel) -> str:
-    """Describes the four largest relative changes of parameters."""
-    changes = changes_between(before, before, after)
-    by = {each: abs(each.after - each.before) / max(abs(each.before), 1e-9) for each in changes}
-    most = [each for each in sorted(changes, key=lambda each: -by[each]) if by[each] > REPORTED_SHARE]
-    return ", ".join(f"{each.parameter} {each.before:.4g} to {each.after:.4g}" for each in most[:4])
-
-
-def _places(observations: Sequence[Observation]) -> tuple[FloatArray, FloatArray]:
-    """Returns columns and mean error of each place; the last column is time from -1 to 1."""
-    rows = np.array([each.row for each in observations])
-    time_s = np.array([each.time_s for each in observations])
-    error = np.array([each.error_arcsec for each in observations])
-    _, place, count = np.unique(np.round(rows / CELL), axis=0, return_inverse=True, return_counts=True)
-    place = place.reshape(-1)
-    middle, half = 0.5 * (time_s[0] + time_s[-1]), 0.5 * float(np.ptp(time_s)) or 1.0
-    rows = np.column_stack([rows, (time_s - middle) / half])
-    means = np.zeros((len(count), rows.shape[1]))
-    np.add.at(means, place, rows)
-    return means / count[:, np.newaxis], np.bincount(place, error) / count
-
-
-class Watch:
-    """Verdicts on one axis and its model."""
-
-    def __init__(self, drift: DriftModel, noise_arcsec: float) -> None:
-        """``noise_arcsec`` is the standard deviation of an observation."""
-        self.evidence: Evidence | None = None
-        """Last evidence; None until enough observations exist."""
-        self._calibrated = bool(drift.model.effects)
-        self._judge = Judge(drift, noise_arcsec)
-        self._adopted = self._other = Verdict.HOLDS
-        """Verdict on the gear, and the different verdict that must persist before it is adopted."""
-        self._lasted_s = 0.0
-        self._faulty = False
-        self._observations: deque[Observation] = deque(maxlen=MAX_OBSERVATIONS)
-        self._new = False
-        self._judged_s = -EVERY_S
-
-    @property
-    def verdict(self) -> Verdict:
-        return Verdict.ENCODER if self._faulty else self._adopted
-
-    def take(
-        self,
-        observations: Sequence[Observation],
-        status: EncoderStatus,
-        zero: Displacement | None,
-        now_s: float,
-    ) -> list[Raised]:
-        """Takes observations, state and zero of the load encoder; returns new verdicts."""
-        raised: list[Raised] = []
-        if (status.fault is not None) != self._faulty:
-            self._faulty = status.fault is not None
-            self._observations.clear()
-            reason = status.reason or "no evidence against the load encoder"
-            raised.append(Raised(self.verdict, reason))
-        self._observations.extend(observations)
-        self._new |= bool(observations)
-        passed_s = now_s - self._judged_s
-        if not 0.0 <= passed_s < EVERY_S:
-            self._judged_s = now_s
-            if self._test(zero, now_s, min(passed_s, 2.0 * EVERY_S)) and self.evidence is not None:
-                raised.append(Raised(self.verdict, self.evidence.text))
-        return raised
-
-    def _test(self, zero: Displacement | None, now_s: float, passed_s: float) -> bool:
-        """Tests the recent observations; returns True if the verdict changes."""
-        recent = self._observations
-        while recent and not 0.0 <= now_s - recent[0].time_s <= WINDOW_S:
-            recent.popleft()
-        # An axis at rest gives no new evidence, and an uncalibrated one has no model to test.
-        if not self._new or self._faulty or not self._calibrated:
-            return False
-        self._new = False
-        evidence = self._judge.judge(recent, zero)
-        if evidence is None:
-            return False
-        self.evidence = evidence
-        return self._adopts(evidence.verdict(self._adopted), passed_s)
-
-    def _adopts(self, verdict: Verdict, passed_s: float) -> bool:
-        """Takes the present verdict and the time since the last; returns True once it has persisted."""
-        if verdict is self._adopted or verdict is not self._other:
-            self._other, self._lasted_s = verdict, 0.0
-        if verdict is self._adopted:
-            return False
-        self._lasted_s += passed_s
-        if self._lasted_s < (WITHDRAW_S if verdict is Verdict.HOLDS else RAISE_S):
-            return False
-        self._adopted, self._lasted_s = verdict, 0.0
-        return True
