@@ -93,13 +93,13 @@ class Adaptation:
         whole: DriftModel,
         settings: AdaptationSettings,
         sigma_arcsec: float,
-        log: Callable[[Entry], None] = lambda _: None,
-        learned: Learned | None = None,
+        log: Callable[[Entry], None],
+        learned: Learned | None,
     ) -> None:
         """``whole`` is the committed model to which the observations refer; ``sigma_arcsec`` their noise.
 
-        ``learned`` is the state of an earlier adaptation of this model. Raises InputError if ``settings``
-        name a parameter that the model lacks.
+        ``log`` takes the lines of the history. ``learned`` is the state of an earlier adaptation of this
+        model. Raises InputError if ``settings`` name a parameter that the model lacks.
         """
         self.settings = settings
         self.mode: Mode = settings.mode
@@ -135,12 +135,12 @@ class Adaptation:
             self._restore(learned)
 
     def take(
-        self, observations: Sequence[Observation], now_s: float, fault: str = "", rates: Sequence[Rate] = ()
+        self, observations: Sequence[Observation], now_s: float, fault: str, rates: Sequence[Rate]
     ) -> Proposal | None:
         """Takes observations in order; returns a proposal when due.
 
-        ``fault`` is a reason for not learning now, such as a fault of the load encoder, ``rates`` are those
-        of the zero.
+        ``fault`` is a reason for not learning now, such as a fault of the load encoder, or empty. ``rates``
+        are those of the zero.
         """
         if self.mode == "off":
             return None

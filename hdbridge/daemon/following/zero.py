@@ -215,7 +215,7 @@ class Zero:
         self._suspicions = self._suspicions + 1 if drifts or abs(away) > MAX_ARCSEC else 0
         if self._suspicions < LASTING:
             return None
-        rate = max(self.rates, key=lambda each: abs(each.arcsec_min) / each.error)
+        rate = max(self.rates, key=lambda each: abs(each.arcsec_min) - SIGMAS * each.error)
         return EncoderFault.DRIFTING, (
             f"its zero moves by {rate.arcsec_min:+.2f} arcsec a minute (standard error {rate.error:.2f}, in "
             f"the last {rate.minutes:.1f} min), {away:+.1f} arcsec since it was verified; a gear's moves by "
