@@ -109,6 +109,11 @@ def worn(offset_arcsec: float = 0.0, second_order_arcsec: float = 0.0) -> Transm
     return drift.changed(change)
 
 
+def used_arcsec(adaptation: Adaptation) -> np.ndarray:
+    """Returns the changes of the adapted coefficients in the model in use."""
+    return np.array(adaptation.learned().applied)
+
+
 def packed(times_s: np.ndarray, axis: np.ndarray) -> SampleArray:
     """Returns samples of a machine with one axis, numbered by their time."""
     samples = np.zeros(len(times_s), sample_dtype(1))

@@ -13,7 +13,7 @@ from hdbridge.daemon.api import problems
 from hdbridge.daemon.api.guard import Traffic
 from hdbridge.daemon.api.metrics import Metrics, exposition
 from hdbridge.daemon.api.routes import axis, machine, sockets
-from hdbridge.daemon.page import PAGE, POLICY, page_file
+from hdbridge.daemon.page import PAGE, POLICY, page_files
 from hdbridge.daemon.service.bridge import ServiceBridge
 
 PREFIX: Final = "/api/v1"
@@ -90,7 +90,7 @@ def _add_pages(app: FastAPI, bridge: ServiceBridge, metrics: Metrics, traffic: T
 
 
 def _static(name: str) -> Response:
-    found = page_file(name)
+    found = page_files().get(name)
     if found is None:
         raise problems.UnknownError(f"the page has no file {name[:80]!a}")
     content, kind = found

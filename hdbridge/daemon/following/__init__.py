@@ -2,6 +2,6 @@
 samples.
 
 `follower` is the pass: `health` of the load encoder, `measuring` (samples to observations and their linear
-problem), then `judging` (verdicts for clients) and `adaptation` (by `estimator`). `statefile` has the files
-of an adaptation.
+problem), `zero` (the one judgement of how the encoders' zero moves), then `judging` (verdicts for clients)
+and `adaptation` (by `estimator`). `statefile` has the files of an adaptation.
 """

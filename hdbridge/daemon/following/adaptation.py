@@ -2,8 +2,8 @@
 
 A window of observations is complete once the axis has moved enough (`Excitation`). It is rejected as a whole
 if neither wear nor temperature can cause it, because both are slow and similar everywhere. Learning is then
-frozen until the cause ends, and the updates by the last windows before the fault are reverted.
-`EncoderHealth` judges every sample; the tests here need the estimate. Pure: observations contain the time.
+frozen until the cause ends, and the updates by the last windows before the fault are reverted. `health` and
+`zero` judge the load encoder; the tests here need the estimate. Pure: observations contain the time.
 """
 
 import math
@@ -27,9 +27,9 @@ from hdbridge.daemon.following.estimator import (
     calibrated_estimator,
     changes_between,
     half_widths,
-    partial_fit,
 )
 from hdbridge.daemon.following.measuring import DriftModel, Observation, reversals, turns
+from hdbridge.daemon.following.zero import Rate
 from hdbridge.daemon.machinefile import AdaptationSettings, Mode
 from hdbridge.errors import InputError
 from hdbridge.strictness import Strict
@@ -46,14 +46,7 @@ RATE_INTERVALS = 2.0
 LEAST_SHARE = 0.99
 """Share of the permitted change per interval from which a change is applied, however small it is."""
 GATE_SIGMAS = 6.0
-TREND_FREE = 4
-"""Degrees of freedom required for fitting a trend to a window."""
-DRIFT_S = 120.0
-"""Time span that is searched for a drift of the zero."""
-DRIFT_WINDOWS = 6
-"""Minimum number of windows for detecting a drift."""
-MAX_DRIFT_WINDOWS = 256
-DRIFT_SIGMAS = 3.0
+"""Standard deviations by which an observation may differ from the model."""
 
 Entry = Mapping[str, Any]
 """Line of the history: ``event``, ``axis_time_s`` and further data, all serialisable as JSON."""
@@ -100,13 +93,13 @@ class Adaptation:
         whole: DriftModel,
         settings: AdaptationSettings,
         sigma_arcsec: float,
-        log: Callable[[Entry], None] = lambda _: None,
-        learned: Learned | None = None,
+        log: Callable[[Entry], None],
+        learned: Learned | None,
     ) -> None:
         """``whole`` is the committed model to which the observations refer; ``sigma_arcsec`` their noise.
 
-        ``learned`` is the state of an earlier adaptation of this model. Raises InputError if ``settings``
-        name a parameter that the model lacks.
+        ``log`` takes the lines of the history. ``learned`` is the state of an earlier adaptation of this
+        model. Raises InputError if ``settings`` name a parameter that the model lacks.
         """
         self.settings = settings
         self.mode: Mode = settings.mode
@@ -122,11 +115,6 @@ class Adaptation:
         self._sigma_arcsec = sigma_arcsec
         self._log = log
         self._now_s = 0.0
-        self._nuisances = drift.has_memory.copy()
-        self._nuisances[drift.zero :] = True
-        """Columns that must not be mistaken for a drift: the loop, the zero, the load encoder's disc."""
-        self._zeros: deque[tuple[float, float]] = deque(maxlen=MAX_DRIFT_WINDOWS)
-        """Time and zero of the last windows."""
         self._window: list[Observation] = []
         self._zero_arcsec: float | None = None
         """Zero when it was learned."""
@@ -146,10 +134,13 @@ class Adaptation:
         if learned is not None:
             self._restore(learned)
 
-    def take(self, observations: Sequence[Observation], now_s: float, fault: str = "") -> Proposal | None:
+    def take(
+        self, observations: Sequence[Observation], now_s: float, fault: str, rates: Sequence[Rate]
+    ) -> Proposal | None:
         """Takes observations in order; returns a proposal when due.
 
-        ``fault`` is a reason for not learning now, such as a fault of the load encoder.
+        ``fault`` is a reason for not learning now, such as a fault of the load encoder, or empty. ``rates``
+        are those of the zero.
         """
         if self.mode == "off":
             return None
@@ -160,7 +151,7 @@ class Adaptation:
             self._window.append(each._replace(row=each.row[self._columns]))
             if self._complete():
                 window, self._window = self._window, []
-                self._close(window)
+                self._close(window, rates)
         return self._proposal()
 
     def set_mode(self, mode: Mode) -> None:
@@ -245,16 +236,6 @@ class Adaptation:
         return self._estimator.estimate[: self._drift.zero].copy()
 
     @property
-    def covariance(self) -> FloatArray:
-        """Covariance of the adapted coefficients, (f, f)."""
-        return self._estimator.covariance[: self._drift.zero, : self._drift.zero].copy()
-
-    @property
-    def used_arcsec(self) -> FloatArray:
-        """Changes of the adapted coefficients in the model in use, (f,)."""
-        return self._used.copy()
-
-    @property
     def zero_moved_arcsec(self) -> float | None:
         """Change of the zero since it was learned; None before. It is reported but never applied."""
         return None if self._zero_arcsec is None else self._zero - self._zero_arcsec
@@ -313,8 +294,8 @@ class Adaptation:
             return False
         return reversals(window) >= required.reversals or turned >= ONE_WAY_TURNS * required.turns
 
-    def _close(self, window: list[Observation]) -> None:
-        """Tests a window and learns from it if it is plausible."""
+    def _close(self, window: list[Observation], rates: Sequence[Rate]) -> None:
+        """Tests a window and learns from it if it is plausible; ``rates`` are those of the zero."""
         rows = np.array([each.row for each in window])
         observed = np.array([each.error_arcsec for each in window])
         if self._zero_arcsec is None:
@@ -322,10 +303,7 @@ class Adaptation:
         residual = observed - rows @ self._estimator.estimate
         variance = np.einsum("ij,jk,ik->i", rows, self._estimator.covariance, rows)
         sigma = np.sqrt(variance + self._sigma_arcsec**2) + self._rate_allowance_arcsec(window, rows)
-        time_s = np.array([each.time_s for each in window])
-        found = _shift(residual, GATE_SIGMAS * sigma)
-        if found is None and len(window) > np.count_nonzero(self._nuisances) + TREND_FREE:
-            found = self._drift_of(time_s, rows[:, self._nuisances], residual, GATE_SIGMAS, lasting=False)
+        found = _shift(residual, GATE_SIGMAS * sigma) or self._zero_drifts(rates)
         self._window_s = window[-1].time_s
         if found is not None:
             self.freeze(found)
@@ -336,8 +314,7 @@ class Adaptation:
                 return
             self._unfreeze("the load encoder agrees with the model again")
         self._learn(window, rows, observed)
-        own_zero = self._zero + float(np.mean(observed - rows @ self._estimator.estimate))
-        found = self._zero_drifts(window[-1].time_s, own_zero) or self._zero_out_of_bound()
+        found = self._zero_out_of_bound()
         if found is not None:
             self.freeze(found)
 
@@ -395,7 +372,6 @@ class Adaptation:
         self._zero_arcsec = None
         self._window.clear()
         self._earlier.clear()
-        self._zeros.clear()
 
     def _set_zero_sigma(self, sigma_arcsec: float) -> None:
         at = self._drift.zero
@@ -404,32 +380,17 @@ class Adaptation:
         covariance[at, at] = sigma_arcsec**2
         self._estimator.covariance = covariance
 
-    def _zero_drifts(self, time_s: float, zero_arcsec: float) -> Freeze | None:
-        """Records the zero of a window; tests whether the last zeros together drift faster than a gear's."""
-        self._zeros.append((time_s, zero_arcsec))
-        while self._zeros[0][0] < time_s - DRIFT_S:
-            self._zeros.popleft()
-        if len(self._zeros) < DRIFT_WINDOWS:
-            return None
-        times_s, zeros = np.array(self._zeros).T
-        return self._drift_of(times_s, np.ones((len(zeros), 1)), zeros, DRIFT_SIGMAS, lasting=True)
-
-    def _drift_of(
-        self, time_s: FloatArray, others: FloatArray, values: FloatArray, sigmas: float, *, lasting: bool
-    ) -> Freeze | None:
-        """Tests whether values (n,) drift faster than a gear's zero can.
-
-        ``others`` (n, m) are columns that must not be mistaken for a drift.
-        """
-        drift = partial_fit((time_s - float(np.mean(time_s))) / 3600.0, others, values)
+    def _zero_drifts(self, rates: Sequence[Rate]) -> Freeze | None:
+        """Tests whether the zero moves faster than the settings permit."""
         most = self.settings.zero_rate_arcsec_per_hour
-        if abs(drift.value) - sigmas * drift.error <= most:
-            return None
-        return Freeze(
-            f"the zero moves by {drift.value:+.0f} arcsec per hour, faster than wear and temperature may "
-            f"({most:.0f}): the load encoder slips or drifts",
-            lasting=lasting,
-        )
+        for each in rates:
+            if each.exceeds(most / 60.0):
+                return Freeze(
+                    f"the zero moves by {60.0 * each.arcsec_min:+.0f} arcsec per hour, faster than wear and "
+                    f"temperature may ({most:.0f}): the load encoder slips or drifts",
+                    lasting=True,
+                )
+        return None
 
     def _zero_out_of_bound(self) -> Freeze | None:
         moved, most = self.zero_moved_arcsec, self.settings.zero_bound_arcsec

@@ -15,12 +15,12 @@ Parameters may be held: their uncertainty is accounted for, but neither they nor
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from hdbridge.analysis.intervals import NORMAL_95, Interval, leaves, nested_half_widths, slopes
-from hdbridge.analysis.linear import SEEN, Column, orthonormal
+from hdbridge.analysis.linear import Column, Linearised
 from hdbridge.axis.effects import BoolArray, Effect, FloatArray
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.following.measuring import DriftModel
@@ -183,27 +183,20 @@ def changes_between(
     )
 
 
-class Partial(NamedTuple):
-    """Coefficient of one column in a least-squares fit with other columns."""
+def ranged_fit(
+    rows: FloatArray, observed: FloatArray, sigma: float, information: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Fits rows (n, p) to observed (n,) with noise ``sigma`` and coefficients of a limited range.
 
-    value: float
-    error: float
-    """Standard error, allowing for coloured noise; infinite if the column is not separable."""
-    mean_square: float
-    """Mean square of the residual."""
+    ``information`` (p,) is 1 / range^2 of each coefficient. Returns the coefficients and their covariance.
+    """
+    known = np.column_stack([information, np.zeros(len(information))])
+    fit = Linearised(rows / sigma, observed / sigma, known)
+    return fit.directions @ fit.slack, fit.directions @ fit.directions.T
 
 
-def partial_fit(column: FloatArray, others: FloatArray, values: FloatArray) -> Partial:
-    """Fits values (n,) with a column (n,) and other columns (n, m)."""
-    basis = orthonormal(others)
-    own = column - basis @ (basis.T @ column)
-    rest = values - basis @ (basis.T @ values)
-    square, free = float(own @ own), len(values) - basis.shape[1] - 1
-    if free < 1 or square <= SEEN * float(column @ column):
-        return Partial(0.0, math.inf, math.inf)
-    value = float(own @ rest) / square
-    left = rest - value * own
-    mean_square = float(left @ left) / free + 1e-12
-    correlation = min(max(float(left[1:] @ left[:-1]) / (free * mean_square), 0.0), MAX_CORRELATION)
-    error = math.sqrt(mean_square / square * (1.0 + correlation) / (1.0 - correlation))
-    return Partial(value, error, mean_square)
+def correlated(left: FloatArray) -> float:
+    """Returns the factor of a coefficient's variance by the correlation of neighbouring residuals (n,)."""
+    correlation = float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-300)
+    correlation = min(max(correlation, 0.0), MAX_CORRELATION)
+    return (1.0 + correlation) / (1.0 - correlation)

@@ -1,7 +1,7 @@
 """Following one axis: one pass over its samples, from the health of the load encoder to both verdicts.
 
-    samples -> encoder health -> measuring -> watch (is the model still valid?)
-                                           -> adaptation (what has drifted, and by how much?)
+    samples -> encoder health -> measuring -> zero -> watch (is the model still valid?)
+                                                   -> adaptation (what has drifted, and by how much?)
 
 Uses no thread and no clock: samples contain the time. Only the adaptation's files are written.
 """
@@ -19,11 +19,19 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import Response
 from hdbridge.client import messages
 from hdbridge.daemon.following.adaptation import Adaptation, Entry, Proposal
-from hdbridge.daemon.following.health import DRIVEN, EncoderHealth, EncoderStatus, held_out_arcsec, in_states
+from hdbridge.daemon.following.health import (
+    DRIVEN,
+    ZERO_UNKNOWN,
+    EncoderHealth,
+    EncoderStatus,
+    held_out_arcsec,
+    in_states,
+)
 from hdbridge.daemon.following.judging import Raised, Verdict, Watch
 from hdbridge.daemon.following.measuring import DriftModel, Measuring
 from hdbridge.daemon.following.servo import ServoWatch
 from hdbridge.daemon.following.statefile import AdaptationFiles
+from hdbridge.daemon.following.zero import Zero
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.machinefile import AdaptationSettings, Mode
 from hdbridge.daemon.memory import NO_FAULT, SampleArray, SampleFlag, joined_samples
@@ -31,8 +39,6 @@ from hdbridge.errors import InputError
 
 SAMPLES_TOGETHER: Final = 25
 """Minimum number of samples evaluated together: ten evaluations per second at 250 Hz."""
-ZERO_LOST: Final = (AxisState.UNVERIFIED, AxisState.LENT, AxisState.LATCHED)
-"""States after which the drive's zero may have changed."""
 NEEDED: Final = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN
 SAVE_S: Final = 300.0
 """Maximum interval in axis time between stores of a changing state."""
@@ -82,6 +88,7 @@ class Follower:
         """Standard deviation of an observation due to quantisation by the encoders' counts."""
         noise = max(held_out_arcsec(model), motor_count / UNIFORM)
         self.watch = Watch(self._drift, noise)
+        self._zero = Zero(self._drift, self._sigma_arcsec)
         channels = tuple(BY_KEY[key] for key in axis.channels)
         self._servo = ServoWatch(axis, model)
         self._measuring = Measuring(self._drift, self._settings.slow_deg_s, channels)
@@ -111,6 +118,7 @@ class Follower:
             )
             self._files = files
         else:
+            self._zero.forget()
             self.adaptation.set_mode(mode)
             self.save()
 
@@ -118,6 +126,7 @@ class Follower:
         """Restores the committed model and only observes; None without an adaptation."""
         if self.adaptation is None:
             return None
+        self._zero.forget()
         proposal = self.adaptation.revert()
         self._applied(proposal)
         return proposal
@@ -138,8 +147,7 @@ class Follower:
         cycle, times_s = samples["cycle"], 1e-9 * samples["time_ns"].astype(np.float64)
         self._now_s = float(times_s[-1])
         joined = self._next_cycle in {None, int(cycle[0])} and int(cycle[-1] - cycle[0]) == len(cycle) - 1
-        self._servo.believed = status.fault is None
-        servo = self._servo.take(axis, joined=joined)
+        servo = self._servo.take(axis, joined=joined, believed=status.fault is None)
         first = self._begin_of_path(axis, cycle)
         raised: list[Raised] = []
         if servo is not None:
@@ -151,11 +159,17 @@ class Follower:
         stopped = axis["fault"] != NO_FAULT
         usable = ((axis["flags"] & NEEDED) == NEEDED) & (axis["state"] == AxisState.ENABLED) & ~stopped
         observations = self._measuring.take(times_s, axis, usable & (status.fault is None))
-        raised = [*self.watch.take(observations, status, self._now_s), *raised]
+        if status.fault is not None:
+            self._zero.forget()
+        moved = self._zero.take(observations)
+        if moved is not None:
+            status = self.health.accuse(*moved)
+        settled = [each for each in observations if each.settled]
+        raised = [*self.watch.take(settled, status, self._zero.moved, self._now_s), *raised]
         proposal = None
         if self.adaptation is not None:
             fault = "the supervision has stopped the axis" if np.any(stopped) else status.reason
-            proposal = self.adaptation.take(observations, self._now_s, fault)
+            proposal = self.adaptation.take(settled, self._now_s, fault, self._zero.rates)
             proposal = proposal or self._refinement()
             if proposal is not None and proposal.apply:
                 self._applied(proposal)
@@ -183,10 +197,9 @@ class Follower:
         return None if refined is None else adaptation.refine(refined)
 
     def state(self) -> messages.AdaptationState:
-        """Returns the state of the adaptation for clients."""
+        """Returns the state of the adaptation, which has begun, for clients."""
         adaptation = self.adaptation
-        if adaptation is None:
-            return messages.AdaptationState(mode=messages.AdaptationMode(self._settings.mode))
+        assert adaptation is not None
         return messages.AdaptationState(
             mode=messages.AdaptationMode(adaptation.mode),
             frozen=adaptation.waiting_reason(path_known=self._measuring.known),
@@ -227,8 +240,10 @@ class Follower:
         gaps = np.diff(cycle, prepend=next_cycle - 1) != 1
         self._next_cycle = int(cycle[-1]) + 1
         interrupted = np.flatnonzero(gaps | ~driven)
-        if self.adaptation is not None and in_states(axis, ZERO_LOST).any():
-            self.adaptation.invalidate_zero()
+        if in_states(axis, ZERO_UNKNOWN).any():
+            self._zero.restart()
+            if self.adaptation is not None:
+                self.adaptation.invalidate_zero()
         if not len(interrupted):
             return 0
         self._measuring.restart()

@@ -1,20 +1,21 @@
 """Health of the load encoder: detects its own faults and distinguishes them from wear of the gear.
 
-Four faults are detected, each by a sign that a gear cannot produce:
+Three faults are detected within a second, each by a sign that a gear cannot produce:
 
 * frozen: the reading does not change at all while the motor turns;
 * jumped: the residual steps although motor, speed and predicted error do not;
-* noisy: the jitter of a reading is several times its usual value, or readings jump there and back;
-* drifting: the zero moves faster or farther than warming up can move it.
+* noisy: the jitter of a reading is several times its usual value, or readings jump there and back.
+
+`zero` adds a zero that drifts, or that steps in motion.
 
 The signs are in the residual, which is measured minus predicted transmission error. A gear's error depends on
-its motor: it does not jump while the motor hardly moves, does not stay constant while the motor turns, does
-not become noisier within a second, and does not drift while the axis rests. The prediction in a sample is
-that at the motor angle *issued* in its cycle. The encoders are read at its SYNC, when the motor still lags,
-so the prediction is taken from an earlier time, by the mean lag.
+its motor: it does not jump while the motor hardly moves, does not stay constant while the motor turns, and
+does not become noisier within a second. The prediction in a sample is that at the motor angle *issued* in
+its cycle. The encoders are read at its SYNC, when the motor still lags, so the prediction is taken from an
+earlier time, by the mean lag.
 
-Jumps, drifts and noise in motion are judged only with a calibrated model, because without its prediction the
-gear's own error looks the same. The other signs are judged on every axis.
+Jumps and noise in motion are judged only with a calibrated model, because without its prediction the gear's
+own error looks the same. The other signs are judged on every axis.
 
 An encoder that drifts as slowly as a gear warms up, or is eccentric, is not separable from the gear by the
 load encoder alone. A reading that freezes at rest is detected at the next motion.
@@ -26,19 +27,16 @@ encoder's zero is unknown until `reset`, or until the drive is verified or homed
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.analysis.linear import orthonormal
 from hdbridge.analysis.readings import jitter_deg
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import BoolArray, FloatArray
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.daemon.following.estimator import Partial, partial_fit
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleArray, SampleFlag, joined_samples
 from hdbridge.units import ARCSEC_PER_DEG
@@ -62,13 +60,7 @@ SHAKE_S = 0.002
 encoders."""
 MEDIAN_DIFFERENCE = 1.0 / (0.6745 * np.sqrt(2.0))
 """Standard deviation of Gaussian values, relative to the median difference of neighbours."""
-STEP_ARCSEC = 6.0
-STEP_SIGMAS = 8.0
-STEP_BLOCKS = 20
-"""Minimum number of blocks on either side of a step of the zero."""
-STEP_BETTER = 0.6
-"""Maximum ratio of the mean squares left by a step and by a trend."""
-ZERO_UNKNOWN = (AxisState.UNVERIFIED, AxisState.LENT)
+ZERO_UNKNOWN: Final = (AxisState.UNVERIFIED, AxisState.LENT, AxisState.LATCHED)
 """States after which the encoders' zeros may have changed."""
 TAIL = 64
 """Number of samples that are evaluated again with the next batch."""
@@ -81,12 +73,6 @@ MAX_LEARNING_BLOCKS = 480
 """Maximum number of blocks for the usual jitter; later ones might include a slow fault."""
 NOISY_BLOCKS = 3
 """Number of consecutive noisy blocks that count as a fault; fewer may be a knock against the machine."""
-TREND_BLOCKS = 120
-"""Minimum number of blocks for a slow trend, and the number of blocks for a fast trend."""
-MAX_TREND_BLOCKS = 720
-TREND_EVERY = 20
-STEP_S = 180.0
-"""Time span, up to now, that is searched for a step of the zero."""
 UNTESTED_ARCSEC = 3.0
 """Assumed residual of a model without a held-out result."""
 SIGMAS = 8.0
@@ -99,11 +85,6 @@ FROZEN_ARCSEC = 120.0
 """Load travel within which the reading must change; more than any backlash."""
 FROZEN_COUNTS = 20.0
 """Minimum of that travel, in counts of the load encoder."""
-ZERO_RATE_ARCSEC_MIN = 3.0
-"""Maximum drift rate of the zero. Warming up moves it by 5 to 60 arcsec in 10 to 60 minutes, typically by 1
-per minute (`effects.zero_drift`)."""
-MAX_ZERO_ARCSEC = 60.0
-"""Maximum total drift of the zero."""
 RECOVERED_S = 10.0
 """Duration of good readings that ends a fault."""
 STANDING_DEG_S = 1e-6
@@ -210,23 +191,6 @@ def misread(found: Residuals, noise_arcsec: float, count_arcsec: float) -> int:
     return int(np.count_nonzero((away > allowed) & np.all(_windows(found["usable"], SIDE), axis=0)))
 
 
-def local_noise_arcsec(found: Residuals) -> float:
-    """Returns the standard deviation of one reading, by the median difference of neighbours."""
-    steps = np.abs(found["residual_arcsec"][1:] - found["residual_arcsec"][:-1])
-    return float(MEDIAN_DIFFERENCE * np.median(steps)) if len(steps) else 0.0
-
-
-def stuck_arcsec(load_deg: FloatArray, motor_deg: FloatArray, ratio: float) -> tuple[int, float]:
-    """Returns the last row with a change of the load reading (0 without one), and the motor travel since.
-
-    The travel is in arcsec at the load.
-    """
-    changed = np.flatnonzero(np.diff(load_deg) != 0.0)
-    since = int(changed[-1]) + 1 if len(changed) else 0
-    travel = np.max(np.abs(motor_deg[since:] - motor_deg[since])) / ratio * ARCSEC_PER_DEG
-    return since, float(travel)
-
-
 _Any = TypeVar("_Any", np.bool_, np.float64)
 
 
@@ -252,60 +216,6 @@ def _motion_arcsec(found: Residuals, width: int) -> FloatArray:
     return PREDICTED_SHARE * predicted + SHAKE_S * ARCSEC_PER_DEG * speed
 
 
-def trend(
-    time_s: FloatArray, residual_arcsec: FloatArray, direction: FloatArray, velocity_deg_s: FloatArray
-) -> tuple[Partial, float] | None:
-    """Fits a trend to block means, corrected for direction and speed of motion.
-
-    Returns the rate in arcsec per minute and the zero in the middle of the time span; None if they are not
-    separable from the motion.
-    """
-    minutes = (time_s - float(np.mean(time_s))) / 60.0
-    plain = _motion_columns(direction, velocity_deg_s)
-    rate = partial_fit(minutes, plain, residual_arcsec)
-    zero = partial_fit(plain[:, 0], np.column_stack([minutes, plain[:, 1:]]), residual_arcsec)
-    if math.isinf(rate.error) or math.isinf(zero.error):
-        return None
-    return rate, zero.value
-
-
-def find_step(
-    time_s: FloatArray, residual_arcsec: FloatArray, direction: FloatArray, velocity_deg_s: FloatArray
-) -> tuple[float, Partial] | None:
-    """Returns time and size of a step of the zero in block means, if a step fits far better than a trend."""
-    plain = _motion_columns(direction, velocity_deg_s)
-    basis = orthonormal(plain)
-    rest = residual_arcsec - basis @ (basis.T @ residual_arcsec)
-    count = len(rest)
-    after = np.arange(1, count)
-    mean_step = np.cumsum(rest[::-1])[::-1][1:] / (count - after) - np.cumsum(rest)[:-1] / after
-    near = slice(STEP_BLOCKS, count - STEP_BLOCKS)
-    likely = np.abs(mean_step * np.sqrt(after * (count - after) / count))[near]
-    if not len(likely):
-        return None
-    row = int(np.argmax(likely)) + STEP_BLOCKS + 1
-    # Both fits include a trend, because a ramp that begins or ends is not a step.
-    minutes = (time_s - time_s[0]) / 60.0
-    stepped = (np.arange(count) >= row).astype(np.float64)
-    step = partial_fit(stepped, np.column_stack([minutes, plain]), residual_arcsec)
-    slope = partial_fit(minutes, plain, residual_arcsec)
-    if abs(step.value) < max(STEP_ARCSEC, STEP_SIGMAS * step.error):
-        return None
-    if step.mean_square > STEP_BETTER * slope.mean_square:
-        return None
-    return float(time_s[row]), step
-
-
-def _motion_columns(direction: FloatArray, velocity_deg_s: FloatArray) -> FloatArray:
-    """Returns a constant, the direction and the speed, (n, 1 to 3)."""
-    columns = [np.ones(len(direction))]
-    for each in (direction, velocity_deg_s):
-        size = float(np.ptp(each))
-        if size:
-            columns.append(each / size)
-    return np.column_stack(columns)
-
-
 class EncoderFault(Enum):
     """Fault of the load encoder."""
 
@@ -325,20 +235,6 @@ class EncoderStatus(NamedTuple):
     reason: str = ""
 
 
-@dataclass(slots=True)
-class _Zero:
-    """Zero of the load encoder since it was last verified."""
-
-    blocks: deque[tuple[float, float, float, float]] = field(
-        default_factory=lambda: deque(maxlen=MAX_TREND_BLOCKS)
-    )
-    """Time, mean residual, direction and speed of each block."""
-    new: int = 0
-    """Number of blocks since the last evaluation."""
-    reference_arcsec: float | None = None
-    suspicions: int = 0
-
-
 class EncoderHealth:
     """Monitors the load encoder of one axis in the loop's samples."""
 
@@ -355,8 +251,7 @@ class EncoderHealth:
         self._predicted = bool(model.effects)
         """False without a prediction, in which case the gear's own error may look like an encoder fault."""
         self._jitters: dict[bool, list[float]] = {True: [], False: []}
-        self._learned: dict[bool, float] = {}
-        """Usual jitter at rest (True) and in motion (False)."""
+        """Jitter of the first good blocks at rest (True) and in motion (False)."""
         self._spikes: deque[float] = deque()
         self._noisy_blocks = 0
         self._bad_s = -math.inf
@@ -367,7 +262,6 @@ class EncoderHealth:
         """Load reading that does not change, and the motor angle since when."""
         self._pending: list[Residuals] = []
         """Samples of an incomplete block."""
-        self._zero = _Zero()
 
     def reset(self) -> None:
         """Ends a fault, after maintenance or after the encoder's zero was set."""
@@ -376,9 +270,9 @@ class EncoderHealth:
         self.restart()
 
     def restart(self) -> None:
-        """Learns the zero again, for example after a change of the predicting model."""
-        self._zero = _Zero()
-        self._forget_samples()
+        """Forgets the last samples, for example after a change of the predicting model."""
+        self._tail, self._held = None, None
+        self._pending = []
 
     def take(self, samples: SampleArray) -> EncoderStatus:
         """Judges the next samples of the loop, oldest first: a tenth of a second or more at a time."""
@@ -386,7 +280,7 @@ class EncoderHealth:
             self.reset()
         tail = self._tail
         if tail is not None and samples["cycle"][0] <= tail["cycle"][-1]:
-            self._forget_samples()  # the loop has restarted
+            self.restart()  # the loop has restarted
             tail = None
         together = samples if tail is None else joined_samples([tail, samples])
         self._tail = together[-TAIL:].copy()
@@ -396,33 +290,27 @@ class EncoderHealth:
         frozen = self._judge_frozen(found[old:])
         if self._predicted and not frozen:
             self._judge_steps(found[max(old - 2 * SIDE + 1, 0) :])
-        self._gather(found[old:])
+        self._judge_noise(found[old:])
         passing = self.status.fault is not None and self.status.fault not in LATCHED
         if passing and self._now_s - self._bad_s >= RECOVERED_S:
             self.status = EncoderStatus()
         return self.status
 
-    def _forget_samples(self) -> None:
-        self._tail, self._held = None, None
-        self._pending = []
-
     def _usual(self, *, standing: bool) -> float:
-        return self._learned.get(standing, self._residual_arcsec)
-
-    def _learn(self, jitter_arcsec: float, *, standing: bool) -> None:
+        """Returns the usual jitter at rest or in motion, arcsec."""
         known = self._jitters[standing]
-        if len(known) >= MAX_LEARNING_BLOCKS:
-            return
-        known.append(jitter_arcsec)
-        if len(known) >= LEARNING_BLOCKS:
-            # In motion the load vibrates more at some speeds, so a high quantile counts as usual.
-            typical = np.median(known) if standing else np.quantile(known, 0.9)
-            self._learned[standing] = max(float(typical), 0.3 * self._load_count_arcsec)
+        if len(known) < LEARNING_BLOCKS:
+            return self._residual_arcsec
+        # In motion the load vibrates more at some speeds, so a high quantile counts as usual.
+        typical = float(np.quantile(known, 0.5 if standing else 0.9))
+        return max(typical, 0.3 * self._load_count_arcsec)
 
-    def _raise(self, fault: EncoderFault, why: str) -> None:
+    def accuse(self, fault: EncoderFault, why: str) -> EncoderStatus:
+        """Reports a fault and returns the state; a fault that lasts replaces one that passes."""
         self._bad_s = self._now_s
         if self.status.fault is None or (fault in LATCHED and self.status.fault not in LATCHED):
             self.status = EncoderStatus(fault, f"load encoder {fault.value}: {why}")
+        return self.status
 
     def _judge_frozen(self, found: Residuals) -> bool:
         """Reports a frozen reading; also returns True while the reading is suspiciously constant."""
@@ -433,11 +321,13 @@ class EncoderHealth:
         held = self._held
         if held is not None and load[0] == held[0]:
             load, motor = np.append(held[0], load), np.append(held[1], motor)
-        since, gone = stuck_arcsec(load, motor, self._ratio)
+        changed = np.flatnonzero(np.diff(load) != 0.0)
+        since = int(changed[-1]) + 1 if len(changed) else 0
+        gone = float(np.max(np.abs(motor[since:] - motor[since]))) / self._ratio * ARCSEC_PER_DEG
         self._held = (float(load[since]), float(motor[since]))
         allowed = max(FROZEN_ARCSEC, FROZEN_COUNTS * self._load_count_arcsec)
         if gone > allowed:
-            self._raise(
+            self.accuse(
                 EncoderFault.FROZEN,
                 f"it reads {self._held[0]:.5f} deg while the motor has turned by {gone:.0f} arcsec of the "
                 f"load (at most {allowed:.0f} are allowed)",
@@ -445,12 +335,15 @@ class EncoderHealth:
         return gone > 2.0 * self._count_arcsec and gone > 3.0 * self._load_count_arcsec
 
     def _judge_steps(self, found: Residuals) -> None:
-        noise = max(self._usual(standing=bool(np.all(_standing(found)))), local_noise_arcsec(found))
+        noise = self._usual(standing=bool(np.all(_standing(found))))
+        if len(found) > 1:
+            steps = np.abs(np.diff(found["residual_arcsec"]))
+            noise = max(noise, MEDIAN_DIFFERENCE * float(np.median(steps)))
         jump = find_jump(found, noise, self._count_arcsec)
         # A frozen reading ends with a jump.
         if jump is not None and self.status.fault is not EncoderFault.FROZEN:
             moved = float(np.ptp(found["motor_deg"][jump.row - SIDE : jump.row + SIDE])) / self._ratio
-            self._raise(
+            self.accuse(
                 EncoderFault.JUMPED,
                 f"by {jump.by_arcsec:+.1f} arcsec at {found['time_s'][jump.row]:.2f} s, while the motor "
                 f"moved by {moved * ARCSEC_PER_DEG:.1f} arcsec of the load (noise, counts and motion make "
@@ -462,22 +355,17 @@ class EncoderHealth:
         while self._spikes and self._spikes[0] < self._now_s - 10.0:
             self._spikes.popleft()
         if len(self._spikes) >= SPIKES:
-            self._raise(
+            self.accuse(
                 EncoderFault.NOISY, f"{len(self._spikes)} readings of the last 10 s jumped there and back"
             )
 
-    def _gather(self, found: Residuals) -> None:
+    def _judge_noise(self, found: Residuals) -> None:
         """Collects samples into blocks of `BLOCK_S` or more and judges each complete block."""
         self._pending.append(found)
         if sum(map(len, self._pending)) < max(BLOCK_S / self._period_s, BLOCK_SAMPLES):
             return
         block = np.concatenate(self._pending)
         self._pending = []
-        self._judge_noise(block)
-        if self._predicted:
-            self._judge_zero(block)
-
-    def _judge_noise(self, block: Residuals) -> None:
         enough = np.count_nonzero(block["fresh"]) >= max(BLOCK_SAMPLES, 0.9 * len(block))
         if not enough or not np.any(block["usable"]):
             return
@@ -493,68 +381,13 @@ class EncoderHealth:
         noisy = jitter > NOISE_RATIO * usual
         self._noisy_blocks = self._noisy_blocks + 1 if noisy else 0
         if self._noisy_blocks >= NOISY_BLOCKS:
-            self._raise(
+            self.accuse(
                 EncoderFault.NOISY,
                 f"its readings jitter by {jitter:.2f} arcsec {'at rest' if standing else 'in motion'}, "
                 f"usually by {usual:.2f} (at most {NOISE_RATIO:g} times as much is allowed)",
             )
-        elif not noisy and self.status.fault is None:
-            self._learn(jitter, standing=standing)
-
-    def _judge_zero(self, block: Residuals) -> None:
-        zero = self._zero
-        chosen = block[block["usable"]]
-        if self.status.fault is not None or len(chosen) < BLOCK_SAMPLES:
-            return
-        speed = chosen["velocity_deg_s"]
-        if float(np.ptp(speed)) > 0.05 * float(np.max(np.abs(speed))) + 1e-9:
-            return  # it accelerates
-        zero.blocks.append((
-            float(np.mean(chosen["time_s"])), float(np.mean(chosen["residual_arcsec"])),
-            self._direction(float(np.mean(speed))), float(np.mean(speed)),
-        ))  # fmt: skip
-        zero.new += 1
-        if len(zero.blocks) < TREND_BLOCKS or zero.new < TREND_EVERY:
-            return
-        zero.new = 0
-        blocks = np.array(zero.blocks, dtype=np.float64)
-        found = find_step(*blocks[blocks[:, 0] > blocks[-1, 0] - STEP_S].T)
-        if found is not None:
-            time_s, step = found
-            self._raise(
-                EncoderFault.JUMPED,
-                f"its zero stepped by {step.value:+.1f} arcsec (standard error {step.error:.2f}) near "
-                f"{time_s:.1f} s; a gear's does not step",
-            )
-        else:
-            self._judge_trend(blocks)
-
-    def _direction(self, speed_deg_s: float) -> float:
-        """Returns the direction of the present motion, or of the last motion at rest."""
-        if abs(speed_deg_s) > 1e-9 or not self._zero.blocks:
-            return float(np.sign(speed_deg_s))
-        return self._zero.blocks[-1][2]
-
-    def _judge_trend(self, blocks: FloatArray) -> None:
-        zero = self._zero
-        slow, fast = (trend(*blocks[-last:].T) for last in (len(blocks), TREND_BLOCKS))
-        if slow is None or fast is None:
-            return
-        if zero.reference_arcsec is None:
-            zero.reference_arcsec = slow[1]
-        away = fast[1] - zero.reference_arcsec
-        rate = max(slow[0], fast[0], key=lambda each: abs(each.value) / each.error)
-        drifts = abs(rate.value) > max(ZERO_RATE_ARCSEC_MIN, SIGMAS * rate.error)
-        # One bad move can affect two evaluations; only a drift affects a third.
-        zero.suspicions = zero.suspicions + 1 if drifts or abs(away) > MAX_ZERO_ARCSEC else 0
-        if zero.suspicions >= 3:
-            minutes = float(np.ptp(blocks[:, 0])) / 60.0
-            self._raise(
-                EncoderFault.DRIFTING,
-                f"its zero moves by {rate.value:+.2f} arcsec a minute (standard error {rate.error:.2f}, in "
-                f"the last {minutes:.1f} min), {away:+.1f} arcsec since it was verified; a gear's moves by "
-                f"at most {ZERO_RATE_ARCSEC_MIN:g} a minute and {MAX_ZERO_ARCSEC:g} in all",
-            )
+        elif not noisy and self.status.fault is None and len(self._jitters[standing]) < MAX_LEARNING_BLOCKS:
+            self._jitters[standing].append(jitter)
 
 
 def _standing(found: Residuals) -> BoolArray:

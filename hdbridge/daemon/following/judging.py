@@ -9,7 +9,7 @@ If the model is valid, the observed error minus the predicted one is noise plus 
 resolution if that is larger. Three tests use generalised least squares:
 
 * Has a part of the model changed by more than its interval and the errors of this fit allow (chi square)?
-* Has the zero moved since it was learned?
+* Has the zero moved since it was learned (by `zero`)?
 * Is the residual, with every part free to change, larger than the noise allows (chi square)?
 
 The significance level follows from `FALSE_ALARMS_PER_DAY`, divided by the number of tests per
@@ -30,13 +30,18 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from hdbridge.analysis.linear import Linearised
 from hdbridge.analysis.scales import Scales
-from hdbridge.axis.effects import FloatArray, IntArray
+from hdbridge.axis.effects import FloatArray
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.daemon.following.estimator import bounds_arcsec, calibrated_estimator, changes_between
+from hdbridge.daemon.following.estimator import (
+    bounds_arcsec,
+    calibrated_estimator,
+    changes_between,
+    ranged_fit,
+)
 from hdbridge.daemon.following.health import EncoderStatus
 from hdbridge.daemon.following.measuring import DriftModel, Observation, Term
+from hdbridge.daemon.following.zero import Displacement
 from hdbridge.daemon.machinefile import AdaptationSettings
 
 DAY_S: Final = 86_400.0
@@ -123,8 +128,6 @@ class Evidence:
     left_arcsec: float
     """Rms residual with every part of the model free to change."""
     left_allowed_arcsec: float
-    zero: FloatArray
-    """Zero in arcsec, and the coefficients of the load encoder's disc."""
     moved: tuple[Moved, ...]
 
     @property
@@ -152,10 +155,35 @@ class Evidence:
         )
 
 
-class Judge:
-    """Tests one model; ``noise_arcsec`` is the standard deviation of an observation."""
+def _largest_changes(before: TransmissionModel, after: TransmissionModel) -> str:
+    """Describes the four largest relative changes of parameters."""
+    changes = changes_between(before, before, after)
+    by = {each: abs(each.after - each.before) / max(abs(each.before), 1e-9) for each in changes}
+    most = [each for each in sorted(changes, key=lambda each: -by[each]) if by[each] > REPORTED_SHARE]
+    return ", ".join(f"{each.parameter} {each.before:.4g} to {each.after:.4g}" for each in most[:4])
+
+
+def _places(observations: Sequence[Observation]) -> tuple[FloatArray, FloatArray]:
+    """Returns columns and mean error of each place; the last column is time from -1 to 1."""
+    rows = np.array([each.row for each in observations])
+    time_s = np.array([each.time_s for each in observations])
+    error = np.array([each.error_arcsec for each in observations])
+    _, place, count = np.unique(np.round(rows / CELL), axis=0, return_inverse=True, return_counts=True)
+    place = place.reshape(-1)
+    middle, half = 0.5 * (time_s[0] + time_s[-1]), 0.5 * float(np.ptp(time_s)) or 1.0
+    rows = np.column_stack([rows, (time_s - middle) / half])
+    means = np.zeros((len(count), rows.shape[1]))
+    np.add.at(means, place, rows)
+    return means / count[:, np.newaxis], np.bincount(place, error) / count
+
+
+class Watch:
+    """Verdicts on one axis and its model."""
 
     def __init__(self, drift: DriftModel, noise_arcsec: float) -> None:
+        """``noise_arcsec`` is the standard deviation of an observation."""
+        self.evidence: Evidence | None = None
+        """Last evidence; None until enough observations exist."""
         self._drift = drift
         self._noise = NOISE_RATIO * noise_arcsec
         settings = AdaptationSettings()
@@ -171,12 +199,72 @@ class Judge:
         tests = (len(drift.terms) + 2) * DAY_S / EVERY_S
         self._alpha = FALSE_ALARMS_PER_DAY / tests
         """Probability of a false positive in one test."""
+        self._adopted = self._other = Verdict.HOLDS
+        """Verdict on the gear, and the different verdict that must persist before it is adopted."""
+        self._lasted_s = 0.0
+        self._faulty = False
+        self._observations: deque[Observation] = deque(maxlen=MAX_OBSERVATIONS)
+        self._new = False
+        self._judged_s = -EVERY_S
 
-    def judge(self, observations: Sequence[Observation], zero: FloatArray | None) -> Evidence | None:
-        """Tests the observations; None if they are too few.
+    @property
+    def verdict(self) -> Verdict:
+        return Verdict.ENCODER if self._faulty else self._adopted
 
-        ``zero`` is the learned `Evidence.zero`; None if it is not known yet.
-        """
+    def take(
+        self,
+        observations: Sequence[Observation],
+        status: EncoderStatus,
+        zero: Displacement | None,
+        now_s: float,
+    ) -> list[Raised]:
+        """Takes observations, state and zero of the load encoder; returns new verdicts."""
+        raised: list[Raised] = []
+        if (status.fault is not None) != self._faulty:
+            self._faulty = status.fault is not None
+            self._observations.clear()
+            reason = status.reason or "no evidence against the load encoder"
+            raised.append(Raised(self.verdict, reason))
+        self._observations.extend(observations)
+        self._new |= bool(observations)
+        passed_s = now_s - self._judged_s
+        if not 0.0 <= passed_s < EVERY_S:
+            self._judged_s = now_s
+            if self._test(zero, now_s, min(passed_s, 2.0 * EVERY_S)) and self.evidence is not None:
+                raised.append(Raised(self.verdict, self.evidence.text))
+        return raised
+
+    def _test(self, zero: Displacement | None, now_s: float, passed_s: float) -> bool:
+        """Tests the recent observations; returns True if the verdict changes."""
+        recent = self._observations
+        while recent and not 0.0 <= now_s - recent[0].time_s <= WINDOW_S:
+            recent.popleft()
+        # An axis at rest gives no new evidence, and an uncalibrated one has no model to test.
+        if not self._new or self._faulty or not self._drift.model.effects:
+            return False
+        self._new = False
+        evidence = self._evidence(recent, zero)
+        if evidence is None:
+            return False
+        self.evidence = evidence
+        return self._adopts(evidence.verdict(self._adopted), passed_s)
+
+    def _adopts(self, verdict: Verdict, passed_s: float) -> bool:
+        """Takes the present verdict and the time since the last; returns True once it has persisted."""
+        if verdict is self._adopted or verdict is not self._other:
+            self._other, self._lasted_s = verdict, 0.0
+        if verdict is self._adopted:
+            return False
+        self._lasted_s += passed_s
+        if self._lasted_s < (WITHDRAW_S if verdict is Verdict.HOLDS else RAISE_S):
+            return False
+        self._adopted, self._lasted_s = verdict, 0.0
+        return True
+
+    # ------------------------------------------------------------------ the tests
+
+    def _evidence(self, observations: Sequence[Observation], zero: Displacement | None) -> Evidence | None:
+        """Tests the observations; None if they are too few. ``zero`` is None if it is not known yet."""
         least = self._drift.count + 1 + SPARE
         if len(observations) < least:
             return None
@@ -184,13 +272,13 @@ class Judge:
         count, columns = rows.shape
         if count < least:
             return None
-        change, spread = self._fit(rows, observed)
+        change, spread = ranged_fit(rows, observed, self._noise, self._information)
         free = max(count - columns, 1)
         left = observed - rows @ change
         rms, allowed = self._as_calibrated(rows, observed)
         moved = [self._moved(each, rows, change, spread) for each in self._drift.terms]
         if zero is not None:
-            moved.append(self._zero_moved(rows, observed, zero))
+            moved.append(self._zero_moved(zero))
         left_allowed = self._noise * float(np.sqrt(self._chi_square(free) / free))
         return Evidence(
             places=count,
@@ -198,21 +286,8 @@ class Judge:
             allowed_arcsec=allowed,
             left_arcsec=float(np.sqrt(left @ left / free)),
             left_allowed_arcsec=float(np.hypot(left_allowed, LEFT_ARCSEC)),
-            zero=change[self._drift.zero : self._drift.count],
             moved=tuple(each for each in moved if each is not None),
         )
-
-    def _fit(
-        self, rows: FloatArray, observed: FloatArray, columns: IntArray | slice = slice(None)
-    ) -> tuple[FloatArray, FloatArray]:
-        """Fits all parts within their possible range; returns the change and its covariance.
-
-        ``columns`` selects the columns that are present in the rows.
-        """
-        information = self._information[columns]
-        known = np.column_stack([information, np.zeros(len(information))])
-        fit = Linearised(rows / self._noise, observed / self._noise, known)
-        return fit.directions @ fit.slack, fit.directions @ fit.directions.T
 
     def _as_calibrated(self, rows: FloatArray, observed: FloatArray) -> tuple[float, float]:
         """Returns the rms about zero and disc, and its upper limit by the model's intervals."""
@@ -252,109 +327,8 @@ class Judge:
         wear &= not changed.effects[term.number].violations()
         return Moved(_largest_changes(self._drift.model, changed), wear)
 
-    def _zero_moved(self, rows: FloatArray, observed: FloatArray, before: FloatArray) -> Moved | None:
-        """Returns the significant change of the zero from the learned value.
-
-        The disc is fixed at its learned value, because over part of a turn it is hardly separable from the
-        zero.
-        """
-        zero, disc = self._drift.zero, slice(self._drift.zero + 1, self._drift.count)
-        others = np.delete(np.arange(rows.shape[1]), np.arange(disc.start, disc.stop))
-        change, spread = self._fit(rows[:, others], observed - rows[:, disc] @ before[1:], others)
-        by = float(change[zero] - before[0])
-        error = float(np.sqrt(2.0 * spread[zero, zero]))
-        if abs(by) < max(ZERO_ARCSEC, math.sqrt(self._chi_square(1)) * error):
+    def _zero_moved(self, zero: Displacement) -> Moved | None:
+        """Returns the significant change of the zero since it was learned."""
+        if abs(zero.arcsec) < max(ZERO_ARCSEC, math.sqrt(self._chi_square(1)) * zero.error):
             return None
-        return Moved(f"zero: by {by:+.1f} arcsec", abs(by) <= self._zero_bound)
-
-
-def _largest_changes(before: TransmissionModel, after: TransmissionModel) -> str:
-    """Describes the four largest relative changes of parameters."""
-    changes = changes_between(before, before, after)
-    by = {each: abs(each.after - each.before) / max(abs(each.before), 1e-9) for each in changes}
-    most = [each for each in sorted(changes, key=lambda each: -by[each]) if by[each] > REPORTED_SHARE]
-    return ", ".join(f"{each.parameter} {each.before:.4g} to {each.after:.4g}" for each in most[:4])
-
-
-def _places(observations: Sequence[Observation]) -> tuple[FloatArray, FloatArray]:
-    """Returns columns and mean error of each place; the last column is time from -1 to 1."""
-    rows = np.array([each.row for each in observations])
-    time_s = np.array([each.time_s for each in observations])
-    error = np.array([each.error_arcsec for each in observations])
-    _, place, count = np.unique(np.round(rows / CELL), axis=0, return_inverse=True, return_counts=True)
-    place = place.reshape(-1)
-    middle, half = 0.5 * (time_s[0] + time_s[-1]), 0.5 * float(np.ptp(time_s)) or 1.0
-    rows = np.column_stack([rows, (time_s - middle) / half])
-    means = np.zeros((len(count), rows.shape[1]))
-    np.add.at(means, place, rows)
-    return means / count[:, np.newaxis], np.bincount(place, error) / count
-
-
-class Watch:
-    """Verdicts on one axis and its model."""
-
-    def __init__(self, drift: DriftModel, noise_arcsec: float) -> None:
-        """``noise_arcsec`` is the standard deviation of an observation."""
-        self.evidence: Evidence | None = None
-        """Last evidence; None until enough observations exist."""
-        self._calibrated = bool(drift.model.effects)
-        self._judge = Judge(drift, noise_arcsec)
-        self._adopted = self._other = Verdict.HOLDS
-        """Verdict on the gear, and the different verdict that must persist before it is adopted."""
-        self._lasted_s = 0.0
-        self._faulty = False
-        self._observations: deque[Observation] = deque(maxlen=MAX_OBSERVATIONS)
-        self._new = False
-        self._zero: FloatArray | None = None
-        self._judged_s = -EVERY_S
-
-    @property
-    def verdict(self) -> Verdict:
-        return Verdict.ENCODER if self._faulty else self._adopted
-
-    def take(self, observations: Sequence[Observation], status: EncoderStatus, now_s: float) -> list[Raised]:
-        """Takes observations and the state of the load encoder; returns new verdicts."""
-        raised: list[Raised] = []
-        if (status.fault is not None) != self._faulty:
-            self._faulty = status.fault is not None
-            self._observations.clear()
-            self._zero = None
-            reason = status.reason or "no evidence against the load encoder"
-            raised.append(Raised(self.verdict, reason))
-        self._observations.extend(observations)
-        self._new |= bool(observations)
-        passed_s = now_s - self._judged_s
-        if not 0.0 <= passed_s < EVERY_S:
-            self._judged_s = now_s
-            if self._test(now_s, min(passed_s, 2.0 * EVERY_S)) and self.evidence is not None:
-                raised.append(Raised(self.verdict, self.evidence.text))
-        return raised
-
-    def _test(self, now_s: float, passed_s: float) -> bool:
-        """Tests the recent observations; returns True if the verdict changes."""
-        recent = self._observations
-        while recent and not 0.0 <= now_s - recent[0].time_s <= WINDOW_S:
-            recent.popleft()
-        # An axis at rest gives no new evidence, and an uncalibrated one has no model to test.
-        if not self._new or self._faulty or not self._calibrated:
-            return False
-        self._new = False
-        evidence = self._judge.judge(recent, self._zero)
-        if evidence is None:
-            return False
-        self.evidence = evidence
-        if self._zero is None and not evidence.unexplained:
-            self._zero = evidence.zero
-        return self._adopts(evidence.verdict(self._adopted), passed_s)
-
-    def _adopts(self, verdict: Verdict, passed_s: float) -> bool:
-        """Takes the present verdict and the time since the last; returns True once it has persisted."""
-        if verdict is self._adopted or verdict is not self._other:
-            self._other, self._lasted_s = verdict, 0.0
-        if verdict is self._adopted:
-            return False
-        self._lasted_s += passed_s
-        if self._lasted_s < (WITHDRAW_S if verdict is Verdict.HOLDS else RAISE_S):
-            return False
-        self._adopted, self._lasted_s = verdict, 0.0
-        return True
+        return Moved(f"zero: by {zero.arcsec:+.1f} arcsec", abs(zero.arcsec) <= self._zero_bound)

@@ -5,9 +5,9 @@ themselves. An effect without memory provides them for any angles. For an effect
 coefficients follow the command, which by linearity is equivalent. Nuisance parameters are fitted as well but
 never applied: the zero, and the once and twice per turn error of an eccentric or oval load encoder disc.
 
-An observation is the mean over a standstill (its second half) or over a few degrees of slow motion. Fast
-motion is not used, because wind-up, drag and the delay between the encoders would look like a change of the
-hysteresis loop.
+An observation is the mean over the second half of a standstill, over a few degrees of slow motion, or over a
+quarter of a second of fast motion at constant speed. Fast motion shows only the zero, because wind-up, drag
+and the delay between the encoders would look like a change of the hysteresis loop.
 """
 
 from __future__ import annotations
@@ -50,7 +50,12 @@ SETTLE_S = 0.05
 SHORTEST_S = 0.04
 """Minimum duration of a standstill, in addition to the settling time."""
 LONGEST_S = 1.0
-"""Maximum duration of a standstill; each provides at most one observation."""
+"""Maximum duration of an observation at rest. Only the first of a standstill is used for more than the
+zero."""
+FAST_S = 0.25
+"""Duration of an observation in fast motion."""
+EVEN = 1e-3
+"""Maximum relative change of a constant speed from one sample to the next."""
 CELL_DEG = 3.0
 """Motor travel of an observation in slow motion."""
 REVERSAL_DEG = 0.3
@@ -197,7 +202,7 @@ def _unit(effect: Effect, number: int) -> Effect:
 
 
 class Observation(NamedTuple):
-    """Observation from one standstill or stretch of slow motion."""
+    """Observation from part of a standstill or of a stretch of motion."""
 
     time_s: float
     """Time at the end of the observation."""
@@ -205,15 +210,20 @@ class Observation(NamedTuple):
     """Observed transmission error less the committed model's, at the load."""
     row: FloatArray
     """Columns of `DriftModel`, shape (count,)."""
+    speed_deg_s: float
+    """Speed of the load target."""
+    settled: bool
+    """True in slow motion and at the beginning of a standstill; all others show only the zero."""
     travel_deg: float
-    """Total travel of the motor since the last observation."""
+    """Total travel of the motor since the last settled observation."""
     reversals: int
-    """Reversals of the motor since the last observation."""
+    """Reversals of the motor since the last settled observation."""
 
 
 class _Reading(NamedTuple):
     time_s: float
     motor_deg: float
+    speed_deg_s: float
     error_arcsec: float
     state: tuple[float, ...]
 
@@ -237,10 +247,12 @@ class Measuring:
         self._last: float | None = None
         self._collected: list[_Reading] = []
         self._quiet_s = math.inf
-        """Time since which the command has been at rest, or slow in one direction."""
+        """Time since which the command has been at rest, slow in one direction, or at constant speed."""
         self._done = True
         """True once this standstill has been used."""
-        self._standing = True
+        self._standing = self._slow = True
+        self._longest_s = LONGEST_S
+        self._speed_deg_s = 0.0
         self._turn_deg = 0.0
         self._sense = 0
         self._travel_deg = 0.0
@@ -272,18 +284,18 @@ class Measuring:
         for number, (time_s, motor_deg, position_deg, load_deg, speed_deg_s, good) in enumerate(samples):
             if self._needs_moments:
                 moment = self._moment(time_s, axis[number])
-            ended = self._follow(time_s, motor_deg, moment, abs(speed_deg_s))
+            ended = self._follow(time_s, motor_deg, moment, speed_deg_s)
             if ended is not None:
                 found.append(ended)
             if not good:
                 self._collected.clear()
                 self._quiet_s = time_s
                 continue
-            if self._done or time_s - self._quiet_s < SETTLE_S or not columns.known():
+            if time_s - self._quiet_s < SETTLE_S or not columns.known():
                 continue
             error = (load_deg - position_deg / self._ratio) * ARCSEC_PER_DEG
-            self._collected.append(_Reading(time_s, motor_deg, error, columns.state()))
-            if self._standing and time_s - self._collected[0].time_s >= LONGEST_S:
+            self._collected.append(_Reading(time_s, position_deg, speed_deg_s, error, columns.state()))
+            if time_s - self._collected[0].time_s >= self._longest_s:
                 found.append(self._observation())
         return found
 
@@ -299,20 +311,19 @@ class Measuring:
             return None
         step = motor_deg - last
         stands = speed_deg_s == 0.0 and step == 0.0
+        slow = abs(speed_deg_s) <= self._slow_deg_s
+        even = slow or abs(speed_deg_s - self._speed_deg_s) <= EVEN * abs(speed_deg_s)
+        turned = self._count(motor_deg, step) if step else False
         ended = None
-        if stands != self._standing:
+        if turned or not even or (stands, slow) != (self._standing, self._slow):
             ended = self._end_of_stretch()
-            self._standing, self._quiet_s, self._done = stands, time_s, False
-        if stands and not self._needs_moments:
-            return ended
-        self._columns.advance(motor_deg, moment)
-        if step:
-            turned = self._count(motor_deg, step)
-            if turned or speed_deg_s > self._slow_deg_s:
-                ended = ended or self._end_of_stretch()
-                self._quiet_s = time_s
-            elif not self._standing and self._cell_deg >= CELL_DEG:
-                ended = ended or self._end_of_stretch()
+            self._standing, self._slow, self._quiet_s, self._done = stands, slow, time_s, False
+            self._longest_s = LONGEST_S if stands else math.inf if slow else FAST_S
+        elif slow and self._cell_deg >= CELL_DEG:
+            ended = self._end_of_stretch()
+        self._speed_deg_s = speed_deg_s
+        if not stands or self._needs_moments:
+            self._columns.advance(motor_deg, moment)
         return ended
 
     def _count(self, motor_deg: float, step_deg: float) -> bool:
@@ -335,7 +346,7 @@ class Measuring:
         collected, self._cell_deg = self._collected, 0.0
         enough = len(collected) > 2 and (
             collected[-1].time_s - collected[0].time_s >= SHORTEST_S
-            if self._standing
+            if self._standing or not self._slow
             else abs(collected[-1].motor_deg - collected[0].motor_deg) >= 0.5 * CELL_DEG
         )
         if enough:
@@ -350,15 +361,19 @@ class Measuring:
         rows = self._columns.rows(motor, states)
         error = np.array([each.error_arcsec for each in used]) - states[:, 0]
         error -= rows[:, : self._drift.zero] @ self._drift.committed
+        settled = self._slow and not self._done
         found = Observation(
             time_s=used[-1].time_s,
             error_arcsec=float(np.mean(error)),
             row=np.mean(rows, axis=0),
+            speed_deg_s=used[-1].speed_deg_s,
+            settled=settled,
             travel_deg=self._travel_deg,
             reversals=self._reversals,
         )
         self._collected = []
-        self._travel_deg, self._reversals = 0.0, 0
+        if settled:
+            self._travel_deg, self._reversals = 0.0, 0
         self._done = self._standing
         return found
 

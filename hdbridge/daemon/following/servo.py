@@ -38,8 +38,6 @@ class ServoWatch:
     def __init__(self, axis: AxisConfig, model: TransmissionModel) -> None:
         self.retuned = False
         """True while the servo's response differs from the measured response."""
-        self.believed = True
-        """False during a fault of the load encoder."""
         self.refinements = 0
         """Number of successive responses that have replaced the committed one."""
         self._ratio, self._period_s = model.ratio, axis.drive.cycle_s
@@ -94,10 +92,11 @@ class ServoWatch:
         changed = self.retuned or self._response != self._committed
         return self._answers.refined(self._committed, self._limits, bound, retuned=changed)
 
-    def take(self, axis: NDArray[Any], *, joined: bool) -> str | None:
+    def take(self, axis: NDArray[Any], *, joined: bool, believed: bool) -> str | None:
         """Takes the next samples of the axis; returns the evidence if the verdict changes.
 
-        ``joined`` is False if cycles are missing before or between them.
+        ``joined`` is False if cycles are missing before or between them, ``believed`` during a fault of the
+        load encoder.
         """
         if self._answers is None or not self._orders or not len(axis):
             return None
@@ -122,9 +121,9 @@ class ServoWatch:
         if duration_s < RUN_S or turns < RUN_TURNS or count < samples_needed(len(self._orders)):
             return None
         run, self._run = np.concatenate(self._run), []
-        return self._judge(run, speed)
+        return self._judge(run, speed, believed=believed)
 
-    def _judge(self, run: NDArray[Any], speed_deg_s: float) -> str | None:
+    def _judge(self, run: NDArray[Any], speed_deg_s: float, *, believed: bool) -> str | None:
         """Adds a run; returns the evidence if the verdict changes."""
         stored, answers = self._response, self._answers
         assert stored is not None
@@ -133,7 +132,7 @@ class ServoWatch:
             return None
         names = ("load_target_deg", "issued_deg", "motor_position_deg", "load_position_deg")
         target, issued, motor, load = (run[each] for each in names)
-        if not self.believed:
+        if not believed:
             self.forget_load()
             load = np.full(len(run), np.nan)
         answers.take(speed_deg_s, target, issued, motor, load)

@@ -31,8 +31,3 @@ def page_files() -> dict[str, tuple[bytes, str]]:
     reports = files("hdbridge.report").joinpath("assets")
     found |= {name: reports.joinpath(source).read_bytes() for name, source in _FROM_REPORTS.items()}
     return {name: (content, _TYPES[name[name.rindex(".") :]]) for name, content in sorted(found.items())}
-
-
-def page_file(name: str) -> tuple[bytes, str] | None:
-    """Returns content and content type of one file; None if it does not exist."""
-    return page_files().get(name)

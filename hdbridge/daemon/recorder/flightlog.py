@@ -45,7 +45,7 @@ _NS: Final = 1_000_000_000
 class Batch(NamedTuple):
     """Data received from the observer in one call."""
 
-    samples: SampleArray | None
+    samples: SampleArray
     events: tuple[Event, ...] = ()
     lost: int = 0
 
@@ -74,8 +74,6 @@ class Counts:
 
     recorded: int = 0
     """Cycles on the disk."""
-    lost: int = 0
-    """Cycles lost because the observer was too slow."""
     dropped: int = 0
     """Cycles dropped because the recorder was too slow."""
     refused: int = 0
@@ -135,7 +133,7 @@ class FlightLog:
     def put(self, item: Item) -> None:
         """Takes an item; it is on the disk after the next `flush`."""
         self._waiting.append(item)
-        if isinstance(item, Batch) and item.samples is not None and len(item.samples):
+        if isinstance(item, Batch) and len(item.samples):
             self._newest_ns = int(item.samples["time_ns"][-1])
 
     def flush(self) -> None:
@@ -146,9 +144,7 @@ class FlightLog:
                 self._models[item.axis] = item
         if not waiting and (self._file is None or not self._file.behind):
             return
-        cycles = sum(
-            len(each.samples) for each in waiting if isinstance(each, Batch) and each.samples is not None
-        )
+        cycles = sum(len(each.samples) for each in waiting if isinstance(each, Batch))
         size = cycles * (1 + len(self._about.axes)) * MESSAGE_BYTES
         try:
             if self._free(self.folder) < size + self._settings.free_mb * _MB:
@@ -178,7 +174,7 @@ class FlightLog:
         self._end()
 
     def _begin(self, items: Sequence[Item]) -> FlightFile:
-        batches = [each.samples for each in items if isinstance(each, Batch) and each.samples is not None]
+        batches = [each.samples for each in items if isinstance(each, Batch) and len(each.samples)]
         now_ns = self._wall_ns()
         self._about = replace(self._about, offset_ns=now_ns - self._newest_ns)
         file = FlightFile(self._new_path(now_ns), self._about)
@@ -196,14 +192,13 @@ class FlightLog:
                 file.note(self._newest_ns, item.kind, item.text)
             case Batch():
                 if item.lost:
-                    self.counts.lost += item.lost
                     file.note(
                         self._newest_ns,
                         "LOST",
                         f"{item.lost} cycles were lost before they were read",
                         logging.WARNING,
                     )
-                if item.samples is not None and len(item.samples):
+                if len(item.samples):
                     file.add_samples(item.samples)
                 for event in item.events:
                     file.add_event(event)

@@ -73,7 +73,7 @@ class FlightRecorder:
         if self.flight is None:
             return
         if self._queue.qsize() < QUEUE_BATCHES:
-            self._queue.put(Batch(samples if len(samples) else None, tuple(events), lost))
+            self._queue.put(Batch(samples, tuple(events), lost))
             return
         if not self.flight.counts.dropped:
             self._notify("the recorder is too slow: cycles are dropped")

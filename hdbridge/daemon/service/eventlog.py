@@ -36,7 +36,6 @@ class Entry(NamedTuple):
     event: Event | None
     """Event of the control process; None for a note of the service."""
     text: str
-    hint: str = ""
 
 
 class EventLog:
@@ -49,8 +48,6 @@ class EventLog:
         self._public: deque[Entry] = deque(maxlen=KEPT)
         self._answers: dict[int, Event] = {}
         self._number = self._public_number = 0
-        self.lost = 0
-        """Events lost because they were not read in time."""
 
     @property
     def newest(self) -> int:
@@ -65,8 +62,7 @@ class EventLog:
     def poll(self) -> None:
         """Reads new events of the control process."""
         with self._lock:
-            events, lost = self._reader.read()
-            self.lost += lost
+            events, _ = self._reader.read()
             for event in events:
                 self._add(event.axis, event, event.text)
                 if event.id and event.kind in _ANSWERS:
@@ -74,10 +70,10 @@ class EventLog:
             while len(self._answers) > ANSWERS_KEPT:
                 del self._answers[next(iter(self._answers))]
 
-    def note(self, text: str, axis: int = -1, hint: str = "") -> None:
+    def note(self, text: str, axis: int = -1) -> None:
         """Adds a note of the service."""
         with self._lock:
-            self._add(axis, None, text, hint)
+            self._add(axis, None, text)
 
     def answer(self, command_id: int) -> Event | None:
         """Returns the DONE or REFUSED event of a command; None until it arrives."""
@@ -98,13 +94,13 @@ class EventLog:
         entries = self.since(since)
         return [each.event for each in entries if each.event is not None and each.axis in {axis, -1}]
 
-    def _add(self, axis: int, event: Event | None, text: str, hint: str = "") -> None:
+    def _add(self, axis: int, event: Event | None, text: str) -> None:
         date = datetime.now(UTC)
         self._number += 1
-        self._entries.append(Entry(self._number, date, axis, event, text, hint))
+        self._entries.append(Entry(self._number, date, axis, event, text))
         if event is None or not _routine(event):
             self._public_number += 1
-            self._public.append(Entry(self._public_number, date, axis, event, text, hint))
+            self._public.append(Entry(self._public_number, date, axis, event, text))
 
 
 def _newest(entries: deque[Entry], count: int) -> list[Entry]:

@@ -137,16 +137,16 @@ class Following:
             self._problem = "there is no model to follow: calibrate first"
         else:
             try:
-                follower.adapt(settings.mode, self._files(follower))
+                files = None
+                if follower.adaptation is None:
+                    files = AdaptationFiles(
+                        self._folder, self._axis.name, follower.model, settings.parameters
+                    )
+                follower.adapt(settings.mode, files)
             except HdbridgeError as problem:
                 self._problem = str(problem)
                 _log.warning("no adaptation", {"axis": self._axis.name, "why": str(problem)})
         self._publish()
-
-    def _files(self, follower: Follower) -> AdaptationFiles | None:
-        if follower.adaptation is not None:
-            return None
-        return AdaptationFiles(self._folder, self._axis.name, follower.model, self._settings.parameters)
 
     def _process(self, samples: SampleArray) -> None:
         try:

@@ -57,7 +57,6 @@ def event_message(entry: Entry, names: Sequence[str]) -> messages.Event:
             date=entry.date,
             axis=axis,
             text=entry.text,
-            hint=entry.hint or None,
         )
     fault = fault_of(event.code) if event.kind is EventKind.FAULT else None
     hint = ROWS[fault].hint if fault is not None else None

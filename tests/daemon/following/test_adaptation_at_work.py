@@ -4,7 +4,7 @@ The change of an hour is packed into minutes, with rates and intervals to match;
 """
 
 import pytest
-from support.adapting import FAULTS, FLOOR_ARCSEC, at_work, truth_of
+from support.adapting import FAULTS, FLOOR_ARCSEC, at_work, truth_of, used_arcsec
 
 from hdbridge.daemon.machinefile import AdaptationSettings
 
@@ -43,7 +43,7 @@ def test_a_load_encoder_that_fails_freezes_the_adaptation(fault: str, left_alone
     with at_work(CHANGING, QUICK) as work:
         work.until(FAULT_S)
         work.faults.load_reading = FAULTS[fault](work)
-        begun_s, before = work.time_s, work.adaptation.used_arcsec
+        begun_s, before = work.time_s, used_arcsec(work.adaptation)
         work.until(FAULTY_UNTIL_S)
         frozen = [each for each in work.history if each["event"] == "frozen"]
         adapted = work.three_sigma_arcsec()
@@ -54,7 +54,7 @@ def test_a_load_encoder_that_fails_freezes_the_adaptation(fault: str, left_alone
     # What was learnt of the fault before it was seen is within what the rate allows, and harmless.
     rate = QUICK.rate_arcsec_per_hour / 3600.0
     blind_s = frozen[0]["axis_time_s"] - begun_s + 2.0 * QUICK.interval_s
-    assert abs(work.adaptation.used_arcsec - before).max() <= rate * blind_s + 1e-9
+    assert abs(used_arcsec(work.adaptation) - before).max() <= rate * blind_s + 1e-9
     assert all(on <= 1.05 * off for on, off in zip(adapted, left_alone, strict=False))
     assert max(adapted) <= 1.3 * FLOOR_ARCSEC
 

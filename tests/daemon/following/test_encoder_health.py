@@ -33,12 +33,13 @@ def model_of(offset=31.6, second=13.7, phase=161.5):
 MODEL = model_of()
 
 
-def judged(samples, health=None, batch=50):
+def judged(samples, follower=None, batch=50):
     """The states of the encoder over the samples, each when it first came."""
-    health = health or EncoderHealth(AXIS, MODEL)
+    follower = follower or Follower(AXIS, MODEL)
     seen = []
     for first in range(0, len(samples), batch):
-        status = health.take(samples[first : first + batch])
+        follower.take(samples[first : first + batch])
+        status = follower.health.status
         if not seen or status.fault is not seen[-1][1].fault:
             seen.append((first * PERIOD_S, status))
     return seen
@@ -131,13 +132,13 @@ def test_a_recovered_encoder_is_trusted_again():
 
 def test_a_jump_persists_until_the_drive_is_verified_again():
     samples = faulty(lambda load, _: load + 100.0 / 3600.0)
-    health = EncoderHealth(AXIS, MODEL)
-    judged(samples, health)
-    assert health.status.fault is EncoderFault.JUMPED
+    follower = Follower(AXIS, MODEL)
+    judged(samples, follower)
+    assert follower.health.status.fault is EncoderFault.JUMPED
     again = working(duration_s=60.0, seed=9)
     again["cycle"] += samples["cycle"][-1]
     again["axes"]["state"][:10] = 0  # unverified
-    assert judged(again, health)[-1][1].fault is None
+    assert judged(again, follower)[-1][1].fault is None
 
 
 def test_verdicts_are_independent_of_batching():
@@ -170,6 +171,6 @@ def test_an_uncalibrated_gear_is_not_an_encoder_fault():
     maker = SampleMaker(AXIS, nothing, model_of(offset=160.0, second=30.0), 3, compensated=False)
     samples = maker.make(moves_and_rests(120.0, PERIOD_S, 3, 60.0))
     assert EncoderHealth(AXIS, MODEL).take(samples).fault is EncoderFault.JUMPED  # what it would be called
-    assert [each.fault for _, each in judged(samples, EncoderHealth(AXIS, nothing))] == [None]
+    assert [each.fault for _, each in judged(samples, Follower(AXIS, nothing))] == [None]
     samples["axes"]["load_position_deg"][len(samples) // 2 :] = samples["axes"]["load_position_deg"][0]
     assert EncoderHealth(AXIS, nothing).take(samples).fault is EncoderFault.FROZEN

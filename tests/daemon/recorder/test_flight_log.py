@@ -152,7 +152,6 @@ def test_lost_cycles_are_recorded(tmp_path):
     log.close()
     (path,) = tmp_path.glob("*.mcap")
     assert [each.text for each in read(path).events] == ["33 cycles were lost before they were read"]
-    assert log.counts.lost == 33
 
 
 def test_files_of_the_same_second_get_different_names(tmp_path):

@@ -1,0 +1,223 @@
+"""Zero of the load encoder: the one judgement of its motion, for encoder health, watch and adaptation.
+
+The zero is the difference of the two encoders' zeros. A gear cannot step it, and wear and temperature move it
+slowly and not far. What moves it faster or farther is the load encoder or its coupling. Because it is one
+number, one fit to the recent observations judges it for all:
+
+    error = columns @ change + zero + rate * time + load encoder disc + share of the speed + noise
+
+The columns and the range of their changes are those of the adaptation, so a gear that has worn is not taken
+for a zero that moves, however few places the axis visits. The error refers to the committed model, so a
+change of the model in use changes nothing here. Noise is the larger of the counts' and of what is left, and
+allows for its correlation.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from hdbridge.axis.effects import FloatArray
+from hdbridge.daemon.following.estimator import calibrated_estimator, correlated, ranged_fit
+from hdbridge.daemon.following.health import EncoderFault
+from hdbridge.daemon.following.measuring import DriftModel, Observation
+from hdbridge.daemon.machinefile import AdaptationSettings
+
+SPANS_S: Final = (15.0, 60.0, 180.0)
+"""Time spans up to now that are searched for a drift, from fast to slow; the last is searched for a step."""
+EVERY_S: Final = 2.0
+"""Interval between judgements."""
+LEAST: Final = 16
+"""Minimum number of observations in a span."""
+SIGMAS: Final = 8.0
+"""Standard errors by which a rate must exceed its limit."""
+LASTING: Final = 3
+"""Number of successive judgements that must agree on a drift; a knock does not last that long."""
+RATE_ARCSEC_MIN: Final = 3.0
+"""Maximum rate of a gear's zero. Warming up moves it by 5 to 60 arcsec in 10 to 60 minutes, typically by 1
+per minute (`effects.zero_drift`)."""
+MAX_ARCSEC: Final = 60.0
+"""Maximum total change of a gear's zero."""
+LEARNED_MIN: Final = 0.5
+"""Minutes of observations from which the zero is learned."""
+FREE_COLUMNS: Final = 4
+"""Number of columns without a known range: time, step, zero, and one for the speed."""
+COUNTS_SHARE: Final = 0.3
+"""Least noise of an observation, which is a mean, as a share of that of a single sample by the counts."""
+SPEED_ARCSEC: Final = 5.0
+"""Expected size of an error in proportion to speed, at the highest speed of the span."""
+STEP_ARCSEC: Final = 6.0
+"""Smallest step of the zero that counts as one."""
+STEP_OBSERVATIONS: Final = 20
+"""Minimum number of observations on either side of a step."""
+STEP_BETTER: Final = 0.6
+"""Maximum ratio of the mean squares left by a step and by a drift that begins there."""
+
+
+class Rate(NamedTuple):
+    """Rate of the zero over a span up to now."""
+
+    arcsec_min: float
+    error: float
+    """Standard error of the rate."""
+    minutes: float
+    """Length of the span."""
+
+    def exceeds(self, limit_arcsec_min: float) -> bool:
+        """Returns True if the rate exceeds a limit by more than its error allows."""
+        return abs(self.arcsec_min) - SIGMAS * self.error > limit_arcsec_min
+
+
+class Displacement(NamedTuple):
+    """Change of the zero since it was learned, in the middle of the longest span."""
+
+    arcsec: float
+    error: float
+    """Standard error."""
+
+
+class Zero:
+    """Judges the zero of one axis since its drive was verified."""
+
+    def __init__(self, drift: DriftModel, sigma_arcsec: float) -> None:
+        """``sigma_arcsec`` is the standard deviation of a single sample by the encoders' counts."""
+        self.rates: list[Rate] = []
+        """Rates at the last judgement, one per span with enough observations."""
+        self.moved: Displacement | None = None
+        """Displacement at the last judgement; None until the zero is learned."""
+        self._judged = bool(drift.model.effects)
+        """False without a prediction, because the gear's own error may look like a moving zero."""
+        self._sigma_arcsec = COUNTS_SHARE * sigma_arcsec
+        self._at = 2 + drift.zero
+        scale = calibrated_estimator(drift, AdaptationSettings()).scale
+        self._information = np.concatenate([[0.0, SPEED_ARCSEC**-2], scale**-2])
+        self._recent: deque[Observation] = deque()
+        self._judged_s = 0.0
+        self._suspicions = 0
+        self._learned: tuple[Displacement, FloatArray] | None = None
+        """Zero, and coefficients of the disc, when they were learned."""
+
+    def restart(self) -> None:
+        """Learns the zero again, because the drive was verified or homed."""
+        self.forget()
+        self._learned = self.moved = None
+
+    def forget(self) -> None:
+        """Forgets the observations, but not the zero that was learned."""
+        self.rates.clear()
+        self._recent.clear()
+        self._suspicions = 0
+
+    def take(self, observations: Sequence[Observation]) -> tuple[EncoderFault, str] | None:
+        """Takes observations in order; returns a fault and its evidence once it is certain."""
+        if not (observations and self._judged):
+            return None
+        recent = self._recent
+        recent.extend(observations)
+        now_s = recent[-1].time_s
+        while not 0.0 <= now_s - recent[0].time_s < SPANS_S[-1]:
+            recent.popleft()
+        if 0.0 <= now_s - self._judged_s < EVERY_S:
+            return None
+        self._judged_s = now_s
+        time_s = np.array([each.time_s for each in recent])
+        spans = [time_s > now_s - span_s for span_s in SPANS_S]
+        rows = self._rows(time_s)
+        error_arcsec = np.array([each.error_arcsec for each in recent])
+        self.rates = [
+            self._rate(rows[span], error_arcsec[span]) for span in spans if np.count_nonzero(span) >= LEAST
+        ]
+        if not self.rates:
+            return None
+        self._displaced(rows, error_arcsec)
+        return self._stepped(time_s, rows, error_arcsec) or self._drifts()
+
+    def _rows(self, time_s: FloatArray) -> FloatArray:
+        """Returns minutes from the middle, share of the highest speed, and the columns of `DriftModel`."""
+        speed = np.array([each.speed_deg_s for each in self._recent])
+        columns = np.array([each.row for each in self._recent])
+        share = speed / max(float(np.max(np.abs(speed))), 1e-9)
+        return np.column_stack([(time_s - 0.5 * (time_s[0] + time_s[-1])) / 60.0, share, columns])
+
+    def _fit(
+        self, rows: FloatArray, error_arcsec: FloatArray, information: FloatArray
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Returns the coefficients, their standard errors and the mean square that is left."""
+        sigma = self._sigma_arcsec
+        change, _ = ranged_fit(rows, error_arcsec, sigma, information)
+        left = error_arcsec - rows @ change
+        sigma = max(sigma, float(np.sqrt(left @ left / (len(left) - FREE_COLUMNS))))
+        change, covariance = ranged_fit(rows, error_arcsec, sigma, information)
+        left = error_arcsec - rows @ change
+        errors = np.sqrt(np.diag(covariance) * correlated(left))
+        return change, errors, float(left @ left) / len(left)
+
+    def _rate(self, rows: FloatArray, error_arcsec: FloatArray) -> Rate:
+        change, errors, _ = self._fit(rows, error_arcsec, self._information)
+        return Rate(float(change[0]), float(errors[0]), float(rows[-1, 0] - rows[0, 0]))
+
+    def _displaced(self, rows: FloatArray, error_arcsec: FloatArray) -> None:
+        """Learns the zero, or determines how far it has moved since.
+
+        The disc is fixed at its learned value, because over part of a turn it is hardly separable from the
+        zero.
+        """
+        own, disc = rows[:, : self._at + 1], rows[:, self._at + 1 :]
+        if self._learned is None:
+            if rows[-1, 0] - rows[0, 0] < LEARNED_MIN:
+                return
+            change, *_ = self._fit(rows, error_arcsec, self._information)
+            coefficients = change[self._at + 1 :]
+        else:
+            coefficients = self._learned[1]
+        change, errors, _ = self._fit(
+            own, error_arcsec - disc @ coefficients, self._information[: self._at + 1]
+        )
+        zero = Displacement(float(change[self._at]), float(errors[self._at]))
+        if self._learned is None:
+            self._learned = zero, coefficients
+        before, _ = self._learned
+        self.moved = Displacement(zero.arcsec - before.arcsec, float(np.hypot(zero.error, before.error)))
+
+    def _stepped(
+        self, time_s: FloatArray, rows: FloatArray, error_arcsec: FloatArray
+    ) -> tuple[EncoderFault, str] | None:
+        """Returns a step of the zero if it fits far better than a drift that begins at the same time."""
+        count = len(rows)
+        before = np.arange(STEP_OBSERVATIONS, count - STEP_OBSERVATIONS + 1)
+        if not len(before):
+            return None
+        change, *_ = self._fit(rows, error_arcsec, self._information)
+        change[0] = 0.0
+        total = np.cumsum(error_arcsec - rows @ change)
+        likely = np.abs(total[before - 1] - total[-1] * before / count)
+        row = int(before[np.argmax(likely / np.sqrt(before * (count - before)))])
+        information = np.append(0.0, self._information)
+        stepped = np.column_stack([np.arange(count) >= row, rows])
+        change, errors, left_by_step = self._fit(stepped, error_arcsec, information)
+        step, error = float(change[0]), float(errors[0])
+        if abs(step) < max(STEP_ARCSEC, SIGMAS * error):
+            return None
+        bent = np.column_stack([np.maximum(rows[:, 0] - rows[row, 0], 0.0), rows])
+        *_, left_by_drift = self._fit(bent, error_arcsec, information)
+        if left_by_step > STEP_BETTER * left_by_drift:
+            return None
+        return EncoderFault.JUMPED, (
+            f"its zero stepped by {step:+.1f} arcsec (standard error {error:.2f}) near {time_s[row]:.1f} s; "
+            "a gear's does not step"
+        )
+
+    def _drifts(self) -> tuple[EncoderFault, str] | None:
+        """Returns a drift that is too fast or too far for a gear, once it has lasted."""
+        away = 0.0 if self.moved is None else self.moved.arcsec
+        drifts = any(each.exceeds(RATE_ARCSEC_MIN) for each in self.rates)
+        self._suspicions = self._suspicions + 1 if drifts or abs(away) > MAX_ARCSEC else 0
+        if self._suspicions < LASTING:
+            return None
+        rate = max(self.rates, key=lambda each: abs(each.arcsec_min) - SIGMAS * each.error)
+        return EncoderFault.DRIFTING, (
+            f"its zero moves by {rate.arcsec_min:+.2f} arcsec a minute (standard error {rate.error:.2f}, in "
+            f"the last {rate.minutes:.1f} min), {away:+.1f} arcsec since it was verified; a gear's moves by "
+            f"at most {RATE_ARCSEC_MIN:g} a minute and {MAX_ARCSEC:g} in all"
+        )
