@@ -25,7 +25,6 @@ from hdbridge.analysis.linear import (
     Prior,
     Terms,
     about_zeros,
-    side_by_side,
     unknown,
 )
 from hdbridge.analysis.noise import White
@@ -256,23 +255,17 @@ class Estimator:
         return turns, change
 
     def crept(self, effects: Sequence[Effect], start: Start) -> FloatArray:
-        """Returns the change at rest if the motor has crept back within a count, weighted, (m, k).
+        """Returns the change of each sample at rest if the motor has crept back within a count, (n,), arcsec.
 
         Its servo does that until friction holds, and no reading shows it. A loop is steepest where the motor
-        turns. The way back is the root mean square of a uniform distribution over a count. One column is
-        common to all rests; up to `MOST_TURNS` also have their own.
+        turns. The way back is the root mean square of a uniform distribution over a count.
         """
         full, loops = self.data.full, with_memory(effects)
         still = full.speed_deg_s == 0.0
         back_deg = full.reading.resolution_deg / math.sqrt(3.0) * direction_of(full.motion)
         motion = replace(full.motion, motor_deg=full.motor_deg - np.where(still, back_deg, 0.0))
         change = sum((each.predict(motion, start) - each.predict(full.motion, start) for each in loops), 0.0)
-        weighted = self.weight * self.at_points(np.where(still, change, 0.0))
-        rest = np.cumsum(np.diff(still, prepend=False))[self.data.runs[self.index]]
-        size = np.bincount(rest, weighted**2)
-        largest = np.argsort(size)[::-1][: min(MOST_TURNS, np.count_nonzero(size))]
-        each = np.where(rest[:, np.newaxis] == largest, weighted[:, np.newaxis], 0.0)
-        return side_by_side([weighted[:, np.newaxis], each], len(weighted))
+        return np.where(still, change, 0.0)
 
     def begun(self, effects: Sequence[Effect]) -> FloatArray:
         """Returns half the range of each sample over all elastic states at the part's start, arcsec, (n,)."""

@@ -29,6 +29,7 @@ from hdbridge.analysis.nuisances import zeros
 from hdbridge.analysis.prepared import Observed, Samples
 from hdbridge.analysis.scales import Scales
 from hdbridge.axis.effects import Effect, FloatArray, IntArray, Part, Start
+from hdbridge.axis.effects.path import standing_s
 from hdbridge.units import ARCSEC_PER_DEG
 
 ORDINARY_HZ = 30.0
@@ -313,21 +314,28 @@ def settled(estimator: Estimator, fitted: Fitted, effects: Sequence[Effect], fou
     error and that of the turning points under the given ``effects``, because the ``fitted`` loop may have
     changed to imitate it. The calmest samples are always kept.
     """
-    data, weight, unknown = estimator.data, estimator.weight, np.zeros(len(estimator.data.full))
+    data, unknown = estimator.data, np.zeros(len(estimator.data.full))
+    moving = (data.points.speed_deg_s != 0.0)[estimator.index]
+    square = (fitted.residual / estimator.weight) ** 2
     if found is not None:
         wind_up = _accelerated(data.full, data.period_s) / (math.tau * found.frequency_hz) ** 2
-        moving = (data.points.speed_deg_s != 0.0)[estimator.index]
         swung = wind_up**2 + found.waves_arcsec2
-        square, size = (fitted.residual / weight)[moving] ** 2, estimator.at_points(swung)[moving]
-        about = size - np.mean(size) if len(size) else size
-        share = min(max(float(about @ square) / max(float(about @ about), 1e-300), 0.0), 1.0)
-        unknown = np.sqrt(share * swung)
+        unknown = np.sqrt(_share(square[moving], estimator.at_points(swung)[moving]) * swung)
+    crept = estimator.crept(effects, fitted.hypothesis.start)
+    calm = (standing_s(estimator.motion) > 2.0 * SETTLE_S)[estimator.index]  # without ringing
+    crept = crept * math.sqrt(_share(square[calm], estimator.at_points(crept**2)[calm]))
     most = max(estimator.scales.floor_arcsec, float(np.quantile(unknown[data.full.usable], CALMEST)))
     usable = data.full.usable & (unknown <= most)
     _, turned = estimator.turned(effects, fitted.hypothesis.start)
-    errors = (data.full.sigma_arcsec, unknown, turned, estimator.first_branch(effects))
+    errors = (data.full.sigma_arcsec, unknown, turned, crept, estimator.first_branch(effects))
     sigma = np.sqrt(sum(each**2 for each in errors))
     return data.having(replace(data.full, usable=usable, sigma_arcsec=sigma))
+
+
+def _share(square: FloatArray, size: FloatArray) -> float:
+    """Returns the share, 0 to 1, of squared errors of a known ``size`` in squared residuals, (k,)."""
+    about = size - np.mean(size) if len(size) else size
+    return min(max(float(about @ square) / max(float(about @ about), 1e-300), 0.0), 1.0)
 
 
 def _accelerated(full: Samples, period_s: float) -> FloatArray:

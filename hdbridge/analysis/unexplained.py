@@ -77,8 +77,8 @@ def rest(estimator: Estimator, fitted: Fitted) -> Rest:
     apart = ~near & (estimator.data.points.speed_deg_s != 0.0)[estimator.index]
     if np.count_nonzero(apart) < FEW:
         apart[:] = True
-    crept = estimator.crept(fitted.hypothesis.effects, fitted.hypothesis.start)
-    seen, small = _seen(estimator, fitted, apart, crept, _views(estimator, residual, apart))
+    crept = estimator.at_points(estimator.crept(fitted.hypothesis.effects, fitted.hypothesis.start))
+    seen, small = _seen(estimator, fitted, apart, _views(estimator, residual, apart))
     views = seen or _views(estimator, residual, np.ones_like(apart))
     best = max((_View(0.0, "time", np.zeros(1)), *views), key=lambda each: each.gain)
     return Rest(
@@ -87,7 +87,7 @@ def rest(estimator: Estimator, fitted: Fitted) -> Rest:
         max(_peak(estimator, residual), estimator.half_span(best.predicted_arcsec) if seen else 0.0),
         float(np.sqrt(max(float(np.mean(residual**2 - 1.0 / estimator.weight**2)), 0.0))),
         _standing(estimator, residual),
-        float(np.linalg.norm(crept[:, 0] / estimator.weight)) / math.sqrt(len(crept)),
+        float(np.sqrt(np.mean(crept**2))),
         best.name,
         bool(seen),
         small,
@@ -185,7 +185,7 @@ def _views(estimator: Estimator, residual: FloatArray, rows: BoolArray) -> Itera
 
 
 def _seen(
-    estimator: Estimator, fitted: Fitted, rows: BoolArray, crept: FloatArray, views: Iterable[_View]
+    estimator: Estimator, fitted: Fitted, rows: BoolArray, views: Iterable[_View]
 ) -> tuple[list[_View], str]:
     """Returns the views that pass the criteria for a cause and are large enough to report, and a remark.
 
@@ -206,7 +206,7 @@ def _seen(
         return [], ""
     tangent, residual = fitted.tangent[rows], fitted.residual[rows]
     known = np.vstack([fitted.linearised.known, np.zeros(2)])
-    discrepancies = np.hstack([law_discrepancies(estimator, fitted.hypothesis), crept])
+    discrepancies = law_discrepancies(estimator, fitted.hypothesis)
 
     def passes(view: _View) -> bool:
         columns = np.column_stack([tangent, weight * view.predicted_arcsec])
