@@ -14,7 +14,7 @@ for each in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # as the command line 
 # With these numbers there is hardly one but where a test asks for it.
 gc.set_threshold(20_000, 50, 100)
 slow_machines = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
-# A change fails or it does not, but not by lot: more of always the same examples would tell little more.
+# The same examples in every run: a change fails or passes reproducibly. More of them would find little more.
 settings.register_profile("same", slow_machines, derandomize=True, max_examples=50)
 settings.register_profile("random", slow_machines)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))

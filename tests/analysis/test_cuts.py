@@ -177,13 +177,13 @@ def test_command_worsens_nothing_if_a_record_ends_in_motion(cut: bool) -> None:
         "load_position_deg": motor / 100.0 + error / 3600.0,
     }
     record = Record(columns)
-    told = Record({**columns, "motor_target_deg": command})
+    commanded = Record({**columns, "motor_target_deg": command})
     if cut:
-        record, told = (each.rows(0, 80) for each in (record, told))
+        record, commanded = (each.rows(0, 80) for each in (record, commanded))
     orders = TransmissionModel.from_text(
         "schema: hdbridge.model/1\nratio: 100\neffects:\n  - effect: synchronous\n    parameters:\n"
         "      orders: [{order: 2, amplitude_arcsec: 20, phase_deg: 0}]\n"
     )
-    without, beside = (diagnose(each, orders) for each in (record, told))
+    without, beside = (diagnose(each, orders) for each in (record, commanded))
     assert beside.baseline.rms_arcsec < 1.05 * without.baseline.rms_arcsec
     assert [each.cause for each in beside.findings] == [each.cause for each in without.findings] == []

@@ -54,8 +54,8 @@ def test_minimum_equals_that_of_scipy() -> None:
 
     def residual(x: FloatArray) -> FloatArray:
         loop = LOOP.fitted(x[1:2], {"width_deg": float(np.exp(x[2])), "exponent": float(x[3])})
-        told = RIPPLE.fitted(x[4:]).predict(MOTION) + loop.predict(MOTION, Start.FORWARD)
-        return (given.observed - x[0] - told) / SIGMA_ARCSEC
+        predicted = RIPPLE.fitted(x[4:]).predict(MOTION) + loop.predict(MOTION, Start.FORWARD)
+        return (given.observed - x[0] - predicted) / SIGMA_ARCSEC
 
     start = np.array([5.0, 40.0, np.log(20.0), 1.6, *RIPPLE.coefficients()])
     best = least_squares(residual, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)

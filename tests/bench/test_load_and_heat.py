@@ -139,7 +139,7 @@ def test_the_record_has_both_columns():
     assert record.columns["load_torque_nm"][-1] == pytest.approx(truly_nm, abs=0.002)
     assert truly_nm == pytest.approx(-7.35, abs=0.05)
     assert record.columns["temperature_c"] == pytest.approx(22.0, abs=0.2)
-    # Told at the same SYNC as the encoders: the torque of this very angle.
+    # Sampled at the same SYNC as the encoders, so it is the torque at this angle.
     torque_nm = -5 * 9.80665 * 0.15 * np.sin(np.radians(record.load_position_deg))
     assert np.abs(record.columns["load_torque_nm"] - torque_nm).max() < 0.01
 
@@ -194,8 +194,8 @@ def test_an_implausible_reading_is_held_and_moves_nothing():
     with loaded(axis) as (drive, node):
         wrong = []
         entry = node.dictionary[0x2101, 0]
-        told = entry.bound
-        entry.bind(lambda: wrong.pop() if wrong else told())
+        bound = entry.bound
+        entry.bind(lambda: wrong.pop() if wrong else bound())
         drive.boot()
         script = Script(cycle_1000=lambda: wrong.append(2**31 - 1))
         bench = Bench(drive, compensation_for(axis, model_with(compliance())), interrupted=script)

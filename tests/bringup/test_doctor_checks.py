@@ -271,8 +271,8 @@ def test_eds_of_another_drive(case: Callable[..., Any]) -> None:
 def test_a_drive_at_another_node_id_is_found(case: Callable[..., Any]) -> None:
     verdicts = case(node_id=5).run(until="node")
     assert failures(verdicts) == ["node"]
-    told = "\n".join(verdicts["node"].remedies)
-    assert "axis.yaml:12:3: drive.node_id: found 1; the drive with this identity is node 5" in told
+    remedies = "\n".join(verdicts["node"].remedies)
+    assert "axis.yaml:12:3: drive.node_id: found 1; the drive with this identity is node 5" in remedies
 
 
 def test_a_drive_that_ignores_a_lost_heartbeat(case: Callable[..., Any]) -> None:

@@ -163,7 +163,7 @@ def test_one_load_encoder_node_cannot_be_two_axes() -> None:
             pair.cycle.join(with_encoder(2))
 
 
-# ------------------------------------------------------------------ what a turn tells
+# ------------------------------------------------------------------ figures of a turn
 
 
 def test_reports_lateness_and_load_of_a_turn(pair: TwoAxes) -> None:

@@ -79,5 +79,5 @@ def test_a_plan_is_judged_before_anything_moves(files: tuple[Path, Path], tmp_pa
     assert result.stdout.startswith("This plan has no torque at the load: ")
     found = json.loads(out.read_text())["identifiability"]
     assert found["motor_order"]["detectable"]
-    # Six motor turns are an eighth of a load turn: nothing tells these apart.
+    # Six motor turns are an eighth of a load turn: these are not separable.
     assert set(found["load_order"]["aliases"]) & {"ratio_error", "compliance"}

@@ -130,11 +130,11 @@ def test_rounded_digits_yield_no_cause(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel, counts: int, digits: int
 ) -> None:
     """Without a command the reading drives the loop, and its count is hidden by the digits that were kept."""
-    told = columns()
+    values = columns()
     lag_s = 2e-4  # of the plant's motor behind its command
-    motor = told["motor_target_deg"]
-    motor = motor - lag_s * np.gradient(motor, told["time_s"])
+    motor = values["motor_target_deg"]
+    motor = motor - lag_s * np.gradient(motor, values["time_s"])
     read = np.round(motor * counts / 360.0) * 360.0 / counts + 36_000.0
-    record = {"time_s": told["time_s"], "load_position_deg": told["load_position_deg"]}
+    record = {"time_s": values["time_s"], "load_position_deg": values["load_position_deg"]}
     record["motor_position_deg"] = np.array([float(f"{each:.{digits}g}") for each in read.tolist()])
     assert diagnose(Record(record), model).findings == ()

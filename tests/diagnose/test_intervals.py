@@ -97,9 +97,9 @@ def test_poorly_known_shapes_have_log_intervals_within_their_range() -> None:
     drag = VelocityWindup(coulomb_arcsec=1.0, viscous_arcsec_s_per_deg=0.02, shear_deg_s=1000.0)
     (shape,) = drag.shape
     for deviation, factor in ((0.3, math.exp(0.3 * NORMAL_95)), (30.0, math.inf)):
-        told = named_parameters(drag, [Column(0, shape.name, shape=True)], np.array([[deviation**2]]))
-        assert told[shape.name].low == pytest.approx(max(1000.0 / factor, shape.lower), rel=1e-3)
-        assert told[shape.name].high == pytest.approx(min(1000.0 * factor, shape.upper), rel=1e-3)
+        intervals = named_parameters(drag, [Column(0, shape.name, shape=True)], np.array([[deviation**2]]))
+        assert intervals[shape.name].low == pytest.approx(max(1000.0 / factor, shape.lower), rel=1e-3)
+        assert intervals[shape.name].high == pytest.approx(min(1000.0 * factor, shape.upper), rel=1e-3)
 
 
 def test_a_changed_order_is_as_uncertain_as_its_reference(columns: Columns, plant: ModuleType) -> None:

@@ -58,9 +58,9 @@ def test_refused_causes_are_reported_if_nothing_else_explains_them(
     """A load that runs ahead as it speeds up is no inertia on a spring, and no delay either."""
     result = diagnosed({"inertial_windup": {"s2": -1.2e-4}})
     assert [each.cause for each in result.findings] == ["unexplained"]
-    told = {each.split(": ")[0]: each for each in result.as_dict()["considered"]}
-    assert ChannelSkew.name not in told
-    assert "inertia_over_stiffness_s2" in told[InertialWindup.name]
+    reasons = {each.split(": ")[0]: each for each in result.as_dict()["considered"]}
+    assert ChannelSkew.name not in reasons
+    assert "inertia_over_stiffness_s2" in reasons[InertialWindup.name]
 
 
 @pytest.mark.parametrize(
@@ -93,5 +93,5 @@ def test_the_search_continues_after_a_refusal(
     }
     hidden = larger | {"motor_order": {"orders": [(7, 1.2, 20.0)]}}
     result = diagnose(Record(columns(hidden)), model)
-    told = {each.cause for each in result.findings} | {each.split(":")[0] for each in result.considered}
-    assert MotorOrders.name in told
+    reported = {each.cause for each in result.findings} | {each.split(":")[0] for each in result.considered}
+    assert MotorOrders.name in reported

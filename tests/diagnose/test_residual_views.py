@@ -97,6 +97,6 @@ def test_time_since_a_stop_or_start():
 
 def test_a_stretch_does_not_predict_itself():
     values = np.where((TIME_S > 400.0) & (TIME_S < 405.0), 5.0, 0.0)  # within one stretch
-    told = predicted(Coordinate("time", "s", TIME_S, bins=25), values, DIRECTION, folds(TIME_S))
-    assert np.all(told[values > 0.0] == 0.0)
-    assert np.max(told) > 0.0  # of its neighbours it does
+    prediction = predicted(Coordinate("time", "s", TIME_S, bins=25), values, DIRECTION, folds(TIME_S))
+    assert np.all(prediction[values > 0.0] == 0.0)
+    assert np.max(prediction) > 0.0  # of its neighbours it does

@@ -66,11 +66,11 @@ def test_drag_with_another_exponent_is_within_its_intervals(
         rng = np.random.default_rng(seed)
         coulomb, viscous, shear = rng.uniform(1.0, 2.5), rng.uniform(0.02, 0.05), rng.uniform(300.0, 600.0)
         record = columns({"velocity_windup": {"coulomb": coulomb, "viscous": viscous, "shear": shear}}, seed)
-        told = parameters(record, model, VelocityWindup.candidate(50.0))
+        fitted = parameters(record, model, VelocityWindup.candidate(50.0))
         inside += [
-            holds(told["coulomb_arcsec"], coulomb),
-            holds(told["viscous_arcsec_s_per_deg"], viscous),
-            holds(told["shear_deg_s"], shear),
+            holds(fitted["coulomb_arcsec"], coulomb),
+            holds(fitted["viscous_arcsec_s_per_deg"], viscous),
+            holds(fitted["shear_deg_s"], shear),
         ]
     assert enough(inside), inside
 
@@ -97,11 +97,11 @@ def test_motor_motion_within_a_count_at_rest_is_not_creep(
     plant: ModuleType, columns: Columns, model: TransmissionModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The motor is 0.8 counts ahead of its command, stays so for 0.3 s after each stop, and then lets go."""
-    path, told = plant.path, []
+    path, motor_angles = plant.path, []
 
     def ahead(plan: Any, rng: np.random.Generator) -> Any:
         time_s, motor, legs = path(plan, rng)
-        told.append(motor)
+        motor_angles.append(motor)
         steps = np.sign(np.diff(motor, prepend=motor[:1]))
         last = np.maximum.accumulate(np.where(steps != 0.0, np.arange(len(steps)), 0))
         still_s = time_s - time_s[last]
@@ -109,7 +109,7 @@ def test_motor_motion_within_a_count_at_rest_is_not_creep(
 
     monkeypatch.setattr(plant, "path", ahead)
     record = columns(slow_noise=0.0)
-    estimator = Estimator(gather(Record({**record, "motor_target_deg": told[0][::10]}), 50.0))
+    estimator = Estimator(gather(Record({**record, "motor_target_deg": motor_angles[0][::10]}), 50.0))
     base = estimator.fit(Hypothesis(model.effects, Start.FORWARD)).hypothesis
     creep = Creep(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=0.3),), build_up=0.1)
     found = gate(estimator, estimator.fit(base.plus(creep)), len(model.effects))
@@ -153,8 +153,8 @@ def test_wind_up_of_a_swinging_load_is_within_its_interval(
         swung = filtered([1.0, 2.0, 1.0], back, acceleration) / first
         record = plant.record(plant.Truth(), plan, seed)
         record["load_position_deg"] -= swung[::10] / 50.0
-        told = parameters(record, model, InertialWindup.candidate(50.0))
-        inside.append(holds(told["inertia_over_stiffness_s2"], turn**-2.0))
+        fitted = parameters(record, model, InertialWindup.candidate(50.0))
+        inside.append(holds(fitted["inertia_over_stiffness_s2"], turn**-2.0))
     assert enough(inside), inside
 
 
@@ -185,9 +185,9 @@ def test_eccentricity_next_to_an_unknown_spring_is_as_uncertain_as_it_should_be(
             "compliance": {"c1": compliance, "c2": compliance, "t1": 1e3},
         }
         record = columns(effects, seed, torque_nm=9.0)
-        told = parameters(record, model, LoadOrders(ratio=50.0, orders=orders_from([1, 2])))
-        inside += [holds(told["order_1_amplitude_arcsec"], size), holds(told["order_1_phase_deg"], phase)]
-        twice = told["order_2_amplitude_arcsec"]
+        fitted = parameters(record, model, LoadOrders(ratio=50.0, orders=orders_from([1, 2])))
+        inside += [holds(fitted["order_1_amplitude_arcsec"], size), holds(fitted["order_1_phase_deg"], phase)]
+        twice = fitted["order_2_amplitude_arcsec"]
         assert twice.low < 4.0 < twice.high < 4.5  # no spring goes twice per turn
     assert enough(inside), inside
 

@@ -202,5 +202,5 @@ def test_every_call_works_without_optional_keys(tmp_path: Path) -> None:
 def test_non_numeric_objects_are_read(value: float) -> None:
     from hdbridge.client.messages import SdoValue
 
-    told = SdoValue(index=0x2000, subindex=0, name="x", type="real32", value=value).model_dump_json()
-    assert SdoValue.model_validate_json(told).value is None
+    text = SdoValue(index=0x2000, subindex=0, name="x", type="real32", value=value).model_dump_json()
+    assert SdoValue.model_validate_json(text).value is None

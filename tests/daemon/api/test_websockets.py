@@ -27,7 +27,7 @@ def batch(connection) -> messages.Samples:
     return messages.Samples.model_validate_json(connection.recv())
 
 
-def told(connection) -> messages.StreamAnswer:
+def next_answer(connection) -> messages.StreamAnswer:
     return messages.StreamAnswer.model_validate_json(connection.recv())
 
 
@@ -181,11 +181,11 @@ def points(*positions_deg: float, end: bool = False) -> str:
 def test_stream_points_are_accepted_and_acknowledged(api, lease):
     with stream(api) as connection:
         begin(connection, lease)
-        assert told(connection).accepted == 0
+        assert next_answer(connection).accepted == 0
         connection.send(points(0.0, 0.1, 0.2))
-        assert told(connection).accepted == 3
+        assert next_answer(connection).accepted == 3
         connection.send(points(0.3, end=True))
-        assert told(connection).accepted == 1
+        assert next_answer(connection).accepted == 1
         with pytest.raises(ConnectionClosed) as closed:
             connection.recv()
     assert closed.value.rcvd.code == 1000
@@ -202,7 +202,7 @@ def test_stream_points_are_accepted_and_acknowledged(api, lease):
 def test_streaming_needs_the_lease(api, lease, first):
     with stream(api) as connection:
         connection.send(first)
-        answer = told(connection)
+        answer = next_answer(connection)
         assert answer.accepted == 0
         assert answer.problem
         with pytest.raises(ConnectionClosed):
@@ -215,7 +215,7 @@ def test_a_disabled_or_unknown_axis_is_reported(api, lease):
     for axis, words in (("joint-2", "enable it first"), ("joint-9", "joint-1, joint-2")):
         with stream(api, axis) as connection:
             begin(connection, lease)
-            assert words in told(connection).problem.detail
+            assert words in next_answer(connection).problem.detail
 
 
 @pytest.mark.parametrize(
@@ -230,9 +230,9 @@ def test_a_disabled_or_unknown_axis_is_reported(api, lease):
 def test_an_invalid_point_ends_the_stream_with_a_reason(api, lease, wrong):
     with stream(api) as connection:
         begin(connection, lease)
-        told(connection)
+        next_answer(connection)
         connection.send(wrong)
-        assert told(connection).problem
+        assert next_answer(connection).problem
         with pytest.raises(ConnectionClosed):
             connection.recv()
     (given,) = api.bridge.streams
@@ -243,16 +243,16 @@ def test_an_invalid_point_ends_the_stream_with_a_reason(api, lease, wrong):
 def test_losing_the_lease_ends_the_stream(api, lease):
     with stream(api) as connection:
         begin(connection, lease)
-        told(connection)
+        next_answer(connection)
         api.bridge.lease.take("another", force=True)
         connection.send(points(0.0))
-        assert "another" in told(connection).problem.detail
+        assert "another" in next_answer(connection).problem.detail
 
 
 def test_the_stream_ends_with_its_client(api, lease):
     with stream(api) as connection:
         begin(connection, lease)
-        told(connection)
+        next_answer(connection)
         connection.socket.shutdown(socket.SHUT_RDWR)
         (given,) = api.bridge.streams
         until(lambda: given.ended)

@@ -115,7 +115,7 @@ class Watch:
             return
         axis = self.daemon.axes[0]
         if self.last is None:
-            # Where the axis is, as the drive told last. It may have moved by some counts since.
+            # The position that the drive reported last; the axis may have moved by some counts since.
             actual = self.daemon.nodes[0].firmware.motion.motor_counts
             assert abs(target - actual) * DEG_PER_COUNT < 0.01, "power begins where the axis is"
         else:

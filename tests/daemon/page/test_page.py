@@ -172,10 +172,10 @@ def test_the_other_axis_is_one_key_away(bridge, page):
 
 
 def test_past_and_new_events_are_listed(place, bridge, chromium):
-    bridge.told.append(event(1, "the first"))
+    bridge.logged.append(event(1, "the first"))
     show(chromium, place)
     chromium.until("document.querySelector('#events').innerText.includes('the first')")
-    bridge.told.append(event(2, "<b>the second</b>"))
+    bridge.logged.append(event(2, "<b>the second</b>"))
     chromium.until("document.querySelector('#events').innerText.includes('<b>the second</b>')")
     assert chromium.evaluate("document.querySelectorAll('#events li').length") == 2
 

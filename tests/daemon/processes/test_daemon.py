@@ -21,7 +21,7 @@ def test_a_whole_daemon_session(tmp_path: Path) -> None:
     """Started, moved, its service killed, its control process killed, ended by a terminal that is closed."""
     arguments = ("article", "--simulate", "--speed", 4, "--page", "--port", 0)
     with running(tmp_path, *arguments, name="article") as daemon:
-        daemon.until_told("READY=1")
+        daemon.until_notified("READY=1")
         state = daemon.state()
         assert state is not None  # it answers at once
         assert state["simulated"]
@@ -95,7 +95,7 @@ def test_full_disk_then_killed_keeper(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     with running(tmp_path, tmp_path, "--simulate", name="full") as daemon:
-        daemon.until_told("READY=1")
+        daemon.until_notified("READY=1")
         daemon.until_axis("disabled")
         daemon.ask("enable")
         recorder = daemon.until(

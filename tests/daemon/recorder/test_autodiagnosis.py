@@ -52,12 +52,12 @@ def recorded(tmp_path_factory):
 
 def test_the_last_minutes_are_diagnosed_next_to_the_recording(recorded, priorities):
     folder, now_ns = recorded
-    told = []
+    notes = []
     diagnosis = AutoDiagnosis(folder, lambda: now_ns)
-    running = diagnosis.start("demo", MODEL.dump(), 10.0, "recalibrate: because", told.append)
-    assert diagnosis.start("demo", MODEL.dump(), 10.0, "again", told.append) is None
+    running = diagnosis.start("demo", MODEL.dump(), 10.0, "recalibrate: because", notes.append)
+    assert diagnosis.start("demo", MODEL.dump(), 10.0, "again", notes.append) is None
     running.result()
-    (words,) = told
+    (words,) = notes
     assert words.startswith("diagnosis: motor_encoder_eccentricity ("), words
     (result,) = (folder / "diagnoses").iterdir()
     assert str(result) in words
@@ -72,22 +72,22 @@ def test_the_last_minutes_are_diagnosed_next_to_the_recording(recorded, prioriti
 
 def test_a_failed_diagnosis_is_explained(recorded):
     folder, now_ns = recorded
-    told = []
+    notes = []
     diagnosis = AutoDiagnosis(folder, lambda: now_ns)
-    diagnosis.start("nose", MODEL.dump(), 10.0, "", told.append).result()
-    (words,) = told
+    diagnosis.start("nose", MODEL.dump(), 10.0, "", notes.append).result()
+    (words,) = notes
     assert "the diagnosis was not made: " in words
     assert "no axis 'nose'" in words
 
 
 def test_diagnosis_ends_with_the_service(recorded):
     folder, now_ns = recorded
-    told = []
+    notes = []
     diagnosis = AutoDiagnosis(folder, lambda: now_ns)
-    diagnosis.start("demo", MODEL.dump(), 10.0, "", told.append)
+    diagnosis.start("demo", MODEL.dump(), 10.0, "", notes.append)
     diagnosis.close()
-    assert told == []  # one that goes to its end says what it found
-    assert diagnosis.start("demo", MODEL.dump(), 10.0, "", told.append) is None
+    assert notes == []  # one that goes to its end says what it found
+    assert diagnosis.start("demo", MODEL.dump(), 10.0, "", notes.append) is None
 
 
 def test_a_diagnosis_without_findings_is_reported():
