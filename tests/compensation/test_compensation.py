@@ -136,7 +136,7 @@ def test_inverse_of_a_lagging_load_never_reverses(model, path, start):
         reached = motor_deg / model.ratio + gear.advance(motor_deg, NOW) / 3600
         assert abs(reached - load_deg) * 3600 <= 1e-6
         if abs(load_deg - last_load_deg) > 1e-6:
-            # Behind friction the motor has further to go than the load, and never goes the other way.
+            # Against friction the motor travels further than the load, and never reverses.
             ahead = (motor_deg - last_deg) / (load_deg - last_load_deg)
             assert ahead >= 0.99 * model.ratio
         last_deg, last_load_deg = motor_deg, load_deg
