@@ -107,7 +107,7 @@ def test_delays_double_until_a_process_stays_alive() -> None:
 
 @pytest.fixture
 def log() -> Iterator[logging.Logger]:
-    """The project's logger, put back afterwards."""
+    """The project's logger, restored afterwards."""
     root = logging.getLogger("hdbridge")
     before = root.handlers[:], root.level, root.propagate
     yield root

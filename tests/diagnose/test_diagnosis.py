@@ -114,7 +114,7 @@ def test_the_same_record_gives_the_same_answer(
 
 
 def test_a_short_record_yields_no_confident_wrong_cause(model: TransmissionModel) -> None:
-    """One way, no command, no standstill, coarse counts, noise: hardly anything can be said."""
+    """One direction, no command, no standstill, coarse counts and noise permit hardly any conclusion."""
     rng = np.random.default_rng(3)
     time = np.arange(150) * 0.02
     motor = np.round(400.0 * time / 0.045) * 0.045
@@ -129,7 +129,7 @@ def test_a_short_record_yields_no_confident_wrong_cause(model: TransmissionModel
 def test_rounded_digits_yield_no_cause(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel, counts: int, digits: int
 ) -> None:
-    """Without a command the reading drives the loop, and its count is hidden by the digits that were kept."""
+    """Without a command the reading drives the loop, and rounding hides its count."""
     values = columns()
     lag_s = 2e-4  # of the plant's motor behind its command
     motor = values["motor_target_deg"]

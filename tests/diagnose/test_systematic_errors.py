@@ -39,7 +39,7 @@ HELD = 0.95
 
 
 def parameters(record: dict[str, Any], model: TransmissionModel, effect: Effect) -> dict[str, Parameter]:
-    """Returns the figures of an effect that is fitted to a record together with the model."""
+    """Returns the parameters of an effect that is fitted to a record together with the model."""
     estimator = Estimator(gather(Record(record), 50.0))
     hypothesis = Hypothesis((*model.effects, effect), Start.FORWARD)
     precise = precisely(estimator, estimator.fit(hypothesis))
@@ -53,14 +53,14 @@ def holds(parameter: Parameter, truth: float) -> bool:
 
 
 def enough(inside: list[bool]) -> bool:
-    """True if as many are inside as the intervals promise, but for chance."""
+    """Returns True if the coverage is nominal within chance."""
     return sum(inside) >= least(len(inside), HELD)
 
 
 def test_drag_with_another_exponent_is_within_its_intervals(
     columns: Columns, model: TransmissionModel
 ) -> None:
-    """The plant's falls off with the power 0.8 of the speed, the law's with the first."""
+    """The plant's drag falls off with speed to the power 0.8, the law's with the first."""
     inside: list[bool] = []
     for seed in range(41, 46):
         rng = np.random.default_rng(seed)
@@ -119,7 +119,7 @@ def test_motor_motion_within_a_count_at_rest_is_not_creep(
 def test_turning_short_by_a_count_is_not_a_changed_loop(
     plant: ModuleType, columns: Columns, model: TransmissionModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Friction holds it 0.4 counts from its command at every turn."""
+    """Friction holds the motor 0.4 counts short of its command at every reversal."""
     path, commands = plant.path, []
 
     def short(plan: Any, rng: np.random.Generator) -> Any:
@@ -139,7 +139,7 @@ def test_turning_short_by_a_count_is_not_a_changed_loop(
 def test_wind_up_of_a_swinging_load_is_within_its_interval(
     plant: ModuleType, model: TransmissionModel
 ) -> None:
-    """The law is that far below the resonance, and these moves speed up in 0.15 s."""
+    """The law holds far below the resonance, and these moves accelerate in 0.15 s."""
     plan = plant.Plan(rate_hz=50.0, scale=0.05, load_turns=0.1, steps=16)
     inside: list[bool] = []
     for seed in range(81, 87):
@@ -161,7 +161,7 @@ def test_wind_up_of_a_swinging_load_is_within_its_interval(
 def test_the_height_of_a_bump_of_another_form_is_within_its_interval(
     columns: Columns, model: TransmissionModel
 ) -> None:
-    """The plant's is a Gaussian, the law's a raised cosine."""
+    """The plant's bump is a Gaussian, the law's a raised cosine."""
     inside: list[bool] = []
     for seed in range(61, 69):
         rng = np.random.default_rng(seed)
@@ -175,7 +175,7 @@ def test_the_height_of_a_bump_of_another_form_is_within_its_interval(
 def test_eccentricity_next_to_an_unknown_spring_is_as_uncertain_as_it_should_be(
     columns: Columns, model: TransmissionModel
 ) -> None:
-    """Under one mass a spring's wind-up goes once per turn as the run-out does: only their sum is seen."""
+    """Under one mass, wind-up and run-out both repeat once per turn, so only their sum is visible."""
     inside: list[bool] = []
     for seed in range(51, 55):
         rng = np.random.default_rng(seed)
@@ -188,7 +188,7 @@ def test_eccentricity_next_to_an_unknown_spring_is_as_uncertain_as_it_should_be(
         fitted = parameters(record, model, LoadOrders(ratio=50.0, orders=orders_from([1, 2])))
         inside += [holds(fitted["order_1_amplitude_arcsec"], size), holds(fitted["order_1_phase_deg"], phase)]
         twice = fitted["order_2_amplitude_arcsec"]
-        assert twice.low < 4.0 < twice.high < 4.5  # no spring goes twice per turn
+        assert twice.low < 4.0 < twice.high < 4.5  # a spring has no second order
     assert enough(inside), inside
 
 

@@ -32,7 +32,7 @@ def next_answer(connection) -> messages.StreamAnswer:
 
 
 def read_on(connection) -> None:
-    """Until it is closed."""
+    """Reads until the connection is closed."""
     while True:
         connection.recv()
 
@@ -79,11 +79,11 @@ def test_an_invalid_request_ends_the_connection_with_a_reason(api, wrong):
 
 
 def test_a_slow_client_loses_only_its_own_samples(api):
-    """A client that reads nothing for thousands of cycles gets the newest samples, and a count of others."""
+    """A client that reads nothing for thousands of cycles gets the newest ones and the number of others."""
     api.bridge.rows = 40
     with socket.socket(socket.AF_UNIX) as raw:
         raw.connect(str(api.socket))
-        # Small buffers, so that what is under way is little.
+        # Small buffers, so that little data is in transit.
         raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         with (
             unix_connect(None, "ws://hdbridge/api/v1/live", sock=raw, max_queue=1) as sleeper,
@@ -158,7 +158,7 @@ def test_a_page_of_another_origin_cannot_watch(api):
 
 @pytest.fixture
 def lease(api):
-    """Held, with the first axis enabled."""
+    """The lease, held, with the first axis enabled."""
     token = api.bridge.lease.take("stream")
     api.bridge.axes["joint-1"].at = messages.ControlState.ENABLED
     return token

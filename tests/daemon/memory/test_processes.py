@@ -1,4 +1,4 @@
-"""The memory between processes: attached, hammered, killed."""
+"""The memory between processes: attaching, heavy traffic, kills."""
 
 import os
 import signal

@@ -43,7 +43,7 @@ class Kept:
             each.start()
 
     def _read_notifications(self) -> None:
-        """At once: of messages that are not read, the kernel keeps ten."""
+        """Reads messages at once, because the kernel queues only ten."""
         while line := self.manager.recv(4096).decode():
             self.notifications.append(line)
 
@@ -202,7 +202,7 @@ def test_a_dead_or_hanging_gateway_is_replaced(keeper: Callable[..., Kept]) -> N
 def test_a_repeatedly_dying_control_process_ends_the_daemon(
     keeper: Callable[..., Kept], number: signal.Signals, how: str
 ) -> None:
-    """SIGTERM to it alone is a death like any other: only the keeper ends the daemon."""
+    """SIGTERM to the control process alone counts as a crash, because only the keeper ends the daemon."""
     kept = keeper()
     kept.until_notified("READY=1")
     for times in range(1, 5):

@@ -1,4 +1,4 @@
-"""From a verdict to a diagnosis next to the recording, by itself."""
+"""Automatic diagnosis after a verdict, written next to the recording."""
 
 import json
 import os
@@ -29,7 +29,7 @@ MODEL = model_of(9.0)
 
 @pytest.fixture(autouse=True)
 def priorities(monkeypatch):
-    """Records the requested priorities: a process of the lowest one would wait for all other tests."""
+    """Records the requested priorities; a process of the lowest one would wait for all other tests."""
     asked = []
     monkeypatch.setattr("os.sched_setscheduler", lambda pid, policy, param: asked.append(policy))
     monkeypatch.setattr("os.setpriority", lambda which, pid, priority: asked.append(priority))
@@ -86,7 +86,7 @@ def test_diagnosis_ends_with_the_service(recorded):
     diagnosis = AutoDiagnosis(folder, lambda: now_ns)
     diagnosis.start("demo", MODEL.dump(), 10.0, "", notes.append)
     diagnosis.close()
-    assert notes == []  # one that goes to its end says what it found
+    assert notes == []  # a diagnosis that finishes reports its findings
     assert diagnosis.start("demo", MODEL.dump(), 10.0, "", notes.append) is None
 
 

@@ -14,7 +14,7 @@ SECOND = 250
 
 
 def run(log, clock, seconds, first=0, axes=1, events=None):
-    """Second by second; ``events`` by the second in which they come."""
+    """Records second by second; ``events`` are keyed by their second."""
     for second in range(first, first + seconds):
         reached = (events or {}).get(second, ())
         log.put(Batch(samples(SECOND, 1 + second * SECOND, axes), tuple(reached)))

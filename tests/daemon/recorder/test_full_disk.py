@@ -67,7 +67,7 @@ def test_a_failed_write_leaves_a_whole_file_and_is_repeated(tmp_path):
     (path,) = tmp_path.glob("*.mcap")
     flight = read(path)
     assert flight.finished
-    # The chunk that failed waited for room; the two after it were not taken.
+    # The failed chunk was kept until there was room; the two after it were dropped.
     assert list(flight.machine["cycle"][[0, 249, 250, 499, 500]]) == [1, 250, 251, 500, 1001]
 
 

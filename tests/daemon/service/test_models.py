@@ -134,7 +134,7 @@ def settled(bridge: ServiceBridge) -> bool:
 
 
 def watched(service: Service, bridge: ServiceBridge) -> list[tuple[list[str], list[str]]]:
-    """Wherever the effects in use and those that the API reports differ, for a second."""
+    """Returns differences between the effects in use and those that the API reports, over a second."""
     differing = []
     for _ in range(round(1.0 / service.daemon.period_s)):
         service.daemon.turn()

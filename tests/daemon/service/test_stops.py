@@ -1,4 +1,4 @@
-"""Every kind of stop: report to clients and recovery, never to power without a request."""
+"""Every kind of stop: report to clients, and recovery without power unless requested."""
 
 from collections.abc import Callable
 
