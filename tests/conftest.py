@@ -10,16 +10,16 @@ from hypothesis import HealthCheck, settings
 
 for each in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # as the command line does, see hdbridge/__main__.py
     os.environ.setdefault(each, "1")
-# Most of what a collection walks through here lives as long as the tests do; a full one takes half a second.
-# With these numbers there is hardly one but where a test asks for it.
+# Most objects here live as long as the tests do, and a full garbage collection takes half a second.
+# With these thresholds a full one is rare unless a test requests it.
 gc.set_threshold(20_000, 50, 100)
 slow_machines = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
-# A change fails or it does not, but not by lot: more of always the same examples would tell little more.
+# The same examples in every run: a change fails or passes reproducibly. More of them would find little more.
 settings.register_profile("same", slow_machines, derandomize=True, max_examples=50)
 settings.register_profile("random", slow_machines)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
-# A script without job control starts what it puts into the background deaf to Ctrl-C, children included.
+# A script without job control starts background processes with Ctrl-C ignored, children included.
 for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGQUIT, signal.SIG_DFL)):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, handler)

@@ -60,9 +60,9 @@ def robust_chi_square(
     kept = np.setdiff1d(np.arange(fitted.count()), shape)
     coefficients = effect.coefficients()[asked]
     own = np.searchsorted(kept, [i for i in own if not fitted.parameters[i].shape])[asked].tolist()
-    columns = side_by_side(
-        [fitted.tangent[:, kept], *([] if nuisances is None else [nuisances])], len(fitted.residual)
-    )
+    columns = fitted.tangent[:, kept]
+    if nuisances is not None:
+        columns = np.hstack([columns, nuisances])
     known = np.zeros((columns.shape[1], 2))
     known[: len(kept)] = fitted.linearised.known[kept]
     fit = Linearised(columns[rows], fitted.residual[rows], known)

@@ -42,7 +42,7 @@ def test_bidirectional_repeatability_is_never_below_either_direction():
     assert found.repeatability == pytest.approx(4.0 * 10.0 * S)
 
 
-def test_a_pure_reversal_error_shows_in_b_alone_of_the_means():
+def test_a_pure_reversal_error_affects_only_b_among_the_means():
     targets = np.repeat(np.arange(0.0, 360.0, 45.0), 10)
     forward = np.tile([True] * 5 + [False] * 5, 8)
     found = axis_accuracy(targets, np.where(forward, 20.0, -20.0), forward)

@@ -43,11 +43,11 @@ def shown(*arguments: Any, **channels: Any) -> Capability:
 
 
 def spoken(found: Capability) -> set[str]:
-    """Subjects that are identified, or at least seen."""
+    """Subjects that are identified or at least visible."""
     return {*found.identified, *(name for group in found.confused for name in group)} - {*found.unseen}
 
 
-# Speeds in motor degrees per second, each for a second; 0 is a rest.
+# Speeds in motor degrees per second, each held for a second; 0 is standstill.
 legs = st.lists(st.sampled_from([0.0, 5.0, 40.0, 360.0, 1500.0]), min_size=3, max_size=8).filter(any)
 
 
@@ -57,7 +57,7 @@ def path(speeds: list[float], rate_hz: float) -> Any:
 
 @FEW
 @given(legs, st.sampled_from([25.0, 60.0]), st.sampled_from([1.0, -1.0]), st.sampled_from([0.1, 2.0]))
-def test_a_record_without_reversals_shows_nothing_that_only_reversals_show(
+def test_without_reversals_effects_that_need_them_are_not_visible(
     speeds: list[float], rate_hz: float, sign: float, noise_arcsec: float
 ) -> None:
     found = shown(sign * path(speeds, rate_hz), rate_hz, noise_arcsec)

@@ -17,7 +17,7 @@ RATIO = 20.0
 
 
 def sweeps(seed: int = 1, begin_deg: float = 0.0, turns: float = 3.0, offset: float = 20.0) -> Record:
-    """There and back twice at 100 Hz over an axis with three orders and a loop."""
+    """Two sweeps each way at 100 Hz on an axis with three orders and a hysteresis loop."""
     rng = np.random.default_rng(seed)
     way = np.concatenate([np.zeros(60), np.arange(1.0, turns * 360.0, 2.0)])
     motor = begin_deg + np.concatenate([way, way[::-1], way, way[::-1]])
@@ -89,7 +89,7 @@ def test_normal_motion_is_neither_cut_nor_dropped() -> None:
     seen = observed(record, RATIO)
     assert seen.record is record
     assert seen.remarks == seen.cuts == ()
-    # Steps of a fast axis, and lost counts, are what it does.
+    # Steps of a fast axis and lost counts are real behaviour of the axis.
     steps = np.repeat(np.arange(40) * 43.56, 10)
     columns = {
         "time_s": 0.05 * np.arange(len(steps)),
@@ -100,7 +100,7 @@ def test_normal_motion_is_neither_cut_nor_dropped() -> None:
 
 
 def test_an_impossible_jump_is_a_cut_not_a_reversal() -> None:
-    """1,876 motor degrees in 10 ms: put together from two one-way moves."""
+    """The joint of two one-way moves is a jump of 1,876 motor degrees in 10 ms."""
     parts = [sweeps(begin_deg=begin).rows(60, 560) for begin in (0.0, -876.0)]
     joined = concatenate(parts)
     one_file = Record(joined.columns)
@@ -165,7 +165,7 @@ def test_torque_beyond_the_range_of_an_effect_is_reported() -> None:
 
 @pytest.mark.parametrize("cut", [False, True])
 def test_command_worsens_nothing_if_a_record_ends_in_motion(cut: bool) -> None:
-    """A motor that follows its command with a lag, half a second of rest, then under way to the end."""
+    """The motor rests, then follows its command with a lag; the record ends in motion."""
     time_s = 0.01 * np.arange(110)
     gone = np.maximum(time_s - 0.3, 0.0)
     command = 713.7 * gone**2
@@ -177,13 +177,13 @@ def test_command_worsens_nothing_if_a_record_ends_in_motion(cut: bool) -> None:
         "load_position_deg": motor / 100.0 + error / 3600.0,
     }
     record = Record(columns)
-    told = Record({**columns, "motor_target_deg": command})
+    commanded = Record({**columns, "motor_target_deg": command})
     if cut:
-        record, told = (each.rows(0, 80) for each in (record, told))
+        record, commanded = (each.rows(0, 80) for each in (record, commanded))
     orders = TransmissionModel.from_text(
         "schema: hdbridge.model/1\nratio: 100\neffects:\n  - effect: synchronous\n    parameters:\n"
         "      orders: [{order: 2, amplitude_arcsec: 20, phase_deg: 0}]\n"
     )
-    without, beside = (diagnose(each, orders) for each in (record, told))
+    without, beside = (diagnose(each, orders) for each in (record, commanded))
     assert beside.baseline.rms_arcsec < 1.05 * without.baseline.rms_arcsec
     assert [each.cause for each in beside.findings] == [each.cause for each in without.findings] == []

@@ -1,4 +1,4 @@
-"""95 % intervals hold 95 % of the values that their covariance allows, at every phase."""
+"""95 % intervals contain 95 % of the draws of their covariance, at every phase."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COLUMNS = (Column(0, "0"), Column(0, "1"))
 
 
 @pytest.mark.parametrize("phase_deg", [-179.99, -90.0, 3.0, 179.99])
-def test_an_interval_holds_95_percent_of_the_draws_of_its_covariance(phase_deg: float) -> None:
+def test_an_interval_contains_95_percent_of_the_draws_of_its_covariance(phase_deg: float) -> None:
     effect = Synchronous(orders=(MotorOrder(order=2, amplitude_arcsec=20.0, phase_deg=phase_deg),))
     root = np.array([[0.3, 0.0], [0.1, 0.2]])
     half = half_widths(effect, COLUMNS, root @ root.T)

@@ -8,9 +8,7 @@ from hdbridge.analysis.linear import solve_symmetric
 
 
 def test_zero_columns_next_to_collinear_columns_stay_at_zero() -> None:
-    """The second spring constant of a record whose torque stays below the first break, and two orders that
-    are one on a short arc.
-    """
+    """An unused second spring constant, and two orders that coincide on a short arc."""
     for seed in range(20):
         rng = np.random.default_rng(seed)
         columns = rng.standard_normal((200, 9)) @ rng.standard_normal((9, 9))

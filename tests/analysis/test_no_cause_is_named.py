@@ -1,4 +1,4 @@
-"""Fit and diagnosis know no particular cause: its particulars are in its own file."""
+"""Fit and diagnosis contain nothing specific to one cause; that is in the cause's own file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CLASSES = {kind.__name__ for kind in CATALOGUE.values()} | {
 
 
 def words(path: Path) -> Iterator[str]:
-    """Names that the code uses, and its strings; no comments and no docstrings."""
+    """Returns names and strings of the code, without comments and docstrings."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     said = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     for node in ast.walk(tree):
@@ -43,7 +43,7 @@ def test_sources_are_found() -> None:
 def test_shared_code_names_no_cause(path: Path) -> None:
     used = set(words(path))
     assert not used & CLASSES
-    # "creep" and "wear" are words too: what gives a name of the catalogue away is that it stands alone.
+    # "creep" and "wear" are ordinary words, so these are compared with whole strings only.
     assert not {name for name in CATALOGUE if name in used and "_" in name}
     alone = {
         node.value

@@ -56,7 +56,7 @@ def test_both_use_the_same_driving_angle_and_speed(seen: Seen) -> None:
 
 
 def test_both_find_the_same_orders_and_loop_with_the_same_uncertainty(seen: Seen) -> None:
-    """The same white noise and blocks handed in: orders, loop and standard errors to 1e-6."""
+    """With the same white noise and blocks, orders, loop and standard errors agree to 1e-6."""
     table = seen.calibration
     design = Design.of(table, make_blocks(table), [Start.VIRGIN])
     blocks = design.blocks
@@ -88,7 +88,7 @@ def test_both_find_the_same_orders_and_loop_with_the_same_uncertainty(seen: Seen
 
 
 def _white(blocks: Blocks) -> Blocks:
-    """Blocks whose noise is that of their samples alone."""
+    """Blocks with white noise only."""
     return replace(blocks, locked_arcsec=np.zeros(len(blocks)))
 
 

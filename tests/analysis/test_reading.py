@@ -1,4 +1,4 @@
-"""Resolution of an angle and its number of turns, for records from any program."""
+"""Resolution of an angle and its number of reversals, for records from any program."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ COUNTS = [8000, 2**14, 2**17, 2**20]
 
 
 def bench(rng: np.random.Generator) -> np.ndarray:
-    """Sweeps, sines and small reversals, in motor degrees at 50 Hz, and rests between them."""
+    """Sweeps, sines and small reversals with rests between them, in motor degrees at 50 Hz."""
     ramp = np.linspace(0.0, 7300.0, 1500)
     time_s = np.arange(1500) / 50.0
     sines = [a * np.sin(2.0 * np.pi * time_s / 10.0) for a in (180.0, 45.0, 5.0)]

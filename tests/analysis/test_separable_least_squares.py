@@ -1,4 +1,4 @@
-"""The least squares that calibration and diagnosis share: minima, bounds, priors, signs."""
+"""Least squares shared by calibration and diagnosis: minima, bounds, priors, signs."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ def test_minimum_equals_that_of_scipy() -> None:
 
     def residual(x: FloatArray) -> FloatArray:
         loop = LOOP.fitted(x[1:2], {"width_deg": float(np.exp(x[2])), "exponent": float(x[3])})
-        told = RIPPLE.fitted(x[4:]).predict(MOTION) + loop.predict(MOTION, Start.FORWARD)
-        return (given.observed - x[0] - told) / SIGMA_ARCSEC
+        predicted = RIPPLE.fitted(x[4:]).predict(MOTION) + loop.predict(MOTION, Start.FORWARD)
+        return (given.observed - x[0] - predicted) / SIGMA_ARCSEC
 
     start = np.array([5.0, 40.0, np.log(20.0), 1.6, *RIPPLE.coefficients()])
     best = least_squares(residual, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
@@ -64,7 +64,7 @@ def test_minimum_equals_that_of_scipy() -> None:
     assert found.chi_square == pytest.approx(2.0 * best.cost, rel=1e-6)
     assert loop.width_deg == pytest.approx(float(np.exp(best.x[2])), rel=1e-3)
     assert loop.exponent == pytest.approx(float(best.x[3]), abs=1e-3)
-    # Columns stand for: zero, four of the ripple, the offset, width and exponent.
+    # Columns: zero, four of the ripple, offset, width and exponent.
     spread = np.linalg.inv(found.information)
     other = np.linalg.inv(best.jac.T @ best.jac)[np.ix_([0, 4, 5, 6, 7, 1, 2, 3], [0, 4, 5, 6, 7, 1, 2, 3])]
     assert np.diag(spread) == pytest.approx(np.diag(other), rel=0.02)
@@ -79,7 +79,7 @@ def test_shape_parameters_stop_at_their_bounds() -> None:
 
 
 def test_a_prior_acts_like_observations() -> None:
-    """A prior is a further row of the least squares."""
+    """A prior is equivalent to an additional row of the least squares."""
     data = terms((LOOP,))
     prior = {(0, "0"): Prior(30.0, 4.0), (0, "width_deg"): Prior(float(np.log(25.0)), 900.0)}
     plain, held = Separable(data).fit((LOOP,)), Separable(replace(data, prior=prior)).fit((LOOP,))
@@ -93,7 +93,7 @@ def test_a_prior_acts_like_observations() -> None:
     assert left + penalty < plain.chi_square + (
         4.0 * (before.offset_arcsec - 30.0) ** 2 + 900.0 * np.log(before.width_deg / 25.0) ** 2
     )
-    # At the minimum the data pull as hard as the prior.
+    # At the minimum, the gradients of data and prior cancel.
     slope = held.jacobian.T @ (held.residual / SIGMA_ARCSEC**2) + held.known[:, 1]
     assert np.abs(slope) == pytest.approx(0.0, abs=0.02 * np.sqrt(np.max(np.diag(held.information))))
 
@@ -120,7 +120,7 @@ def test_a_coefficient_of_the_wrong_sign_is_held_at_zero() -> None:
 
 
 def test_nested_parameters_are_updated_during_the_fit() -> None:
-    """The shift of the two directions is one of the orders as they are fitted, not as they were given."""
+    """The shift between the directions applies to the fitted orders, not to the initial ones."""
     phase = DirectionPhase(orders=RIPPLE.orders, shift_deg=4.0)
     data = replace(terms((RIPPLE, phase)), columns=lambda effect: effect.columns(MOTION, Start.FORWARD))
     half = RIPPLE.fitted(0.5 * RIPPLE.coefficients())

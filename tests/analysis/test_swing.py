@@ -1,4 +1,4 @@
-"""Swing of the load on its spring: the response, and how near the driving angle stays to its encoder."""
+"""Swing of the load on its spring: response, and distance of the driving angle from its encoder."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ COUNT_DEG = 0.018
 
 
 @pytest.mark.parametrize(("frequency_hz", "damping"), [(25.0, 0.1), (60.0, 0.4)])
-def test_the_load_follows_its_base_as_the_equation_says(frequency_hz: float, damping: float) -> None:
-    """Over irregular samples, two of which belong to another record."""
+def test_the_load_follows_its_base_according_to_the_equation(frequency_hz: float, damping: float) -> None:
+    """The samples are irregular, and two belong to another record."""
     rng = np.random.default_rng(1)
     time_s = np.cumsum(rng.uniform(0.5e-3, 1.5e-3, 800))
     natural = math.tau * frequency_hz
@@ -48,7 +48,7 @@ def test_the_load_follows_its_base_as_the_equation_says(frequency_hz: float, dam
 
 
 def test_a_steady_acceleration_winds_the_load_up() -> None:
-    """Wind-up J / K per acceleration: 1 / (2 pi f)^2."""
+    """Wind-up per acceleration is J / K = 1 / (2 pi f)^2."""
     time_s = np.arange(2000) * 1e-3
     bent = bend_of(0.5 * 3600.0 * 100.0 * time_s**2, np.diff(time_s), [slice(0, 2000)])
     found = swing(bent, np.diff(time_s), [0], 40.0, 0.2)

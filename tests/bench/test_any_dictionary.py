@@ -1,4 +1,4 @@
-"""Check, boot-up and steps on simulated drives that carry other dictionaries than the project's own."""
+"""Check, boot-up and steps on simulated drives with dictionaries other than the project's own."""
 
 import math
 import re
@@ -87,14 +87,14 @@ def test_mandatory_objects_alone_are_sufficient(tmp_path: Path, usual: Record) -
     assert record.columns["load_position_deg"] == pytest.approx(usual.columns["load_position_deg"], abs=1e-9)
 
 
-def test_the_drive_that_is_simulated_has_this_dictionary(tmp_path: Path) -> None:
+def test_the_simulated_drive_has_this_dictionary(tmp_path: Path) -> None:
     axis = profile_with(tmp_path, without(OWN, 0x6085))
     with simulated(axis) as drive, pytest.raises(DriveError, match="06020000h"):
         drive.sdo.read(0x6085)
 
 
 def test_fixed_mappings_in_another_order_on_other_pdos(tmp_path: Path, usual: Record) -> None:
-    eds = mapped(OWN, 0x1800, 0x60410010, kind=255)  # not with every SYNC: of no use
+    eds = mapped(OWN, 0x1800, 0x60410010, kind=255)  # not sent on every SYNC, so not usable
     eds = mapped(eds, 0x1801, 0x60640020, 0x60410010, can_id=0x281, kind=1)
     eds = mapped(eds, 0x1802, 0x60E40120, 0x60610008, 0x60770010, can_id=0x395)
     eds = mapped(eds, 0x1400, 0x60400010, 0x00050008, 0x60600008, kind=0)
@@ -198,7 +198,7 @@ def test_limits_of_the_eds_are_compared_beforehand(tmp_path: Path) -> None:
 
 
 def test_limits_of_a_part_of_a_value_are_not_those_of_the_value(tmp_path: Path) -> None:
-    """Elmo's Gold drives permit 0 to 65535 for 1016h:01: the time. The node's number stands above it."""
+    """Elmo's Gold drives permit 0 to 65535 for 1016h:01, which limits the time; the node id is above it."""
     axis = profile_with(tmp_path, stating(OWN, "1016sub1", LowLimit=0, HighLimit=65535))
     assert left_to_drive(axis) == []
     assert [row.value for row in plan(axis) if row.index == 0x1016] == [127 << 16 | 50]
@@ -223,7 +223,7 @@ def test_the_limits_of_6060h_count_if_6502h_gives_no_value(
 ) -> None:
     low, high = limits
     limited = stating(OWN, "6060", LowLimit=low, HighLimit=high)
-    plan(profile_with(tmp_path, limited))  # 6502h says that it has both
+    plan(profile_with(tmp_path, limited))  # 6502h reports both modes
     edit = (MODE, f"{MODE}  mode: {mode}\n")
     for eds in (without(limited, 0x6502), stating(limited, "6502", DefaultValue="")):
         axis = profile_with(tmp_path, eds, edit)
@@ -281,7 +281,7 @@ def test_the_load_encoder_in_an_object_of_the_vendors(tmp_path: Path, usual: Rec
               "source: {index: 0x2030, subindex: 0, type: uint16}")  # fmt: skip
     _, record = stepped(profile_with(tmp_path, without(OWN, 0x60E4) + own, source))
     offset_deg = record.columns["load_position_deg"] - usual.columns["load_position_deg"]
-    assert offset_deg == pytest.approx(0x10000 * 360 / 2_880_000, abs=1e-9)  # it begins below zero
+    assert offset_deg == pytest.approx(0x10000 * 360 / 2_880_000, abs=1e-9)  # negative at the start
 
 
 def test_identity_from_the_device_info_section(tmp_path: Path) -> None:

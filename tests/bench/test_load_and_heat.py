@@ -139,7 +139,7 @@ def test_the_record_has_both_columns():
     assert record.columns["load_torque_nm"][-1] == pytest.approx(truly_nm, abs=0.002)
     assert truly_nm == pytest.approx(-7.35, abs=0.05)
     assert record.columns["temperature_c"] == pytest.approx(22.0, abs=0.2)
-    # Told at the same SYNC as the encoders: the torque of this very angle.
+    # Sampled at the same SYNC as the encoders, so it is the torque at this angle.
     torque_nm = -5 * 9.80665 * 0.15 * np.sin(np.radians(record.load_position_deg))
     assert np.abs(record.columns["load_torque_nm"] - torque_nm).max() < 0.01
 
@@ -159,7 +159,7 @@ def test_a_missing_torque_is_held_then_faded_out_and_returns_without_a_jump():
         script = Script(cycle_1000=lambda: stops(node), cycle_1250=lambda: resumes(node))
         bench = Bench(drive, compensation_for(axis, model_with(compliance())), interrupted=script)
         record = bench.run(Moves(MoveTo(60.0), Dwell(3.0))).record
-    assert "load_torque_nm" not in record.columns  # what was held would pass for measured
+    assert "load_torque_nm" not in record.columns  # a held value would pass for a measured one
     assert "temperature_c" in record.columns
     off_arcsec = 3600 * (record.load_position_deg - 60.0)
     wind_up = -5 * 9.80665 * 0.15 * np.sin(np.radians(60.0)) * np.degrees(3600.0 / STIFFNESS_NM_PER_RAD)
@@ -171,7 +171,7 @@ def test_a_missing_torque_is_held_then_faded_out_and_returns_without_a_jump():
     assert counts[Fault.CHANNEL_LOST] == 1
     assert counts[Fault.CHANNEL_HELD] == pytest.approx(100 / 4, abs=2)
     assert counts[Fault.LOST_TPDO] == 0
-    # At rest the whole wind-up is taken out in half a second: under one motor count per cycle.
+    # At rest the whole wind-up fades out in half a second, at under one motor count per cycle.
     at_rest = record.columns["motor_target_deg"][1000:]
     assert np.abs(np.diff(at_rest)).max() <= 360 / axis.motor_encoder.counts_per_turn + 1e-9
 
@@ -185,7 +185,7 @@ def test_a_torque_lost_in_motion_causes_no_jump():
         record = bench.run(Moves(MoveTo(60.0), Dwell(0.1))).record
     steps_deg = np.diff(record.columns["motor_target_deg"][100:700])
     assert bench.supervision.counts[Fault.CHANNEL_LOST] == 1
-    # 20 deg/s, less and more by what the tooth error asks for: at most 8 arcsec per cycle, and a count.
+    # 20 deg/s, plus or minus the tooth correction: at most 8 arcsec per cycle, and a count.
     assert np.abs(steps_deg - 4.0).max() < (8 + 3.24 + 1) / 72
 
 
@@ -194,8 +194,8 @@ def test_an_implausible_reading_is_held_and_moves_nothing():
     with loaded(axis) as (drive, node):
         wrong = []
         entry = node.dictionary[0x2101, 0]
-        told = entry.bound
-        entry.bind(lambda: wrong.pop() if wrong else told())
+        bound = entry.bound
+        entry.bind(lambda: wrong.pop() if wrong else bound())
         drive.boot()
         script = Script(cycle_1000=lambda: wrong.append(2**31 - 1))
         bench = Bench(drive, compensation_for(axis, model_with(compliance())), interrupted=script)
@@ -229,8 +229,8 @@ def test_a_model_with_missing_channels_is_refused_for_compensation():
     compensation_for(without, model_with(compliance(torque="motor_torque_nm")))
 
 
-def test_the_torque_of_the_motor_has_the_sense_of_the_axis():
-    """A motor encoder that counts down: the drive's torque is negative where the axis speeds up forward."""
+def test_the_motor_torque_has_the_sign_of_the_axis():
+    """If the motor encoder counts down, the drive's torque is negative when the axis accelerates forward."""
     reversed_text = (PROFILE / "axis.yaml").read_text().replace(
         "counts_per_turn: 8000         # one count is 3.24 arcsec at the load\n  direction: 1",
         "counts_per_turn: 8000\n  direction: -1",

@@ -1,4 +1,4 @@
-"""A measured channel more is one row of one table: from the drive's object to the record and the effects."""
+"""An additional measured channel is one row of one table, from the drive's object to record and effects."""
 
 import os
 import shutil
@@ -97,6 +97,6 @@ def test_a_new_channel_needs_one_table_row(tmp_path):
     assert done.returncode == 0, done.stderr
     said = dict(line.split(": ", 1) for line in done.stdout.splitlines())
     assert "add 'humidity' to" in said["refused"]
-    assert float(said["column"]) > 20.0  # what the simulated drive's object 2100h says, here as per cent
+    assert float(said["column"]) > 20.0  # value of the simulated drive's object 2100h, here in per cent
     assert said["motion"] == "True"
     assert float(said["correction"]) == pytest.approx(10.0 * float(said["column"]), rel=0.02)

@@ -32,7 +32,7 @@ def edited(text: str, changes: dict[str, str]) -> str:
 
 @dataclass
 class Case:
-    """One examination, and the parts that a test may have changed."""
+    """One examination, with the parts that a test may change."""
 
     folder: Path
     axis: dict[str, str] = field(default_factory=dict)
@@ -76,7 +76,7 @@ class Case:
             yield bus, clock
 
     def run(self, until: str = "off", **options: Any) -> dict[str, Verdict]:
-        """The verdicts by the name of the check, up to the check ``until``."""
+        """Returns the verdicts by check name, up to the check ``until``."""
         last = [check.name for check in CHECKS].index(until)
         permitted = options.pop("permitted", lambda: None)
         with BringUpContext(self.prepare, self.connect, **options) as context:

@@ -1,4 +1,4 @@
-"""The doctor's list on a simulated drive with one thing wrong: each is found, and its key named."""
+"""The doctor's checks on a simulated drive with one fault: each fault is found and its key named."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -34,7 +34,7 @@ def test_a_sound_axis_passes_every_check(case: Callable[..., Any]) -> None:
     assert 0.025 < verdicts["heartbeat"].figures["time_s"] < 0.1
     assert 0.016 <= verdicts["set_points"].figures["time_s"] < 0.05
     assert decode(examined.node.firmware.statusword()) is State.SWITCH_ON_DISABLED
-    assert abs(examined.node.firmware.motion.motor_counts) < 4000  # it came back, but for the last stop
+    assert abs(examined.node.firmware.motion.motor_counts) < 4000  # returned, except for the last stop
 
 
 def test_test_motion_turns_toward_the_side_with_room(case: Callable[..., Any]) -> None:
@@ -49,7 +49,7 @@ def test_test_motion_turns_toward_the_side_with_room(case: Callable[..., Any]) -
     ids=["high ratio", "coarse load encoder"],
 )
 def test_other_gears_and_encoders_pass(case: Callable[..., Any], ratio: int, counts: int, turns: int) -> None:
-    """The motor's encoder counts the other way besides."""
+    """The motor encoder also counts the other way."""
     verdicts = case(
         axis={
             "  direction: 1\n\nload": "  direction: -1\n\nload",
@@ -200,7 +200,7 @@ def test_gains_changed_since_the_response_measurement(case: Callable[..., Any], 
     assert "measure the response again" in verdicts["identity"].remedies[0]
 
 
-def test_a_load_encoder_that_is_not_there(case: Callable[..., Any]) -> None:
+def test_a_missing_load_encoder(case: Callable[..., Any]) -> None:
     def unplug(node: DriveNode) -> None:
         node.dictionary[0x60E4, 1].bind(lambda: 17)
 
@@ -251,7 +251,7 @@ def test_a_torque_sensor_that_is_not_connected(case: Callable[..., Any]) -> None
     assert verdicts["hold"].outcome is NOT_POSSIBLE
 
 
-def test_a_torque_that_the_drive_does_not_have(case: Callable[..., Any]) -> None:
+def test_a_torque_channel_that_the_drive_lacks(case: Callable[..., Any]) -> None:
     verdicts = case(axis=CHANNELS, spoil=_without((0x2101, 0))).run(until="eds")
     assert failures(verdicts)[0] == "eds"
     verdicts = case(axis=CHANNELS, eds={"[2101]": "[2111]"}).run()
@@ -271,8 +271,8 @@ def test_eds_of_another_drive(case: Callable[..., Any]) -> None:
 def test_a_drive_at_another_node_id_is_found(case: Callable[..., Any]) -> None:
     verdicts = case(node_id=5).run(until="node")
     assert failures(verdicts) == ["node"]
-    told = "\n".join(verdicts["node"].remedies)
-    assert "axis.yaml:12:3: drive.node_id: found 1; the drive with this identity is node 5" in told
+    remedies = "\n".join(verdicts["node"].remedies)
+    assert "axis.yaml:12:3: drive.node_id: found 1; the drive with this identity is node 5" in remedies
 
 
 def test_a_drive_that_ignores_a_lost_heartbeat(case: Callable[..., Any]) -> None:

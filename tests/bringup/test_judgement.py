@@ -62,7 +62,7 @@ def file(
 
 
 def turned(truth: AxisConfig, by: AxisConfig, motor_deg: float = 360.0) -> Turned:
-    """Returns the readings of the axis ``truth`` that is commanded to turn by the file ``by``."""
+    """Returns the readings of the axis ``truth`` when commanded through the axis file ``by``."""
     counts = by.motor_encoder.counts(motor_deg)
     true_motor_deg = truth.motor_encoder.degrees(counts)
     return Turned(counts, truth.load_encoder.counts(true_motor_deg / truth.gear.ratio))

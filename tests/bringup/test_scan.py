@@ -96,7 +96,7 @@ def test_a_scan_writes_no_object_and_commands_nothing() -> None:
         scan_bus(link)
         assert {(each.index, each.sub): each.value for each in node.dictionary} == before
     requests = [each for each in seen if 0x600 < each.arbitration_id < 0x680]
-    # 40h reads, 60h and 70h fetch the segments of a name, 80h gives up
+    # 40h reads, 60h and 70h fetch the segments of a name, 80h aborts
     assert {each.data[0] & 0xEF for each in requests} <= {0x40, 0x60, 0x80}
     assert not [each for each in seen if each.arbitration_id in (0x000, 0x080)]
     assert {each.arbitration_id - 0x600 for each in requests} == set(range(1, 128))

@@ -154,7 +154,7 @@ def logged() -> Logged:
 
 @pytest.fixture(scope="module")
 def without_demand() -> Logged:
-    """The same, but the drive sends no position demand."""
+    """The same session without a position demand from the drive."""
     return driven(with_demand=False)
 
 
@@ -166,7 +166,7 @@ def run(*arguments: object) -> str:
 
 
 def check_angles(recording: Recording, logged: Logged, *, time_s: float = 1e-6) -> slice:
-    """The angles to the last bit, the time as well as the format keeps it; the rows that the master knew."""
+    """Checks the angles exactly, the time to the format's resolution, and the rows that the master has."""
     record, rows = recording.record, np.array(logged.rows)
     motor = np.round(record.motor_position_deg * 8000 / 360.0)
     load = np.round(record.load_position_deg * 2_880_000 / 360.0)

@@ -20,7 +20,7 @@ validation: {count: 4, cycles: 0}
 
 
 def begun(cell, *arguments):
-    """A calibration whose second task is done: it is in the third, a long one."""
+    """A calibration in its third task, which is long."""
     (cell.folder / "long.yaml").write_text(LONG)
     process = cell.start("calibrate", "axis", "--simulate", "--plan", "long.yaml", "--out", "rec", *arguments)
     about = cell.folder / "rec" / "recording.yaml"

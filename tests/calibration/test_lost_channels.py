@@ -49,7 +49,7 @@ def test_a_channel_lost_during_calibration_is_reported_and_remembered(cell):
     assert f"note: {line}" in done.stdout.splitlines()
     assert line in cell.json("result.json")["warnings"]
     assert line in (cell.folder / "rec" / "report.html").read_text()
-    # What was survived beside it is in the recording, and told the same way.
+    # The recording has the tolerated faults as well, in the same form.
     missing = [
         (name, row)
         for name, rows in survived_in.items()

@@ -25,7 +25,7 @@ def place(tmp_path_factory):
 
 @pytest.fixture
 def machine(place, monkeypatch):
-    """The machine as it comes up, its first axis enabled; the environment leads to it."""
+    """A machine after start-up with its first axis enabled; the environment has its address."""
     monkeypatch.setenv("HDBRIDGE_SOCKET", str(place.socket))
     place.bridge.__init__()
     place.bridge.axes["joint-1"].at = messages.ControlState.ENABLED

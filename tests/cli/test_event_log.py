@@ -20,7 +20,7 @@ def test_log_records_bus_actions_but_not_single_cycles(hdbridge, tmp_path):
     for expected in ("command", "nmt", "booted", "sdo write", "enable", "disabled", "run ended"):
         assert expected in names
     assert {"date", "level", "where"} <= events[0].keys()
-    # Hundreds of cycles were run between the two; what writes there costs time that the loop has not.
+    # Hundreds of cycles ran between the two; a line for each would cost time that the loop lacks.
     (begin,) = [place for place, each in enumerate(events) if each["event"] == "enable"]
     assert names[begin + 1].startswith("sdo") or names[begin + 1] == "disabled"
     (run,) = [each for each in events if each["event"] == "run ended"]

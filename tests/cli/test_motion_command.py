@@ -67,7 +67,7 @@ def test_measures_and_proposes_the_response_and_the_committed_model_uses_it(hdbr
         assert other["filtered_arcsec"] == pytest.approx(one["filtered_arcsec"], rel=0.1, abs=0.2)
     assert again["remarks"] == []
     assert "corrected up to 90 Hz" in hdbridge("check", "fast").stdout
-    # At rest the axis points as well as without the response.
+    # At rest the accuracy is the same as without the response.
     done = hdbridge("step", "fast", "--simulate", "--count", 12, "--scheme", "both", "--json", "step.json")
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "step.json").read_text())["both"]["pooled"]["three_sigma_arcsec"] < 4.5

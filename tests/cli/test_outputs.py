@@ -122,7 +122,7 @@ def test_a_pipe_is_written_directly(hdbridge, tmp_path):
 
 
 def test_a_device_is_never_replaced(hdbridge, tmp_path):
-    """A node of its own, as root; for others the terminal's will do, which they cannot replace anyway."""
+    """Root makes a device node; other users take the terminal's, which they cannot replace anyway."""
     device = tmp_path / "null"
     try:
         os.mknod(device, 0o666 | stat.S_IFCHR, os.makedev(1, 3))

@@ -1,6 +1,6 @@
 """Invalid arguments and options of every command are refused in one line, without side effects.
 
-The commands, their parameters and the ranges of those come from the command line itself.
+Commands, parameters and their ranges are read from the command line itself.
 """
 
 import inspect
@@ -58,7 +58,7 @@ PRINTS = {("doctor",)}
 
 @dataclass(frozen=True)
 class Parameter:
-    """Texts for one parameter of a command, and the values that cannot be right."""
+    """Arguments for one parameter of a command, and its invalid values."""
 
     name: str
     option: str
@@ -132,7 +132,7 @@ def line(command, changed, value):
 
 @pytest.fixture
 def place(tmp_path):
-    """A folder in which a person has one of everything."""
+    """A folder with one file of every kind."""
     shutil.copytree(PROFILES / "article", tmp_path / "axis")
     rows = "".join(f"{number},{number},{number / 50}\n" for number in range(9))
     (tmp_path / "record.csv").write_text("time_s,motor_position_deg,load_position_deg\n" + rows)

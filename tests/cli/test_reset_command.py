@@ -48,7 +48,7 @@ def test_without_a_fault_nothing_is_done(hdbridge):
 
 
 def texts(tree: ast.Module) -> Iterator[str]:
-    """Every text of a module but its docstrings; an f-string with the expressions in it."""
+    """Returns all strings of a module except docstrings; f-strings with their expressions."""
     skipped = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):

@@ -34,7 +34,7 @@ ARTICLE = (bundled_profile("article") / "axis.yaml").read_text(encoding="utf-8")
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A set-up of a simulated axis, from nothing to the end."""
+    """A completed set-up of a simulated axis."""
     folder = tmp_path_factory.mktemp("setup")
     (folder / "short.yaml").write_text(PLAN)
     return folder, run_here(folder, "setup", "arm", "--simulate", "--yes", "--plan", "short.yaml")
@@ -57,7 +57,7 @@ def test_sets_up_a_compensated_axis_from_scratch(finished):
 
 
 def test_prints_ordinary_commands(finished, tmp_path):
-    """Printed, they can be typed: the first three, in another folder, do the same."""
+    """The first three printed commands, run in another folder, have the same effect."""
     _, done = finished
     for line in re.findall(r"^\$ hdbridge (.*)", done.stdout, re.M)[:3]:
         again = run_here(tmp_path, *line.split())
@@ -137,7 +137,7 @@ def test_missing_requirements_are_reported(arguments, status, said, tmp_path):
 
 
 def test_nothing_moves_without_consent(tmp_path):
-    """On a terminal, with a no to the first question."""
+    """On a terminal, answering no to the first question."""
     parent, child = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, "-m", "hdbridge", "setup", "arm", "--simulate"],

@@ -50,7 +50,7 @@ def test_overview_repeats_the_commands_own_summary(name, summary):
 
 
 def test_help_loads_no_numeric_or_bus_modules_and_a_daemon_no_scipy():
-    """All commands are imported as their help needs them; what they run with is not."""
+    """Help imports all commands, but not the modules that they use when run."""
     program = (
         "import sys\nfrom hdbridge.cli import PANELS, load\n"
         "for panel in PANELS.values():\n    for name in panel:\n        load(name)\n"

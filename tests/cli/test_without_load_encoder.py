@@ -18,7 +18,7 @@ def blind(tmp_path: Path) -> Path:
 
 
 def ripples(profile: Path, *models: TransmissionModel) -> list[float]:
-    """Ripple of the load at 76 deg/s, arcsec rms; load encoder sees it."""
+    """Ripple of the load at 76 deg/s as measured by the load encoder, arcsec rms."""
     with simulated(AxisConfig.load(profile)) as drive:
         drive.boot()
         runs = [Bench(drive, each).run(EvenSpeed((76.0,))).outcome for each in models]

@@ -16,7 +16,7 @@ def place(tmp_path_factory):
 
 @pytest.fixture
 def api(place):
-    """The machine as it comes up, its first axis enabled."""
+    """A machine after start-up, its first axis enabled."""
     place.bridge.__init__()
     place.bridge.axes["joint-1"].at = messages.ControlState.ENABLED
     return place

@@ -14,7 +14,7 @@ from hdbridge.errors import DaemonError, InputError
 
 @pytest.fixture
 def machine(tmp_path, monkeypatch):
-    """A function that has a daemon of a name listen, and an environment that leads to it."""
+    """A function that listens as the daemon of a given name, and an environment to find it."""
     monkeypatch.setattr(address, "SYSTEM_FOLDER", tmp_path / "system")
     with ExitStack() as stack:
 
@@ -69,7 +69,7 @@ def test_a_daemon_ending_during_the_search_is_not_found(machine, tmp_path):
 
 
 def test_a_world_writable_folder_is_not_trusted(machine):
-    """Below /tmp a stranger could put a socket where ours would be."""
+    """Below /tmp another user could put a socket in the daemon's place."""
     path = machine("cell")
     path.parent.chmod(0o777)
     with pytest.raises(DaemonError, match="no daemon runs"):

@@ -181,14 +181,14 @@ def test_a_refused_point_or_an_error_ends_the_stream(client, api):
 def test_samples_are_received_live(client):
     cycles: list[int] = []
     for samples in client.live(every=5, axes=["joint-2"]):
-        if set(samples.axes) == {"joint-2"}:  # as asked for, once that has arrived
+        if set(samples.axes) == {"joint-2"}:  # as requested, once the request has arrived
             cycles += samples.cycle
         if len(cycles) > 10:
             break
     assert all(each % 5 == 0 for each in cycles)
 
 
-def test_without_a_daemon_it_says_how_to_start_one(tmp_path, monkeypatch):
+def test_without_a_daemon_the_error_explains_how_to_start_one(tmp_path, monkeypatch):
     for name in ("HDBRIDGE_SOCKET", "HDBRIDGE_URL"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))

@@ -18,8 +18,8 @@ def test_documented_example_runs(number, api, monkeypatch, capsys):
     monkeypatch.setenv("HDBRIDGE_SOCKET", str(api.socket))
     exec(compile(EXAMPLES[number], f"{PAGE.name}, example {number + 1}", "exec"), {"__name__": "__main__"})
     assert not api.bridge.state().lease.held
-    told = capsys.readouterr().out
-    assert bool(told) == ("print(" in EXAMPLES[number])
+    output = capsys.readouterr().out
+    assert bool(output) == ("print(" in EXAMPLES[number])
 
 
 def test_the_page_has_examples():

@@ -76,7 +76,7 @@ def test_every_variable_size_field_is_bounded(request_):
 
 @pytest.mark.parametrize("wrong", ["a\nb", "\x1b[2J", "\x9b2J", "\u202egnitirw", "\u2028", "x" * 401, 3])
 def test_client_texts_are_one_line_without_control_characters(wrong):
-    """Others are shown it, and it goes into the log."""
+    """The text is shown to other clients and logged."""
     with pytest.raises(ValidationError, match="client"):
         messages.LeaseRequest(client=wrong)
     assert messages.LeaseRequest(client="Zelle 3, Prüfstand \u2192 Süd").client

@@ -32,7 +32,7 @@ def run_with(effect) -> TransmissionModel:
 
 
 def moments(loads):
-    """Yields the readings of a control loop on the way, with changing torque and temperature."""
+    """Yields the readings of a control loop in motion, with changing torque and temperature."""
     observer = Observer()
     for index, load in enumerate(loads):
         time_s = index * PERIOD
@@ -101,7 +101,7 @@ def test_an_effect_fades_out_without_its_channel_and_in_again_with_it():
         steps.append(abs(compensation.correction_arcsec - last))
         last = compensation.correction_arcsec
     without_torque = compensation.correction_arcsec
-    # 80 arcsec in half a second, and what the loop makes of turning back: never more than 3 per cycle.
+    # 80 arcsec in half a second, plus the loop's change on reversal: never more than 3 per cycle.
     assert 0 < max(steps) < 3.0
     assert max(steps[130:]) == 0.0
     assert abs(with_torque - without_torque) > 30

@@ -136,7 +136,7 @@ def test_inverse_of_a_lagging_load_never_reverses(model, path, start):
         reached = motor_deg / model.ratio + gear.advance(motor_deg, NOW) / 3600
         assert abs(reached - load_deg) * 3600 <= 1e-6
         if abs(load_deg - last_load_deg) > 1e-6:
-            # Behind friction the motor has further to go than the load, and never goes the other way.
+            # Against friction the motor travels further than the load, and never reverses.
             ahead = (motor_deg - last_deg) / (load_deg - last_load_deg)
             assert ahead >= 0.99 * model.ratio
         last_deg, last_load_deg = motor_deg, load_deg
@@ -152,7 +152,7 @@ def test_within_the_backlash_the_motor_never_reverses():
         inverse.advance(path[-1])
     steps = -np.diff(path)
     assert np.all(steps > 0.0)
-    # It takes up the lost motion on either side, and goes on as the load is told to.
+    # It takes up the lost motion on either side, then continues at the commanded rate.
     assert steps[0] > 3 * 50e-4
     assert steps[-1] == pytest.approx(50e-4, rel=1e-3)
 

@@ -1,4 +1,4 @@
-"""Laws of the slow loop over the load encoder, on a load that follows its motor but for one offset."""
+"""Laws of the slow loop around the load encoder, on a load that follows its motor with one offset."""
 
 import math
 from dataclasses import dataclass, field
@@ -49,13 +49,13 @@ class Plant:
         return self.its.step(self.target, load, motor, moving)
 
     def rest(self, seconds: float) -> float:
-        """The true error at the end."""
+        """Rests; returns the true error at the end."""
         for _ in range(round(seconds / PERIOD_S)):
             self.step()
         return self.lag - self.its.value_arcsec
 
     def move(self, target: float, seconds: float = 1.0) -> float:
-        """To another place, and rest there."""
+        """Moves to another angle and rests there."""
         self.target = target
         self.step(moving=True)
         return self.rest(seconds)
@@ -142,7 +142,7 @@ def test_motor_counts_noise_and_reversals_are_not_faults(lag, noise, count, move
     plant.rest(4.0)
     assert its.doubt == ""
     for target, change in moves:
-        plant.lag = lag + change  # the model is wrong by something else at every place
+        plant.lag = lag + change  # the model error differs at every angle
         plant.move(target, 2.0)
         assert its.doubt == ""
 

@@ -95,7 +95,7 @@ def test_at_constant_speed_each_order_has_the_gain_of_the_filter(speed_deg_s):
             amplitude * np.exp(1j * math.radians(phase)) * gain(measured.filter, np.array([hertz]), PERIOD)[0]
         )
         found = cos_sin[2 * place] - 1j * cos_sin[2 * place + 1]
-        # The correction shifts the motor angle by a little: the second order of a small quantity.
+        # The correction itself shifts the motor angle slightly, a second-order effect.
         assert abs(found - wanted) < 0.02 * abs(wanted) + 0.1
 
 

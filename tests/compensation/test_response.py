@@ -1,4 +1,4 @@
-"""The filter computed from runs at constant speed is the inverse of the response that they were made with."""
+"""The filter computed from runs at constant speed inverts the response of the axis in those runs."""
 
 import cmath
 import math
@@ -49,7 +49,7 @@ def resonance(hz: float, damping: float):
 
 
 def runs(answer, filters=None, noise_arcsec: float = 0.0, seed: int = 0) -> tuple[Harmonics, ...]:
-    """Orders that remain where the load answers a correction with ``answer``; without correction if None."""
+    """Residual orders if the load answers a correction with ``answer``; without correction if None."""
     rng = np.random.default_rng(seed)
     found = []
     for speed in SPEEDS:
@@ -87,7 +87,7 @@ def left(answer, filters, hertz: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("noise_arcsec", [0.0, 0.02])
 @pytest.mark.parametrize("hz", [18.0, 31.0, 45.0])
 def test_a_narrow_notch_is_inverted_between_the_measured_frequencies(hz, noise_arcsec):
-    """A filter without poles would have to be as long as the notch rings, ten times longer than it is."""
+    """A filter without poles would need the length of the notch's ringing, ten times its actual length."""
     answer = resonance(hz, 0.12)
     found = measured(answer, noise_arcsec=noise_arcsec)
     remaining = left(answer, found.filter, np.linspace(1.0, 80.0, 300))

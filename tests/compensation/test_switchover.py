@@ -87,7 +87,7 @@ def test_a_change_is_continuous_and_ends_at_the_new_model(old, new, before, afte
     assert not correction.changing
     assert correction.memory_known
     assert correction.model is new
-    # Both have run farther than they remember: the same model in the same state.
+    # Both have travelled beyond their memory, so they are the same model in the same state.
     assert correction.correction_arcsec == pytest.approx(alone.correction_arcsec, abs=2e-6)
     assert correction.predicted_arcsec == pytest.approx(alone.predicted_arcsec, abs=2e-6)
 
@@ -251,7 +251,7 @@ def bundled() -> list[Path]:
 
 @pytest.mark.parametrize("folder", bundled(), ids=lambda each: each.name)
 def test_compensation_can_be_pickled(folder):
-    """The service makes it, the loop takes it."""
+    """The service creates the compensation, and the control loop receives it."""
     axis = AxisConfig.load(folder / "axis.yaml")
     whole = TransmissionModel.load(folder / "model.yaml")
     for scheme in Scheme.offered_by(whole):

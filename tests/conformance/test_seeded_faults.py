@@ -52,17 +52,17 @@ Method = Callable[..., Any]
 
 
 def sends(check: str, text: str, change: Callable[[int, bytes], list[Frame]]) -> Fault:
-    """Other frames from the node."""
+    """Modifies frames from the node."""
     return check, text, lambda patch, node, bus: setattr(bus, "outgoing", change)
 
 
 def receives(check: str, text: str, change: Callable[[can.Message], can.Message | None]) -> Fault:
-    """Other frames to the node."""
+    """Modifies frames to the node."""
     return check, text, lambda patch, node, bus: setattr(bus, "incoming", change)
 
 
 def wraps(check: str, text: str, path: str, make: Callable[[Method, DriveNode], Method]) -> Fault:
-    """Another method, made of the right one and the node; its path begins at the node or at a mode."""
+    """Replaces a method by one made from the original and the node; the path begins at node or mode."""
 
     def seed(patch: Any, node: DriveNode, bus: Spoiled) -> None:
         *owners, name = path.split(".")
@@ -77,7 +77,7 @@ def wraps(check: str, text: str, path: str, make: Callable[[Method, DriveNode], 
 
 
 def wraps_pdos(check: str, text: str, kind: str, name: str, make: Callable[[Method, Any], Method]) -> Fault:
-    """Another method of each PDO of a kind, made of the right one and the PDO."""
+    """Replaces a method of each PDO of a kind by one made from the original and the PDO."""
 
     def seed(patch: Any, node: DriveNode, bus: Spoiled) -> None:
         for pdo in getattr(node, kind):
@@ -87,7 +87,7 @@ def wraps_pdos(check: str, text: str, kind: str, name: str, make: Callable[[Meth
 
 
 def entry(check: str, text: str, index: int, sub: int, **changes: Any) -> Fault:
-    """An entry of the dictionary with another value or guard."""
+    """Gives a dictionary entry another value or guard."""
 
     def seed(patch: Any, node: DriveNode, bus: Spoiled) -> None:
         for name, value in changes.items():
@@ -97,17 +97,17 @@ def entry(check: str, text: str, index: int, sub: int, **changes: Any) -> Fault:
 
 
 def follows(check: str, text: str, index: int, make: Callable[[DriveNode], Method | None]) -> Fault:
-    """Another effect of writing an object."""
+    """Changes the effect of writing an object."""
     return check, text, lambda patch, node, bus: setattr(node.dictionary[index, 0], "follower", make(node))
 
 
 def reads(check: str, text: str, index: int, value: Callable[[DriveNode], int]) -> Fault:
-    """An object with another value."""
+    """Changes the value read from an object."""
     return check, text, lambda patch, node, bus: node.dictionary[index, 0].bind(lambda: value(node))
 
 
 def described(check: str, text: str, index: int, **changes: Any) -> Fault:
-    """An entry with another description."""
+    """Changes the description of an entry."""
     return check, text, lambda patch, node, bus: replace_entry(node, index, **changes)
 
 
@@ -120,14 +120,14 @@ def replace_entry(node: DriveNode, index: int, **changes: Any) -> None:
 
 
 def used_as(check: str, text: str, index: int, change: Callable[[int], int]) -> Fault:
-    """An object whose value has another effect, whatever it reads as."""
+    """Changes the effect of an object's value, but not the value read."""
     return wraps(check, text, "dictionary.value", lambda read, node: (
         lambda i, sub=0: change(read(i, sub)) if i == index else read(i, sub)
     ))  # fmt: skip
 
 
 def transition(check: str, text: str, state: State, command: Command, then: State | None) -> Fault:
-    """An additional, another or (None) a missing transition."""
+    """Adds, changes or (None) removes a transition."""
     return check, text, lambda patch, node, bus: patch.setitem(TRANSITIONS, (state, command), then or state)
 
 
@@ -136,7 +136,7 @@ def status_bit(check: str, text: str, clear: int, put: int = 0) -> Fault:
 
 
 def also(check: str, text: str, more: Callable[[DriveNode], object]) -> Fault:
-    """More that is done whenever frames are assigned to PDOs."""
+    """Runs an additional action whenever frames are assigned to PDOs."""
 
     def seed(patch: Any, node: DriveNode, bus: Spoiled) -> None:
         route = node._route
@@ -273,13 +273,13 @@ WATCHING = (
 
 
 def lss_answers(check: str, text: str, command: int, *values: int) -> Fault:
-    """An answer of LSS with other bytes."""
+    """Changes bytes of an LSS answer."""
     return sends(check, text, when(lambda i, d: i == 0x7E4 and d[0] == command,
                                    lambda i, d: [(i, bytes(values).ljust(8, b"\0"))]))  # fmt: skip
 
 
 def lss(check: str, text: str, name: str, make: Callable[[Method, Any], Method]) -> Fault:
-    """Another method of the LSS slave, made of the right one and the slave."""
+    """Replaces a method of the LSS slave by one made from the original and the slave."""
     return wraps(check, text, f"_lss.{name}", lambda right, node: make(right, node._lss))
 
 
@@ -595,7 +595,7 @@ POWER = (
 
 
 def profile_position(check: str, text: str, change: Callable[[int], int]) -> Fault:
-    """Profile position sees another controlword."""
+    """Changes the controlword that profile position mode sees."""
     return wraps(check, text, "pp.control",
                  lambda control, node: lambda word, rising: control(change(word), rising))  # fmt: skip
 

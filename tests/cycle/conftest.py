@@ -49,7 +49,7 @@ class SyncAnswer:
 
 @dataclass
 class Rig:
-    """An axis under way, and everything a test may turn."""
+    """An axis in motion, and everything that a test may change."""
 
     bus: LoggingBus
     clock: VirtualClock
@@ -86,7 +86,7 @@ class Rig:
         self.bad = counts
 
     def move(self, cycles: int = 1) -> Feedback:
-        """Go on at constant speed."""
+        """Continues at constant speed."""
         for _ in range(cycles):
             self.target += STEP_COUNTS
             bad, self.bad = self.bad, None
@@ -94,12 +94,12 @@ class Rig:
         return feedback
 
     def interfere(self, can_id: int, data: bytes = b"", **kind: bool) -> None:
-        """A frame from another node, on the bus before the next cycle."""
+        """Sends a frame from another node before the next cycle."""
         kind = {"is_extended_id": False, **kind}
         self.intruder.send(can.Message(arbitration_id=can_id, data=data, **kind))
 
     def hang(self, duration_s: float) -> None:
-        """The master does nothing for so long."""
+        """Stalls the master for ``duration_s``."""
         self.clock.sleep_until(self.clock.now() + duration_s)
 
     def interface_down(self) -> None:
@@ -119,7 +119,7 @@ class Rig:
         return [event.reaction for event in self.supervision.events if event.fault is fault]
 
     def stopped_within(self, cycles: int, fault: Fault) -> str:
-        """Go on until the stop comes, which must be by this many cycles and for this fault; its text."""
+        """Continues until the stop, which must come within these cycles for this fault; returns its text."""
         first = self.drive.image.target_counts
         for _ in range(cycles):
             try:
@@ -131,7 +131,7 @@ class Rig:
         raise AssertionError(f"no stop within {cycles} cycles; target went from {first} to {self.target}")
 
     def stands_still(self) -> None:
-        """Lets time pass without the master; the axis comes to rest and stays there."""
+        """Checks that the axis comes to rest without the master and stays there."""
         self.clock.sleep_until(self.clock.now() + 1.0)
         place = self.node.firmware.motion.machine.motor_counts
         self.clock.sleep_until(self.clock.now() + 0.5)
@@ -139,7 +139,7 @@ class Rig:
         assert abs(place - self.target) < 8000
 
     def next_program(self, cycles: int = 10) -> None:
-        """Another program begins on this bus, with a cycle of its own, and asks for no power."""
+        """Starts another program with its own cycle on this bus; it requests no power."""
         self.bus.down = self.bus.no_room_for = None
         link = Link(self.bus, self.clock)
         cycle = Cycle(link, self.clock, ProcessImage(self.drive.axis), Supervision(), self.period_s)

@@ -86,7 +86,7 @@ def test_a_latched_axis_gets_no_rpdo_while_the_other_moves(pair: TwoAxes) -> Non
     assert pair.axes[0].silent, "a latch is not released by beginning anew"
 
 
-def test_after_a_latch_nothing_enables_the_axis_by_itself(pair: TwoAxes) -> None:
+def test_nothing_enables_a_latched_axis_automatically(pair: TwoAxes) -> None:
     pair.interfere(0x701, b"\x00")
     pair.turn(300)
     pair.axes[0].reset(verified=True)

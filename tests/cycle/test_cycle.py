@@ -1,4 +1,4 @@
-"""The control cycle on the simulated drive and a virtual clock: its order, its deadlines, its answers."""
+"""The control cycle on the simulated drive and a virtual clock: order, deadlines, answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each row of the fault table by real frames: the reaction, how soon it comes, and that the axis stands."""
+"""Each row of the fault table by real frames: reaction, delay, and standstill of the axis."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_stale_tpdo_before_sync_is_discarded(moving) -> None:
     assert moving.events(Fault.DUPLICATE_TPDO) == [Reaction.GO]
 
 
-def test_a_tpdo_of_the_wrong_length_beside_a_good_one_is_only_counted(moving) -> None:
+def test_a_tpdo_of_the_wrong_length_next_to_a_good_one_is_only_counted(moving) -> None:
     moving.answers_sync((0x181, b"short"))
     assert moving.move().fresh
     assert moving.events(Fault.DISCARDED_FRAME) == [Reaction.GO]
@@ -74,7 +74,7 @@ def test_a_drive_fault_stops_the_axis_and_is_named(moving) -> None:
 
 @pytest.mark.parametrize("stays", [False, True], ids=["leaves operational", "stays operational"])
 def test_a_stall_of_the_control_process_is_reported_as_such(moving, stays: bool) -> None:
-    """The drive gave its master up meanwhile: neither an NMT master nor an enable input has to do with it."""
+    """The drive timed out its master meanwhile; neither an NMT master nor an enable input is the cause."""
     moving.node.faults.stay_operational = stays
     moving.move()
     moving.clock.sleep_until(moving.clock.now() + 0.4)

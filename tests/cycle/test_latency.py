@@ -1,4 +1,4 @@
-"""The lateness histogram, the rule for the cycle time, and the measurement on a made-up clock."""
+"""The lateness histogram, the rule for the cycle time, and the measurement on a simulated clock."""
 
 from __future__ import annotations
 

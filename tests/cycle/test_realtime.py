@@ -1,4 +1,4 @@
-"""Preparing for real time gives everything back."""
+"""Real-time settings are restored afterwards."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hdbridge.control.realtime import left_realtime, prepare_realtime, resumed_r
 
 @pytest.fixture(autouse=True)
 def heap_of_a_small_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spares the tests full collections of everything that a test process has loaded."""
+    """Avoids full garbage collections of everything that a test process has loaded."""
     monkeypatch.setattr(gc, "collect", lambda: 0)
 
 
@@ -74,7 +74,7 @@ def test_a_missing_processor_is_reported() -> None:
 
 def test_a_fit_runs_without_priority_and_motion_within_it_with():
     with left_realtime(), resumed_realtime():
-        assert gc.isenabled()  # nothing was prepared, nothing to leave
+        assert gc.isenabled()  # without preparation there is nothing to change
     with prepare_realtime(priority=0):
         assert not gc.isenabled()
         with left_realtime():

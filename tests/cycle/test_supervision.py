@@ -11,7 +11,7 @@ from hdbridge.errors import SafetyStop
 
 GO, FREEZE, STOP, LATCH = Reaction.GO, Reaction.FREEZE, Reaction.QUICK_STOP, Reaction.LATCH
 EXPECTED = {
-    # fault: what the first, second and third cycle in a row with it lead to
+    # fault: reactions to the first, second and third consecutive cycle with it
     Fault.LOST_TPDO: (FREEZE, STOP, STOP),
     Fault.OVERRUN: (GO, STOP, STOP),
     Fault.DUPLICATE_TPDO: (GO, GO, GO),

@@ -50,7 +50,7 @@ def machine_axes():
 
 
 class Disorder(RuleBasedStateMachine):
-    """Two axes, a service that does anything, and a bus on which anything happens."""
+    """Two axes, a service with random commands, and a bus with random events."""
 
     events = 0
     """Rules applied, of all examples."""
@@ -85,7 +85,7 @@ class Disorder(RuleBasedStateMachine):
 
     def post(self, kind: CommandKind | int, axis: int = 0, **fields: float) -> None:
         with suppress(MailboxFullError):
-            # The laws have to know before a turn takes it.
+            # The laws must see the command before a turn takes it.
             self.laws.post(kind, axis, self.daemon.post(kind, axis, **fields))  # type: ignore[arg-type]
 
     def go(self, number: int = 1) -> None:
@@ -96,10 +96,10 @@ class Disorder(RuleBasedStateMachine):
             self.daemon.events.clear()
         self.laws.samples()
 
-    # ---------------------------------------------------------------- a service that knows what it does
+    # ---------------------------------------------------------------- commands of a correct service
 
     def _boot(self, axis: int) -> None:
-        """Boot over the relay, as far as the bus lets it, and verify; where it was, verify alone."""
+        """Boots the drive over the relay if necessary, as far as the bus permits, then verifies it."""
         daemon = self.daemon
         if not daemon.axes[axis].cycle.feedback.fresh or not self.booted[axis]:
             with suppress(HdbridgeError):
@@ -123,7 +123,7 @@ class Disorder(RuleBasedStateMachine):
     @precondition(stopped)
     @rule()
     def start(self) -> None:
-        """Does all that a user and a service do to get a stopped machine going again."""
+        """Takes all steps of user and service to restart a stopped machine."""
         for node in self.daemon.nodes:
             node.faults.silent = node.faults.mute_heartbeat = False
         self.go(5)
@@ -145,7 +145,7 @@ class Disorder(RuleBasedStateMachine):
     @precondition(stopped)
     @rule()
     def start_again(self) -> None:
-        """The same: so that it is not the exception."""
+        """The same rule again, so that a restart is frequent."""
         self.start()
 
     @rule(axis=axes, number=turns)
@@ -208,7 +208,7 @@ class Disorder(RuleBasedStateMachine):
         number=turns,
     )
     def stream_smoothly(self, mask: int, travel: float, knots: int, before: bool, number: int) -> None:
-        """A path from where the axes stand, whole or broken off, its knots there before or after."""
+        """A path from the present positions, complete or cut short, with knots queued before or after."""
         self.stream += 1
         if not before:
             self.post(K.STREAM_BEGIN, 0, a=0.1, i=mask, j=self.stream)
@@ -231,7 +231,7 @@ class Disorder(RuleBasedStateMachine):
         self.post(K.CHANGE, axis, i=self.daemon.memory.settings[axis].put(self.models[which]))
         self.go(number)
 
-    # ---------------------------------------------------------------- a service out of its mind
+    # ---------------------------------------------------------------- commands of a faulty service
 
     @rule(
         kind=st.one_of(st.sampled_from(KINDS), st.integers(-5, 300)),
@@ -240,7 +240,7 @@ class Disorder(RuleBasedStateMachine):
     )  # fmt: skip
     def nonsense(self, kind, axis, a, b, c, i, j, k, number) -> None:
         if kind in (K.VERIFIED, K.UNLEND, K.ENABLE):
-            # Which of the turns of 2**32 counts it is in nobody but the service can know.
+            # Only the service can know how often the position has wrapped around 2**32 counts.
             i = max(min(i, (1 << 31) - 1), -(1 << 31))
         self.post(kind, axis, a=a, b=b, c=c, i=i, j=j, k=k)
         self.go(number)
@@ -271,13 +271,13 @@ class Disorder(RuleBasedStateMachine):
         number=turns,
     )
     def outgoing(self, can_id: int, data: bytes, number: int) -> None:
-        # A node that the service has set up otherwise is none of the loop's laws; restarts and reads are.
+        # The laws do not cover a node that the service has reconfigured; they cover restarts and reads.
         if 0x600 <= can_id < 0x680 and data and data[0] >> 5 not in (2, 3, 4):
             data = b"\x40" + data[1:]
         self.daemon.memory.outgoing.add(RelayedFrame(0, can_id, data))
         self.go(number)
 
-    # ---------------------------------------------------------------- a bus on which anything happens
+    # ---------------------------------------------------------------- events on the bus
 
     @rule(axis=axes, what=st.sampled_from(["drop_tpdos", "shorten_tpdos", "duplicate_tpdos", "hold_tpdos"]),
           how_many=st.integers(1, 4), number=turns)  # fmt: skip
@@ -314,7 +314,7 @@ class Disorder(RuleBasedStateMachine):
         if can_id == 0x701 or can_id == 0x702:
             data = data[:1]
         if 0x181 <= can_id <= 0x182 or 0x281 <= can_id <= 0x282:
-            return  # a liar about where the axis is: see `lying_tpdo`
+            return  # reports a false position: see `lying_tpdo`
         self.daemon.interfere(can_id, data)
         self.go(number)
 

@@ -23,7 +23,7 @@ axes:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Two axes that go together: nodes 1 and 2."""
+    """Two compatible axes: nodes 1 and 2."""
     for name, node in (("one", 1), ("two", 2)):
         axis(tmp_path, name, node)
     return tmp_path

@@ -44,8 +44,8 @@ def test_a_folder_open_to_others_is_refused(tmp_path: Path) -> None:
 def test_a_child_reads_its_start_data() -> None:
     start = Start(Machine.find("article"), memory_fd=7, keeper=os.getpid())
     fd = start.hand_over(restarts=2, api_fds=(8, 9))
-    told = Start.inherited([str(fd)])
-    assert (told.machine, told.restarts, told.api_fds) == (start.machine, 2, (8, 9))
+    inherited = Start.inherited([str(fd)])
+    assert (inherited.machine, inherited.restarts, inherited.api_fds) == (start.machine, 2, (8, 9))
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(fd)
 
@@ -64,7 +64,7 @@ def manager(tmp_path: Path) -> Iterator[socket.socket]:
         yield made
 
 
-def test_the_service_manager_is_told(manager: socket.socket) -> None:
+def test_the_service_manager_is_notified(manager: socket.socket) -> None:
     environment = {"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "3000000"}
     notifier = Notifier.of_environment(environment)
     assert environment == {}
@@ -86,7 +86,7 @@ def test_a_watchdog_for_another_process_is_not_fed(manager: socket.socket) -> No
     assert manager.recv(100) == b"STOPPING=1"
 
 
-def test_without_a_service_manager_nobody_is_told(tmp_path: Path) -> None:
+def test_without_a_service_manager_notifications_are_dropped(tmp_path: Path) -> None:
     for notifier in (Notifier.of_environment({}), Notifier(str(tmp_path / "nobody"), 1.0)):
         notifier.ready()
         notifier.alive()
@@ -107,7 +107,7 @@ def test_delays_double_until_a_process_stays_alive() -> None:
 
 @pytest.fixture
 def log() -> Iterator[logging.Logger]:
-    """The project's logger, put back afterwards."""
+    """The project's logger, restored afterwards."""
     root = logging.getLogger("hdbridge")
     before = root.handlers[:], root.level, root.propagate
     yield root

@@ -28,7 +28,7 @@ class RawMaster:
         self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
     def take(self) -> list[tuple[int, bytes]]:
-        """All frames that have come, without waiting."""
+        """Returns all received frames without waiting."""
         frames = []
         while (message := self.bus.recv(0)) is not None:
             frames.append((message.arbitration_id, bytes(message.data)))
@@ -61,7 +61,7 @@ class RawMaster:
         return [data for can_id, data in self.take() if can_id == 0x581]
 
     def write(self, index: int, sub: int, value: int, size: int) -> int:
-        """Expedited download; the abort code, 0 for success."""
+        """Expedited download; returns the abort code, 0 for success."""
         raw = (value & (1 << 8 * size) - 1).to_bytes(size, "little").ljust(4, b"\0")
         answer = self.request(struct.pack("<BHB", 0x23 | (4 - size) << 2, index, sub) + raw)
         assert answer[1:4] == struct.pack("<HB", index, sub)
@@ -75,7 +75,7 @@ class RawMaster:
         assert abort == 0, f"{index:04X}h:{sub:02X} := {value} aborted with {abort:08X}h"
 
     def read(self, index: int, sub: int = 0) -> int:
-        """Expedited upload of a signed number as wide as the object; see ``unsigned``."""
+        """Expedited upload of a signed number of the object's width; see ``unsigned``."""
         answer = self.request(struct.pack("<BHBI", 0x40, index, sub, 0))
         assert answer[0] & 0xE3 == 0x43, answer.hex()
         return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little", signed=True)
@@ -100,7 +100,7 @@ class RawMaster:
         self.put(0x6040, 0, word, 2)
 
     def enable(self, mode: int | None = None) -> None:
-        """To OPERATION ENABLED over SDO."""
+        """Leads the drive to OPERATION ENABLED by SDO."""
         if mode is not None:
             self.put(0x6060, 0, mode, 1)
         for word in (0x06, 0x07, 0x0F):
@@ -123,7 +123,7 @@ class RawMaster:
         return feedback
 
     def enable_csp(self) -> None:
-        """Start the node, and enable it in CSP over PDOs alone but for the mode."""
+        """Starts the node and enables it in CSP by PDOs; only the mode is set by SDO."""
         self.put(0x6060, 0, 8, 1)
         self.nmt(1)
         for word in (0x06, 0x06, 0x07, 0x07, 0x0F, 0x0F):
@@ -132,7 +132,7 @@ class RawMaster:
         assert feedback[0] & 0x6F == 0x27
 
     def cruise(self, counts_per_cycle: int, cycles: int, start: int | None = None) -> int:
-        """Move the CSP target evenly; the last target."""
+        """Moves the CSP target at constant speed; returns the last target."""
         target = self.read(0x6064) if start is None else start
         for _ in range(cycles):
             target += counts_per_cycle

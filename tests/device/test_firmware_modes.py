@@ -207,7 +207,7 @@ def test_pp_target_reached_needs_the_window_for_its_time(master, motor):
 
 @pytest.mark.parametrize("behaviour", [Behaviour(), Behaviour(controlword=Controlword.LEVEL)])
 def test_a_halt_in_the_word_that_enables_holds_the_axis(motor, behaviour):
-    """As ros2_canopen enables."""
+    """ros2_canopen enables this way."""
     with lockstep_bench(motor, EDS, behaviour=behaviour) as (bus, clock, node):
         master = RawMaster(bus, clock, node, motor)
         master.put(0x6060, 0, 8, 1)

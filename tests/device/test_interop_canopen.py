@@ -1,6 +1,6 @@
 """The simulated drive driven by canopen's own client, with its notifier thread, in real time.
 
-Nothing here asserts how long anything takes: events are waited for, generously.
+No test asserts a duration; events are awaited with generous time-outs.
 """
 
 import threading
@@ -76,7 +76,7 @@ def test_pdo_configuration_by_canopen(network, remote):
 
 
 class BrokenBus(can.BusABC):
-    """An interface that has gone away."""
+    """An interface that was unplugged."""
 
     def __init__(self) -> None:
         super().__init__(channel="gone")

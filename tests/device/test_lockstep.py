@@ -54,7 +54,7 @@ def test_a_wait_without_peers_ends():
             bus.recv()
 
 
-def test_filters_hold(master):
+def test_filters_are_applied(master):
     master.bus.set_filters([{"can_id": 0x181, "can_mask": 0x7FF, "extended": False}])
     master.nmt(1)
     master.send(0x080)
@@ -94,7 +94,7 @@ def test_every_kind_of_frame_passes_unchanged(motor):
 
 
 def run_several(node_ids: list[int]) -> dict[int, list[bytes]]:
-    """Two hundred SYNCs for several axes on one bus: each one's TPDO1, by its node id."""
+    """Sends 200 SYNCs to several axes on one bus; returns the TPDO1s of each by its node id."""
     frames: dict[int, list[bytes]] = {node_id: [] for node_id in node_ids}
     axes = [SimulatedAxis(ARTICLE, EDS, node_id, seed=node_id) for node_id in node_ids]
     with simulated_benches(axes) as (bus, clock, nodes):

@@ -1,4 +1,4 @@
-"""The EDS: read without a complaint, complete in itself, and true of the node."""
+"""The EDS is valid, complete, and consistent with the node."""
 
 import logging
 import re

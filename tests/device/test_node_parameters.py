@@ -1,4 +1,4 @@
-"""Stored parameters: they outlive a reset and, with a file, the process."""
+"""Stored parameters survive a reset and, with a file, the process."""
 
 import struct
 from contextlib import contextmanager

@@ -8,7 +8,7 @@ RANGE = 0x06090030
 
 
 def remap(master, number: int, words: list[int], *, receive: bool = False, kind: int = 1) -> int:
-    """The sequence of CiA 301; the first abort code or 0."""
+    """Remaps by the sequence of CiA 301; returns the first abort code or 0."""
     communication = (0x1400 if receive else 0x1800) + number - 1
     mapping = (0x1600 if receive else 0x1A00) + number - 1
     can_id = (0x101 if receive else 0x081) + 0x100 * number

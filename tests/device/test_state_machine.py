@@ -76,7 +76,7 @@ def state_of(statusword: int) -> str:
 
 
 def expected(state: str, word: int, before: int) -> str:
-    """The state that the standard demands after ``word``, in ``state`` and after the word ``before``."""
+    """Returns the state that the standard requires after ``word`` in ``state``, and after ``before``."""
     if state == FAULT:
         return DISABLED if word & 0x80 and not before & 0x80 else FAULT  # 15
     found = {
@@ -155,7 +155,7 @@ class Slave:
         return state_of(self.statusword)
 
     def bring(self, state: str) -> None:
-        """Lead to a state, at rest, from any."""
+        """Leads the drive from any state to this one, at rest."""
         if self.state in (REACTION, FAULT):
             self.wait(0.1)
             self.control(0x00)
@@ -204,7 +204,7 @@ def test_the_tables_are_those_of_the_standard():
 @pytest.mark.parametrize("behaviour", ["edge", "level"])
 @pytest.mark.parametrize("state", STATES)
 def test_every_controlword_in_every_state(state, behaviour):
-    """All 512 words of bits 0 to 8, and the axis stays where it is."""
+    """Tries all 512 words of bits 0 to 8; the axis does not move."""
     with slave(behaviour) as node:
         node.bring(state)
         for word in range(0x200):
@@ -238,7 +238,7 @@ def test_a_fault_reset_is_an_edge_after_any_word(behaviour):
 
 @pytest.mark.parametrize("behaviour", ["edge", "level"])
 def test_every_controlword_while_power_is_being_switched_on(behaviour):
-    """The state remains switched on until the power is there."""
+    """The state remains switched on until power is available."""
     with slave(behaviour, takes=4) as node:
         for word in range(0x100):
             node.bring(ON)
@@ -248,7 +248,7 @@ def test_every_controlword_while_power_is_being_switched_on(behaviour):
             wanted = expected(ON, word, 0x0F)
             assert node.state == (ON if wanted == ENABLED else wanted), f"{word:02X}h"
             node.wait(0.004 * 8)
-            pending = word & 0x80  # no command, so what was asked for is still asked for
+            pending = word & 0x80  # not a command, so the earlier request stands
             assert node.state in ({ON, ENABLED} if pending else {wanted}), f"{word:02X}h"
 
 
@@ -259,7 +259,7 @@ def test_every_controlword_while_power_is_being_switched_on(behaviour):
     ids=str,
 )
 def test_a_master_that_is_lost_while_power_is_being_switched_on(option, state, behaviour):
-    """Its request ends with it, and the same controlword from a master that returns is no new one."""
+    """A lost master's request ends, and its repeated controlword after it returns is not a new request."""
     with slave(behaviour, takes=4) as node:
         node.bring(ON)
         node.control(0x0F)
@@ -336,7 +336,7 @@ def test_every_event_in_every_state_and_then_every_command(state, event, behavio
             node.control(word)
             wanted = expected(reached, word, before)
             if word == before and wanted != reached and behaviour == "edge":
-                wanted = reached  # a repeated word is no new command
+                wanted = reached  # a repeated word is not a new command
             assert node.state == wanted, f"{word:02X}h after {event} in {state}"
             node.wait(0.05)
             assert node.motor.position == place

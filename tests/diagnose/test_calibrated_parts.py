@@ -43,7 +43,7 @@ def run_out(
 
 
 def holds(known: float, result: Diagnosis) -> bool:
-    """True if the order alone is named, with its size, and the spring is unchanged."""
+    """Returns True if only the order is named, with its size, and the spring is unchanged."""
     (spring,) = (each for each in result.model.effects if each.name == "compliance")
     if [each.cause for each in result.findings] != ["load_order"]:
         return False
@@ -65,7 +65,7 @@ def test_eccentricity_next_to_known_springs(run_out: Callable[[int], tuple[float
 
 
 def test_parts_are_as_wide_as_the_model_file_says(model: TransmissionModel) -> None:
-    """The loop by its 95 % half widths, the orders, which have none, by 4 %; at least 0.1 arcsec each."""
+    """The loop has its 95 % half widths; the orders, which have none, get 4 %, at least 0.1 arcsec each."""
     loop = next(place for place, each in enumerate(model.effects) if each.name == "hysteresis")
     parts = calibrated(
         model.effects,

@@ -32,7 +32,7 @@ def spring_of(model: TransmissionModel) -> float:
 def test_a_changed_spring_is_found_and_written_to_the_model(
     columns: Columns, known: TransmissionModel
 ) -> None:
-    """Under a torque that goes with nothing else."""
+    """The torque is uncorrelated with everything else."""
     record = columns()
     torque_nm = 6.0 * np.sin(2.0 * np.pi * record["time_s"] / 37.0)
     record["load_torque_nm"] = torque_nm + 0.01 * np.random.default_rng(1).normal(size=len(torque_nm))
@@ -49,7 +49,7 @@ def test_a_changed_spring_is_found_and_written_to_the_model(
 def test_a_change_explained_by_eccentricity_is_not_reported(
     columns: Columns, known: TransmissionModel
 ) -> None:
-    """Under a mass off centre the torque goes once per turn, as a run-out does."""
+    """The torque of an off-centre mass repeats once per turn, as a run-out does."""
     record = columns({"compliance": {"c1": NOW, "c2": NOW, "t1": 1e3}}, torque_nm=9.0)
     result = diagnose(Record(record), known)
     assert len(result.findings) == 1

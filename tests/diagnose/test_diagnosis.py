@@ -114,7 +114,7 @@ def test_the_same_record_gives_the_same_answer(
 
 
 def test_a_short_record_yields_no_confident_wrong_cause(model: TransmissionModel) -> None:
-    """One way, no command, no standstill, coarse counts, noise: hardly anything can be said."""
+    """One direction, no command, no standstill, coarse counts and noise permit hardly any conclusion."""
     rng = np.random.default_rng(3)
     time = np.arange(150) * 0.02
     motor = np.round(400.0 * time / 0.045) * 0.045
@@ -129,12 +129,12 @@ def test_a_short_record_yields_no_confident_wrong_cause(model: TransmissionModel
 def test_rounded_digits_yield_no_cause(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel, counts: int, digits: int
 ) -> None:
-    """Without a command the reading drives the loop, and its count is hidden by the digits that were kept."""
-    told = columns()
+    """Without a command the reading drives the loop, and rounding hides its count."""
+    values = columns()
     lag_s = 2e-4  # of the plant's motor behind its command
-    motor = told["motor_target_deg"]
-    motor = motor - lag_s * np.gradient(motor, told["time_s"])
+    motor = values["motor_target_deg"]
+    motor = motor - lag_s * np.gradient(motor, values["time_s"])
     read = np.round(motor * counts / 360.0) * 360.0 / counts + 36_000.0
-    record = {"time_s": told["time_s"], "load_position_deg": told["load_position_deg"]}
+    record = {"time_s": values["time_s"], "load_position_deg": values["load_position_deg"]}
     record["motor_position_deg"] = np.array([float(f"{each:.{digits}g}") for each in read.tolist()])
     assert diagnose(Record(record), model).findings == ()

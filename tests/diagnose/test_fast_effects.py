@@ -103,7 +103,7 @@ def test_an_unattributed_arcsec_is_unexplained(plant: ModuleType) -> None:
 
 
 def one_way(seed: int) -> Record:
-    """Four moves of a second that are alike, with two orders' ripple, a term in speed and something slow."""
+    """Four equal moves of a second, with ripple of two orders, a speed term and a slow error."""
     rng = np.random.default_rng(seed)
     part = np.arange(100) / 100.0
     turns, phase, drag = rng.uniform(1.2, 2.5), rng.uniform(0.0, 6.0), rng.uniform(0.01, 0.03)

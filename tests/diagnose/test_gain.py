@@ -27,7 +27,7 @@ WORSE = Gain("stretches of time", 8, np.ones(8), np.full(8, 4.0), np.full(8, 4.1
 
 @pytest.fixture(scope="module")
 def wider(diagnosed: Diagnosed) -> Diagnosis:
-    """A loop half again as wide as the model's."""
+    """A loop 1.5 times as wide as the model's."""
     found = diagnosed(width=30.0)
     assert [each.cause for each in found.findings] == ["hysteresis_parameters"]
     return found
@@ -36,7 +36,7 @@ def wider(diagnosed: Diagnosed) -> Diagnosis:
 def test_a_spurious_change_worsens_held_out_data(
     columns: Callable[..., dict[str, Any]],
 ) -> None:
-    """Orders of nothing but noise: a fit always gains by them in itself."""
+    """Orders fitted to noise alone always improve the fitted data."""
     record = Record(columns(orders=(), offset=0.0))
     estimator = Estimator(gather(record, 50.0))
     nothing = Synchronous(orders=orders_from(range(3, 24), 0.0))
@@ -72,7 +72,7 @@ def test_a_gain_is_that_of_the_written_model_on_a_fresh_record(
     model: TransmissionModel,
     effects: dict[str, Any],
 ) -> None:
-    """The given model, refitted, would hide a part of the gain."""
+    """Refitting the given model would hide a part of the gain."""
     found = diagnosed(effects)
     assert {each.cause for each in found.findings} == set(effects)
     fresh = Record(columns(effects, seed=2))
@@ -109,7 +109,7 @@ def test_a_cause_without_a_gain_is_not_more_likely_than_not(wider: Diagnosis, ga
 def test_a_finding_that_cannot_be_written_is_dropped(
     diagnosed: Diagnosed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its parameters are out of bounds once everything is fitted together."""
+    """The finding's parameters are out of bounds once everything is fitted together."""
     monkeypatch.setattr(
         VelocityWindup, "tidied", lambda self, _: self.model_copy(update={"shear_deg_s": -1.0})
     )
@@ -141,11 +141,11 @@ def test_unexplained_findings_have_no_hold_out(diagnosed: Diagnosed) -> None:
 def test_unnamed_findings_are_not_written(
     diagnosed: Diagnosed, columns: Callable[..., dict[str, Any]]
 ) -> None:
-    """Several near-equal orders of the flexspline are one unknown, and none of them goes into the model."""
+    """Several near-equal orders of the flexspline are one unknown cause, and none is added to the model."""
     orders = {"orders": [(2, 4.0, 30.0), (3, 4.0, 70.0), (5, 4.0, 10.0)]}
     found = diagnosed({"flexspline_order": orders})
     assert [each.cause for each in found.findings] == ["unexplained"]
     assert {each.name for each in found.model.effects} == {"synchronous", "hysteresis"}
-    # What the extended model is said to leave is what it leaves.
+    # The stated residual of the extended model is its actual one.
     again = diagnose(Record(columns({"flexspline_order": orders})), found.model)
     assert found.extended.rms_arcsec == pytest.approx(again.baseline.rms_arcsec, rel=0.01)

@@ -54,7 +54,7 @@ def sweeps(error_arcsec: Callable[[Any], Any], *legs: tuple[float, float]) -> Re
 
 
 def judged(ratio: float, true_ratio: float, load_turns: float) -> str:
-    """Reason why a model of this ratio cannot be wrong by so much."""
+    """Returns the reason why a model of this ratio cannot be wrong by this much."""
     ramp = 360.0 * 3600.0 * (1.0 / true_ratio - 1.0 / ratio)
     motion = Motion(np.array([0.0, 360.0 * ratio * load_turns]))
     seen: Any = SimpleNamespace(motion=motion, ratio=ratio)

@@ -88,7 +88,7 @@ def test_intervals_have_their_nominal_coverage(
                 if not name.endswith("phase_deg"):
                     halves.append(0.5 * (parameter.high - parameter.low) / abs(true))
     assert len(inside) == 20 * len(SEEDS)
-    # So few are inside by chance in one run of a thousand, were the share as low as LEAST.
+    # If the share were as low as LEAST, fewer would be inside in one run of a thousand.
     assert sum(inside) >= least(len(inside), LEAST, 1e-3), f"{sum(inside)} of {len(inside)}"
     assert np.median(halves) < 0.02
 
@@ -97,9 +97,9 @@ def test_poorly_known_shapes_have_log_intervals_within_their_range() -> None:
     drag = VelocityWindup(coulomb_arcsec=1.0, viscous_arcsec_s_per_deg=0.02, shear_deg_s=1000.0)
     (shape,) = drag.shape
     for deviation, factor in ((0.3, math.exp(0.3 * NORMAL_95)), (30.0, math.inf)):
-        told = named_parameters(drag, [Column(0, shape.name, shape=True)], np.array([[deviation**2]]))
-        assert told[shape.name].low == pytest.approx(max(1000.0 / factor, shape.lower), rel=1e-3)
-        assert told[shape.name].high == pytest.approx(min(1000.0 * factor, shape.upper), rel=1e-3)
+        intervals = named_parameters(drag, [Column(0, shape.name, shape=True)], np.array([[deviation**2]]))
+        assert intervals[shape.name].low == pytest.approx(max(1000.0 / factor, shape.lower), rel=1e-3)
+        assert intervals[shape.name].high == pytest.approx(min(1000.0 * factor, shape.upper), rel=1e-3)
 
 
 def test_a_changed_order_is_as_uncertain_as_its_reference(columns: Columns, plant: ModuleType) -> None:
@@ -113,12 +113,12 @@ def test_a_changed_order_is_as_uncertain_as_its_reference(columns: Columns, plan
         for order, size, phase in added:
             truth = {f"order_{order}_amplitude_arcsec": size, f"order_{order}_phase_deg": phase}
             inside += [held(found.parameters[name], name, value) for name, value in truth.items()]
-    # Without the calibration's own variance in them one in ten holds.
+    # Without the calibration's own variance, one interval in ten would hold.
     assert sum(inside) >= least(len(inside), LEAST, 1e-3), f"{sum(inside)} of {len(inside)}"
 
 
 def swinging(columns: dict[str, Any], orders: Any, frequency_hz: float) -> dict[str, Any]:
-    """The load on a spring, which swings beyond the waves of the motor angle that shake it."""
+    """The load on a spring, whose swing exceeds the exciting waves of the motor angle."""
     motor = columns["motor_target_deg"]
     rate = np.radians(np.gradient(motor, columns["time_s"]))
     beyond = sum(
@@ -134,7 +134,7 @@ def test_orders_are_reported_at_rest_despite_load_swing(
     order = (7, 5.0, 40.0)
     record = swinging(columns({"motor_order": {"orders": [order]}}), (*plant.ORDERS, order), 40.0)
     found = diagnose(Record(record), model).findings[0].parameters["order_7_amplitude_arcsec"]
-    # At the quicker speed, 1.7 turns a second, the load shows 9 % more of this order.
+    # At the higher speed, 1.7 turns a second, the load shows 9 % more of this order.
     assert found.low < 5.0 < found.high
     assert found.high - found.low < 0.2
 

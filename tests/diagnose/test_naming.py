@@ -30,7 +30,7 @@ def names(diagnosis: Diagnosis) -> list[str]:
 
 @pytest.fixture
 def drifting(columns: Callable[..., dict[str, Any]], model: TransmissionModel) -> Callable[..., Diagnosis]:
-    """A ripple that grows with warmth, on a day that is warmer than the model's reference of 20 degrees."""
+    """A ripple that grows with temperature, on a day warmer than the model's reference of 20 degrees."""
 
     def run(growth_per_k: float, rise_k: float, warmer_k: float) -> Diagnosis:
         record = columns({"amplitude_drift": {"ripple": growth_per_k}}, temperature_rise_k=rise_k)
@@ -49,7 +49,7 @@ def test_drift_is_reported_from_the_model_temperature(drifting: Callable[..., Di
 
 
 def test_ripple_drift_is_found_next_to_a_larger_skew(diagnosed: Diagnosed) -> None:
-    """One lies between the directions, the other in both alike."""
+    """One differs between the directions, the other is the same in both."""
     effects = {"channel_skew": {"ms": 0.7}, "amplitude_drift": {"ripple": 0.006}}
     assert set(names(diagnosed(effects, temperature_rise_k=14.0))) == {"channel_skew", "amplitude_drift"}
 
@@ -136,7 +136,7 @@ def test_flanks_shift_an_order_that_the_model_lacks_as_well(diagnosed: Diagnosed
     assert set(names(found)) == {"direction_phase", "motor_order"}
 
 
-def test_a_vibration_that_swells_and_fades_is_one(
+def test_a_vibration_of_varying_amplitude_is_named_once(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> None:
     record = columns()
@@ -166,7 +166,7 @@ def test_a_wider_loop_of_the_same_height_has_changed(diagnosed: Diagnosed) -> No
 
 
 def test_a_sticking_loop_is_not_count_loss(plant: ModuleType) -> None:
-    """A friction that is higher at rest, shaken to and fro within its own width."""
+    """Friction is higher at rest, and the axis moves back and forth within the loop's width."""
     rng = np.random.default_rng(2)
     time_s = np.arange(0.0, 28.0, 1.0 / 256.0)
     shaken = rng.normal(size=len(time_s))
@@ -224,7 +224,7 @@ def test_stronger_evidence_raises_the_probability() -> None:
 def test_a_lagging_load_is_a_loop_of_the_opposite_sign(
     columns: Callable[..., dict[str, Any]], plant: ModuleType
 ) -> None:
-    """Nothing is named where the model has it lag as well; where it has it lead, its loop has changed."""
+    """Nothing is named if the model's load lags as well; if it leads, the loop has changed."""
     record = Record(columns(offset=-30.0))
     lags = TransmissionModel.from_text(plant.model_text(5, truth=plant.Truth(offset=-30.0)))
     assert [each.cause for each in diagnose(record, lags).findings] == []

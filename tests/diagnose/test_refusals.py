@@ -47,7 +47,7 @@ def test_linear_drag_is_reported_as_a_delay_with_alias(
 def test_inertial_wind_up_does_not_turn_drag_into_a_delay(
     diagnosed: Callable[..., Diagnosis], drag: dict[str, float], inertia_s2: float, names: set[str]
 ) -> None:
-    """A delay has a part in acceleration, too, and its straight line in speed may cancel that of a drag."""
+    """A delay also has an acceleration term, and its linear speed term may cancel that of a drag."""
     result = diagnosed({"velocity_windup": drag, "inertial_windup": {"s2": inertia_s2}})
     assert {each.cause for each in result.findings} == names
 
@@ -55,12 +55,12 @@ def test_inertial_wind_up_does_not_turn_drag_into_a_delay(
 def test_refused_causes_are_reported_if_nothing_else_explains_them(
     diagnosed: Callable[..., Diagnosis],
 ) -> None:
-    """A load that runs ahead as it speeds up is no inertia on a spring, and no delay either."""
+    """A load that leads while accelerating is neither an inertia on a spring nor a delay."""
     result = diagnosed({"inertial_windup": {"s2": -1.2e-4}})
     assert [each.cause for each in result.findings] == ["unexplained"]
-    told = {each.split(": ")[0]: each for each in result.as_dict()["considered"]}
-    assert ChannelSkew.name not in told
-    assert "inertia_over_stiffness_s2" in told[InertialWindup.name]
+    reasons = {each.split(": ")[0]: each for each in result.as_dict()["considered"]}
+    assert ChannelSkew.name not in reasons
+    assert "inertia_over_stiffness_s2" in reasons[InertialWindup.name]
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_parts_of_an_unknown_cause_are_not_named(
 def test_the_search_continues_after_a_refusal(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Four causes that cannot be seem to explain more than the one that can."""
+    """Four impossible causes seem to explain more than the possible one."""
     for kind in CATALOGUE.values():
         if kind is not MotorOrders:
             monkeypatch.setattr(kind, "implausible", lambda *_: "cannot be")
@@ -93,5 +93,5 @@ def test_the_search_continues_after_a_refusal(
     }
     hidden = larger | {"motor_order": {"orders": [(7, 1.2, 20.0)]}}
     result = diagnose(Record(columns(hidden)), model)
-    told = {each.cause for each in result.findings} | {each.split(":")[0] for each in result.considered}
-    assert MotorOrders.name in told
+    reported = {each.cause for each in result.findings} | {each.split(":")[0] for each in result.considered}
+    assert MotorOrders.name in reported

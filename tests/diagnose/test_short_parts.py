@@ -28,7 +28,7 @@ def test_a_part_of_one_sample_is_accepted(
 def test_a_part_that_ends_in_its_fast_move_is_accepted(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> None:
-    """Samples of moves are not used; a run that was interrupted in the first one consists of nothing else."""
+    """Samples of moves are not used, and a run interrupted in its first move has no others."""
     parts = [
         Record({name: np.asarray(each)[rows] for name, each in columns({}).items()})
         for rows in (slice(0, 1500), slice(1500, 1520))

@@ -1,4 +1,4 @@
-"""A spring that stiffens, against the load order that a straight one would need in addition."""
+"""A stiffening spring versus the load order that a linear one would need in addition."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SEEDS = range(201, 209)
 def stiffening(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> Callable[[int], tuple[dict[str, float], Diagnosis]]:
-    """Mass on a spring that stiffens at some torque, drawn by the seed; the spring, and the findings."""
+    """Returns a spring that stiffens at a torque drawn by the seed, and the findings under a mass."""
 
     def run(seed: int) -> tuple[dict[str, float], Diagnosis]:
         rng = np.random.default_rng(seed)

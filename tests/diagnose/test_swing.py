@@ -75,7 +75,7 @@ def test_an_ordinary_load_is_silent(seen) -> None:
 
 
 def test_set_points_joined_by_straight_lines_are_silent(seen) -> None:
-    """The load is struck at each set-point, by more than a spline through the samples shows."""
+    """Each set-point shocks the load by more than a spline through the samples shows."""
     assert not seen(65.0, sync=SYNC).findings
 
 

@@ -39,7 +39,7 @@ HELD = 0.95
 
 
 def parameters(record: dict[str, Any], model: TransmissionModel, effect: Effect) -> dict[str, Parameter]:
-    """Returns the figures of an effect that is fitted to a record together with the model."""
+    """Returns the parameters of an effect that is fitted to a record together with the model."""
     estimator = Estimator(gather(Record(record), 50.0))
     hypothesis = Hypothesis((*model.effects, effect), Start.FORWARD)
     precise = precisely(estimator, estimator.fit(hypothesis))
@@ -53,24 +53,24 @@ def holds(parameter: Parameter, truth: float) -> bool:
 
 
 def enough(inside: list[bool]) -> bool:
-    """True if as many are inside as the intervals promise, but for chance."""
+    """Returns True if the coverage is nominal within chance."""
     return sum(inside) >= least(len(inside), HELD)
 
 
 def test_drag_with_another_exponent_is_within_its_intervals(
     columns: Columns, model: TransmissionModel
 ) -> None:
-    """The plant's falls off with the power 0.8 of the speed, the law's with the first."""
+    """The plant's drag falls off with speed to the power 0.8, the law's with the first."""
     inside: list[bool] = []
     for seed in range(41, 46):
         rng = np.random.default_rng(seed)
         coulomb, viscous, shear = rng.uniform(1.0, 2.5), rng.uniform(0.02, 0.05), rng.uniform(300.0, 600.0)
         record = columns({"velocity_windup": {"coulomb": coulomb, "viscous": viscous, "shear": shear}}, seed)
-        told = parameters(record, model, VelocityWindup.candidate(50.0))
+        fitted = parameters(record, model, VelocityWindup.candidate(50.0))
         inside += [
-            holds(told["coulomb_arcsec"], coulomb),
-            holds(told["viscous_arcsec_s_per_deg"], viscous),
-            holds(told["shear_deg_s"], shear),
+            holds(fitted["coulomb_arcsec"], coulomb),
+            holds(fitted["viscous_arcsec_s_per_deg"], viscous),
+            holds(fitted["shear_deg_s"], shear),
         ]
     assert enough(inside), inside
 
@@ -97,11 +97,11 @@ def test_motor_motion_within_a_count_at_rest_is_not_creep(
     plant: ModuleType, columns: Columns, model: TransmissionModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The motor is 0.8 counts ahead of its command, stays so for 0.3 s after each stop, and then lets go."""
-    path, told = plant.path, []
+    path, motor_angles = plant.path, []
 
     def ahead(plan: Any, rng: np.random.Generator) -> Any:
         time_s, motor, legs = path(plan, rng)
-        told.append(motor)
+        motor_angles.append(motor)
         steps = np.sign(np.diff(motor, prepend=motor[:1]))
         last = np.maximum.accumulate(np.where(steps != 0.0, np.arange(len(steps)), 0))
         still_s = time_s - time_s[last]
@@ -109,7 +109,7 @@ def test_motor_motion_within_a_count_at_rest_is_not_creep(
 
     monkeypatch.setattr(plant, "path", ahead)
     record = columns(slow_noise=0.0)
-    estimator = Estimator(gather(Record({**record, "motor_target_deg": told[0][::10]}), 50.0))
+    estimator = Estimator(gather(Record({**record, "motor_target_deg": motor_angles[0][::10]}), 50.0))
     base = estimator.fit(Hypothesis(model.effects, Start.FORWARD)).hypothesis
     creep = Creep(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=0.3),), build_up=0.1)
     found = gate(estimator, estimator.fit(base.plus(creep)), len(model.effects))
@@ -119,7 +119,7 @@ def test_motor_motion_within_a_count_at_rest_is_not_creep(
 def test_turning_short_by_a_count_is_not_a_changed_loop(
     plant: ModuleType, columns: Columns, model: TransmissionModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Friction holds it 0.4 counts from its command at every turn."""
+    """Friction holds the motor 0.4 counts short of its command at every reversal."""
     path, commands = plant.path, []
 
     def short(plan: Any, rng: np.random.Generator) -> Any:
@@ -139,7 +139,7 @@ def test_turning_short_by_a_count_is_not_a_changed_loop(
 def test_wind_up_of_a_swinging_load_is_within_its_interval(
     plant: ModuleType, model: TransmissionModel
 ) -> None:
-    """The law is that far below the resonance, and these moves speed up in 0.15 s."""
+    """The law holds far below the resonance, and these moves accelerate in 0.15 s."""
     plan = plant.Plan(rate_hz=50.0, scale=0.05, load_turns=0.1, steps=16)
     inside: list[bool] = []
     for seed in range(81, 87):
@@ -153,15 +153,15 @@ def test_wind_up_of_a_swinging_load_is_within_its_interval(
         swung = filtered([1.0, 2.0, 1.0], back, acceleration) / first
         record = plant.record(plant.Truth(), plan, seed)
         record["load_position_deg"] -= swung[::10] / 50.0
-        told = parameters(record, model, InertialWindup.candidate(50.0))
-        inside.append(holds(told["inertia_over_stiffness_s2"], turn**-2.0))
+        fitted = parameters(record, model, InertialWindup.candidate(50.0))
+        inside.append(holds(fitted["inertia_over_stiffness_s2"], turn**-2.0))
     assert enough(inside), inside
 
 
 def test_the_height_of_a_bump_of_another_form_is_within_its_interval(
     columns: Columns, model: TransmissionModel
 ) -> None:
-    """The plant's is a Gaussian, the law's a raised cosine."""
+    """The plant's bump is a Gaussian, the law's a raised cosine."""
     inside: list[bool] = []
     for seed in range(61, 69):
         rng = np.random.default_rng(seed)
@@ -175,7 +175,7 @@ def test_the_height_of_a_bump_of_another_form_is_within_its_interval(
 def test_eccentricity_next_to_an_unknown_spring_is_as_uncertain_as_it_should_be(
     columns: Columns, model: TransmissionModel
 ) -> None:
-    """Under one mass a spring's wind-up goes once per turn as the run-out does: only their sum is seen."""
+    """Under one mass, wind-up and run-out both repeat once per turn, so only their sum is visible."""
     inside: list[bool] = []
     for seed in range(51, 55):
         rng = np.random.default_rng(seed)
@@ -185,10 +185,10 @@ def test_eccentricity_next_to_an_unknown_spring_is_as_uncertain_as_it_should_be(
             "compliance": {"c1": compliance, "c2": compliance, "t1": 1e3},
         }
         record = columns(effects, seed, torque_nm=9.0)
-        told = parameters(record, model, LoadOrders(ratio=50.0, orders=orders_from([1, 2])))
-        inside += [holds(told["order_1_amplitude_arcsec"], size), holds(told["order_1_phase_deg"], phase)]
-        twice = told["order_2_amplitude_arcsec"]
-        assert twice.low < 4.0 < twice.high < 4.5  # no spring goes twice per turn
+        fitted = parameters(record, model, LoadOrders(ratio=50.0, orders=orders_from([1, 2])))
+        inside += [holds(fitted["order_1_amplitude_arcsec"], size), holds(fitted["order_1_phase_deg"], phase)]
+        twice = fitted["order_2_amplitude_arcsec"]
+        assert twice.low < 4.0 < twice.high < 4.5  # a spring has no second order
     assert enough(inside), inside
 
 

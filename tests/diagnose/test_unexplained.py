@@ -38,9 +38,9 @@ def test_effects_below_a_motor_count_are_remarks(diagnosed: Callable[..., Diagno
 def test_residuals_of_another_law_at_reversals_belong_to_the_loop(
     diagnosed: Callable[..., Diagnosis], law: str
 ) -> None:
-    """An arcsecond rms, but none of it where the axis has gone on further than a loop remembers."""
+    """The residual is an arcsecond rms, but zero beyond the memory of the loop."""
     (found,) = diagnosed(law=law, rate_hz=16.0).findings
-    # At 16 Hz the errors of the turning points are as large as what it leaves.
+    # At 16 Hz the errors at turning points are as large as the residual.
     assert found.cause in LOOPS | ({"unexplained"} if law == "bouc_wen" else set())
 
 

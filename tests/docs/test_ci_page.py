@@ -1,4 +1,4 @@
-"""The example of docs/ci.md, in docs/ci-example: on every bus that is here, by real runs of pytest."""
+"""The example of docs/ci.md, in docs/ci-example: on every available bus, by real runs of pytest."""
 
 import os
 import re
@@ -37,7 +37,7 @@ def main(interface, channel):
 
 
 def test_the_example_in_real_time(pytester):
-    """And the few lines with which the page begins."""
+    """Includes the first lines of the page."""
     pytester.makepyfile(my_program=MY_PROGRAM)
     (lines,) = re.findall(
         r"\n\n((?: {4}.*\n)*? {4}def test_my_program.*\n(?: {4}.*\n)*)", ci_page.PAGE.read_text("utf-8")

@@ -1,4 +1,4 @@
-"""Promises of the documents: links lead somewhere, commands exist, examples run."""
+"""Links on the pages are valid, commands exist, and examples run."""
 
 import re
 from pathlib import Path
@@ -113,7 +113,7 @@ def test_examples_of_the_library_run(number, tmp_path, monkeypatch, capsys):
 
 
 def test_the_readme_example_runs(monkeypatch, capsys):
-    """From a fresh clone's folder, no longer than it is meant to be, with the answer that the page prints."""
+    """Runs from a fresh clone, within its length limit, with the answer that the page prints."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     lines = [each for each in program.splitlines() if each]

@@ -63,11 +63,11 @@ def booting(tiny: Any, boot_up_s: float | None, sdo_s: float) -> None:
     """After a reset its boot-up message and its SDO server come that late, counted from the reset."""
     nmt, sdo, clock = tiny.nmt, tiny.sdo, tiny.clock
     reset_s = [0.0]
-    told = [True]
+    announced = [True]
 
     def command(value: int) -> None:
         if value == 0x82:
-            reset_s[0], told[0] = clock.now(), boot_up_s is None
+            reset_s[0], announced[0] = clock.now(), boot_up_s is None
         elif clock.now() >= reset_s[0] + sdo_s:
             nmt(value)
 
@@ -76,8 +76,8 @@ def booting(tiny: Any, boot_up_s: float | None, sdo_s: float) -> None:
             sdo(data)
 
     def call() -> None:
-        if not told[0] and clock.now() >= reset_s[0] + (boot_up_s or 0.0):
-            told[0] = True
+        if not announced[0] and clock.now() >= reset_s[0] + (boot_up_s or 0.0):
+            announced[0] = True
             tiny.send(0x700, b"\x00")
 
     tiny.nmt, tiny.sdo = command, request

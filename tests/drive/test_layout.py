@@ -33,14 +33,14 @@ def words(layout: Any) -> list[int]:
     return [entry.mapping for entry in layout.codec.entries]
 
 
-def told(found: Layouts) -> dict[int, list[int]]:
+def mappings(found: Layouts) -> dict[int, list[int]]:
     """The mapping of each PDO by its identifier."""
     return {each.can_id: words(each) for each in (*found.cyclic, *found.channels, *found.rpdos)}
 
 
 def test_free_mappings_get_the_standard_layout(laid_out: Any) -> None:
     found = laid_out(OWN)
-    assert told(found) == {
+    assert mappings(found) == {
         0x181: [STATUS, POSITION, TORQUE],
         0x281: [LOAD, DEMAND],
         0x201: [CONTROL, TARGET],
@@ -50,7 +50,7 @@ def test_free_mappings_get_the_standard_layout(laid_out: Any) -> None:
 
 def test_unavailable_objects_are_omitted_and_their_room_used(laid_out: Any) -> None:
     found = laid_out(without(OWN, 0x6077, 0x6062))
-    assert told(found) == {0x181: [STATUS, POSITION], 0x281: [LOAD], 0x201: [CONTROL, TARGET]}
+    assert mappings(found) == {0x181: [STATUS, POSITION], 0x281: [LOAD], 0x201: [CONTROL, TARGET]}
     assert [each.index for each in found.absent] == [0x6077, 0x6062]
     found = laid_out(stating(OWN, "6062", PDOMapping=0))
     assert [each.index for each in found.absent] == [0x6062]
@@ -58,7 +58,7 @@ def test_unavailable_objects_are_omitted_and_their_room_used(laid_out: Any) -> N
 
 def test_the_drives_own_types_decide_what_fits(laid_out: Any) -> None:
     found = laid_out(stating(OWN, "6077", DataType="0x0004"))
-    assert told(found) == {
+    assert mappings(found) == {
         0x181: [STATUS, POSITION],
         0x281: [0x60770020, LOAD],
         0x381: [DEMAND],
@@ -151,7 +151,7 @@ def test_the_load_encoder_must_match_the_eds(laid_out: Any, source: dict[str, An
 
 def test_the_eds_does_not_describe_other_nodes(laid_out: Any) -> None:
     found = laid_out(OWN, load_encoder__source={"index": 0x6004, "subindex": 0, "type": "uint32", "node": 2})
-    assert told(found)[0x182] == [0x60040020]
+    assert mappings(found)[0x182] == [0x60040020]
 
 
 @pytest.mark.parametrize("index", [0x6041, 0x6064, 0x6040, 0x607A])

@@ -166,16 +166,16 @@ def test_an_opened_bus_is_closed_again() -> None:
 
 
 def test_options_passed_to_the_interface(monkeypatch: pytest.MonkeyPatch) -> None:
-    told: dict[str, object] = {}
+    passed: dict[str, object] = {}
 
     def bus(**options: object) -> FakeBus:
-        told.update(options)
+        passed.update(options)
         return FakeBus()
 
     monkeypatch.setattr("can.Bus", bus)
     with open_bus(BusConfig(interface="socketcan", channel="can0", bitrate_bps=500_000), shared=True):
         pass
-    assert told == {
+    assert passed == {
         "interface": "socketcan",
         "channel": "can0",
         "ignore_config": True,

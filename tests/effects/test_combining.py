@@ -114,11 +114,11 @@ def test_a_shrinking_additional_loop_stays_monotonic():
 def test_incompatible_effects_are_reported():
     order = LoadOrders.candidate(80.0)
     assert conflicts([*BASE, order], 80.0) == ()
-    (told,) = conflicts([*BASE, order], RATIO)
-    assert "load_order" in told
-    assert "80" in told
-    (told,) = conflicts([*BASE, HysteresisMemory.candidate(RATIO, BASE)], RATIO)
-    assert told.startswith("'hysteresis_memory' stands in place of 'hysteresis'")
+    (conflict,) = conflicts([*BASE, order], RATIO)
+    assert "load_order" in conflict
+    assert "80" in conflict
+    (conflict,) = conflicts([*BASE, HysteresisMemory.candidate(RATIO, BASE)], RATIO)
+    assert conflict.startswith("'hysteresis_memory' stands in place of 'hysteresis'")
 
 
 def test_the_hysteresis_scheme_uses_the_substituted_law():

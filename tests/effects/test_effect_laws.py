@@ -95,15 +95,15 @@ def error_stays_within_its_bound(effect, motion, start):
 
 def batch_equals_on_line_and_peeking_changes_nothing(effect, motion, start, probes):
     tracker, twin = effect.tracker(start), effect.tracker(start)
-    told = []
+    tracked = []
     for angle, now in zip(motion.motor_deg, moments(motion), strict=True):
         for probe in probes:
             elsewhere = tracker.peek(probe, now)
         asked = tracker.peek(float(angle), now)
         assert not isinstance(tracker, Level) or not probes or elsewhere == asked
-        told.append(tracker.advance(float(angle), now))
-        assert told[-1] == asked == twin.advance(float(angle), now)
-    np.testing.assert_allclose(effect.predict(motion, start), np.array(told), **CLOSE)
+        tracked.append(tracker.advance(float(angle), now))
+        assert tracked[-1] == asked == twin.advance(float(angle), now)
+    np.testing.assert_allclose(effect.predict(motion, start), np.array(tracked), **CLOSE)
 
 
 def error_falls_no_steeper_than_its_slope_bound(effect, motion, start, away):

@@ -44,7 +44,7 @@ def test_a_foreign_master_moves_the_axis_and_a_dead_gateway_does_not(tmp_path: P
     assert gateway is not None
     path_of_eds = write_eds(tmp_path, machine.axes[0].config, gateway)
     with running(tmp_path, path, "--simulate", name="between") as daemon:
-        daemon.until_told("READY=1")
+        daemon.until_notified("READY=1")
         daemon.until_axis("disabled")
         network = canopen.Network()
         options = {"port": gateway.bus.options["port"]}

@@ -147,8 +147,8 @@ def test_acceleration_effects_are_independent_of_the_sampling_rate(rate_hz: floa
     command = amplitude * (number + way)
     true = np.where(moving, 2.0 * amplitude / 0.5 * np.pi / 0.5 * np.sin(turn * since), 0.0)
     count = 360.0 / 65536
-    told = np.round(command / count) * count
-    acceleration = kinematics(told, told, time, reading_of(told))[2]
+    rounded = np.round(command / count) * count
+    acceleration = kinematics(rounded, rounded, time, reading_of(rounded))[2]
     assert true @ acceleration / (acceleration @ acceleration) == pytest.approx(1.0, abs=0.01)
 
 

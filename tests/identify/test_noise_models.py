@@ -84,9 +84,9 @@ def test_excluded_blocks_have_no_influence():
     out = np.zeros(30, dtype=bool)
     out[10:20] = True
     noise = NoiseModel(1.0, 1.0, 0.8, 5.0)
-    told = Precision(noise, blocks, out).apply(np.where(out, 1e6, 1.0))
-    assert told[out] == pytest.approx(np.zeros(10))
-    assert told == pytest.approx(Precision(noise, blocks, out).apply(np.ones(30)))
+    weighted = Precision(noise, blocks, out).apply(np.where(out, 1e6, 1.0))
+    assert weighted[out] == pytest.approx(np.zeros(10))
+    assert weighted == pytest.approx(Precision(noise, blocks, out).apply(np.ones(30)))
 
 
 def test_a_wander_is_found_beside_white_noise():

@@ -78,9 +78,9 @@ def test_standard_errors_are_those_of_many_records():
         for _ in range(100)
     ]
     scatter = np.std([each[2].amplitude_arcsec for each in found])
-    told = np.mean([each[2].standard_error_arcsec for each in found])
-    assert told == pytest.approx(scatter, rel=0.25)
-    assert told == pytest.approx(np.sqrt(2.0 / 800.0), rel=0.25)
+    reported = np.mean([each[2].standard_error_arcsec for each in found])
+    assert reported == pytest.approx(scatter, rel=0.25)
+    assert reported == pytest.approx(np.sqrt(2.0 / 800.0), rel=0.25)
 
 
 def test_noise_seldom_makes_an_order():

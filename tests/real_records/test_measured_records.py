@@ -67,7 +67,7 @@ def test_a_robot_joint_is_named_and_the_names_predict_the_recording_left_out(
     orders = next(each for each in found.model.effects if each.name == "motor_order").orders
     if joint == 4:
         assert max(orders, key=lambda each: each.amplitude_arcsec).order == 2
-        assert "channel_skew" in named  # a drag that is a straight line in speed is told as a delay
+        assert "channel_skew" in named  # a drag that is a straight line in speed is reported as a delay
     else:
         assert "compliance" in named
     assert not set(named) & UNLIKELY
@@ -191,9 +191,9 @@ def test_return_point_memory_of_the_damper_is_reported_if_visible(name: str) -> 
 @pytest.mark.parametrize("joint", [4, 5])
 def test_command_worsens_no_record(joints: dict[int, list[Record]], joint: int) -> None:
     """The recordings end in motion, the command ahead of the motor by some degrees."""
-    told = [Record.read_csv(each) for each in measured(f"cobot-command/joint{joint}-*.csv")]
+    commanded = [Record.read_csv(each) for each in measured(f"cobot-command/joint{joint}-*.csv")]
     without, beside = (
-        diagnose(concatenate(each), NOTHING, independent_zeros=True) for each in (joints[joint], told)
+        diagnose(concatenate(each), NOTHING, independent_zeros=True) for each in (joints[joint], commanded)
     )
     assert set(names(beside)) == set(names(without))
     assert beside.extended.rms_arcsec < 1.02 * without.extended.rms_arcsec

@@ -20,7 +20,7 @@ FLAGS = [
     "--dump-dom",
 ]
 SCRIPT = """
-const told = {}, holder = document.querySelector("[data-chart]");
+const measured = {}, holder = document.querySelector("[data-chart]");
 const x = () => [holder.drawn.scales.x.min, holder.drawn.scales.x.max];
 const y = () => [holder.drawn.scales.y.min, holder.drawn.scales.y.max];
 const press = key => holder.dispatchEvent(new KeyboardEvent("keydown", { key, cancelable: true }));
@@ -36,7 +36,7 @@ const pinch = (from, to) => {
   finger("pointerup", 1, to[0]); finger("pointerup", 2, to[1]);
 };
 const settled = step => new Promise(done => setTimeout(() => {
-  told[step] = { x: x(), y: y() };
+  measured[step] = { x: x(), y: y() };
   done();
 }, 20));
 (async () => {
@@ -55,10 +55,10 @@ const settled = step => new Promise(done => setTimeout(() => {
   await settled("dragged");
   over.dispatchEvent(new MouseEvent("dblclick", { bubbles: true })); await settled("doubled");
   document.querySelector("button[aria-label='enlarge']").click(); await settled("button");
-  told.focusable = holder.tabIndex === 0;
+  measured.focusable = holder.tabIndex === 0;
   const pre = document.createElement("pre");
-  pre.id = "told";
-  pre.textContent = JSON.stringify(told);
+  pre.id = "measured";
+  pre.textContent = JSON.stringify(measured);
   document.body.append(pre);
 })();
 """
@@ -69,7 +69,7 @@ def span(ends):
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory):
+def measured(tmp_path_factory):
     if BROWSER is None:
         pytest.skip("no chromium on this machine: zoom by keyboard and touch is not tested")
     folder = tmp_path_factory.mktemp("browser")
@@ -79,37 +79,37 @@ def told(tmp_path_factory):
     page.write_text(text.replace("</body>", f"<script>{SCRIPT}</script></body>"), encoding="utf-8")
     command = [BROWSER, *FLAGS, f"--user-data-dir={folder / 'profile'}", "--virtual-time-budget=4000"]
     done = subprocess.run([*command, page.as_uri()], capture_output=True, text=True, check=True)
-    return json.loads(re.search(r'<pre id="told">(.*?)</pre>', done.stdout)[1])
+    return json.loads(re.search(r'<pre id="measured">(.*?)</pre>', done.stdout)[1])
 
 
-def test_a_chart_is_reached_and_enlarged_by_the_keyboard(told):
-    assert told["focusable"]
+def test_a_chart_is_reached_and_enlarged_by_the_keyboard(measured):
+    assert measured["focusable"]
     for axis in "xy":
-        assert span(told["plus"][axis]) == pytest.approx(span(told["whole"][axis]) / 1.6)
+        assert span(measured["plus"][axis]) == pytest.approx(span(measured["whole"][axis]) / 1.6)
 
 
-def test_arrows_pan_within_the_data(told):
-    assert told["right"]["x"][0] > told["plus"]["x"][0]
-    assert told["right"]["y"] == told["plus"]["y"]
-    assert told["up"]["y"][0] > told["right"]["y"][0]
-    assert told["edge"]["x"][1] == pytest.approx(told["whole"]["x"][1])
-    assert span(told["edge"]["x"]) == pytest.approx(span(told["plus"]["x"]))
+def test_arrows_pan_within_the_data(measured):
+    assert measured["right"]["x"][0] > measured["plus"]["x"][0]
+    assert measured["right"]["y"] == measured["plus"]["y"]
+    assert measured["up"]["y"][0] > measured["right"]["y"][0]
+    assert measured["edge"]["x"][1] == pytest.approx(measured["whole"]["x"][1])
+    assert span(measured["edge"]["x"]) == pytest.approx(span(measured["plus"]["x"]))
 
 
-def test_zooming_out_ends_at_the_whole_chart(told):
-    assert told["minus"] == told["escape"] == told["doubled"] == told["whole"]
+def test_zooming_out_ends_at_the_whole_chart(measured):
+    assert measured["minus"] == measured["escape"] == measured["doubled"] == measured["whole"]
 
 
-def test_two_fingers_zoom_about_their_centre(told):
-    whole, pinched = told["whole"], told["pinched"]
+def test_two_fingers_zoom_about_their_centre(measured):
+    whole, pinched = measured["whole"], measured["pinched"]
     assert span(pinched["x"]) == pytest.approx(span(whole["x"]) / 2.0, rel=0.01)
     assert sum(pinched["x"]) == pytest.approx(sum(whole["x"]), rel=0.01)
 
 
-def test_one_finger_moves_an_enlarged_chart_sideways_only(told):
-    assert told["dragged"]["x"][0] < told["pinched"]["x"][0]
-    assert told["dragged"]["y"] == told["pinched"]["y"]
+def test_one_finger_moves_an_enlarged_chart_sideways_only(measured):
+    assert measured["dragged"]["x"][0] < measured["pinched"]["x"][0]
+    assert measured["dragged"]["y"] == measured["pinched"]["y"]
 
 
-def test_buttons_zoom(told):
-    assert span(told["button"]["x"]) < span(told["whole"]["x"])
+def test_buttons_zoom(measured):
+    assert span(measured["button"]["x"]) < span(measured["whole"]["x"])

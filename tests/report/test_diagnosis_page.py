@@ -309,9 +309,9 @@ def test_external_text_is_escaped():
 
 def test_a_changed_loop_is_plotted_with_the_models_loop():
     """A finding may come from a fit with more freedom than the model has; the picture must not repeat it."""
-    told = CATALOGUE["hysteresis_parameters"].candidate(RATIO, MODEL.effects)
-    boasted = told.model_copy(update={"offset_arcsec": told.base.offset_arcsec + 100.0})
-    honest = diagnosis(finding("hysteresis_parameters", effect=told))
+    found = CATALOGUE["hysteresis_parameters"].candidate(RATIO, MODEL.effects)
+    boasted = found.model_copy(update={"offset_arcsec": found.base.offset_arcsec + 100.0})
+    honest = diagnosis(finding("hysteresis_parameters", effect=found))
     loud = dataclasses.replace(honest, findings=(finding("hysteresis_parameters", effect=boasted),))
     drawn = [charts(render(diagnosis_page(each, title="t"))) for each in (honest, loud)]
     caption = "Residual without it, over the motor angle since the last reversal"

@@ -278,15 +278,15 @@ def test_an_external_torque_acts_alike_compiled_or_not() -> None:
     """The load yields as the spring does: this torque does not break the motor away."""
     made = truth({})
     outer_nm = np.concatenate([np.zeros(20), np.full(300, 0.2)])
-    told = [
+    runs = [
         Machine(made, 7, may_compile=each, loaded=True).follow_all([0.0] * 321, [4] * 320, outer_nm)
         for each in (False, True)
     ]
-    assert all(np.array_equal(getattr(told[0], name), getattr(told[1], name)) for name in told[0]._fields)
+    assert all(np.array_equal(getattr(runs[0], name), getattr(runs[1], name)) for name in runs[0]._fields)
     per_arcsec = made.load_.encoder.counts_per_turn / 1_296_000.0
-    yields_arcsec = np.diff(told[0].load_reading[[19, 319]])[0] / per_arcsec
+    yields_arcsec = np.diff(runs[0].load_reading[[19, 319]])[0] / per_arcsec
     assert yields_arcsec == pytest.approx(0.2 * 206_265.0 / made.gear.stiffness_nm_per_rad, rel=0.02)
-    assert told[0].load_torque_nm[-1] == 0.2
+    assert runs[0].load_torque_nm[-1] == 0.2
 
 
 @pytest.mark.parametrize("may_compile", [False, True])
@@ -305,11 +305,11 @@ def test_batched_cycles_equal_single_cycles() -> None:
     counts = [0.0] * 5 + [float(100 * k) for k in range(60)] + [5_900.0] * 20
     substeps = [3 + k % 2 for k in range(len(counts) - 1)]
     at_once, each = Machine(made, 7, may_compile=True), Machine(made, 7, may_compile=True)
-    told = at_once.follow_all(counts, substeps)
+    run = at_once.follow_all(counts, substeps)
     for cycle, steps in enumerate(substeps):
         each.follow(counts[cycle], counts[cycle + 1], steps)
-        for name in told._fields:
-            assert getattr(told, name)[cycle] == getattr(each, name), (name, cycle)
+        for name in run._fields:
+            assert getattr(run, name)[cycle] == getattr(each, name), (name, cycle)
     each.follow(counts[-1], counts[-1] + 90.0, 4)
     at_once.follow(counts[-1], counts[-1] + 90.0, 4)
     assert {name: getattr(each, name) for name in PLACES} == {name: getattr(at_once, name) for name in PLACES}

@@ -28,7 +28,7 @@ fast.waiting.left = 0
 truth = Truth.load(sys.argv[1])
 for dead_time_ms in map(float, sys.argv[2:]):
     servo = truth.servo.model_copy(update={"dead_time_ms": dead_time_ms})
-    told = []
+    readings = []
     for may_compile in (True, False):
         machine = Machine(truth.model_copy(update={"servo": servo}), 0, may_compile=may_compile)
         place = 0.0
@@ -36,9 +36,9 @@ for dead_time_ms in map(float, sys.argv[2:]):
             step = 20.0 * math.sin(cycle / 10.0)
             machine.follow(place, place + step, 8)
             place += step
-            told.append((machine.motor_counts, machine.load_counts, machine.torque_nm))
+            readings.append((machine.motor_counts, machine.load_counts, machine.torque_nm))
         print(type(machine._axis).__name__)
-    print(told[:200] == told[200:])
+    print(readings[:200] == readings[200:])
 """
 
 
@@ -67,5 +67,5 @@ def test_layout_names_are_unique_and_stable_between_processes(
 def test_layouts_that_two_processes_compiled_run_side_by_side_in_a_third(tmp_path: Path) -> None:
     """A dead time of 11 ms takes more room than one of 1 ms."""
     for dead_times in ([1.0], [11.0], [1.0, 11.0, 1.0], [11.0, 1.0]):
-        told = said(MOVE, ARTICLE, *dead_times, NUMBA_CACHE_DIR=str(tmp_path), HDBRIDGE_COMPILE="1")
-        assert told == ["CompiledAxis", "Axis", "True"] * len(dead_times)
+        output = said(MOVE, ARTICLE, *dead_times, NUMBA_CACHE_DIR=str(tmp_path), HDBRIDGE_COMPILE="1")
+        assert output == ["CompiledAxis", "Axis", "True"] * len(dead_times)

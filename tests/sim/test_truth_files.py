@@ -141,8 +141,8 @@ def test_an_invalid_cause_is_refused(old: str, new: str, complaint: str) -> None
 
 
 def test_provenance_of_twin_values_is_kept_and_has_no_effect() -> None:
-    told = "\nintervals: {gear.stiffness_nm_per_rad: [15500, 16400]}\nprovenance: {axis: article}\n"
-    twin = Truth.from_text(ARTICLE.read_text() + told)
+    appended = "\nintervals: {gear.stiffness_nm_per_rad: [15500, 16400]}\nprovenance: {axis: article}\n"
+    twin = Truth.from_text(ARTICLE.read_text() + appended)
     assert twin.intervals == {"gear.stiffness_nm_per_rad": (15500.0, 16400.0)}
     assert twin.provenance == {"axis": "article"}
     assert twin.model_copy(update={"intervals": {}, "provenance": {}}) == Truth.load(ARTICLE)

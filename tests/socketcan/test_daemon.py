@@ -48,7 +48,7 @@ class Benches:
         self._stack.callback(cable.unplug)
         cable.plug()
         daemon = self._stack.enter_context(running(folder, folder, name=NAME))
-        daemon.until_told("READY=1")
+        daemon.until_notified("READY=1")
         self._bench = DaemonBench(
             daemon, cable, disk, axis.drive.cycle_s, 2e-3 * axis.drive.heartbeat_ms,
             Witness(THEIRS, axis.drive.cycle_s),

@@ -115,7 +115,7 @@ def under_way(folder: Path) -> Iterator[tuple[Daemon, Plc, Witness]]:
     try:
         cable.plug()
         with running(folder, path, name="killed") as daemon:
-            daemon.until_told("READY=1")
+            daemon.until_notified("READY=1")
             daemon.until_axis("disabled")
             with master(folder, Machine.load(path)) as plc:
                 enable(daemon, plc)

@@ -86,7 +86,7 @@ def moving_axis(folder: Path, profile: Path) -> Iterator[tuple[Axis, Recorder]]:
     cable.plug()
     try:
         with running(folder, folder, name="fast") as daemon:
-            daemon.until_told("READY=1")
+            daemon.until_notified("READY=1")
             daemon.until_axis("disabled")
             with Client(str(daemon.socket)) as client, client.lease():
                 axis = client.axis(AxisConfig.load(profile).name)

@@ -60,14 +60,14 @@ class Page:
                 return message.get("result", {})
             self._note(message.get("method", ""), message.get("params", {}))
 
-    def _note(self, method: str, told: dict[str, Any]) -> None:
+    def _note(self, method: str, data: dict[str, Any]) -> None:
         if method == "Runtime.exceptionThrown":
-            details = told["exceptionDetails"]
+            details = data["exceptionDetails"]
             self.complaints.append(details.get("exception", {}).get("description") or details["text"])
-        elif method == "Log.entryAdded" and told["entry"]["level"] == "error":
-            self.complaints.append(f"{told['entry']['text']} {told['entry'].get('url', '')}".strip())
+        elif method == "Log.entryAdded" and data["entry"]["level"] == "error":
+            self.complaints.append(f"{data['entry']['text']} {data['entry'].get('url', '')}".strip())
         elif method == "Network.requestWillBeSent":
-            self.requested.append(told["request"]["url"])
+            self.requested.append(data["request"]["url"])
 
     def open(self, url: str, *, width: int = 1280, height: int = 900, dark: bool = False) -> None:
         """Loads a page in a window of this size."""

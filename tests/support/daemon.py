@@ -127,7 +127,7 @@ class SteppedDaemon:
             if done():
                 return
             self.turn()
-        raise AssertionError(f"not within {timeout_s} s; states {self.states}, told {list(self.events)[-5:]}")
+        raise AssertionError(f"not within {timeout_s} s; {self.states}, events {list(self.events)[-5:]}")
 
     # ---------------------------------------------------------------- what is
 

@@ -204,7 +204,7 @@ class FakeBridge:
         self.moved: list[tuple[Any, ...]] = []
         self.stopped: list[tuple[str, str]] = []
         self.streams: list[FakeStream] = []
-        self.told: list[messages.Event] = []
+        self.logged: list[messages.Event] = []
         self.alive = True
         self.batch_s = 0.005
         self.rows = 5
@@ -225,8 +225,8 @@ class FakeBridge:
         )  # fmt: skip
 
     def events(self, since: int = 0) -> messages.Events:
-        newest = self.told[-1].sequence if self.told else 0
-        return messages.Events(events=[each for each in self.told if each.sequence > since], newest=newest)
+        newest = self.logged[-1].sequence if self.logged else 0
+        return messages.Events(events=[each for each in self.logged if each.sequence > since], newest=newest)
 
     def followed(self, holder: str, name: str) -> FakeAxis:
         self.lease.check(holder)
@@ -289,7 +289,7 @@ class FakeBridge:
         return found
 
     def mark(self, text: str) -> None:
-        number = len(self.told) + 1
-        self.told.append(
+        number = len(self.logged) + 1
+        self.logged.append(
             messages.Event(sequence=number, kind=messages.EventKind.NOTE, date=BEGAN, cycle=1234, text=text)
         )

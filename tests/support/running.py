@@ -35,7 +35,7 @@ class Daemon:
             [sys.executable, "-m", "hdbridge", "run", *map(str, arguments)],
             env=environment, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
         )  # fmt: skip
-        self.told: list[str] = []
+        self.notifications: list[str] = []
         """Messages to the service manager."""
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -52,7 +52,7 @@ class Daemon:
     def _listen(self) -> None:
         """Reads messages at once, because the kernel queues only ten."""
         while line := self._manager.recv(4096).decode():
-            self.told.append(line)
+            self.notifications.append(line)
 
     def _read(self) -> None:
         assert self.process.stderr is not None
@@ -64,9 +64,9 @@ class Daemon:
 
     # ------------------------------------------------------------------ what it says
 
-    def until_told(self, line: str) -> None:
+    def until_notified(self, line: str) -> None:
         """Waits until the service manager has received this message."""
-        self.until(lambda: line in self.told, line)
+        self.until(lambda: line in self.notifications, line)
 
     def until(self, met: Callable[[], Any], what: str) -> Any:
         """Polls ``met`` until it returns something true, and returns it."""
@@ -79,8 +79,8 @@ class Daemon:
         return patience.until(still, lambda: f"{what}: {self._last_words()}")
 
     def _last_words(self) -> str:
-        told = [each for each in self.events if each["event"] != "request"][-20:]
-        return "\n".join(json.dumps(each) for each in (*told, self.axis()))
+        shown = [each for each in self.events if each["event"] != "request"][-20:]
+        return "\n".join(json.dumps(each) for each in (*shown, self.axis()))
 
     def names(self) -> list[str]:
         """Returns the names of the events in its log."""
@@ -110,8 +110,8 @@ class Daemon:
     def newest_event(self) -> int:
         """Returns the number of the newest event."""
         newest = 0
-        while told := self.events_since(newest):
-            newest = int(told[-1]["sequence"])
+        while newer := self.events_since(newest):
+            newest = int(newer[-1]["sequence"])
         return newest
 
     def axis(self, place: int = 0) -> dict[str, Any]:

@@ -109,8 +109,8 @@ async def until(bridge: ServiceBridge, done: Callable[[], bool], timeout_s: floa
     while not done():
         bridge.core.observer.poll()
         states = {name: each.state().state for name, each in bridge.axes.items()}
-        told = [each.text for each in bridge.events().events[-5:]]
-        assert timing.clock.now() < end_s, f"not within {timeout_s} s: {states}, {told}"
+        texts = [each.text for each in bridge.events().events[-5:]]
+        assert timing.clock.now() < end_s, f"not within {timeout_s} s: {states}, {texts}"
         await timing.sleep(0.02)
 
 

@@ -67,9 +67,9 @@ def against(measured: Record, truth: Truth) -> Comparison:
 
 def test_the_same_axis_differs_by_its_noise(measured: Record) -> None:
     comparison = against(measured, TRUTH)
-    told = comparison.as_dict()["figures"]
-    assert {each["kind"] for each in told} == {ALL, "step", "sweep"}
-    assert all(np.isfinite(each["difference"]) for each in told)
+    figures = comparison.as_dict()["figures"]
+    assert {each["kind"] for each in figures} == {ALL, "step", "sweep"}
+    assert all(np.isfinite(each["difference"]) for each in figures)
     for channel in ("load_error", "following_error", "motor_torque"):
         for kind in (ALL, "step", "sweep"):
             row = comparison.row(channel, kind)

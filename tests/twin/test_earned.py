@@ -80,8 +80,8 @@ def warm_and_cold(truth: Truth) -> Recording:
     for warm_c in (22.0, 37.0):
         heat = truth.temperature.model_copy(update={"start_c": warm_c})
         part = recorded(truth.model_copy(update={"temperature": heat}))
-        told_c = np.full(len(part.record), warm_c)
-        parts.append(replace(part, record=Record({**part.record.columns, "temperature_c": told_c})))
+        reported_c = np.full(len(part.record), warm_c)
+        parts.append(replace(part, record=Record({**part.record.columns, "temperature_c": reported_c})))
     return Recording.joined(parts)
 
 
@@ -140,7 +140,7 @@ def test_another_hysteresis_law_is_adopted_if_the_load_shows_it() -> None:
     assert dahl.gear.hysteresis.law == "dahl"
     assert TRUTH.gear.hysteresis is not None
     assert TRUTH.gear.hysteresis.law != "dahl"
-    # As a calibration by one law tells it: too low, and crossed elsewhere.
+    # As a calibration with another law reports it: too low, and with crossings elsewhere.
     wrong = with_values(TRUTH, {"loop offset": 0.93 * TRUTH.gear.hysteresis.offset_arcsec})
     with Replays(prepare(recorded(dahl), AXIS, wrong), 1) as replays:
         found = with_loop(replays, fitted(replays, wrong))

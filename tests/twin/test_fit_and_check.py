@@ -110,12 +110,12 @@ def test_a_twin_has_encoder_noise_and_uncertainty() -> None:
 
 
 def test_a_check_is_silent_without_a_change() -> None:
-    told = check(recorded(seed=1), AXIS, twin(), workers=1)
-    assert told.changes == ()
+    checked = check(recorded(seed=1), AXIS, twin(), workers=1)
+    assert checked.changes == ()
     # The feed-forwards leave little to the loops, no step comes near the limit, and the demo's friction does
     # not depend on its temperature.
-    assert told.unseen == ("servo gains", "friction feed-forward", "current limit", "warmth")
-    assert told.sentence == (
+    assert checked.unseen == ("servo gains", "friction feed-forward", "current limit", "warmth")
+    assert checked.sentence == (
         "Nothing has changed since the twin was made, unless it is one of these, which this recording does "
         "not show: servo gains, friction feed-forward, current limit, warmth."
     )
@@ -125,8 +125,8 @@ def test_recorded_warmth_is_not_a_change() -> None:
     """A warming by 20 K lowers the friction by a fifth, which matters."""
     grows = TRUTH.temperature.model_copy(update={"friction_growth_per_k": -0.01, "reference_c": 22.0})
     warm = TRUTH.model_copy(update={"temperature": grows.model_copy(update={"start_c": 42.0})})
-    told = {**twin().intervals, "temperature.ambient_c": (21.0, 23.0)}
-    known = twin().model_copy(update={"temperature": grows, "intervals": told})
+    intervals = {**twin().intervals, "temperature.ambient_c": (21.0, 23.0)}
+    known = twin().model_copy(update={"temperature": grows, "intervals": intervals})
     found = check(benched(WITH_SENSOR, warm, 3, 1), WITH_SENSOR, known, workers=1)
     assert found.changes == ()
     assert "warmth" not in found.unseen
@@ -151,11 +151,11 @@ def test_a_check_names_changes_not_misfit(
     # Shorter by less than anybody would care for, but with more inertia other rows show it.
     near = twin(0.9 * TRUTH.servo.command_filter_ms)
     changed = recorded(seed=2, count=1, load_inertia=1.5 * TRUTH.load_.inertia_kg_m2)
-    told = check(seen(changed), AXIS, near, workers=1)
-    assert [each.cause for each in told.changes] == ["load inertia"]
-    (inertia,) = told.changes[0].parameters
+    checked = check(seen(changed), AXIS, near, workers=1)
+    assert [each.cause for each in checked.changes] == ["load inertia"]
+    (inertia,) = checked.changes[0].parameters
     assert inertia.after == pytest.approx(1.5 * TRUTH.load_.inertia_kg_m2, rel=0.05)
-    assert "load inertia" in told.sentence
+    assert "load inertia" in checked.sentence
 
 
 def test_a_load_that_rings_out_of_step_has_changed() -> None:
@@ -164,11 +164,11 @@ def test_a_load_that_rings_out_of_step_has_changed() -> None:
     damping = 0.3 * gear.damping_nm_s_per_rad * math.sqrt(stiffness / gear.stiffness_nm_per_rad)
     soft = {"gear stiffness": stiffness, "gear damping": damping}
     heavier = with_values(TRUTH, {**soft, "load inertia": 1.5 * TRUTH.load_.inertia_kg_m2})
-    told = check(benched(AXIS, heavier, 2, 1), AXIS, with_values(twin(), soft), workers=1)
-    assert [each.cause for each in told.changes] == ["load inertia"]
-    (inertia,) = told.changes[0].parameters
+    checked = check(benched(AXIS, heavier, 2, 1), AXIS, with_values(twin(), soft), workers=1)
+    assert [each.cause for each in checked.changes] == ["load inertia"]
+    (inertia,) = checked.changes[0].parameters
     assert inertia.after == pytest.approx(1.5 * TRUTH.load_.inertia_kg_m2, rel=0.05)
-    assert told.unexplained == {}
+    assert checked.unexplained == {}
 
 
 @cache
@@ -184,10 +184,10 @@ def replay_only() -> Truth:
 
 
 def test_a_twin_with_values_of_its_own_is_checked_by_the_misfit_that_it_was_made_with() -> None:
-    told = check(recorded(seed=1), AXIS, replay_only(), workers=1)
-    assert told.changes == ()
-    assert told.sentence.startswith("Nothing has changed since the twin was made")
-    assert max(told.growth_before.values()) < 1.1
+    checked = check(recorded(seed=1), AXIS, replay_only(), workers=1)
+    assert checked.changes == ()
+    assert checked.sentence.startswith("Nothing has changed since the twin was made")
+    assert max(checked.growth_before.values()) < 1.1
 
 
 def test_a_change_that_the_twin_s_own_error_hides_is_not_ruled_out() -> None:
@@ -197,20 +197,20 @@ def test_a_change_that_the_twin_s_own_error_hides_is_not_ruled_out() -> None:
         known = with_knowledge(
             solve(replays, early, (BY_NAME["Coulomb friction"],), 2), replays.data, Values.REPLAY
         )
-    told = check(recorded(seed=1, servo_dead_time=0.0), AXIS, known, workers=1)
-    assert told.changes == ()
-    assert max(told.growth_before.values()) < 1.5
-    assert "servo dead time" in told.unseen
-    assert "servo dead time" in told.sentence
+    checked = check(recorded(seed=1, servo_dead_time=0.0), AXIS, known, workers=1)
+    assert checked.changes == ()
+    assert max(checked.growth_before.values()) < 1.5
+    assert "servo dead time" in checked.unseen
+    assert "servo dead time" in checked.sentence
 
 
 def test_such_a_twin_names_a_change_by_its_ratio() -> None:
     doubled = recorded(seed=2, Coulomb_friction=2.0 * TRUTH.motor.coulomb_nm)
-    told = check(doubled, AXIS, replay_only(), workers=1)
-    assert [each.cause for each in told.changes] == ["friction"]
-    friction = next(each for each in told.changes[0].parameters if each.name == "Coulomb friction")
+    checked = check(doubled, AXIS, replay_only(), workers=1)
+    assert [each.cause for each in checked.changes] == ["friction"]
+    friction = next(each for each in checked.changes[0].parameters if each.name == "Coulomb friction")
     assert friction.after == pytest.approx(2.0, rel=0.2)
-    assert "times what it was" in told.sentence
+    assert "times what it was" in checked.sentence
 
 
 @pytest.mark.parametrize("twin_of", [twin, replay_only])
@@ -219,10 +219,10 @@ def test_increased_misfit_is_never_silent(twin_of: Callable[[], Truth]) -> None:
     recording = recorded(seed=1, count=1)
     torque = recording.record.columns["motor_torque_nm"]
     hunts = torque + 0.05 * np.sin(np.arange(len(torque)) / 2.0) * (torque != 0.0)
-    told = check(with_torque(recording, hunts), AXIS, twin_of(), workers=1)
-    assert told.growth_before["motor torque"] > 1.5
-    assert "Nothing has changed" not in told.sentence
-    assert "motor torque" in told.sentence
+    checked = check(with_torque(recording, hunts), AXIS, twin_of(), workers=1)
+    assert checked.growth_before["motor torque"] > 1.5
+    assert "Nothing has changed" not in checked.sentence
+    assert "motor torque" in checked.sentence
 
 
 def test_growth_follows_a_change_of_any_size_and_not_a_single_reading() -> None:
@@ -245,14 +245,14 @@ def test_a_twin_that_leaves_all_of_a_signal_shows_no_change() -> None:
     about = known.provenance["fit"]
     huge = {name: {kind: 1e6 * rms for kind, rms in by.items()} for name, by in about["misfit"].items()}
     lost = known.model_copy(update={"provenance": {**known.provenance, "fit": {**about, "misfit": huge}}})
-    told = check(recorded(seed=1), AXIS, lost, workers=1)
-    assert told.sentence == "The twin explains too little of this axis to show a change."
+    checked = check(recorded(seed=1), AXIS, lost, workers=1)
+    assert checked.sentence == "The twin explains too little of this axis to show a change."
 
 
 def test_unexplained_changes_are_reported() -> None:
     grown = {"following error": 1.1, "motor torque": 21.0, "load error": 242.0}
-    told = Check((), grown, grown, ("warmth",))
-    assert told.sentence == (
+    checked = Check((), grown, grown, ("warmth",))
+    assert checked.sentence == (
         "Something has changed since the twin was made that no change of a cause explains. "
         "The twin leaves 21 times as much of the motor torque as when it was made. "
         "The twin leaves 242 times as much of the load error as when it was made. "

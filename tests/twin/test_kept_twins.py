@@ -110,6 +110,6 @@ def test_the_model_command_manages_twins(profile: Path) -> None:
     assert "coulomb_nm" in run_here(profile, "model", "diff", profile, "--twin").stdout
     assert "twin 1 is active" in run_here(profile, "model", "commit", profile, "--twin").stdout
     run_here(profile, "model", "log", profile, "--twin", "--json", "log.json")
-    told = json.loads((profile / "log.json").read_text())
-    assert told["schema"] == "hdbridge.twin-log/1"
-    assert [each["reason"] for each in told["twins"]] == ["made of a recording"]
+    log = json.loads((profile / "log.json").read_text())
+    assert log["schema"] == "hdbridge.twin-log/1"
+    assert [each["reason"] for each in log["twins"]] == ["made of a recording"]

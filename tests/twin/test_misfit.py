@@ -50,7 +50,7 @@ def recorded() -> Recording:
     return Recording(record_of(TRUTH, moves), axis="demo", ratio=50.0)
 
 
-def told_by_another_zero(counts: int = ZERO_COUNTS) -> Recording:
+def with_command_offset(counts: int = ZERO_COUNTS) -> Recording:
     """Command of a controller whose zero differs from the drive's."""
     columns = dict(recorded().record.columns)
     columns["motor_target_deg"] = columns["motor_target_deg"] + counts * COUNT_DEG
@@ -64,16 +64,16 @@ def left(truth: Truth, recording: Recording | None = None) -> dict[str, float]:
 
 
 def test_a_command_offset_is_not_a_following_error() -> None:
-    assert left(TRUTH, told_by_another_zero())[FOLLOWING] == pytest.approx(left(TRUTH)[FOLLOWING], rel=0.05)
+    assert left(TRUTH, with_command_offset())[FOLLOWING] == pytest.approx(left(TRUTH)[FOLLOWING], rel=0.05)
 
 
 def test_a_count_is_not_a_zero_offset() -> None:
     """A motor may rest so far from its command; in motion it is a following error like any other."""
-    data = prepare(told_by_another_zero(1), AXIS, TRUTH)
+    data = prepare(with_command_offset(1), AXIS, TRUTH)
     counts = np.concatenate([each.counts[FOLLOWING] for each in data.pieces]) > 0.0
     assert np.median(residuals(data, TRUTH)[FOLLOWING][counts]) == pytest.approx(COUNT_DEG, rel=0.3)
     # Nor is it in a comparison.
-    for recording in (recorded(), told_by_another_zero()):
+    for recording in (recorded(), with_command_offset()):
         row = compare(recording.record, replay(recording, AXIS, TRUTH), (), 50.0).row(FOLLOWING_ERROR)
         assert row is not None
         assert row.difference < 0.1, "motor degrees: two counts"

@@ -94,8 +94,8 @@ def noise(seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("size", "least", "most"), [(0.01, 0.005, 0.05), (0.5, 1.0, 1.0)])
 def test_changes_below_the_noise_keep_the_false_alarm_rate(size: float, least: float, most: float) -> None:
-    told = [worse_than_chance(noise(seed), size * CHANGE, LEG_OF_ROW) for seed in range(400)]
-    assert least <= np.mean(told) <= most
+    detections = [worse_than_chance(noise(seed), size * CHANGE, LEG_OF_ROW) for seed in range(400)]
+    assert least <= np.mean(detections) <= most
 
 
 def test_correlated_residuals_hide_changes_that_white_noise_would_show() -> None:

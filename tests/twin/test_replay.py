@@ -133,8 +133,8 @@ def test_a_part_begins_as_warm_as_it_was_recorded() -> None:
     assert apart["motor_position_deg"] < 1.5 * 360.0 / 8000.0
     assert apart["motor_torque_nm"] < 0.1 * truth.motor.coulomb_nm
     assert apart["temperature_c"] < 0.15
-    untold = [column for column in joined.record.columns if column != "temperature_c"]
-    record = Record({name: joined.record.columns[name] for name in untold}, starts=joined.record.starts)
+    remaining = [column for column in joined.record.columns if column != "temperature_c"]
+    record = Record({name: joined.record.columns[name] for name in remaining}, starts=joined.record.starts)
     cold = replay(replace(joined, record=record), axis, plants[0])
     second = slice(joined.record.starts[1], None)
     torque_nm = (each.columns["motor_torque_nm"][second] for each in (cold, joined.record))
@@ -172,8 +172,8 @@ def test_commands_at_uneven_times_are_met_to_the_last_row() -> None:
     """A recording that ends in motion, between two cycles."""
     time_s = 0.01 * np.arange(60) + 0.00037 * np.arange(60)
     target_deg = 300.0 * np.maximum(time_s - 0.1, 0.0)
-    told = replay(Recording(record_at(time_s, target_deg), ratio=50.0), *demo()).columns["motor_target_deg"]
-    assert np.max(np.abs(told - target_deg)) < 0.06, "motor degrees: a count and its rounding"
+    used = replay(Recording(record_at(time_s, target_deg), ratio=50.0), *demo()).columns["motor_target_deg"]
+    assert np.max(np.abs(used - target_deg)) < 0.06, "motor degrees: a count and its rounding"
 
 
 def test_a_late_stamp_changes_no_simulated_signal() -> None:

@@ -87,8 +87,8 @@ def plain_fit(data: Data, start: Truth, steps: int = 25) -> Truth:
 
 def shares(other: Recording, axis: AxisConfig, truth: Truth) -> dict[str, float]:
     """Following error and torque on the other motion, share of the signal."""
-    told = compare(other.record, replay(other, axis, truth), other.segments, axis.gear.ratio)
-    rows = {name: told.row(name) for name in ("following_error", "motor_torque")}
+    comparison = compare(other.record, replay(other, axis, truth), other.segments, axis.gear.ratio)
+    rows = {name: comparison.row(name) for name in ("following_error", "motor_torque")}
     return {name: row.share for name, row in rows.items() if row is not None}
 
 

@@ -42,16 +42,16 @@ def warmed(heat: TrueTemperature, seed: int, minutes: float, rests: float = 0.25
             bench.move(way * 400.0, 5000.0, 60_000.0) if fast else bench.move(way * 2000.0, 2500.0, 9000.0)
             bench.hold(0.2)
     bench.hold(rests * seconds)
-    told = bench.readings()
+    readings = bench.readings()
     return Recording(
         Record(
             {
-                "time_s": told.time_s,
-                "motor_target_deg": told.target_deg,
-                "motor_position_deg": told.motor_deg,
-                "load_position_deg": told.load_deg,
-                "motor_torque_nm": told.motor_torque_nm,
-                "temperature_c": SENSOR_K * np.round(told.temperature_c / SENSOR_K),
+                "time_s": readings.time_s,
+                "motor_target_deg": readings.target_deg,
+                "motor_position_deg": readings.motor_deg,
+                "load_position_deg": readings.load_deg,
+                "motor_torque_nm": readings.motor_torque_nm,
+                "temperature_c": SENSOR_K * np.round(readings.temperature_c / SENSOR_K),
             }
         )
     )
@@ -77,9 +77,9 @@ HEATS = (
 @pytest.mark.parametrize("seed", range(len(HEATS)))
 def test_constants_that_are_off_by_factors_are_learned_from_a_warm_up(seed: int) -> None:
     recording = warmed(HEATS[seed], seed, 10.0)
-    after, told = with_warmth(recording, AXIS, fitted(recording), TRUTH)
-    assert told is not None
-    assert told.cause == "warmth"
+    after, change = with_warmth(recording, AXIS, fitted(recording), TRUTH)
+    assert change is not None
+    assert change.cause == "warmth"
     for each in THERMAL:
         lower, upper = after.intervals[each.path]
         assert lower <= getattr(HEATS[seed], each.path.split(".")[-1]) <= upper, each.name
@@ -90,8 +90,8 @@ def test_constants_that_are_off_by_factors_are_learned_from_a_warm_up(seed: int)
 def test_seconds_of_motion_leave_thermal_constants_unchanged() -> None:
     heat = TrueTemperature(ambient_c=23.0, resistance_k_per_w=2.0, time_constant_s=600.0, copper_loss_w=5.0)
     recording = warmed(heat, 0, 0.1, rests=0.0)
-    after, told = with_warmth(recording, AXIS, fitted(recording), TRUTH)
-    assert told is None
+    after, change = with_warmth(recording, AXIS, fitted(recording), TRUTH)
+    assert change is None
     assert after.temperature.ambient_c == pytest.approx(22.0, abs=3.0)
     for each in THERMAL[1:3]:
         lower, upper = after.intervals[each.path]

@@ -277,10 +277,10 @@ def test_the_simulated_drive_errs_as_the_model_says(name: str, monkeypatch: pyte
     )
     record = exercised(quiet(translation.truth), case.lead)
     error = after(record, record.transmission_error_arcsec(N))
-    told = predicted(case.parts, record)
-    own = told - predicted(tuple(each for each in case.parts if each.name != name), record)
+    prediction = predicted(case.parts, record)
+    own = prediction - predicted(tuple(each for each in case.parts if each.name != name), record)
     size = float(np.sqrt(np.mean(own**2)))
-    left = float(np.sqrt(np.mean((error - told) ** 2)))
+    left = float(np.sqrt(np.mean((error - prediction) ** 2)))
     allowed = case.left * size + case.floor_arcsec
     assert left < allowed, f"{left:.2f} arcsec of {size:.2f} are left"
     assert allowed < 0.5 * size, "a drive that had nothing of it would pass"
@@ -295,8 +295,8 @@ def test_a_loop_in_which_the_load_lags_is_friction_at_the_load(law: type[effects
     parts = (law(**LAG),)
     translation = translate(AXIS, TransmissionModel(N, parts))
     record = exercised(quiet(translation.truth), to_and_fro)
-    error, told = after(record, record.transmission_error_arcsec(N)), predicted(parts, record)
-    assert np.std(error - told) < 0.08 * np.std(told)
+    error, prediction = after(record, record.transmission_error_arcsec(N)), predicted(parts, record)
+    assert np.std(error - prediction) < 0.08 * np.std(prediction)
     assert translation.truth.gear.hysteresis is None
     assert translation.truth.load_.presliding
 

@@ -62,7 +62,7 @@ def trips(truth: Truth, folder: Path) -> Path:
 
     led = record_of(truth, lead)
     legs = tuple(Segment(kind="step", start_s=a, end_s=b) for a, b in pairwise(ends))
-    # A drive is told whole counts; what it was led by here has fractions of them.
+    # A drive receives whole counts; the command here has fractions of them.
     record = replay(Recording(led, legs, axis="demo", ratio=50.0), AxisConfig.load(DEMO), truth)
     Recording(record, legs, axis="demo", ratio=50.0).save(folder)
     return folder
@@ -78,19 +78,19 @@ def profile(tmp_path: Path) -> Path:
     return folder
 
 
-def figures(told: dict[str, Any], which: str) -> dict[str, dict[str, Any]]:
-    return {each["channel"]: each for each in told[which]["figures"] if each["kind"] == "all"}
+def figures(report: dict[str, Any], which: str) -> dict[str, dict[str, Any]]:
+    return {each["channel"]: each for each in report[which]["figures"] if each["kind"] == "all"}
 
 
 def test_simulation_errors_are_reported_by_channel(profile: Path, recording: Path) -> None:
     done = run_here(
-        profile, "twin", profile, recording, "--compare", "--json", "told.json", "--html", "page.html"
+        profile, "twin", profile, recording, "--compare", "--json", "report.json", "--html", "page.html"
     )
     assert done.returncode == 0, done.stderr
-    assert "no transmission error is simulated" not in done.stderr, "the truth file tells it"
-    told = json.loads((profile / "told.json").read_text())
-    assert told["schema"] == "hdbridge.twin/1"
-    before = figures(told, "before")
+    assert "no transmission error is simulated" not in done.stderr, "the truth file has it"
+    report = json.loads((profile / "report.json").read_text())
+    assert report["schema"] == "hdbridge.twin/1"
+    before = figures(report, "before")
     assert before["motor_torque"]["difference"] > 0.015
     assert before["load_error"]["difference"] < 3.0
     assert "motor torque" in done.stdout
@@ -190,17 +190,17 @@ def run(profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 
     def run(fit: Callable[..., Twin], *options: str) -> tuple[str, dict[str, Any], str]:
         monkeypatch.setattr("hdbridge.twin.twin.fit_twin", fit)
-        files = ("--json", "told.json", "--html", "page.html")
+        files = ("--json", "report.json", "--html", "page.html")
         done = run_here(profile, "twin", profile, recording, *files, *options)
         assert done.returncode == 0, done.stderr
-        told = json.loads((profile / "told.json").read_text())
-        return done.stdout, told, (profile / "page.html").read_text()
+        report = json.loads((profile / "report.json").read_text())
+        return done.stdout, report, (profile / "page.html").read_text()
 
     return run
 
 
 def test_a_better_twin_is_kept_as_pending(profile: Path, recording: Path, run: Run) -> None:
-    said, told, page = run(fitted(Truth.load(DEMO)))
+    said, report, page = run(fitted(Truth.load(DEMO)))
     assert "friction: Coulomb friction 0.068 -> 0.034 Nm" in said
     assert "unexplained: motor torque is left with 2.5 times its noise" in said
     assert f"hdbridge model commit {profile} --twin" in said
@@ -208,37 +208,37 @@ def test_a_better_twin_is_kept_as_pending(profile: Path, recording: Path, run: R
     assert pending.truth.motor.coulomb_nm == 0.034
     assert pending.provenance["recordings"] == [str(recording)]
     assert pending.provenance["axis"] == "demo"
-    assert figures(told, "after")["motor_torque"]["difference"] < 0.008
-    (friction,) = told["parameters"]
+    assert figures(report, "after")["motor_torque"]["difference"] < 0.008
+    (friction,) = report["parameters"]
     assert (friction["before"], friction["value"], friction["ci95"]) == (0.068, 0.034, [0.033, 0.035])
     assert "Errors of the initial simulation" in page
     assert "model commit" in page
 
 
 def test_a_twin_without_improvement_is_not_kept(profile: Path, run: Run) -> None:
-    said, told, page = run(fitted(Truth.load(profile)))
+    said, report, page = run(fitted(Truth.load(profile)))
     assert "not kept" in said
     assert "Coulomb friction" not in said, "nothing is known of it"
     assert "unexplained: motor torque" in said
-    assert [each["cause"] for each in told["findings"]] == ["unexplained"]
-    assert told["parameters"] == []
+    assert [each["cause"] for each in report["findings"]] == ["unexplained"]
+    assert report["parameters"] == []
     assert "What the plant is" not in page
     assert not (profile / "pending-twin.yaml").exists()
 
 
 def test_values_fitting_the_replay_only_are_offered_as_such(profile: Path, run: Run) -> None:
-    said, told, page = run(fitted(Truth.load(DEMO), "replay", 22.0))
+    said, report, page = run(fitted(Truth.load(DEMO), "replay", 22.0))
     headline = (
         "The twin replays this drive (motor torque to 4 %), but its values are not the axis's: motor torque "
         "is left with 22 times its noise; the twin is kept as pending:"
     )
     assert said.startswith(headline)
     assert "friction:" not in said, "no value is called a finding"
-    assert told["values"] == "replay"
-    assert told["verdict"].lower().startswith(headline.lower())
-    assert [(each["channel"], each["explained"]) for each in told["left"]] == [("motor torque", False)]
-    assert [each["cause"] for each in told["findings"]] == ["unexplained"]
-    assert [each["ci95"] for each in told["parameters"]] == [None]
+    assert report["values"] == "replay"
+    assert report["verdict"].lower().startswith(headline.lower())
+    assert [(each["channel"], each["explained"]) for each in report["left"]] == [("motor torque", False)]
+    assert [each["cause"] for each in report["findings"]] == ["unexplained"]
+    assert [each["ci95"] for each in report["parameters"]] == [None]
     assert headline.replace("'", "&#x27;") in page or headline.replace("'", "&#39;") in page
     assert "They are not the axis" in page
     pending = KeptTwin.load(profile / "pending-twin.yaml").truth
@@ -263,10 +263,10 @@ def test_implausible_values_are_refused(profile: Path, run: Run) -> None:
 
 
 def test_from_usual_values_a_fit_gives_estimates_and_no_changes(run: Run) -> None:
-    said, told, _ = run(fitted(Truth.load(DEMO)), "--afresh")
+    said, report, _ = run(fitted(Truth.load(DEMO)), "--afresh")
     assert "estimate: Coulomb friction 0.034 Nm (0.033 to 0.035)" in said
     assert "->" not in said
-    (friction,) = told["parameters"]
+    (friction,) = report["parameters"]
     assert friction["before"] is None
 
 

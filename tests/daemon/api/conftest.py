@@ -7,7 +7,7 @@ from support.fake_bridge import FakeBridge
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """One server for all tests of a file: each begins with a machine as it comes up."""
+    """One server for all tests of a file; each test begins with a freshly started machine."""
     with served(FakeBridge(), tmp_path_factory.mktemp("api")) as place:
         yield place
 

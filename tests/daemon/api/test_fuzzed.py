@@ -33,7 +33,7 @@ fewer = settings(max_examples=most, phases=[Phase.generate])
 
 
 def machine(case) -> str:
-    """Both axes enabled, the lease with somebody, whose token it is; the request is for an axis there is."""
+    """Enables both axes and directs the request to an existing one; returns the token of the held lease."""
     BRIDGE.__init__()
     token = BRIDGE.lease.take("the holder")
     for each in BRIDGE.axes.values():

@@ -29,7 +29,7 @@ async def served(service: Service):
 
 
 def with_client(service: Service, use: Callable[[Client], None]) -> None:
-    """Run a client's program in a thread, as if in another process."""
+    """Runs a client's program in a thread, as if in another process."""
 
     async def story() -> None:
         async with served(service) as path:

@@ -101,7 +101,7 @@ def files(folder: Path) -> tuple[Any, Any]:
 
 
 def keys(data: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """The place of every key of a file."""
+    """Returns the path of every key of a file."""
     inside = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
     for key, value in inside:
         if isinstance(key, str):
@@ -110,7 +110,7 @@ def keys(data: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 
 def without(data: Any, places: Iterable[tuple[Any, ...]]) -> Any:
-    """The same file with these keys left out, a section before its keys."""
+    """Returns the file without these keys; a section precedes its keys."""
     left = copy.deepcopy(data)
     for place in places:
         at: Any = left
@@ -121,7 +121,7 @@ def without(data: Any, places: Iterable[tuple[Any, ...]]) -> Any:
 
 
 def machine_of(folder: Path, axis: dict[str, Any], machine: dict[str, Any]) -> Machine:
-    """Read from files; InputError if a key that was left out is required."""
+    """Reads the machine from files; InputError if a required key is missing."""
     (folder / "axis1" / "axis.yaml").write_text(yaml.safe_dump(axis))
     (folder / "machine.yaml").write_text(yaml.safe_dump(machine))
     return Machine.load(folder)
@@ -137,14 +137,14 @@ def content(machine: Machine) -> str:
 
 
 def call_everything(machine: Machine, folder: Path) -> list[str]:
-    """Every call of a client against the real service; complaints about answers that it cannot read."""
+    """Makes every client call to the real service; returns complaints about unreadable answers."""
     complaints: list[str] = []
 
     def tried(name: str, call: Any, on: Any) -> None:
         try:
             call(on)
         except Exception as problem:
-            # What the daemon refuses is an answer as well.
+            # A refusal is an answer as well.
             if not isinstance(problem, HdbridgeError) or type(problem) is DaemonError:
                 complaints.append(f"{name}: {problem!r}")
 
@@ -171,7 +171,7 @@ def call_everything(machine: Machine, folder: Path) -> list[str]:
 
 
 def test_every_call_works_without_optional_keys(tmp_path: Path) -> None:
-    """Together with others: of each two keys, each is left out once where the other is there."""
+    """Of any two keys, each is left out at least once while the other is present."""
     whole = files(tmp_path)
     tried = {content(machine_of(tmp_path, *whole))}
     optional = []
@@ -202,5 +202,5 @@ def test_every_call_works_without_optional_keys(tmp_path: Path) -> None:
 def test_non_numeric_objects_are_read(value: float) -> None:
     from hdbridge.client.messages import SdoValue
 
-    told = SdoValue(index=0x2000, subindex=0, name="x", type="real32", value=value).model_dump_json()
-    assert SdoValue.model_validate_json(told).value is None
+    text = SdoValue(index=0x2000, subindex=0, name="x", type="real32", value=value).model_dump_json()
+    assert SdoValue.model_validate_json(text).value is None

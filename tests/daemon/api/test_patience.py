@@ -11,7 +11,7 @@ from hdbridge.daemon.api import guard, server
 
 @pytest.fixture(scope="module")
 def hasty(tmp_path_factory):
-    """A server that waits for a fifth of a second."""
+    """A server with a time-out of a fifth of a second."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(server, "HEAD_S", 0.2)
         patch.setattr(guard, "BODY_S", 0.2)

@@ -1,4 +1,4 @@
-"""Remote access through a reverse proxy: nginx as the docs have it, and one that only terminates TLS."""
+"""Remote access through a reverse proxy: nginx as documented, and one that only terminates TLS."""
 
 import asyncio
 import re
@@ -97,7 +97,7 @@ def until_listening(port: int, process: subprocess.Popen[bytes]) -> None:
 
 @contextmanager
 def tls_only(daemon_port: int, certificate: Path, folder: Path) -> Iterator[int]:
-    """A proxy that takes TLS off and passes every byte on."""
+    """A proxy that terminates TLS and forwards every byte."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate / "cell.pem", certificate / "cell.key")
     listening: list[int] = []

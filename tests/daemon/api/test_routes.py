@@ -26,7 +26,7 @@ from hdbridge.client import messages
     ],
 )
 def test_motion_requests_need_the_lease(api, leased, method, path, body, asked):
-    """The same request: with the lease it is done once; without, or with another token, nothing is."""
+    """The same request is executed once with the lease, and never without it or with another token."""
     url = f"/axes/joint-1/{path}"
     with api.over_socket() as stranger:
         refused = [
@@ -81,7 +81,7 @@ def test_a_lease_without_a_name_gets_the_peer_process(api):
 
 
 def test_waiting_for_a_move_renews_the_lease(api):
-    """The lease would run out before the axis arrives."""
+    """The lease would otherwise expire before the axis arrives."""
     bridge = api.bridge
     bridge.lease = type(bridge.lease)(1.5, bridge.lease._now)
     token = bridge.lease.take("patience")

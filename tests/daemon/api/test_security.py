@@ -97,7 +97,7 @@ def client_schema(api):
 )  # fmt: skip
 @pytest.mark.parametrize("over", ["over_tcp", "over_socket"])
 def test_a_foreign_host_name_is_refused(api, host, over):
-    """A page whose name was pointed at this machine asks with that name."""
+    """A page whose name was rebound to this machine sends that name as its host."""
     with getattr(api, over)(Host=host) as client:
         assert client.post("/stop").status_code == 421
     assert api.bridge.stopped == []
@@ -148,7 +148,7 @@ def test_the_daemons_own_page_is_accepted(api):
 
 
 def test_a_foreign_form_is_not_parsed_as_json(api):
-    """Without an Origin, as an old browser sends it: the type alone gives it away."""
+    """An old browser sends no Origin, so only the content type identifies the form."""
     lease = api.bridge.lease.take("form")
     with api.over_socket(**{"X-Lease": lease}) as client:
         client.post("/axes/joint-1/enable")
@@ -181,7 +181,7 @@ def test_peers_on_the_unix_socket_are_logged(api, caplog):
     caplog.set_level(logging.INFO)
     with api.over_socket() as client:
         client.post("/stop")
-        client.post("/stop")  # logged after it was answered: the first one is by now
+        client.post("/stop")  # requests are logged after the answer; the first one has been by now
     about = next(each.args for each in caplog.records if each.args and "path" in each.args)
     assert about["peer"] == f"uid={os.getuid()}:{os.getpid()}"
     assert about["status"] == 200

@@ -109,7 +109,7 @@ def test_a_stop_does_not_wait_for_its_body(api, length):
     ],
 )
 def test_a_refused_body_closes_the_connection(api, over, head, status):
-    """The rest of it is not read."""
+    """The rest of the body is not read."""
     with connected(api, over) as raw:
         raw.sendall(f"{head}\r\n".encode())
         chunk = b"4000\r\n" + b" " * 0x4000 + b"\r\n" if "chunked" in head else b" " * 0x4000

@@ -27,12 +27,12 @@ def batch(connection) -> messages.Samples:
     return messages.Samples.model_validate_json(connection.recv())
 
 
-def told(connection) -> messages.StreamAnswer:
+def next_answer(connection) -> messages.StreamAnswer:
     return messages.StreamAnswer.model_validate_json(connection.recv())
 
 
 def read_on(connection) -> None:
-    """Until it is closed."""
+    """Reads until the connection is closed."""
     while True:
         connection.recv()
 
@@ -79,11 +79,11 @@ def test_an_invalid_request_ends_the_connection_with_a_reason(api, wrong):
 
 
 def test_a_slow_client_loses_only_its_own_samples(api):
-    """A client that reads nothing for thousands of cycles gets the newest samples, and a count of others."""
+    """A client that reads nothing for thousands of cycles gets the newest ones and the number of others."""
     api.bridge.rows = 40
     with socket.socket(socket.AF_UNIX) as raw:
         raw.connect(str(api.socket))
-        # Small buffers, so that what is under way is little.
+        # Small buffers, so that little data is in transit.
         raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         with (
             unix_connect(None, "ws://hdbridge/api/v1/live", sock=raw, max_queue=1) as sleeper,
@@ -158,7 +158,7 @@ def test_a_page_of_another_origin_cannot_watch(api):
 
 @pytest.fixture
 def lease(api):
-    """Held, with the first axis enabled."""
+    """The lease, held, with the first axis enabled."""
     token = api.bridge.lease.take("stream")
     api.bridge.axes["joint-1"].at = messages.ControlState.ENABLED
     return token
@@ -181,11 +181,11 @@ def points(*positions_deg: float, end: bool = False) -> str:
 def test_stream_points_are_accepted_and_acknowledged(api, lease):
     with stream(api) as connection:
         begin(connection, lease)
-        assert told(connection).accepted == 0
+        assert next_answer(connection).accepted == 0
         connection.send(points(0.0, 0.1, 0.2))
-        assert told(connection).accepted == 3
+        assert next_answer(connection).accepted == 3
         connection.send(points(0.3, end=True))
-        assert told(connection).accepted == 1
+        assert next_answer(connection).accepted == 1
         with pytest.raises(ConnectionClosed) as closed:
             connection.recv()
     assert closed.value.rcvd.code == 1000
@@ -202,7 +202,7 @@ def test_stream_points_are_accepted_and_acknowledged(api, lease):
 def test_streaming_needs_the_lease(api, lease, first):
     with stream(api) as connection:
         connection.send(first)
-        answer = told(connection)
+        answer = next_answer(connection)
         assert answer.accepted == 0
         assert answer.problem
         with pytest.raises(ConnectionClosed):
@@ -215,7 +215,7 @@ def test_a_disabled_or_unknown_axis_is_reported(api, lease):
     for axis, words in (("joint-2", "enable it first"), ("joint-9", "joint-1, joint-2")):
         with stream(api, axis) as connection:
             begin(connection, lease)
-            assert words in told(connection).problem.detail
+            assert words in next_answer(connection).problem.detail
 
 
 @pytest.mark.parametrize(
@@ -230,9 +230,9 @@ def test_a_disabled_or_unknown_axis_is_reported(api, lease):
 def test_an_invalid_point_ends_the_stream_with_a_reason(api, lease, wrong):
     with stream(api) as connection:
         begin(connection, lease)
-        told(connection)
+        next_answer(connection)
         connection.send(wrong)
-        assert told(connection).problem
+        assert next_answer(connection).problem
         with pytest.raises(ConnectionClosed):
             connection.recv()
     (given,) = api.bridge.streams
@@ -243,16 +243,16 @@ def test_an_invalid_point_ends_the_stream_with_a_reason(api, lease, wrong):
 def test_losing_the_lease_ends_the_stream(api, lease):
     with stream(api) as connection:
         begin(connection, lease)
-        told(connection)
+        next_answer(connection)
         api.bridge.lease.take("another", force=True)
         connection.send(points(0.0))
-        assert "another" in told(connection).problem.detail
+        assert "another" in next_answer(connection).problem.detail
 
 
 def test_the_stream_ends_with_its_client(api, lease):
     with stream(api) as connection:
         begin(connection, lease)
-        told(connection)
+        next_answer(connection)
         connection.socket.shutdown(socket.SHUT_RDWR)
         (given,) = api.bridge.streams
         until(lambda: given.ended)

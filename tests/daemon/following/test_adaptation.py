@@ -1,4 +1,4 @@
-"""Adaptation of an axis, and its limits, on work that is not simulated (see test_following)."""
+"""Adaptation of an axis, and its limits, on synthetic samples."""
 
 from typing import Any
 
@@ -112,7 +112,7 @@ def test_observe_mode_changes_nothing_and_reports_the_proposal():
     assert axis.adaptation.model == MODEL
     assert {each["event"] for each in axis.history} == {"would change"}
     assert axis.follower.state().parameters["hysteresis.offset_arcsec"] == pytest.approx(4.0, abs=0.3)
-    # Turned on, it begins from the committed model: nothing that was only observed is applied at once.
+    # Once enabled, it begins from the committed model; nothing that was only observed is applied at once.
     axis.follower.adapt("on")
     begun_s = axis.time_s
     axis.works(worn(4.0), seed=9)

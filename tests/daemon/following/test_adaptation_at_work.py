@@ -1,6 +1,6 @@
 """A simulated axis whose gear changes at work, over real frames: followed and never made worse.
 
-The change of an hour is packed into minutes, with rates and intervals to match; `test_hour` takes the hour.
+An hour of change is compressed into minutes, with matching rates and intervals, in all tests but the last.
 """
 
 import pytest
@@ -17,7 +17,7 @@ OFFSET, SECOND = 12, slice(2, 4)
 
 @pytest.fixture(scope="module")
 def left_alone() -> list[float]:
-    """Three sigma over neighbouring tests without adaptation; the load encoder has no part in that."""
+    """Three sigma over neighbouring tests without adaptation; independent of the load encoder."""
     with at_work(CHANGING, None) as work:
         work.until(WORKED_S)
         return work.three_sigma_arcsec()
@@ -51,7 +51,7 @@ def test_a_load_encoder_that_fails_freezes_the_adaptation(fault: str, left_alone
     assert len(frozen) == 1
     assert begun_s <= frozen[0]["axis_time_s"]
     assert not [each for each in work.history[work.history.index(frozen[0]) :] if each["event"] == "changed"]
-    # What was learnt of the fault before it was seen is within what the rate allows, and harmless.
+    # Anything learnt from the fault before its detection is within the rate limit, and harmless.
     rate = QUICK.rate_arcsec_per_hour / 3600.0
     blind_s = frozen[0]["axis_time_s"] - begun_s + 2.0 * QUICK.interval_s
     assert abs(used_arcsec(work.adaptation) - before).max() <= rate * blind_s + 1e-9

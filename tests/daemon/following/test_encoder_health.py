@@ -1,4 +1,4 @@
-"""Faults of the load encoder are named; a gear that wears is not taken for one."""
+"""Faults of the load encoder are named; gear wear is not mistaken for one."""
 
 from functools import cache
 from pathlib import Path
@@ -34,7 +34,7 @@ MODEL = model_of()
 
 
 def judged(samples, follower=None, batch=50):
-    """The states of the encoder over the samples, each when it first came."""
+    """Returns the encoder's states over the samples, each at its first occurrence."""
     follower = follower or Follower(AXIS, MODEL)
     seen = []
     for first in range(0, len(samples), batch):
@@ -59,7 +59,7 @@ def made(truth, duration_s, seed, speed_deg_s):
 
 @cache
 def as_modelled(duration_s, seed, speed_deg_s):
-    """Most tests begin with the same samples."""
+    """Cached, because most tests begin with the same samples."""
     return made(MODEL, duration_s, seed, speed_deg_s)
 
 
@@ -104,7 +104,7 @@ def test_a_changed_gear_is_not_an_encoder_fault(truth):
 
 
 def test_gradual_wear_is_not_an_encoder_fault():
-    """The loop grows by a fifth within minutes, which no gear's does."""
+    """The loop grows by a fifth within minutes, faster than in any real gear."""
     path = moves_and_rests(360.0, PERIOD_S, 5)
     before, after = (
         SampleMaker(AXIS, MODEL, truth, 5).make(path) for truth in (MODEL, model_of(offset=38.0))
@@ -166,11 +166,11 @@ def test_no_fault_is_reported_while_the_hysteresis_state_is_unknown():
 
 
 def test_an_uncalibrated_gear_is_not_an_encoder_fault():
-    """A loop of 160 arcsec that no model predicts does all that an encoder does that has faults."""
+    """An unmodelled loop of 160 arcsec looks like every kind of encoder fault."""
     nothing = TransmissionModel(AXIS.gear.ratio)
     maker = SampleMaker(AXIS, nothing, model_of(offset=160.0, second=30.0), 3, compensated=False)
     samples = maker.make(moves_and_rests(120.0, PERIOD_S, 3, 60.0))
-    assert EncoderHealth(AXIS, MODEL).take(samples).fault is EncoderFault.JUMPED  # what it would be called
+    assert EncoderHealth(AXIS, MODEL).take(samples).fault is EncoderFault.JUMPED  # with a model
     assert [each.fault for _, each in judged(samples, Follower(AXIS, nothing))] == [None]
     samples["axes"]["load_position_deg"][len(samples) // 2 :] = samples["axes"]["load_position_deg"][0]
     assert EncoderHealth(AXIS, nothing).take(samples).fault is EncoderFault.FROZEN

@@ -1,4 +1,4 @@
-"""The recursive estimator: the same as least squares, and nothing learnt or forgotten that was not shown."""
+"""The recursive estimator equals least squares, and learns or forgets only excited parameters."""
 
 import numpy as np
 import pytest
@@ -80,7 +80,7 @@ def test_endless_forgetting_does_not_inflate_the_variance(seed, keep, shown):
         estimator.update(rows, rng.normal(size=6), SIGMA, retention=keep)
         values = np.linalg.eigvalsh(estimator.covariance)
         assert values[0] > 0.0
-    # In units of the scale: no direction is less sure than the prior or the scale.
+    # In units of the scale, no direction is less certain than the prior or the scale.
     scaled = estimator.covariance / np.outer(estimator.scale, estimator.scale)
     prior = first / np.outer(estimator.scale, estimator.scale)
     most = max(float(np.linalg.eigvalsh(prior)[-1]), 1.0)

@@ -1,4 +1,4 @@
-"""A servo that was retuned since the response in motion was measured: reported, and the response refined."""
+"""A servo retuned since the response in motion was measured is reported, and the response refined."""
 
 import math
 from dataclasses import replace
@@ -41,7 +41,7 @@ class Seen(NamedTuple):
 
 
 def seen(profile: Path, mode: Mode = "on", stuck: bool = False, **servo: float) -> Seen:
-    """Verdicts and proposals over moves there and back, with these parameters of the servo."""
+    """Returns verdicts and proposals over moves in both directions, with these servo parameters."""
     axis = AxisConfig.load(profile)
     model = replace(TransmissionModel.load(profile / "model.yaml"), response=measured_response(profile))
     truth = Truth.load(profile / "truth.yaml")
@@ -122,7 +122,7 @@ def test_refinement_needs_a_trusted_encoder_and_permission(profile: Path, mode: 
 def test_gain_and_phase_changes_are_detected_but_a_pure_delay_is_not(
     speed: float, later_ms: float, gain: float, phase_deg: float
 ) -> None:
-    """The motor answers its set-points with a gain, a phase, and its lag."""
+    """The motor follows its set-points with a gain, a phase, and its lag."""
     ratio, orders = 50.0, (2, 4)
     stored = Response(
         cycle_ms=4.0, following_lag_ms=10.0, known_to_hz=90.0, frequency_hz=(1.0, 90.0), gain=(1.0, 1.0),

@@ -27,7 +27,7 @@ def on(folder: Path, model=MODEL, settings=SETTINGS) -> Follower:
 
 
 class Machine:
-    """A follower that is given the work of one axis."""
+    """A follower that processes the work of one axis."""
 
     def __init__(self, follower: Follower) -> None:
         self.follower = follower

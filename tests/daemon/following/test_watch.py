@@ -1,4 +1,4 @@
-"""A model that holds raises nothing, wear raises `recalibrate`, anything else `something_changed`."""
+"""A valid model raises nothing, wear raises `recalibrate`, anything else `something_changed`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -72,7 +72,7 @@ def test_hours_of_normal_work_raise_nothing(seed):
 
 
 def quiet(seed, duration_s):
-    """The truth lies within the model's intervals, at their edge even."""
+    """The truth lies within the model's intervals, even at their edge."""
     sign = (-1) ** seed
     truth = model_of(31.6 + sign * HALF_WIDTH_OFFSET_ARCSEC, second(sign * HALF_WIDTH_ARCSEC))
     watch, raised = watched(truth, duration_s=duration_s, seed=seed)
@@ -151,7 +151,7 @@ def test_a_resting_axis_raises_nothing():
     assert watch.evidence is None
 
 
-def test_lost_cycles_leave_the_path_unknown_until_it_is_known_again():
+def test_lost_cycles_leave_the_path_unknown_until_it_is_re_established():
     path = moves_and_rests(900.0, PERIOD_S, 4)
     samples = SampleMaker(AXIS, MODEL, MODEL, 4).make(path)
     follower = Follower(AXIS, MODEL)

@@ -37,7 +37,7 @@ def pair() -> Iterator[SteppedDaemon]:
 
 @pytest.fixture(scope="module")
 def benches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[Character], DaemonBench]]:
-    """Gives the bench of the test before, as a daemon continues after a fault; a new one if that failed."""
+    """Reuses the previous test's bench, as a daemon continues after a fault; a new one after a failure."""
     with ExitStack() as stack:
         made: dict[Character, DaemonBench] = {}
 

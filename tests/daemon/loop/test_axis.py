@@ -21,7 +21,7 @@ S, K, E = AxisState, CommandKind, EventKind
 
 
 def record(daemon: SteppedDaemon, axis: int = 0) -> np.ndarray:
-    """The axis's samples since this was last called."""
+    """Returns the axis's samples since the last call."""
     samples, lost = daemon.samples.read()
     assert lost == 0
     return samples["axes"][:, axis]
@@ -66,7 +66,7 @@ def test_enabling_moves_nothing_and_a_move_arrives(daemon: SteppedDaemon) -> Non
     sent = rpdos(daemon)
     daemon.enable()
     daemon.run(1.0)
-    # But for the compensation, which is faded in.
+    # Except for the compensation, which is faded in.
     assert max(abs(target - sent[0][1]) for _, target in sent) < 8000 * 50 * 300 / 3600 / 360
     record(daemon)
     id_ = daemon.move(12.5)
@@ -339,7 +339,7 @@ def test_the_load_loop_removes_the_remaining_error_and_fades_out() -> None:
 
 
 def test_a_sound_load_encoder_raises_no_doubt() -> None:
-    """Reversals at rest, by one motor count and by more, in motion; all hysteresis is left to the loop."""
+    """Reversals at rest, by one count and more, and in motion; the load loop corrects all hysteresis."""
     maximum_arcsec = 60.0
     settings = LoadLoopSettings(gain_1_s=0.5, maximum_arcsec=maximum_arcsec)
     with stepped_daemon(setup=lambda _, made: replace(made, load_loop=settings)) as daemon:

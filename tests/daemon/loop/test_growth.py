@@ -1,4 +1,4 @@
-"""A loop that runs for months leaves nothing behind in a turn."""
+"""A turn of the loop leaks no memory, so it can run for months."""
 
 import gc
 import math

@@ -1,4 +1,4 @@
-"""The interface of the control process: heard before it is used, opened again when it works again."""
+"""The interface of the control process: listening before use, and reopening after a failure."""
 
 import errno
 from uuid import uuid4

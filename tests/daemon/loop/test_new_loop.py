@@ -1,4 +1,4 @@
-"""The first SYNC of a new loop, or after the bus was down, puts no buffered set-point into force."""
+"""The first SYNC of a new loop, or after the bus was down, activates no buffered set-point."""
 
 import errno
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Requests that the relay accepts, by itself and on the bus."""
+"""Requests that the relay accepts, alone and on the bus."""
 
 import pytest
 from support.daemon import SteppedDaemon

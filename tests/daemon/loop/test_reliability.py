@@ -16,7 +16,7 @@ Benches = Callable[[Character], DaemonBench]
 
 
 def in_every_run(character: Character, row: Row) -> bool:
-    """Returns True for the friendly drive, and for faults in which the firmware has a part."""
+    """Returns True for the friendly drive, and for faults that involve the firmware."""
     return character is FRIENDLY or row.fault in ABOUT_POWER
 
 

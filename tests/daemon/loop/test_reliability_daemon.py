@@ -1,4 +1,4 @@
-"""Rows of the fault table that need the daemon: clients that err, processes that end, a bus that is back."""
+"""Rows of the fault table that need the daemon: client errors, ended processes, a returning bus."""
 
 import errno
 import math
@@ -161,7 +161,7 @@ def test_invalid_targets_are_refused(moving: DaemonBench) -> None:
     daemon = moving.daemon
     for bad in (math.nan, math.inf, -math.inf, 400.1, -1e300):
         before = daemon.axes[0].set_point.velocity_deg_s
-        # A jog at a finite speed is one at most as fast as the axis may be.
+        # A jog at any finite speed is accepted, up to the speed limit of the axis.
         for kind in (K.MOVE,) if math.isfinite(bad) else (K.MOVE, K.JOG):
             id_ = daemon.post(kind, 0, a=bad, b=math.nan if kind is K.MOVE else 1.0, c=math.nan)
             daemon.turn()
@@ -238,7 +238,7 @@ def test_a_stale_position_at_enable_moves_nothing(bench: DaemonBench) -> None:
     enabled = [target for word, target in targets if word & 0x0F == ENABLE_OPERATION]
     assert enabled
     assert abs(enabled[0] - before) <= 1
-    # All that it moves from there on is the compensation's, as it is faded in.
+    # Any further motion is that of the compensation as it is faded in.
     assert abs(bench.motor_counts() - before) < 20
     further("the position in the enable command is stale").show(0)
 

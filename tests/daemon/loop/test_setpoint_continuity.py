@@ -44,7 +44,7 @@ def _command(kind: CommandKind, **fields: float) -> Event:
 
 
 def _bring_back(daemon: SteppedDaemon) -> None:
-    """Does for a client the steps to go on: verify, reset, enable."""
+    """Takes a client's steps to continue: verify, reset, enable."""
     daemon.bus.down = None
     try:
         daemon.run(0.6)
@@ -60,7 +60,7 @@ def _bring_back(daemon: SteppedDaemon) -> None:
         if daemon.states[0] is AxisState.DISABLED:
             daemon.enable(0)
     except (AssertionError, HdbridgeError):
-        daemon.run(0.2)  # it was not possible just then, and that is an answer, too
+        daemon.run(0.2)  # a refusal is an answer, too
 
 
 def _moves(daemon: SteppedDaemon, target_deg: float) -> None:
@@ -97,7 +97,7 @@ EVENTS: st.SearchStrategy[Event] = st.one_of(
 
 
 class Watch:
-    """Takes the RPDOs that enable the drive, and compares each with those before."""
+    """Compares each RPDO that enables the drive with the previous ones."""
 
     def __init__(self, daemon: SteppedDaemon) -> None:
         self.daemon = daemon
@@ -115,7 +115,7 @@ class Watch:
             return
         axis = self.daemon.axes[0]
         if self.last is None:
-            # Where the axis is, as the drive told last. It may have moved by some counts since.
+            # The position that the drive reported last; the axis may have moved by some counts since.
             actual = self.daemon.nodes[0].firmware.motion.motor_counts
             assert abs(target - actual) * DEG_PER_COUNT < 0.01, "power begins where the axis is"
         else:
@@ -129,7 +129,7 @@ class Watch:
         acceleration = (velocity - self.velocity) / PERIOD_S
         assert abs(velocity) <= limits.velocity_deg_s + 2 * rounding
         assert abs(acceleration) <= limits.acceleration_deg_s2 * 1.001 + 4 * rounding / PERIOD_S, mode
-        if mode != "STREAM":  # the one mode that need not keep it
+        if mode != "STREAM":  # the one mode without a jerk limit
             jerk = (acceleration - self.acceleration) / PERIOD_S
             assert abs(jerk) <= limits.jerk_deg_s3 * 1.001 + 8 * rounding / PERIOD_S**2, mode
         self.velocity, self.acceleration = velocity, acceleration

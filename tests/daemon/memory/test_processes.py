@@ -1,4 +1,4 @@
-"""The memory between processes: attached, hammered, killed."""
+"""The memory between processes: attaching, heavy traffic, kills."""
 
 import os
 import signal
@@ -47,9 +47,9 @@ def test_samples_are_never_torn(checked: bool) -> None:
         samples_of, events_of = memory.reader(), memory.event_reader()
         process = start(HAMMER, memory)
         try:
-            seen = lost = told = 0
+            seen = lost = event_count = 0
             last = last_event = 0
-            while seen < 50_000 or told < 500:
+            while seen < 50_000 or event_count < 500:
                 assert process.poll() is None
                 samples, missed = samples_of.read()
                 lost += missed
@@ -66,7 +66,7 @@ def test_samples_are_never_torn(checked: bool) -> None:
                 if seen:
                     assert {each for _ in range(200) for each in memory.outer[0].values()} <= {1, 2}
                 events, missed = events_of.read()
-                told += len(events)
+                event_count += len(events)
                 for event in events:
                     assert event.text == str(event.cycle) == str(event.id)
                     assert event.sequence > last_event

@@ -48,7 +48,7 @@ def test_unread_events_are_counted(memory: Memory) -> None:
     for cycle in range(EVENTS_KEPT + 10):
         memory.events.append(Event(0, cycle, 0, -1, EventKind.DONE))
     events, lost = reader.read()
-    assert lost == 11  # one more: the slot that may be under way
+    assert lost == 11  # one more: the slot that may be being written
     assert [each.cycle for each in events] == list(range(11, EVENTS_KEPT + 10))
 
 
@@ -109,7 +109,7 @@ def test_a_slot_returns_only_the_setting_of_its_number(memory: Memory) -> None:
 
 
 class MailboxMachine(RuleBasedStateMachine):
-    """The mailbox against a list."""
+    """The mailbox compared with a list."""
 
     def __init__(self) -> None:
         super().__init__()

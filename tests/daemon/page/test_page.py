@@ -1,4 +1,4 @@
-"""The live page as a person has it: in a browser, over TCP with a token."""
+"""The live page as a user sees it: in a browser, over TCP with a token."""
 
 import json
 import math
@@ -55,7 +55,7 @@ def asked(bridge, what):
 
 
 def eventually(what):
-    """The page asks in its own time."""
+    """Waits, because the page polls at its own rate."""
     return until(what, lambda: "it was never asked")
 
 
@@ -139,7 +139,7 @@ def test_an_axis_without_a_model_is_not_called_compensated(bridge, page):
 
 
 def test_labels_of_an_axis_at_rest_are_distinct(page):
-    """Half a million arcsec or a tenth of one: the labels of a chart are different numbers."""
+    """The labels of a chart differ at any scale, from a tenth of an arcsec to half a million."""
     page.until("document.querySelector('#load').innerText === '0.0003'")
     labels = page.evaluate("""import('/page/plots.js').then(({ labels }) =>
         [0.0002, 0.0005, 0.001, 0.02, 0.25, 1, 50].map((step) =>
@@ -172,10 +172,10 @@ def test_the_other_axis_is_one_key_away(bridge, page):
 
 
 def test_past_and_new_events_are_listed(place, bridge, chromium):
-    bridge.told.append(event(1, "the first"))
+    bridge.logged.append(event(1, "the first"))
     show(chromium, place)
     chromium.until("document.querySelector('#events').innerText.includes('the first')")
-    bridge.told.append(event(2, "<b>the second</b>"))
+    bridge.logged.append(event(2, "<b>the second</b>"))
     chromium.until("document.querySelector('#events').innerText.includes('<b>the second</b>')")
     assert chromium.evaluate("document.querySelectorAll('#events li').length") == 2
 

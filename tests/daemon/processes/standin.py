@@ -23,9 +23,9 @@ def main(kind: str, *arguments: str) -> int:
     begin_child(start, f"standin-{kind}")
     if status := os.environ.get(f"HDBRIDGE_TEST_{kind.upper()}"):
         return int(status)
-    told = []
+    signals = []
     wanted = []
-    signal.signal(signal.SIGTERM, lambda *_: told.append("term"))
+    signal.signal(signal.SIGTERM, lambda *_: signals.append("term"))
     signal.signal(signal.SIGUSR1, lambda *_: wanted.append(1))
     with Memory.attach(start.memory_fd) as memory:
         status = memory.status
@@ -33,7 +33,7 @@ def main(kind: str, *arguments: str) -> int:
         own = {"control": Cell.LOOP_PID, "service": Cell.SERVICE_PID, "gateway": Cell.GATEWAY_PID}
         status[own[kind]] = os.getpid()
         say(f"{kind} {os.getpid()} {start.restarts}")
-        while not told and not (kind == "control" and status[Cell.STOP_ASKED]):
+        while not signals and not (kind == "control" and status[Cell.STOP_ASKED]):
             if kind == "control":
                 status[Cell.LOOP_COUNT] = status.loop_count + 1
             else:

@@ -16,7 +16,7 @@ CYCLE_S = 0.004
 
 if __name__ == "__main__":
     begin_log(LogSettings())
-    # What the keeper asks of a machine: the whole one takes each of the processes a second to load.
+    # Only the attributes that the keeper uses; a complete machine takes each process a second to load.
     machine = SimpleNamespace(
         name="article",
         axes=(SimpleNamespace(name="article"),),

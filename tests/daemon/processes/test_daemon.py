@@ -18,10 +18,10 @@ TRUTH = Path(__file__).parents[3] / "profiles" / "article" / "truth.yaml"
 
 @pytest.mark.usefixtures("at_a_terminal")
 def test_a_whole_daemon_session(tmp_path: Path) -> None:
-    """Started, moved, its service killed, its control process killed, ended by a terminal that is closed."""
+    """Start, move, kill of the service, kill of the control process, and end by a closed terminal."""
     arguments = ("article", "--simulate", "--speed", 4, "--page", "--port", 0)
     with running(tmp_path, *arguments, name="article") as daemon:
-        daemon.until_told("READY=1")
+        daemon.until_notified("READY=1")
         state = daemon.state()
         assert state is not None  # it answers at once
         assert state["simulated"]
@@ -89,13 +89,13 @@ def test_a_whole_daemon_session(tmp_path: Path) -> None:
 
 
 def test_full_disk_then_killed_keeper(tmp_path: Path) -> None:
-    """The daemon reports that nothing is recorded, and works; then it stops the axes and ends."""
+    """The daemon reports that nothing is recorded and continues to work; then it stops the axes and ends."""
     (tmp_path / "machine.yaml").write_text(
         "schema: hdbridge.machine/1\nname: full\naxes: [{profile: article}]\nrecorder: {free_mb: 1e7}\n",
         encoding="utf-8",
     )
     with running(tmp_path, tmp_path, "--simulate", name="full") as daemon:
-        daemon.until_told("READY=1")
+        daemon.until_notified("READY=1")
         daemon.until_axis("disabled")
         daemon.ask("enable")
         recorder = daemon.until(

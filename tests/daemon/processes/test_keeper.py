@@ -23,29 +23,29 @@ class Kept:
     def __init__(self, folder: Path, **environment: str) -> None:
         self.manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self.manager.bind(str(folder / "notify"))
-        told = {
+        passed = {
             "NOTIFY_SOCKET": str(folder / "notify"), "WATCHDOG_USEC": "1000000",
             "HDBRIDGE_TEST_LOCKS": str(folder), **environment,
         }  # fmt: skip
         self.process = subprocess.Popen(
-            [sys.executable, str(PROGRAM)], env={**os.environ, **told},
+            [sys.executable, str(PROGRAM)], env={**os.environ, **passed},
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         self.said: list[str] = []
         self.events: list[dict[str, object]] = []
-        self.told: list[str] = []
+        self.notifications: list[str] = []
         self._readers = [
-            threading.Thread(target=self._read_told, daemon=True),
+            threading.Thread(target=self._read_notifications, daemon=True),
             threading.Thread(target=self._read_said, daemon=True),
             threading.Thread(target=self._read_events, daemon=True),
         ]
         for each in self._readers:
             each.start()
 
-    def _read_told(self) -> None:
-        """At once: of messages that are not read, the kernel keeps ten."""
+    def _read_notifications(self) -> None:
+        """Reads messages at once, because the kernel queues only ten."""
         while line := self.manager.recv(4096).decode():
-            self.told.append(line)
+            self.notifications.append(line)
 
     def _read_said(self) -> None:
         assert self.process.stdout is not None
@@ -68,9 +68,9 @@ class Kept:
         self.until(lambda: len(self.pids(kind)) == times, f"{kind} begins {times} times")
         return self.pids(kind)[-1]
 
-    def until_told(self, line: str) -> None:
+    def until_notified(self, line: str) -> None:
         """Waits until the service manager has received this message."""
-        self.until(lambda: line in self.told, line)
+        self.until(lambda: line in self.notifications, line)
 
     def until_ended(self) -> int:
         status = self.process.wait()
@@ -105,9 +105,9 @@ def keeper(tmp_path: Path) -> Iterator[Callable[..., Kept]]:
 
 def test_reports_readiness_and_ends_in_order(keeper: Callable[..., Kept]) -> None:
     kept = keeper()
-    kept.until_told("READY=1")
+    kept.until_notified("READY=1")
     kept.process.send_signal(signal.SIGTERM)
-    kept.until_told("STOPPING=1")
+    kept.until_notified("STOPPING=1")
     assert kept.until_ended() == 0
     assert kept.said[-2:] == ["control ends", "service ends"]
     assert [name for name in kept.names() if name in {"ready", "stopping"}] == ["ready", "stopping"]
@@ -115,20 +115,20 @@ def test_reports_readiness_and_ends_in_order(keeper: Callable[..., Kept]) -> Non
 
 def test_a_dead_or_hanging_process_is_replaced_and_the_other_continues(keeper: Callable[..., Kept]) -> None:
     kept = keeper()
-    kept.until_told("READY=1")
-    kept.until_told("WATCHDOG=1")
+    kept.until_notified("READY=1")
+    kept.until_notified("WATCHDOG=1")
     for times, number in ((1, signal.SIGKILL), (2, signal.SIGSTOP)):
         os.kill(kept.until_begun("service", times), number)
     kept.until_begun("service", times=3)
     assert len(kept.pids("control")) == 1
     assert [line.split()[2] for line in kept.said if line.startswith("service")] == ["0", "1", "2"]
-    kept.until_told("STATUS=holds article; service restarted 2 times")
+    kept.until_notified("STATUS=holds article; service restarted 2 times")
 
     os.kill(kept.until_begun("control"), signal.SIGSTOP)
     kept.until_begun("control", times=2)
     assert kept.names().count("process hangs") == 2
     assert len(kept.pids("service")) == 3
-    kept.until_told("STATUS=holds article; control restarted 1 times, service restarted 2 times")
+    kept.until_notified("STATUS=holds article; control restarted 1 times, service restarted 2 times")
 
     last = [kept.pids("control")[-1], kept.pids("service")[-1]]
     kept.process.kill()
@@ -149,7 +149,7 @@ with InterfaceLock("socketcan", "can0", Path(sys.argv[1])):
 def test_a_lent_bus_returns_however_its_borrower_ends(keeper: Callable[..., Kept], tmp_path: Path) -> None:
     """The borrower is killed, and meanwhile the service as well. Nothing else runs on the bus."""
     kept = keeper()
-    kept.until_told("READY=1")
+    kept.until_notified("READY=1")
     os.kill(kept.until_begun("service"), signal.SIGUSR1)
     kept.until(lambda: "bus is lent" in kept.said, "the bus is lent")
     assert kept.said.index("control ends") < kept.said.index("bus is lent")
@@ -170,7 +170,7 @@ def test_a_lent_bus_returns_however_its_borrower_ends(keeper: Callable[..., Kept
 
 def test_an_unused_lent_bus_returns_and_the_daemon_may_end_meanwhile(keeper: Callable[..., Kept]) -> None:
     kept = keeper()
-    kept.until_told("READY=1")
+    kept.until_notified("READY=1")
     os.kill(kept.until_begun("service"), signal.SIGUSR1)
     kept.until_begun("control", times=2)
     assert [name for name in kept.names() if "bus" in str(name)] == [
@@ -185,7 +185,7 @@ def test_an_unused_lent_bus_returns_and_the_daemon_may_end_meanwhile(keeper: Cal
 
 def test_a_dead_or_hanging_gateway_is_replaced(keeper: Callable[..., Kept]) -> None:
     kept = keeper(HDBRIDGE_TEST_WITH_GATEWAY="1")
-    kept.until_told("READY=1")
+    kept.until_notified("READY=1")
     for times, number in ((1, signal.SIGKILL), (2, signal.SIGSTOP)):
         os.kill(kept.until_begun("gateway", times), number)
     kept.until_begun("gateway", times=3)
@@ -202,9 +202,9 @@ def test_a_dead_or_hanging_gateway_is_replaced(keeper: Callable[..., Kept]) -> N
 def test_a_repeatedly_dying_control_process_ends_the_daemon(
     keeper: Callable[..., Kept], number: signal.Signals, how: str
 ) -> None:
-    """SIGTERM to it alone is a death like any other: only the keeper ends the daemon."""
+    """SIGTERM to the control process alone counts as a crash, because only the keeper ends the daemon."""
     kept = keeper()
-    kept.until_told("READY=1")
+    kept.until_notified("READY=1")
     for times in range(1, 5):
         os.kill(kept.until_begun("control", times), number)
     assert kept.until_ended() == 1

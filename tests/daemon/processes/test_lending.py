@@ -59,7 +59,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
     axis["bus"] = {"interface": "udp_multicast", "channel": channel, "options": options}
     path.write_text(yaml.safe_dump(axis))
     with started(tmp_path, "simulate", tmp_path), running(tmp_path, tmp_path, name="article") as daemon:
-        daemon.until_told("READY=1")
+        daemon.until_notified("READY=1")
         until_off(daemon)
         yield daemon
 

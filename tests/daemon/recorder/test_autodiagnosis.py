@@ -1,4 +1,4 @@
-"""From a verdict to a diagnosis next to the recording, by itself."""
+"""Automatic diagnosis after a verdict, written next to the recording."""
 
 import json
 import os
@@ -29,7 +29,7 @@ MODEL = model_of(9.0)
 
 @pytest.fixture(autouse=True)
 def priorities(monkeypatch):
-    """Records the requested priorities: a process of the lowest one would wait for all other tests."""
+    """Records the requested priorities; a process of the lowest one would wait for all other tests."""
     asked = []
     monkeypatch.setattr("os.sched_setscheduler", lambda pid, policy, param: asked.append(policy))
     monkeypatch.setattr("os.setpriority", lambda which, pid, priority: asked.append(priority))
@@ -52,12 +52,12 @@ def recorded(tmp_path_factory):
 
 def test_the_last_minutes_are_diagnosed_next_to_the_recording(recorded, priorities):
     folder, now_ns = recorded
-    told = []
+    notes = []
     diagnosis = AutoDiagnosis(folder, lambda: now_ns)
-    running = diagnosis.start("demo", MODEL.dump(), 10.0, "recalibrate: because", told.append)
-    assert diagnosis.start("demo", MODEL.dump(), 10.0, "again", told.append) is None
+    running = diagnosis.start("demo", MODEL.dump(), 10.0, "recalibrate: because", notes.append)
+    assert diagnosis.start("demo", MODEL.dump(), 10.0, "again", notes.append) is None
     running.result()
-    (words,) = told
+    (words,) = notes
     assert words.startswith("diagnosis: motor_encoder_eccentricity ("), words
     (result,) = (folder / "diagnoses").iterdir()
     assert str(result) in words
@@ -72,22 +72,22 @@ def test_the_last_minutes_are_diagnosed_next_to_the_recording(recorded, prioriti
 
 def test_a_failed_diagnosis_is_explained(recorded):
     folder, now_ns = recorded
-    told = []
+    notes = []
     diagnosis = AutoDiagnosis(folder, lambda: now_ns)
-    diagnosis.start("nose", MODEL.dump(), 10.0, "", told.append).result()
-    (words,) = told
+    diagnosis.start("nose", MODEL.dump(), 10.0, "", notes.append).result()
+    (words,) = notes
     assert "the diagnosis was not made: " in words
     assert "no axis 'nose'" in words
 
 
 def test_diagnosis_ends_with_the_service(recorded):
     folder, now_ns = recorded
-    told = []
+    notes = []
     diagnosis = AutoDiagnosis(folder, lambda: now_ns)
-    diagnosis.start("demo", MODEL.dump(), 10.0, "", told.append)
+    diagnosis.start("demo", MODEL.dump(), 10.0, "", notes.append)
     diagnosis.close()
-    assert told == []  # one that goes to its end says what it found
-    assert diagnosis.start("demo", MODEL.dump(), 10.0, "", told.append) is None
+    assert notes == []  # a diagnosis that finishes reports its findings
+    assert diagnosis.start("demo", MODEL.dump(), 10.0, "", notes.append) is None
 
 
 def test_a_diagnosis_without_findings_is_reported():

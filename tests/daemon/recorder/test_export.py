@@ -28,7 +28,7 @@ COLUMNS = ("motor_target_deg", "motor_position_deg", "load_position_deg", "motor
 
 
 def flown(folder, *batches, axes=1, model=None, **limits):
-    """The files of a flight whose seconds are the batches."""
+    """Returns the files of a flight with one batch per second."""
     log, clock = flight_log(folder, axes=axes, **limits)
     if model:
         log.put(ModelUse("demo", "4", model))

@@ -14,10 +14,10 @@ SECOND = 250
 
 
 def run(log, clock, seconds, first=0, axes=1, events=None):
-    """Second by second; ``events`` by the second in which they come."""
+    """Records second by second; ``events`` are keyed by their second."""
     for second in range(first, first + seconds):
-        told = (events or {}).get(second, ())
-        log.put(Batch(samples(SECOND, 1 + second * SECOND, axes), tuple(told)))
+        reached = (events or {}).get(second, ())
+        log.put(Batch(samples(SECOND, 1 + second * SECOND, axes), tuple(reached)))
         clock.ns = START_NS + (second + 1) * 10**9
         log.flush()
 
@@ -139,11 +139,11 @@ def test_a_mark_keeps_samples_like_a_fault(tmp_path):
 
 
 def test_kept_files_are_limited_and_removals_reported(tmp_path):
-    told = []
-    log, clock = flight_log(tmp_path, told, file_s=5.0, before_s=1.0, after_s=1.0, kept_mb=1.0)
+    reports = []
+    log, clock = flight_log(tmp_path, reports, file_s=5.0, before_s=1.0, after_s=1.0, kept_mb=1.0)
     run(log, clock, 100, events={each: [event(each + 0.5)] for each in range(5, 100, 10)})
     assert sum(each.stat().st_size for each in (tmp_path / "kept").iterdir()) <= 1.0e6
-    assert any("over 1 MB; removed: " in each for each in told)
+    assert any("over 1 MB; removed: " in each for each in reports)
 
 
 def test_lost_cycles_are_recorded(tmp_path):

@@ -15,8 +15,8 @@ from pathlib import Path
 sys.path.insert(0, "tests")
 from support.flight import flight_log, samples
 from hdbridge.daemon.recorder.flightlog import Batch
-told = []
-log, clock = flight_log(Path(sys.argv[1]), told)
+reports = []
+log, clock = flight_log(Path(sys.argv[1]), reports)
 put = 0
 def second():
     global put
@@ -31,14 +31,14 @@ for _ in range(3):
 resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 second()
 log.close()
-print(log.counts.recorded, log.counts.refused, len(told))
-print(*told, sep="\\n")
+print(log.counts.recorded, log.counts.refused, len(reports))
+print(*reports, sep="\\n")
 """
 
 
 def test_free_space_is_checked_and_dropped_cycles_are_counted(tmp_path):
-    told, free = [], [10**9]
-    log, clock = flight_log(tmp_path, told, free=lambda _: free[0], free_mb=100.0)
+    reports, free = [], [10**9]
+    log, clock = flight_log(tmp_path, reports, free=lambda _: free[0], free_mb=100.0)
     for second in range(6):
         free[0] = 99_000_000 if second in (2, 3) else 10**9
         log.put(Batch(samples(SECOND, 1 + second * SECOND)))
@@ -47,10 +47,10 @@ def test_free_space_is_checked_and_dropped_cycles_are_counted(tmp_path):
     log.close()
     assert log.counts.recorded == 4 * SECOND
     assert log.counts.refused == 2 * SECOND
-    assert len(told) == 2
-    assert "nothing is recorded" in told[0]
-    assert "less than 100 MB" in told[0]
-    assert f"{2 * SECOND} cycles were not" in told[1]
+    assert len(reports) == 2
+    assert "nothing is recorded" in reports[0]
+    assert "less than 100 MB" in reports[0]
+    assert f"{2 * SECOND} cycles were not" in reports[1]
     (path,) = tmp_path.glob("*.mcap")
     flight = read(path)
     assert len(flight.machine["cycle"]) == 4 * SECOND
@@ -61,24 +61,24 @@ def test_a_failed_write_leaves_a_whole_file_and_is_repeated(tmp_path):
     done = subprocess.run(
         [sys.executable, "-B", "-c", SCRIPT, str(tmp_path)], capture_output=True, text=True, check=True
     )
-    counts, *told = done.stdout.splitlines()
+    counts, *reports = done.stdout.splitlines()
     assert counts == "750 500 2", done.stdout
-    assert "File too large" in told[0]
+    assert "File too large" in reports[0]
     (path,) = tmp_path.glob("*.mcap")
     flight = read(path)
     assert flight.finished
-    # The chunk that failed waited for room; the two after it were not taken.
+    # The failed chunk was kept until there was room; the two after it were dropped.
     assert list(flight.machine["cycle"][[0, 249, 250, 499, 500]]) == [1, 250, 251, 500, 1001]
 
 
 def test_an_unwritable_folder_is_left_clean(tmp_path):
-    told = []
-    log, _ = flight_log(tmp_path / "inside", told)
+    reports = []
+    log, _ = flight_log(tmp_path / "inside", reports)
     (tmp_path / "inside").rmdir()
     for _ in range(3):
         log.put(Batch(samples(SECOND)))
         log.flush()
-    assert len(told) == 1
+    assert len(reports) == 1
     (tmp_path / "inside").mkdir()
     log.put(Batch(samples(SECOND)))
     log.close()

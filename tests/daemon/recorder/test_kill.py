@@ -43,7 +43,7 @@ def killed(tmp_path_factory):
             if confirmed >= 2000:
                 break
         process.send_signal(signal.SIGKILL)
-        for line in process.stdout:  # what it had said meanwhile
+        for line in process.stdout:  # output received meanwhile
             confirmed = int(line)
     return folder, confirmed
 

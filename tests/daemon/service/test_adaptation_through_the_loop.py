@@ -1,4 +1,4 @@
-"""The adaptation through the whole daemon: samples out of the loop, another model into it."""
+"""The adaptation through the whole daemon: samples from the loop, another model into it."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -37,7 +37,7 @@ def service(tmp_path: Path):
 
 @asynccontextmanager
 async def adapting(service: Service) -> AsyncIterator[tuple[ServiceBridge, str, Following]]:
-    """As the service process puts it together."""
+    """Adaptation assembled as in the service process."""
     async with service.enabled() as (bridge, token):
         made = begin(service, bridge)
         task = asyncio.get_running_loop().create_task(follow(bridge, made))

@@ -1,4 +1,4 @@
-"""Clients in disorder: leases, moves, queues, streams, stops in any order move nothing that may not."""
+"""Leases, moves, queues, streams and stops in any order cause no unpermitted motion."""
 
 import asyncio
 import tempfile
@@ -46,7 +46,7 @@ class Disorder(RuleBasedStateMachine):
         self.loop.close()
         self.stack.close()
 
-    # ---------------------------------------------------------------- how things are asked
+    # ---------------------------------------------------------------- requests
 
     def run(self, coroutine: Coroutine[Any, Any, Any]) -> Any:
         return self.loop.run_until_complete(coroutine)
@@ -74,10 +74,10 @@ class Disorder(RuleBasedStateMachine):
     token = st.integers(0, 5)
 
     def of(self, which: int) -> str:
-        """Mostly the newest token."""
+        """Returns a token, mostly the newest."""
         return self.tokens[-1] if which else self.tokens[len(self.tokens) // 2]
 
-    # ---------------------------------------------------------------- what clients do
+    # ---------------------------------------------------------------- actions of clients
 
     @rule(client=st.sampled_from(["page", "script"]), force=st.booleans())
     def take(self, client: str, force: bool) -> None:
@@ -173,7 +173,7 @@ class Disorder(RuleBasedStateMachine):
         assert self.axis.state().at_rest
         assert self.axis.motion.queued == 0
 
-    # ---------------------------------------------------------------- what is always true
+    # ---------------------------------------------------------------- laws
 
     @invariant()
     def every_target_was_one_that_may_be_sent(self) -> None:

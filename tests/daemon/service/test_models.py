@@ -134,7 +134,7 @@ def settled(bridge: ServiceBridge) -> bool:
 
 
 def watched(service: Service, bridge: ServiceBridge) -> list[tuple[list[str], list[str]]]:
-    """Wherever the effects in use and those that the API reports differ, for a second."""
+    """Returns differences between the effects in use and those that the API reports, over a second."""
     differing = []
     for _ in range(round(1.0 / service.daemon.period_s)):
         service.daemon.turn()
@@ -184,8 +184,8 @@ async def test_each_axis_keeps_its_compensation_over_restarts_of_the_control_pro
             assert used(pair) == [["synchronous"], ["hysteresis"]]
             assert [axis.state().scheme for axis in bridge.axes.values()] == [*SCHEMES.values()]
             assert [axis.state().load_loop.on for axis in bridge.axes.values()] == [False, True]
-        told = [each.text for each in bridge.events().events]
-        assert "the control process was started again: every axis is disabled" in told
+        texts = [each.text for each in bridge.events().events]
+        assert "the control process was started again: every axis is disabled" in texts
 
 
 async def test_an_axis_is_enabled_with_its_chosen_compensation_only(pair: Service) -> None:

@@ -98,8 +98,8 @@ async def test_the_end_of_a_lease_stops_a_queue_and_not_a_move(service: Service)
         await timing.sleep(2.0)
         assert axis.state().load_target_deg == stopped_deg
         assert axis.state().state == "enabled"
-        told = [each.text for each in bridge.events().events if each.kind == "note"]
-        assert "a queue of moves was stopped: the lease of its client has ended" in told
+        texts = [each.text for each in bridge.events().events if each.kind == "note"]
+        assert "a queue of moves was stopped: the lease of its client has ended" in texts
 
 
 async def test_a_lease_taken_by_force_stops_the_jog_of_the_other(service: Service) -> None:

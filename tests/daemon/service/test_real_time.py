@@ -19,7 +19,7 @@ from hdbridge.errors import RefusedError
 
 @contextmanager
 def turning(service: Service) -> Iterator[None]:
-    """The loop turns by itself, faster than its period: its clock is virtual, the service's is not."""
+    """The loop turns in a thread, faster than its period; its clock is virtual, the service's is real."""
     ended = threading.Event()
 
     def turn() -> None:
@@ -61,7 +61,7 @@ def test_many_concurrent_requests(tmp_path: Path, slower: int) -> None:
             assert second.state().load_target_deg == pytest.approx(-2.0)
             batch = await anext(feed)
             assert len(batch.samples) <= 20
-            assert batch.lost > 0  # who does not fetch loses samples
+            assert batch.lost > 0  # clients that do not fetch lose samples
             feed.close()
 
             # One client waits for a move, others look, read, and take its place.

@@ -1,4 +1,4 @@
-"""The service dies and another takes its place; the control process dies; the axes are found as they are."""
+"""A restart of the service or the control process leaves every axis in its state."""
 
 import pytest
 from support.service import Service, until
@@ -15,7 +15,7 @@ async def test_a_new_service_finds_the_axis_where_it_is(service: Service) -> Non
         await axis.compensate(token, Scheme.SYNCHRONOUS)
         await axis.motion.move(token, 30.0, wait=False)
         await bridge.core.timing.sleep(0.3)
-    service.daemon.run(3.0)  # nobody is there; the move goes to its end
+    service.daemon.run(3.0)  # without a service, the move still finishes
     assert service.daemon.states == [AxisState.ENABLED]
     async with service.bridge() as bridge:
         axis = bridge.axes["axis1"]
@@ -32,7 +32,7 @@ async def test_a_new_service_finds_the_axis_where_it_is(service: Service) -> Non
 
 
 async def test_no_request_is_made_before_the_axis_state_is_known(service: Service) -> None:
-    """A drive that still holds its axis after a quick stop is not booted because the service is young."""
+    """A drive that still holds its axis after a quick stop is not booted by a newly started service."""
     daemon = service.daemon
     daemon.verify()
     daemon.enable()
@@ -52,7 +52,7 @@ async def test_no_request_is_made_before_the_axis_state_is_known(service: Servic
 
 
 async def test_without_a_control_process_nothing_is_sent(service: Service) -> None:
-    """A request between two control processes is refused, and the next one does not find it."""
+    """A request between two control processes is refused, and the next process does not receive it."""
     async with service.ready() as bridge:
         axis, token = bridge.axes["axis1"], bridge.lease.take("test")
         status = service.daemon.memory.status

@@ -1,4 +1,4 @@
-"""Every kind of stop: report to clients and recovery, never to power without a request."""
+"""Every kind of stop: report to clients, and recovery without power unless requested."""
 
 from collections.abc import Callable
 
@@ -81,8 +81,8 @@ async def test_a_drive_that_restarts_is_verified_again_and_stays_disabled(
         with pytest.raises(SafetyStop):
             await axis.motion.move(token, 150.0)
         await until(bridge, lambda: axis.state().state == "disabled")
-        told = [each.text for each in bridge.events().events if each.kind == "note"]
-        assert "the drive was verified; the axis is disabled" in told
+        texts = [each.text for each in bridge.events().events if each.kind == "note"]
+        assert "the drive was verified; the axis is disabled" in texts
         await bridge.core.timing.sleep(1.0)
         assert axis.state().power == "switch on disabled"
         with pytest.raises(RefusedError, match="enable it first"):

@@ -21,7 +21,7 @@ SPEED_DEG_S = 60.0
 
 @pytest.fixture(scope="module")
 def blind(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Raised limits, a model with the measured response, and then no load encoder."""
+    """Raised limits, a model with the measured response, and the load encoder removed afterwards."""
     return without_load_encoder(measured_profile(tmp_path_factory.mktemp("blind") / "axis"))
 
 

@@ -70,7 +70,7 @@ def inertial_windup(site: Site) -> Hidden:
     # The same damping ratio as before.
     site.gear["damping_nm_s_per_rad"] *= heavier / math.sqrt(more)
     frequency_hz = math.sqrt(acceleration / size * ARCSEC_PER_RAD) / math.tau
-    _tell_servo(site, heavier, frequency_hz)
+    _commission_servo(site, heavier, frequency_hz)
     return Hidden(
         "inertial_windup",
         size,
@@ -80,7 +80,7 @@ def inertial_windup(site: Site) -> Hidden:
     )
 
 
-def _tell_servo(site: Site, heavier: float, frequency_hz: float) -> None:
+def _commission_servo(site: Site, heavier: float, frequency_hz: float) -> None:
     """Commissions the drive for the true load."""
     known = site.part("servo")["load_feedforward"]
     if known is not None:
