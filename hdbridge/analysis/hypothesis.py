@@ -242,8 +242,8 @@ class Estimator:
             return np.empty(0, dtype=np.intp), change
         turning, signs = branches(full.motor_deg, start)
         turns = np.array(turning[1:-1], dtype=np.intp)
-        reading = full.reading
-        error = reading.jitter_deg if full.commanded else COUNTS * CHATTER_COUNTS * reading.unaided_deg
+        count = full.reading.resolution_deg if full.commanded else CHATTER_COUNTS * full.reading.unaided_deg
+        error = max(COUNTS * count, full.reading.jitter_deg)
         beyond = (error + missed_deg(full.motor_deg, turns)) * np.array(signs[:-1])
         later, earlier = full.motor_deg.copy(), full.motor_deg.copy()
         later[turns] += beyond

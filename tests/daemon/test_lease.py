@@ -102,7 +102,7 @@ class Disorder(RuleBasedStateMachine):
         self.heard_s = 0.0
 
     def present(self) -> tuple[str, str] | None:
-        if self.holds and self.time.s - self.heard_s >= 10.0:
+        if self.holds and self.time.s >= self.heard_s + 10.0:
             self.holds = None
         return self.holds
 

@@ -46,7 +46,7 @@ class Lease:
     @property
     def holder(self) -> Holder | None:
         """Present holder; None if the lease is free."""
-        if not self._lasts and self._now() - self._heard_s >= self.timeout_s:
+        if not self._lasts and self._now() >= self._heard_s + self.timeout_s:
             self._token = None
         if self._token is None:
             return None
