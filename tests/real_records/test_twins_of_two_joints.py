@@ -25,7 +25,7 @@ def recordings_of(joint: int) -> list[Recording]:
 
 @pytest.mark.parametrize("joint", [4, 5])
 def test_typical_values_do_not_match_a_robot_joint(joint: int) -> None:
-    """Its drive lags the command by 8 ms; a usual one follows within two or three."""
+    """Its drive lags the command by 8 ms; a typical one follows within two or three."""
     truth = translate(real_records.joint_axis()).truth
     for recording in recordings_of(joint):
         row = real_records.held_against(recording, truth).row("following_error")

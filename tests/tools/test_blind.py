@@ -44,7 +44,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def shorten(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-    """Everyday suites have work of some seconds, and a calibration of a minute."""
+    """Shortens everyday suites to some seconds of work and a calibration of a minute."""
     plan = folder / "tiny.yaml"
     plan.write_text(PLAN)
     axis_of = blindcase.axis_of

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(not IS_COMPLETE, reason="user-mode-linux is not 
 
 @pytest.fixture
 def run_with(tmp_path: Path):
-    """Runs a command with programs of one's own (name: shell text) in front of the machine's."""
+    """Runs a command with stub programs (name: shell text) in place of the machine's."""
 
     def run(*options: str, **programs: str) -> subprocess.CompletedProcess[str]:
         for name, text in programs.items():
@@ -69,7 +69,7 @@ def test_real_time_priority_is_given_on_request_only(run_with, options, policy) 
 def test_two_runs_get_a_processor_each(run_with, tmp_path: Path) -> None:
     if len(os.sched_getaffinity(0)) < 2:
         pytest.skip("this machine has one processor")
-    # Each waits for the other, and says where it was with its last words.
+    # Each waits for the other, then prints its processor.
     kernel = tmp_path / "linux.uml"
     kernel.write_text(
         f"#!/bin/sh\ncd {tmp_path}; touch $$.here\n"

@@ -1,4 +1,4 @@
-"""Two records of the same commands, compared by channel, and the verdict on a twin by them."""
+"""Comparison by channel of two records of the same commands, and the verdict on a twin."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_more_friction_shows_in_the_torque(measured: Record) -> None:
     comparison = against(measured, changed(motor={"coulomb_nm": 0.068}))
     row = comparison.row("motor_torque")
     assert row is not None
-    # 0.034 Nm while it moves, and what the integral holds at rest.
+    # 0.034 Nm in motion, and the torque of the integral at rest.
     assert 0.015 < row.difference < 0.045
     assert row.in_noise > 10.0
     load = comparison.row("load_error", "sweep")
@@ -126,7 +126,7 @@ def test_a_softer_spring_settles_later_and_beyond(measured: Record) -> None:
 
 @pytest.mark.parametrize("creeps_deg", [0.0, 0.3])
 def test_holding_torque_is_not_a_difference(measured: Record, creeps_deg: float) -> None:
-    """Friction holds it by any torque between two, by the past; also if it breaks away later."""
+    """Friction holds the motor at any torque in a range; it depends on the past, not on later creep."""
     target, time_s = measured.motor_target_deg, measured.time_s
     assert target is not None
     moved = np.diff(target, prepend=target[0]) != 0.0

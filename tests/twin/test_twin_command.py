@@ -51,7 +51,7 @@ TRIPS = ((400.0, 600.0), (-450.0, 600.0), (90.0, 120.0), (-150.0, 120.0), (700.0
 
 
 def trips(truth: Truth, folder: Path) -> Path:
-    """A recording of them, a leg for each."""
+    """Records the `TRIPS`, a leg for each."""
     ends = [0.0]
 
     def lead(bench: Exercise) -> None:
@@ -97,7 +97,7 @@ def test_simulation_errors_are_reported_by_channel(profile: Path, recording: Pat
     page = (profile / "page.html").read_text()
     assert "Twin of axis" in page
     assert "truth.yaml" in page
-    # Without a transmission error, its torque and following error would be taken for motor and loops.
+    # Without a transmission error, its torque and following error would be attributed to motor and loops.
     (profile / "truth.yaml").unlink()
     done = run_here(profile, "twin", profile, recording, "--compare")
     assert "no transmission error is simulated" in done.stderr
@@ -273,7 +273,7 @@ def test_from_usual_values_a_fit_gives_estimates_and_no_changes(run: Run) -> Non
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_an_axis_is_learned_and_a_later_change_of_it_is_named(profile: Path) -> None:
-    """The whole way, with the fit itself: some 150 seconds of CPU."""
+    """Runs the whole procedure including the fit, some 150 seconds of CPU time."""
     recording = trips(Truth.load(DEMO), profile / "recording")
     done = run_here(profile, "twin", profile, recording)
     assert done.returncode == 0, done.stderr
