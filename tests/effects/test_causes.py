@@ -370,7 +370,7 @@ def test_the_slope_bound_is_tight(effect):
     assert 0.99 * bound <= falls.max() <= bound * (1 + 1e-6)
 
 
-# ---- mutations that no other test detects ---------------- --------------------------------------
+# ---- mutations that no other test detects -------------------------------------------------------
 
 
 def test_the_discrepancy_of_a_drag_is_its_derivative_by_the_exponent_of_the_thinning():

@@ -49,7 +49,7 @@ COARSE = (("cycle_ms: 4", "cycle_ms: 20"), ("counts_per_turn: 8000", "counts_per
 
 
 class Cell:
-    """A folder in which somebody improves an axis: `axis/` is the profile, `small.yaml` a plan."""
+    """A folder for the improvement of an axis: `axis/` is the profile, `small.yaml` a plan."""
 
     def __init__(self, folder, run):
         self.folder = folder

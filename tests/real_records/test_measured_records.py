@@ -192,8 +192,8 @@ def test_return_point_memory_of_the_damper_is_reported_if_visible(name: str) -> 
 def test_command_worsens_no_record(joints: dict[int, list[Record]], joint: int) -> None:
     """The recordings end in motion, the command ahead of the motor by some degrees."""
     commanded = [Record.read_csv(each) for each in measured(f"cobot-command/joint{joint}-*.csv")]
-    without, beside = (
+    without, with_command = (
         diagnose(concatenate(each), NOTHING, independent_zeros=True) for each in (joints[joint], commanded)
     )
-    assert set(names(beside)) == set(names(without))
-    assert beside.extended.rms_arcsec < 1.02 * without.extended.rms_arcsec
+    assert set(names(with_command)) == set(names(without))
+    assert with_command.extended.rms_arcsec < 1.02 * without.extended.rms_arcsec

@@ -203,7 +203,7 @@ def test_the_torque_stays_within_its_limit() -> None:
         axis.to(axis.target)
         peak = max(peak, abs(machine.torque_permille))
     assert peak == 120
-    assert abs(machine.motor_counts - axis.target) <= 1, "it comes to its target all the same"
+    assert abs(machine.motor_counts - axis.target) <= 1, "it reaches its target nevertheless"
 
 
 def test_the_torque_limit_cannot_be_set_beyond_the_drive_s_own() -> None:

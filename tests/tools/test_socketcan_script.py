@@ -84,9 +84,9 @@ def test_two_runs_get_a_processor_each(run_with, tmp_path: Path) -> None:
 
 
 def test_computing_takes_little_time_and_idle_time_is_skipped() -> None:
-    """Time is the guest's own: a machine that takes the processor away does not show in it.
+    """Time is the guest's own, so a busy machine does not affect it.
 
-    From the command's first moment, before anything has been idle: to count takes the machine a tenth of a
+    This holds from the start of the command, before any idle time. Counting takes the machine a tenth of a
     second at least. While the kernel boots, time passes eight times as fast.
     """
     counted = "i=0; while [ $i -lt 300000 ]; do i=$((i+1)); done"

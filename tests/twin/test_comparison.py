@@ -208,10 +208,10 @@ def comparison(kind: str = HELD_OUT, **differences: float) -> Comparison:
         (HELD_OUT, {"load_error": 4.0, "motor_torque": 1.0}, {"load_error": 1.0, "motor_torque": 1.2}, False,
          "motor torque differs by 1.2 Nm, before by 1"),
         (HELD_OUT, {"load_error": 4.0}, {"load_error": 4.0}, False, "no nearer"),
-        # Below the noise nothing is lost.
+        # A loss below the noise does not count.
         (HELD_OUT, {"load_error": 4.0, "motor_torque": 0.02}, {"load_error": 1.0, "motor_torque": 0.04}, True,
          "29 % smaller"),
-        # Rounding, and what a reversal leaves in third differences: a replay of the true axis has both.
+        # A replay of the true axis has rounding errors and residuals of reversals in third differences.
         (HELD_OUT, {"motor_torque": 0.08}, {"motor_torque": 0.02}, True, "75 % smaller"),
     ],
 )  # fmt: skip
@@ -229,5 +229,5 @@ def test_a_temperature_counts_beyond_the_step_of_its_reading() -> None:
     assert "75 % smaller" in better(cold, near).text
     far = comparison(load_error=1.0, temperature=0.4)
     assert "temperature differs by 0.4 K, before by 0.05" in better(cold, far).text
-    # Each a quarter: of the temperature 0.4 to 0.1, for what is within a step is none.
+    # Both fall to a quarter: the temperature from 0.4 to 0.1, as a difference within a step counts as a step.
     assert "75 % smaller" in better(comparison(load_error=4.0, temperature=0.4), near).text

@@ -148,7 +148,7 @@ def with_torque(recording: Recording, torque: np.ndarray) -> Recording:
 def test_a_check_names_changes_not_misfit(
     seen: Callable[[Recording], Recording],
 ) -> None:
-    # Shorter by less than anybody would care for, but with more inertia other rows show it.
+    # The filter is shorter by an irrelevant amount, but with more inertia other rows show it.
     near = twin(0.9 * TRUTH.servo.command_filter_ms)
     changed = recorded(seed=2, count=1, load_inertia=1.5 * TRUTH.load_.inertia_kg_m2)
     checked = check(seen(changed), AXIS, near, workers=1)

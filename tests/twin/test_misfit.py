@@ -135,7 +135,7 @@ def test_a_resting_motor_contributes_one_load_residual_and_no_torque() -> None:
 
 
 def test_a_motor_sets_out_from_the_torque_that_held_it() -> None:
-    """The replay has not been where friction holds the axis in the sense in which it came."""
+    """The recording begins at rest, so the replay lacks the motion whose friction holds the axis."""
     stiff = with_values(TRUTH, {"Coulomb friction": 0.1})
 
     def forward_and_on(bench: Exercise) -> None:
@@ -198,7 +198,7 @@ def noisy(where: str) -> Data:
 
 def test_noise_in_motion_is_estimated_for_any_motion() -> None:
     assert noise_in_motion(noisy("motion")) == pytest.approx(NOISE, rel=0.25)
-    # At rest it says nothing of it, and none is less than the rounding.
+    # Noise at rest gives no estimate for motion, and no estimate is below the rounding.
     assert noise_in_motion(noisy("rest")) == pytest.approx(noise_in_motion(as_measured()), rel=0.1)
     still = [
         replace(each, measured={name: 0.0 * column for name, column in each.measured.items()})

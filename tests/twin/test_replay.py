@@ -479,7 +479,7 @@ def test_the_second_part_counts_from_its_first_row_where_it_is_known_what_came_b
     first, second = prepare(two_tasks(), AXIS, TRUTH).pieces
     judged = second.counts["following error"] > 0.0
     assert judged.sum() == len(two_tasks().record) - two_tasks().record.starts[1]
-    assert not judged[: -int(judged.sum())].any(), "what leads up to it does not count"
+    assert not judged[: -int(judged.sum())].any(), "the motion before it does not count"
     alone = prepare(moved(two_tasks(), 5.0), AXIS, TRUTH).pieces[1]
     assert second.counts[LOAD].sum() > alone.counts[LOAD].sum() + 50
     assert first.counts[LOAD].any()

@@ -283,7 +283,7 @@ def test_the_simulated_drive_errs_as_the_model_says(name: str, monkeypatch: pyte
     left = float(np.sqrt(np.mean((error - prediction) ** 2)))
     allowed = case.left * size + case.floor_arcsec
     assert left < allowed, f"{left:.2f} arcsec of {size:.2f} are left"
-    assert allowed < 0.5 * size, "a drive that had nothing of it would pass"
+    assert allowed < 0.5 * size, "a drive without the effect would pass"
     assert [row.effect for row in translation.rows if row.counterpart is None] == []
 
 
