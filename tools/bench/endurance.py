@@ -2,7 +2,7 @@
 
     python tools/bench/endurance.py [--minutes 30] [--every SECONDS] [--idle SECONDS] [--json FILE]
 
-`hdbridge run --simulate` with all its processes and its flight recorder; first without clients, then with four
+`hdbridge run --simulate` with all its processes and the recorder; first without clients, then with four
 that poll, five that watch, a live page, and one that moves (the story of `clients.py`).
 
 A figure grows if its median over the last quarter of the run exceeds that over the second quarter by more
