@@ -1,6 +1,6 @@
 """Runs the commands of a page of the documentation in order, as printed, and compares what they print.
 
-python tools/pages.py docs/tutorial.md             run a page; print what is not as shown
+python tools/pages.py docs/tutorial.md             run a page; print the deviations
 python tools/pages.py docs/tutorial.md --write     and write today's outputs into the page
 
 A page is a shell session in a new folder:

@@ -226,7 +226,7 @@ fi
 uml "$@"
 status=$?
 if [ $status -eq $unavailable ] && [ ! -e "$work/ready" ]; then
-    # Tests of function that run at once are told apart by their kernels; here they have the interface in turn.
+    # Concurrent functional tests are separated by their kernels; here they take turns on the interface.
     if [ $force_uml = no ] && [ -n "$slowed" ] && exec {turn}>"$locks-native.lock" && flock "$turn" && native; then
         say "with this kernel's vcan instead, and with this machine's time"
         here "$@"

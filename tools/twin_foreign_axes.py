@@ -6,7 +6,7 @@ Each axis is recorded on the plan ``dynamics`` and on another motion. Its twin s
 gear's true transmission error, as from a calibration. Prints for each axis the twin's errors of following
 error and torque on the other motion, per cent of the measured signal; the number of intervals, and of those
 that contain the truth; the remarks on the twin; and the CPU time of the fit. With ``--checks``
-each axis is changed, recorded again and held against its twin.
+each axis is changed, recorded again and compared with its twin.
 """
 
 from __future__ import annotations

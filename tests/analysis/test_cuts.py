@@ -184,6 +184,6 @@ def test_command_worsens_nothing_if_a_record_ends_in_motion(cut: bool) -> None:
         "schema: hdbridge.model/1\nratio: 100\neffects:\n  - effect: synchronous\n    parameters:\n"
         "      orders: [{order: 2, amplitude_arcsec: 20, phase_deg: 0}]\n"
     )
-    without, beside = (diagnose(each, orders) for each in (record, commanded))
-    assert beside.baseline.rms_arcsec < 1.05 * without.baseline.rms_arcsec
-    assert [each.cause for each in beside.findings] == [each.cause for each in without.findings] == []
+    without, with_command = (diagnose(each, orders) for each in (record, commanded))
+    assert with_command.baseline.rms_arcsec < 1.05 * without.baseline.rms_arcsec
+    assert [each.cause for each in with_command.findings] == [each.cause for each in without.findings] == []

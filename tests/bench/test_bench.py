@@ -63,7 +63,7 @@ def test_extended_compensation_reaches_the_noise_floor(axis, model, bench_on):
     assert 115 < pooled[Scheme.NONE] < 135
     assert 115 < pooled[Scheme.SYNCHRONOUS] < 125
     assert 30 < pooled[Scheme.HYSTERESIS] < 40
-    # 33 steps each way are few for a standard deviation: the limit of 1.15 is for 240.
+    # The limit of 1.15 is for 240 steps; 33 each way give a less certain standard deviation.
     assert pooled[Scheme.BOTH] < 1.3 * comparison.quantisation_floor_arcsec
     none = comparison.results[Scheme.NONE]
     assert none.cw.mean_arcsec == pytest.approx(40, abs=4)

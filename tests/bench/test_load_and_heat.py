@@ -95,7 +95,7 @@ def test_a_mass_on_the_axis_is_compensated_with_load_torque():
     floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
     assert three_sigma[2] > 10 * floor
     assert abs(mean[2]) > 20
-    # 33 steps each way are few for a standard deviation: the limit of 1.15 is for 240.
+    # The limit of 1.15 is for 240 steps; 33 each way give a less certain standard deviation.
     assert three_sigma[3] < 1.3 * floor
     assert abs(mean[3]) < 1
 

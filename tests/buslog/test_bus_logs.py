@@ -379,7 +379,7 @@ def test_a_refused_write_is_not_the_mapping(tmp_path: Path, logged: Logged) -> N
 
 
 def synthetic(count: int = 200) -> tuple[np.ndarray, np.ndarray]:
-    """Counts of motor and load of a sweep one way."""
+    """Counts of motor and load in a one-way sweep."""
     motor = np.round(np.linspace(0.0, 3.0 * 8000, count)).astype(int)
     return motor, np.round(motor * 7.2).astype(int)
 

@@ -25,7 +25,7 @@ validation: {count: 8, cycles: 2, travel_deg: 10}
 
 
 class Cell:
-    """A folder in which somebody calibrates an axis: `axis/` is the profile, `short.yaml` a plan."""
+    """A folder for the calibration of an axis: `axis/` is the profile, `short.yaml` a plan."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

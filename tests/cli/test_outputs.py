@@ -1,4 +1,4 @@
-"""An output destroys nothing: refused before anything is computed, or written straight through."""
+"""Outputs destroy nothing: they are refused before anything is computed, or written directly."""
 
 import json
 import os

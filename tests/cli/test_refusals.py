@@ -44,16 +44,16 @@ NEEDED = {
     ("fleet", "run", "--out"), ("fleet", "run", "--manifest"),
     ("fleet", "watch", "--out"), ("fleet", "watch", "--manifest"),
 }  # fmt: skip
-"""Options that a command cannot do without, except in another use of it."""
+"""Options that a command needs, except in another use of it."""
 PARENTS_MADE = {
     ("new", "NAME"), ("record", "export", "--out"), ("record", "import", "--out"),
     ("fleet", "run", "--out"), ("fleet", "watch", "--out"), ("fleet", "simulate", "FOLDER"),
 }  # fmt: skip
-"""A folder that is not there is right, with its parents."""
+"""A missing folder is valid, also with missing parents."""
 BY_ANOTHER = {("setup", "NAME"), ("setup", "--eds")}
 """Refused by the command that `setup` prints and runs."""
 PRINTS = {("doctor",)}
-"""Its checks are a list, the file's among them."""
+"""Its checks are a list that includes those of the file."""
 
 
 @dataclass(frozen=True)

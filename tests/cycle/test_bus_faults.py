@@ -83,7 +83,7 @@ def test_a_latched_axis_gets_no_rpdo_while_the_other_moves(pair: TwoAxes) -> Non
     assert [can_id for _, can_id, _ in pair.bus.sent].count(0x202) == 20
     assert pair.axes[0].silent
     pair.axes[0].begin()
-    assert pair.axes[0].silent, "a latch is not released by beginning anew"
+    assert pair.axes[0].silent, "a latch is not released by a new start"
 
 
 def test_nothing_enables_a_latched_axis_automatically(pair: TwoAxes) -> None:

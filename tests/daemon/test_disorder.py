@@ -27,7 +27,7 @@ from hdbridge.errors import HdbridgeError
 
 K = CommandKind
 TRAVEL_DEG = 3.0
-"""Short, so that the ends are met often."""
+"""Short, so that the limits are reached often."""
 KINDS = list(K)
 axes = st.integers(0, 1)
 angles = st.one_of(

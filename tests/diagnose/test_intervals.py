@@ -26,7 +26,7 @@ from hdbridge.records.record import Record
 Columns = Callable[..., dict[str, Any]]
 SEEDS = range(10, 20)
 LEAST = 0.9
-"""Share of truths that intervals have to hold."""
+"""Minimum share of truths within the intervals."""
 
 
 def held(parameter: Parameter, name: str, truth: float) -> bool:

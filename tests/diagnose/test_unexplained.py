@@ -19,7 +19,7 @@ LOOPS = {"hysteresis_parameters", "hysteresis_memory"}
 
 
 def test_local_unknown_effects_are_unexplained(diagnosed: Callable[..., Diagnosis]) -> None:
-    """Less than half an arcsecond rms is left of it, as much as a cause needs at its peak."""
+    """Its residual is below half an arcsecond rms; a cause needs as much at its peak."""
     (found,) = diagnosed({"unknown": {"kind": "packet", "size": 5.0, "width": 8.0}}).findings
     assert found.cause == "unexplained"
     assert found.left_arcsec < 0.5 < found.peak_arcsec < 6.0

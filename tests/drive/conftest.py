@@ -48,7 +48,7 @@ def make_axis(**changes: Any) -> AxisConfig:
 class PeerBus(can.BusABC):
     """The master's end of a virtual channel: peers answer whenever the master sends or waits.
 
-    Single-threaded. A peer is called with nothing and reads and writes a virtual bus of its own. Waiting
+    Single-threaded. A peer is called without arguments and reads and writes a virtual bus of its own. Waiting
     advances the clock, in steps of ``step_s``, until something has come.
     """
 
@@ -127,7 +127,7 @@ def peer_bus(bus: PeerBus, channel: str) -> Iterator[can.BusABC]:
 
 
 class TinyDrive:
-    """A CiA-402 node as small as it can be: SDO server, NMT, heartbeat, states, PP and HM. No PDOs.
+    """A minimal CiA-402 node: SDO server, NMT, heartbeat, states, PP and HM. No PDOs.
 
     Its objects are those of the EDS. `scripts` replaces the answer to one object: a function from the request
     to the frames that are sent back. `stuck` objects take no value; `silent` answers nothing at all.

@@ -60,7 +60,7 @@ def test_an_absent_drive_is_named_within_a_bounded_time(
 
 
 def booting(tiny: Any, boot_up_s: float | None, sdo_s: float) -> None:
-    """After a reset its boot-up message and its SDO server come that late, counted from the reset."""
+    """Delays boot-up message and SDO server by these times after a reset."""
     nmt, sdo, clock = tiny.nmt, tiny.sdo, tiny.clock
     reset_s = [0.0]
     announced = [True]
@@ -229,7 +229,7 @@ def test_a_value_that_is_not_kept_is_detected(
 
 
 def refusing(code: int, held: int = 0) -> Callable[[bytes], list[bytes]]:
-    """A script for an object that can be read, and refuses to be written."""
+    """A script for an object that can be read but not written."""
 
     def answer(request: bytes) -> list[bytes]:
         if request[0] >> 5 == 2:
@@ -273,7 +273,7 @@ def test_a_write_only_object_is_written(drive: Drive, tiny: Any) -> None:
     tiny.od[0x605A].access_type = "wo"
     tiny.scripts[0x605A, 0] = lambda request: [b"\x60" + request[1:4] + bytes(4)]
     assert 0x605A in {row.index for row in drive.boot().written}
-    tiny.od[0x605A].access_type = "rw"  # the drive itself knows better
+    tiny.od[0x605A].access_type = "rw"  # unlike the drive itself
     tiny.scripts[0x605A, 0] = lambda request: [
         b"\x80" + request[1:4] + (0x06010001).to_bytes(4, "little")
         if request[0] >> 5 == 2

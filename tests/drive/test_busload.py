@@ -19,7 +19,7 @@ def with_bus(axis: AxisConfig, bitrate_bps: int) -> AxisConfig:
 
 
 def stuffed_bits(bits: list[int]) -> list[int]:
-    """Applies the bit-stuffing rule: after five equal bits follows one of the other kind."""
+    """Applies the bit-stuffing rule: a complementary bit follows five equal ones."""
     sent: list[int] = []
     alike = 0
     for bit in bits:
@@ -45,7 +45,7 @@ def test_no_frame_is_longer_than_the_worst_case(length: int, data: st.DataObject
 
 @pytest.mark.parametrize("length", range(9))
 def test_the_worst_case_frame_exists(length: int) -> None:
-    # Five alike, then four of the other kind in turns: each stuff bit begins the next run.
+    # Five equal bits, then alternating runs of four: each stuff bit begins the next run.
     bits, value = [0] * 5, 1
     while len(bits) < 34 + 8 * length:
         bits += [value] * 4

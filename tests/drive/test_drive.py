@@ -1,4 +1,4 @@
-"""Enabling, moving, homing, faults, and that a drive is never left enabled."""
+"""Enabling, moving, homing and faults; a drive is never left enabled."""
 
 import math
 import struct
@@ -221,7 +221,7 @@ def test_leaving_disables_and_ends_operation(bus: Any, clock: Any, tiny: Any, ax
 
 @pytest.fixture
 def session(bus: Any, clock: Any, tiny: Any, axis: AxisConfig) -> Callable[[Callable[[Drive], object]], None]:
-    """Opens a drive, enables it, does something, and leaves."""
+    """Opens and enables a drive, acts on it, and leaves."""
 
     def run(do: Callable[[Drive], object]) -> None:
         with Drive(bus, axis, clock, tiny.od) as drive:

@@ -23,7 +23,7 @@ def free_port() -> int:
 
 @pytest.fixture
 def multicast() -> BusConfig:
-    """A multicast channel of this test's own; the test is skipped where the machine carries none."""
+    """A multicast channel of this test's own; skips the test if the machine has no multicast."""
     config = BusConfig(interface="udp_multicast", channel=GROUP, options={"port": free_port()})
     try:
         with open_bus(config, shared=True) as near, open_bus(config, shared=True) as far:

@@ -111,7 +111,7 @@ def test_impossible_angles_are_refused(deg: float, axis: AxisConfig) -> None:
 
 def test_before_power_the_target_is_the_actual_position(axis: AxisConfig) -> None:
     image = ProcessImage(axis)
-    # Beyond int32, by way of a wrap, and outside the limits: still no reason to send another target.
+    # Even beyond int32, after a wrap, and outside the limits, no other target is sent.
     image.seed(motor_counts=2**31 - 10, load_counts=5, statusword=0x0040)
     image.accept(0x181, tpdo1(0x0040, -(2**31) + 10))
     assert image.motor_counts == 2**31 + 10

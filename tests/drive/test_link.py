@@ -76,7 +76,7 @@ def test_an_interface_that_went_down_stays_down(closing: deque[can.BusABC], code
     link = link_to(closing, FakeBus(gone, None, message()))
     with pytest.raises(BusError, match=r"can0.*cannot receive"):
         link.recv(0.0)
-    # SocketCAN says it once and is silent from then on.
+    # SocketCAN reports it once and is silent from then on.
     for call in (lambda: link.recv(0.0), lambda: link.send(1, b"")):
         with pytest.raises(BusError, match="can0"):
             call()

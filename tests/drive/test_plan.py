@@ -13,7 +13,7 @@ from hdbridge.errors import InputError
 
 
 def values(axis: AxisConfig, od: Any = None) -> dict[tuple[int, int, int], int]:
-    """The last value of each object."""
+    """Returns the last value of each object."""
     return {(row.node_id, row.index, row.sub): row.value for row in plan(axis, od)}
 
 

@@ -139,7 +139,7 @@ def test_four_bytes_for_a_shorter_object(
 
 
 def endless(tiny: Any, chunk: bytes) -> None:
-    """Answers every segment, and none is the last."""
+    """Answers every segment without ever marking a last one."""
     original = tiny.sdo
 
     def serve(request: bytes) -> None:

@@ -1,4 +1,4 @@
-"""The CiA-402 state table: decoding, every legal and every illegal transition, ways, the diagram."""
+"""The CiA-402 state table: decoding, every legal and every illegal transition, paths, the diagram."""
 
 from itertools import pairwise, product
 
@@ -29,7 +29,7 @@ STATUSWORDS = {
     State.FAULT: 0x0008,
 }
 LEGAL = {(row.source, row.command) for row in TRANSITIONS if row.command}
-# Written out once more on purpose, from CiA 402-2, so that a slip in the table is not its own proof.
+# Copied independently from CiA 402-2, so that an error in the table is detected.
 EXPECTED_LEGAL = {
     (State.SWITCH_ON_DISABLED, Command.SHUTDOWN): State.READY_TO_SWITCH_ON,
     (State.READY_TO_SWITCH_ON, Command.SWITCH_ON): State.SWITCHED_ON,
@@ -103,7 +103,7 @@ def test_paths_into_and_out_of_power() -> None:
     assert list(states_on_the_way(State.SWITCH_ON_DISABLED, State.OPERATION_ENABLED)) == up
     assert [controlword_for(state, State.OPERATION_ENABLED) for state in up] == [0x06, 0x07, 0x0F, 0x0F]
     assert controlword_for(State.OPERATION_ENABLED, State.SWITCH_ON_DISABLED) == 0x00
-    # Resuming out of a quick stop (16) is never implied: the way back is by 'switch on disabled'.
+    # Resuming out of a quick stop (16) is never implied; recovery is by 'switch on disabled'.
     resumed = list(states_on_the_way(State.QUICK_STOP_ACTIVE, State.OPERATION_ENABLED))
     assert resumed[1] is State.SWITCH_ON_DISABLED
 
@@ -170,7 +170,7 @@ def test_a_drive_that_drops_out_is_not_enabled_again(word: int, controlword: int
     walk.observe(word)
     assert walk.aim is not State.OPERATION_ENABLED
     assert walk.controlword() == controlword
-    # Even when the drive should come back by itself.
+    # Even if the drive recovers on its own.
     walk.observe(0x0027)
     assert walk.controlword() != 0x0F
 

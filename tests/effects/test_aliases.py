@@ -1,4 +1,4 @@
-"""Look-alikes are so in both directions."""
+"""Aliases are symmetric."""
 
 from hdbridge.axis.effects import CATALOGUE, aliases_of
 

@@ -169,7 +169,7 @@ def test_skew_is_what_a_late_sample_shows_also_while_it_accelerates():
     assert np.ptp(measured) > 1000
 
 
-def test_a_load_lags_while_it_is_sped_up():
+def test_a_load_lags_while_accelerating():
     effect = InertialWindup(ratio=50, inertia_over_stiffness_s2=1 / (2 * math.pi * 50) ** 2)
     motion = Motion(
         np.zeros(1), motor_speed_deg_s=np.zeros(1), motor_acceleration_deg_s2=np.array([200.0 * 50])
@@ -365,12 +365,12 @@ STEEP = [
 def test_the_slope_bound_is_tight(effect):
     angle = np.linspace(0, 1000, 200_001)
     falls = -np.diff(effect.predict(Motion(angle), Start.BACKWARD)) / np.diff(angle)
-    falls = falls[1:]  # in the first step the direction changes, which is the command's doing
+    falls = falls[1:]  # in the first step the direction changes, which the command causes
     bound = effect.slope_bound_arcsec_per_deg()
     assert 0.99 * bound <= falls.max() <= bound * (1 + 1e-6)
 
 
-# ---- what a mutation run showed that no other test notices --------------------------------------
+# ---- mutations that no other test detects -------------------------------------------------------
 
 
 def test_the_discrepancy_of_a_drag_is_its_derivative_by_the_exponent_of_the_thinning():

@@ -31,7 +31,7 @@ CLOSE = {"rtol": 1e-9, "atol": 1e-7}
 
 
 def law(test):
-    """Hold every effect of the catalogue to it."""
+    """Applies a law to every effect of the catalogue."""
     return pytest.mark.parametrize("name", NAMES)(settings(max_examples=12, deadline=None)(test))
 
 
@@ -49,7 +49,7 @@ def test_every_effect_is_tested():
     probes=st.lists(st.floats(-3000, 3000), max_size=4),
 )
 def test_an_effect_on_any_path_obeys_the_laws(name, data, motion, start, factor, away, probes):
-    """One draw for all: to draw an effect and a path takes far longer than to try a law on them."""
+    """One draw serves all laws, because drawing an effect and a path takes far longer than testing a law."""
     effect = data.draw(EXAMPLES[name])
     parameters_go_out_and_come_back(effect)
     prediction_is_columns_times_coefficients(effect, motion, start)
@@ -107,7 +107,7 @@ def batch_equals_on_line_and_peeking_changes_nothing(effect, motion, start, prob
 
 
 def error_falls_no_steeper_than_its_slope_bound(effect, motion, start, away):
-    """Seen from one state, as the inverse sees it: between any two angles that it may try."""
+    """From one state, as in the inverse, between any two angles that it may try."""
     bound = effect.slope_bound_arcsec_per_deg()
     tracker = effect.tracker(start)
     for angle, now in zip(motion.motor_deg, moments(motion), strict=True):
@@ -140,7 +140,7 @@ def nothing_moved_and_nothing_recorded_is_no_trouble(effect):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_memory_of_a_tracker_does_not_grow(name):
-    """Not with time, and not with ever smaller loops within loops, each of them worth remembering."""
+    """Neither time nor ever smaller nested loops, each of them significant, make it grow."""
     tracker = CATALOGUE[name].candidate(50.0, BASE).tracker()
     if isinstance(tracker, Memoryless):
         return
@@ -161,8 +161,8 @@ def test_memory_of_a_tracker_does_not_grow(name):
     sign=st.sampled_from([-1.0, 1.0]),
     gentle=st.booleans(),
 )
-def test_after_its_memory_a_tracker_has_forgotten_where_it_began(name, data, excursions, steps, sign, gentle):
-    """Two of different pasts agree once both have run so far in one direction."""
+def test_beyond_its_memory_a_tracker_is_independent_of_its_start(name, data, excursions, steps, sign, gentle):
+    """Two trackers with different pasts agree after this much travel in one direction."""
     effect = data.draw(EXAMPLES[name])
     trackers = [
         (effect.gentle_tracker(start, 30.0) if gentle else None) or effect.tracker(start) for start in Start

@@ -15,7 +15,7 @@ PLAIN, MEMORY = Hysteresis(**GEAR), HysteresisMemory(**GEAR)
 
 
 def finely(*turns):
-    """A path through these angles, 1/500 of each leg at a time."""
+    """A path through these angles in steps of 1/500 of each leg."""
     legs = [np.linspace(a, b, 500, endpoint=False) for a, b in pairwise(turns)]
     return Motion(np.concatenate([*legs, turns[-1:]]))
 
@@ -42,7 +42,7 @@ def test_excursions_that_are_undone_are_forgotten(shares, first, beyond):
     np.testing.assert_allclose(with_them[-2:], without[-2:], atol=1e-6)
 
 
-# Small steps stay within the width, where there is something to remember; large ones wipe it out.
+# Small steps stay within the width and fill the memory; large ones erase it.
 grid_steps = st.one_of(st.integers(-4, 4), st.integers(-4, 4), st.integers(-30, 30))
 
 
@@ -66,7 +66,7 @@ def test_the_law_is_a_sum_of_stop_operators(path, start):
 
 
 def test_hundreds_of_nested_loops_are_followed_without_a_jump():
-    """More than it remembers: the innermost are merged, by no more than their own height."""
+    """Beyond its capacity the innermost loops are merged, with an error below their own height."""
     tracker = MEMORY.tracker(Start.FORWARD)
     turns = [(-1) ** i * 9.0 * (1 - i / 700) for i in range(600)]
     for angle in turns:

@@ -29,7 +29,7 @@ PULL, BEGIN_DEG = 0.08, 215.0
 
 @pytest.fixture(scope="module")
 def taut_cable(tmp_path_factory: pytest.TempPathFactory) -> Iterator[type[Effect]]:
-    """Its class, registered by the page's own code."""
+    """The effect's class, registered by the page's own code."""
     (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     path = tmp_path_factory.mktemp("effects") / "taut_cable.py"
     path.write_text(code, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""EDS files as vendors ship them: encodings, letter case, odd numbers, compact descriptions."""
+"""EDS files as vendors ship them: encodings, letter case, unusual numbers, compact descriptions."""
 
 # ruff: noqa: E501  (tables)
 
@@ -191,7 +191,7 @@ def test_the_first_of_duplicate_keys_or_sections_counts(tmp_path, original):
     assert described(found.dictionary) == original
 
 
-def test_compact_objects_are_spelt_out(tmp_path):
+def test_compact_objects_are_expanded(tmp_path):
     found = described(read(tmp_path, COMPACT).dictionary)
     assert [found[0x1003, sub][0] for sub in range(4)] == [
         "Number of entries",
@@ -205,7 +205,7 @@ def test_compact_objects_are_spelt_out(tmp_path):
     assert found[0x1A00, 0][0] == "Number"
 
 
-def test_compact_pdos_are_spelt_out_next_to_those_with_sections(tmp_path):
+def test_compact_pdos_are_expanded_next_to_those_with_sections(tmp_path):
     lacking = re.sub(r"\[1(4|6|8|A)0[123](sub\d)?\][^[]*", "", TEXT).replace(
         "CompactPDO=0", "CompactPDO=0x13"
     )

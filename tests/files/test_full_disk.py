@@ -1,4 +1,4 @@
-"""A disk that is full or takes nothing: the old file stands, and nothing that fills the disk is left."""
+"""On a full or read-only disk the old file remains, and no part of the new one is left."""
 
 import subprocess
 import sys
@@ -20,7 +20,7 @@ except OutputError as error:
 """
 
 
-def test_the_old_file_stands_and_no_part_of_the_new_one_remains(tmp_path):
+def test_the_old_file_remains_and_no_part_of_the_new_one(tmp_path):
     path = tmp_path / "model.yaml"
     path.write_text("old")
     done = subprocess.run(

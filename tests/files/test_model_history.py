@@ -275,7 +275,7 @@ def test_a_kill_at_any_moment_leaves_a_usable_profile(profile):
         numbered = [each for each in versions if each.number]
         assert [each.number for each in numbered] == list(range(len(numbered), 0, -1))
         assert sum(each.active for each in numbered) == 1
-        assert len(numbered) >= 3 + attempt, "what was committed before the kill is there"
+        assert len(numbered) >= 3 + attempt, "the model committed before the kill is present"
         active = next(each for each in numbered if each.active)
         went_back = store.rollback(profile, "after the kill", DATE)
         assert went_back != active.number

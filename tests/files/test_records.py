@@ -216,7 +216,7 @@ def test_a_span_of_time_includes_both_ends():
     assert len(one.between(1.0, 2.0)) == 0
 
 
-def test_a_long_record_takes_the_fast_way(tmp_path, monkeypatch):
+def test_a_long_record_takes_the_fast_path(tmp_path, monkeypatch):
     path = tmp_path / "long.csv"
     one = record(samples=20_000, travel_deg=3.3)
     one.write_csv(path)

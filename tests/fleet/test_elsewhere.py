@@ -1,4 +1,4 @@
-"""Recordings that lie elsewhere: in S3 and behind SFTP, on real servers here; in flight recordings."""
+"""Recordings in S3 and behind SFTP (on real servers), and in flight recordings."""
 
 import asyncio
 import gc

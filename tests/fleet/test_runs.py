@@ -1,4 +1,4 @@
-"""Runs over small fleets on a real Dask cluster: the same Parquet however they went."""
+"""Runs over small fleets on a real Dask cluster: the same Parquet however the run went."""
 
 import gc
 import os

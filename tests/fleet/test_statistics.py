@@ -144,7 +144,7 @@ def test_a_passed_limit_is_reached_now():
     assert trend.hours_to(5.0).high == 0.0
 
 
-def test_one_recording_has_no_trend_and_neither_has_nothing():
+def test_one_or_no_recording_has_no_trend():
     alone = Series(np.array([5.0]), np.array([1.0]), np.array([0.1]))
     assert trends([alone]) == [None]
     assert trends([]) == []

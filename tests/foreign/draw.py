@@ -91,7 +91,7 @@ class Truth:
 
 
 class _Lot:
-    """Random draws of a seed: even, log-even, one of several."""
+    """Random draws of a seed: uniform, log-uniform, one of several."""
 
     def __init__(self, *seed: int) -> None:
         self._rng = np.random.default_rng(seed)

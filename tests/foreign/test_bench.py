@@ -67,7 +67,7 @@ def test_the_same_seed_gives_the_same_record_over_the_bus(structure, tmp_path):
     assert record(tmp_path / "one") == record(tmp_path / "two")
 
 
-def test_the_stepping_test_measures_what_the_static_law_says(tmp_path):
+def test_the_stepping_test_measures_the_static_law(tmp_path):
     with foreign_bench(1, "observed", tmp_path) as bench, Drive(bench.bus, bench.axis, bench.clock) as drive:
         drive.boot()
         outcome = Bench(drive).run(Stepping(count=12)).outcome

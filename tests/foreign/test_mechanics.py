@@ -87,7 +87,7 @@ def test_without_losses_energy_is_kept_and_with_them_it_never_grows(axis):
         plant.state[0]["motor_speed"], plant.state[0]["load"] = 40.0, 3e-4
         energy = advance(plant, 1.0, every=10)[:, 4]
         if loss:
-            assert np.diff(energy).max() < 1e-4 * energy[0]  # what the integrator swings to and fro
+            assert np.diff(energy).max() < 1e-4 * energy[0]  # oscillation of the integrator
             assert energy[-1] < 0.7 * energy[0]
         else:
             assert energy == pytest.approx(energy[0], rel=0.01)

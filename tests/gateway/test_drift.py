@@ -1,4 +1,4 @@
-"""Two clocks for a day: the set-points of the other master lose nothing and are one inner cycle late."""
+"""Two clocks drift for a day: no set-point of the other master is lost, and each is one inner cycle late."""
 
 from bisect import bisect_right
 from collections import deque

@@ -1,4 +1,4 @@
-"""The fault table on the bus of the other master: each fault is survived, or stops the axis in its time."""
+"""The fault table on the other master's bus: each fault is survived, or stops the axis within its time."""
 
 import math
 

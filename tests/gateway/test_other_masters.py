@@ -188,7 +188,7 @@ class Master:
         self.listen()
 
     def next(self, can_id):
-        """The next frame with an identifier, within a second; those before it are past."""
+        """Returns the next frame with an identifier, within a second; earlier frames are discarded."""
         for _ in range(250):
             for place, (heard_id, data) in enumerate(self.heard):
                 if heard_id == can_id:

@@ -22,7 +22,7 @@ STATE, ENABLED, FAULT, OFF = 0x6F, 0x27, 0x08, 0x40
 
 
 async def stands(bench, duration_s=0.3, within_deg=0.003):
-    """The load does not move by itself, whatever the PLC sends meanwhile."""
+    """Checks that the load does not move, whatever the PLC sends meanwhile."""
     place = bench.load_deg
     for _ in range(round(duration_s / 0.02)):
         await bench.wait(0.02)
@@ -30,7 +30,7 @@ async def stands(bench, duration_s=0.3, within_deg=0.003):
 
 
 async def faulted(bench, *codes, within_s=1.0):
-    """The outer side is in FAULT with one of these codes; the drive has no power in the end."""
+    """Checks FAULT with one of these codes on the outer side, and then a drive without power."""
     plc = bench.plc
     await bench.until(lambda: plc.statusword & 0x4F == FAULT, within_s)
     assert set(plc.emergencies) & set(codes), [hex(each) for each in plc.emergencies]
@@ -38,7 +38,7 @@ async def faulted(bench, *codes, within_s=1.0):
 
 
 async def reset(bench):
-    """Fault reset by an edge, then motion."""
+    """Resets the fault by an edge, then requests motion."""
     plc = bench.plc
     plc.plan = lambda cycle: None
     plc.controlword = 0
@@ -50,7 +50,7 @@ async def reset(bench):
 
 
 async def go(bench):
-    """The way to operation enabled, and motion."""
+    """Leads the node to operation enabled, then requests motion."""
     bench.plc.plan = lambda cycle: None
     bench.plc.emergencies.clear()
     await bench.wait(1.0)  # the inner drive is prepared again
@@ -380,9 +380,9 @@ async def test_a_withdrawn_power_request_is_not_executed(bench, withdraw, seen):
     if seen == "ENABLING":
         assert not any(axis["mode"] == MotionMode.FOLLOW)
     driven = axis["load_target_deg"][axis["state"] == AxisState.ENABLED]
-    assert np.ptp(driven) < 0.01  # the target begins at the load encoder; 1 degree was asked for
+    assert np.ptp(driven) < 0.01  # the target begins at the load encoder; 1 degree was requested
     await stands(bench)
-    if withdraw is not client_by_force:  # who has it now, and at rest
+    if withdraw is not client_by_force:  # the present holder, at rest
         assert bench.daemon.states[0].name == "DISABLED"
 
 

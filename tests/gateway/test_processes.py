@@ -27,7 +27,7 @@ COUNTS_PER_DEG = 36_000
 
 
 class Patient(BaseNode402):
-    """A busy machine may be slow; the class is as it is."""
+    """Only extends the time-outs, because a busy machine may be slow."""
 
     TIMEOUT_SWITCH_STATE_FINAL = 60.0
     TIMEOUT_SWITCH_STATE_SINGLE = 30.0

@@ -1,8 +1,8 @@
-"""Something is hidden in the axis by its physics: the diagnosis names it, the extended model makes up for it.
+"""A cause is hidden in the axis by its physics: the diagnosis names it, the extended model compensates it.
 
 One bench for each cause of the catalogue, for pairs, for nothing, for another hysteresis law, and for causes
 that are not in the catalogue. Sizes are 5 arcsec at the load (an interpolation error 2) under readings with
-0.3 arcsec of noise. Each plan is what an engineer would run who suspects the cause.
+0.3 arcsec of noise. Each plan suits an engineer who suspects the cause.
 """
 
 import json
@@ -79,17 +79,17 @@ AT_REST = replace(STEPPING, settle=Settle(minimum_s=1.0))
 
 
 def lagging() -> Truth:
-    """The axis whose gear follows its temperature sensor with a minute."""
+    """The axis whose gear follows its temperature sensor with a lag of a minute."""
     data = bare_truth().model_dump(by_alias=True)
     data["temperature"]["zero_time_constant_s"] = 60.0
     return Truth.model_validate(data)
 
 
 def greased() -> Truth:
-    """The axis whose servo was set up with the drag of its grease on.
+    """The axis whose servo was set up with the drag of its grease present.
 
-    Else its integral carries the drag, and every stop overshoots by three counts of the motor (2.4 arcsec):
-    at rest 7.4 times the floor is left then, whatever the model.
+    Otherwise the integral carries the drag, every stop overshoots by three motor counts (2.4 arcsec), and the
+    error at rest is 7.4 times the floor, whatever the model.
     """
     data = bare_truth().model_dump(by_alias=True)
     data["servo"]["viscous_feedforward_nm_s_per_rad"] = 0.004
@@ -122,7 +122,7 @@ class Bench:
 
     @contextmanager
     def run(self, folder: Path, seed: int) -> Iterator[Cell]:
-        """The axis with it, measured."""
+        """Measures the axis with the cause."""
         sizes = [(each, 2.0 if each == "subdivisional_error" else 5.0) for each in self.causes]
         parts = (*LOOP, *self.parts)
         with hidden_bench(folder, sizes, seed, parts, self.highest_deg_s2, self.truth, self.cycle_ms) as cell:
@@ -182,7 +182,7 @@ NONE = {"nothing": Bench((*FAST, *TURN), ())}
 
 
 def of(benches: dict[str, Bench]) -> list[Any]:
-    """Parameters: a bench and a seed each."""
+    """Returns parameters of a bench and a seed each."""
     return [
         pytest.param(
             (bench, seed),
@@ -196,7 +196,7 @@ def of(benches: dict[str, Bench]) -> list[Any]:
 
 @pytest.fixture(scope="module")
 def cell(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
-    """The bench of a case, measured; its diagnosis is made when it is asked for, once."""
+    """The measured bench of a case; its diagnosis is made once, on request."""
     bench, seed = request.param
     with bench.run(tmp_path_factory.mktemp("hidden"), seed) as cell:
         yield cell
@@ -248,7 +248,7 @@ def test_a_zero_that_follows_its_sensor_slowly_is_named_with_its_lag(cell: Cell)
 
 
 @pytest.mark.parametrize("cell", of({"count_loss": SINGLE["count_loss"]}), indirect=True)
-def test_the_command_says_the_same_of_the_recording_folder(cell: Cell, tmp_path: Path) -> None:
+def test_the_command_gives_the_same_result_for_the_recording_folder(cell: Cell, tmp_path: Path) -> None:
     out, extended = tmp_path / "diagnosis.json", tmp_path / "extended.yaml"
     command = ["diagnose", str(cell.recording), "--model", str(cell.model), "--json", str(out)]
     done = CliRunner().invoke(app, [*command, "--extend", str(extended)], catch_exceptions=False)
@@ -265,7 +265,7 @@ def test_nothing_is_found_if_nothing_is_hidden(cell: Cell) -> None:
 
 
 @pytest.mark.parametrize("cell", of(OTHER_LAW), indirect=True)
-def test_another_law_of_the_loop_is_called_that_and_nothing_else(cell: Cell) -> None:
+def test_another_law_of_the_loop_is_named_as_such_and_nothing_else(cell: Cell) -> None:
     named = {each.cause for each in cell.diagnosis.findings}
     assert named & {"hysteresis_parameters", "hysteresis_memory", "unexplained"}, described(cell)
     assert not named - {"hysteresis_parameters", "hysteresis_memory", "unexplained"}, described(cell)

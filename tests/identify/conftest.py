@@ -31,7 +31,7 @@ class Axis:
     zero_arcsec: float = 700.0
 
     def error(self, motor_deg: np.ndarray, state: float = 1.0) -> np.ndarray:
-        """Transmission error, branch by branch; ``state`` is the sense of saturation at first."""
+        """Transmission error, branch by branch; ``state`` is the initial direction of saturation."""
         radians = np.deg2rad(motor_deg)
         total = sum(
             amplitude * np.cos(order * radians + np.deg2rad(phase))

@@ -56,7 +56,7 @@ def driving_angle(command, measured, every_s=0.004):
     return kinematics(measured, command, time, reading_of(measured))[0]
 
 
-def test_chatter_of_a_count_makes_no_turns():
+def test_chatter_of_a_count_makes_no_reversals():
     rng = np.random.default_rng(2)
     count = 0.045
     true = np.concatenate([np.linspace(0.0, 20.0, 2000), np.full(500, 20.0), np.linspace(20.0, 5.0, 2000)])
@@ -153,7 +153,7 @@ def test_acceleration_effects_are_independent_of_the_sampling_rate(rate_hz: floa
 
 
 @pytest.mark.parametrize("rate_hz", [50.0, 100.0])
-def test_a_record_that_begins_and_ends_in_motion_has_the_acceleration_that_is_seen_of_it(
+def test_a_record_that_begins_and_ends_in_motion_has_its_visible_acceleration(
     rate_hz: float,
 ) -> None:
     """The drift is proportional to time, and needs no correction, neither inside nor at the ends."""

@@ -28,7 +28,7 @@ def test_every_parameter_of_an_axis_is_found_within_its_interval(standard, bench
         assert off(standard, "synchronous", f"orders[{order}].phase_deg", phase) < 2.0
 
 
-def test_intervals_are_narrow_enough_to_be_of_use(standard):
+def test_intervals_are_narrow_enough_to_be_useful(standard):
     assert standard.interval("hysteresis", "offset_arcsec").half_width < 0.4
     assert standard.interval("hysteresis", "width_deg").half_width < 0.04 * 18.0
     assert standard.interval("hysteresis", "exponent").half_width < 0.04
@@ -94,7 +94,7 @@ def test_an_unchanged_axis_gets_no_new_model(bench):
         pytest.param(30.0, 1.25, marks=pytest.mark.slow),
     ],
 )
-def test_shapes_far_from_the_typical_one_are_found(bench, width, exponent):
+def test_shapes_far_from_a_typical_one_are_found(bench, width, exponent):
     axis = bench.axis(width=width, exponent=exponent)
     result = fit(axis.record(bench.plan(turns=8.0)), axis.ratio, bench.options)
     assert result.interval("hysteresis", "width_deg").value == pytest.approx(width, rel=0.04)
@@ -185,8 +185,8 @@ def test_encoder_delay_is_separated_from_the_offset(bench):
     assert result.interval("hysteresis", "offset_arcsec").value == pytest.approx(40.0, rel=0.01)
 
 
-def test_a_load_that_cannot_follow_a_turn_bends_no_loop(bench):
-    """Just after each turn the hysteresis rises faster than a load on a spring can."""
+def test_a_load_that_cannot_follow_a_reversal_biases_no_loop(bench):
+    """Just after each reversal the hysteresis rises faster than a load on a spring can follow."""
     axis = bench.axis(noise=0.2)
     segments = []
     for each in axis.record(bench.plan()):
@@ -201,7 +201,7 @@ def test_a_load_that_cannot_follow_a_turn_bends_no_loop(bench):
 
 
 def test_a_load_that_swings_raises_and_shifts_no_orders(bench):
-    """Sweeps at two speeds, each order raised and delayed as a damped load of 16 Hz does it."""
+    """Sweeps at two speeds, each order amplified and delayed as by a damped load of 16 Hz."""
     axis = bench.axis(orders={1: (5.0, -120.0), 6: (8.0, 100.0)}, noise=0.2)
     segments = []
     for each in axis.record(
@@ -249,7 +249,7 @@ def test_default_options_suit_a_bare_record(bench):
 
 
 def test_a_load_that_lags_is_fitted_as_well_as_one_that_leads(bench):
-    """Friction at the load: the loop is that of an elastic one with the other sign."""
+    """With friction at the load, the loop equals the elastic one with the opposite sign."""
     axis = bench.axis(offset=-30.0)
     found = fit(axis.record(bench.plan(turns=8.0)), axis.ratio, bench.options)
     assert off(found, "hysteresis", "offset_arcsec", -30.0) < 2.0
@@ -259,8 +259,8 @@ def test_a_load_that_lags_is_fitted_as_well_as_one_that_leads(bench):
     assert found.noise.residual_arcsec == pytest.approx(0.5, rel=0.1)
 
 
-def test_turns_between_two_samples_bend_no_parameter_of_the_loop(bench):
-    """Read at every fifth place of the path, a turn at 40 deg/s may lie 0.4 deg beyond the nearest sample."""
+def test_reversals_between_two_samples_bias_no_parameter_of_the_loop(bench):
+    """Sampled at every fifth point of the path, a reversal may lie 0.4 deg beyond the nearest sample."""
     axis, every = bench.axis(width=10.0, noise=0.1, motor_counts=3e6), 5
     legs = [
         ("sweep", bench.ramp(0.0, 1440.0, 200.3 / every)),
@@ -282,8 +282,8 @@ def test_turns_between_two_samples_bend_no_parameter_of_the_loop(bench):
     assert result.interval("hysteresis", "width_deg").half_width < 0.3
 
 
-def test_counts_that_a_motor_lags_by_at_each_speed_bend_no_parameter_of_the_loop(bench):
-    """The motor is behind its reading by up to a quarter of a count: once round with every 200 counts/s."""
+def test_a_lag_of_counts_that_varies_with_speed_biases_no_parameter_of_the_loop(bench):
+    """The motor lags its reading by up to a quarter of a count, with a period of 200 counts/s."""
     axis, count = bench.axis(motor_counts=8000.0), 360.0 / 8000.0
     plan = [*bench.plan(turns=8.0), *bench.plan(turns=8.0, speed=61.7)[1:3]]
     speed = np.gradient(np.concatenate([each for _, each in plan])) * bench.rate_hz

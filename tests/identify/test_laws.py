@@ -38,7 +38,7 @@ def bouc_wen(motor_deg: Any, state: float) -> Any:
 
 
 def lagging(bench: Any, law: Any) -> Any:
-    """An axis whose load is held back by 25 arcsec times a loop."""
+    """An axis whose load lags by 25 arcsec times a loop."""
 
     class Lagging(bench.axis):  # type: ignore[misc, name-defined]
         def error(self, motor_deg: Any, state: float = 1.0) -> Any:
@@ -49,7 +49,7 @@ def lagging(bench: Any, law: Any) -> Any:
 
 
 def beyond(bench: Any) -> Any:
-    """The plan, and small steps back from a branch that then continues, which only memory forgets."""
+    """The plan, then small back steps on a branch that continues, which only a law with memory forgets."""
     legs = [("move", bench.ramp(0.0, -60.0, 400.0))]
     for depth in (1.0, 2.0, 4.0, 2.0, 1.0):
         for begin, to in ((-60.0, -53.0), (-53.0, -53.0 - depth), (-53.0 - depth, 0.0), (0.0, -60.0)):

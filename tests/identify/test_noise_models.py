@@ -1,4 +1,4 @@
-"""Noise that is not white: the banded algebra is the dense one, and its parameters are found."""
+"""Coloured noise: the banded algebra equals the dense one, and the parameters are found."""
 
 from dataclasses import replace
 
@@ -89,7 +89,7 @@ def test_excluded_blocks_have_no_influence():
     assert weighted == pytest.approx(Precision(noise, blocks, out).apply(np.ones(30)))
 
 
-def test_a_wander_is_found_beside_white_noise():
+def test_a_wander_is_found_next_to_white_noise():
     rng = np.random.default_rng(2)
     blocks, samples = blocks_of(6000, rng)
     wander = np.zeros(6000)
@@ -99,7 +99,7 @@ def test_a_wander_is_found_beside_white_noise():
     noise = fit_noise(wander + 0.5 * rng.normal(size=6000), blocks, 1)
     assert noise.slow_arcsec == pytest.approx(1.0, rel=0.15)
     assert noise.slow_s == pytest.approx(8.0, rel=0.35)
-    # What forgets within a step and what is white are the same to this record.
+    # Noise with a memory shorter than a step is not separable from white noise.
     assert np.hypot(noise.moving_arcsec, noise.place_arcsec) == pytest.approx(0.5, rel=0.15)
 
 
@@ -129,7 +129,7 @@ def test_blocks_average_a_column_exactly():
     assert np.max(blocks.extent_deg[near]) < 0.5 < np.max(blocks.extent_deg)
 
 
-def test_a_load_is_left_time_to_settle_after_a_turn_but_not_most_of_the_way():
+def test_settling_after_a_reversal_is_excluded_but_not_most_of_the_travel():
     time = np.arange(4000) / 250.0
     up, down = np.linspace(0.0, 60.0, 1600), np.linspace(60.0, 40.0, 1600)
     motor = np.concatenate([up, down, np.tile([38.0, 40.0], 20).repeat(20)])  # then a turn each 0.08 s
@@ -140,7 +140,7 @@ def test_a_load_is_left_time_to_settle_after_a_turn_but_not_most_of_the_way():
 
 
 def test_constants_over_a_leg_are_not_motion():
-    """Legs that are read wrong by as much as their counts allow do not move a mean by more than its error."""
+    """Reading errors within the counts of each leg shift a mean by no more than its error."""
     rng = np.random.default_rng(7)
     motor = np.round(np.concatenate([rng.uniform(5.0, 30.0, 50).cumsum() * s for s in (1, -1, 1, -1)]) / 0.09)
     blocks, _ = blocks_of(200, rng, motor * 0.09)

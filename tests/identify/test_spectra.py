@@ -51,7 +51,7 @@ def test_indistinguishable_orders_are_named():
     assert not first.significant
 
 
-def test_motor_and_flexspline_orders_come_apart_over_two_load_turns():
+def test_motor_and_flexspline_orders_are_separable_over_two_load_turns():
     orders = [Order.motor(2), Order.flexspline(2, 50.0)]
     rng = np.random.default_rng(1)
     short = np.sort(rng.uniform(0.0, 360.0 * 2, 3000))

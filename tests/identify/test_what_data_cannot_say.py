@@ -61,7 +61,7 @@ def test_an_effect_without_its_channel_is_omitted_with_a_note(bench):
     assert any("compliance: not fitted, the record has no load_torque_nm" in each for each in result.warnings)
 
 
-def test_noise_alone_brings_no_order(bench):
+def test_noise_alone_yields_no_order(bench):
     axis = bench.axis(orders={}, offset=0.0, noise=2.0)
     axis.error = lambda motor, state=1.0: np.zeros(len(motor))
     result = fit(axis.record(bench.plan(turns=8.0)), axis.ratio, bench.options)
@@ -69,7 +69,7 @@ def test_noise_alone_brings_no_order(bench):
     assert not result.held_out.improves
 
 
-def test_an_order_below_what_matters_is_not_put_in(bench):
+def test_an_insignificant_order_is_not_included(bench):
     axis = bench.axis(orders={1: (5.0, 0.0), 4: (0.05, 0.0)}, noise=0.2)
     result = fit(axis.record(bench.plan()), axis.ratio, bench.options)
     assert [each.order.number for each in result.orders] == [1]

@@ -1,4 +1,4 @@
-"""An axis with a model and something hidden in it, and `hdbridge improve` on its simulated drive."""
+"""An axis with a model and a hidden cause, and `hdbridge improve` on its simulated drive."""
 
 import json
 import random
@@ -49,7 +49,7 @@ COARSE = (("cycle_ms: 4", "cycle_ms: 20"), ("counts_per_turn: 8000", "counts_per
 
 
 class Cell:
-    """A folder in which somebody improves an axis: `axis/` is the profile, `small.yaml` a plan."""
+    """A folder for the improvement of an axis: `axis/` is the profile, `small.yaml` a plan."""
 
     def __init__(self, folder, run):
         self.folder = folder
@@ -67,7 +67,7 @@ class Cell:
         self.hidden = self.hide()
 
     def hide(self, cause=None, size_arcsec=5.0, seed=1):
-        """Write the truth file, with a cause in it."""
+        """Writes the truth file with a hidden cause."""
         data = Truth.load(DEMO).model_dump(by_alias=True, mode="json")
         data["substep_ms"] = 1.0
         data["motor"]["encoder"].update(counts_per_turn=32768, interpolation=16)
@@ -118,7 +118,7 @@ def cell(tmp_path):
 
 @pytest.fixture(scope="session")
 def improved_once(tmp_path_factory):
-    """An axis with an order of the motor hidden in it, improved once for everybody to look at."""
+    """An axis with a hidden motor order, improved once for all tests."""
     cell = Cell(tmp_path_factory.mktemp("improved") / "cell", run)
     cell.hidden = cell.hide("motor_order")
     return cell, *cell.improve("--html", "page.html")

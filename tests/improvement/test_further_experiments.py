@@ -17,7 +17,7 @@ PROFILE = "profiles/article"
 
 @dataclass
 class Left:
-    """As much of a diagnosis as the choice looks at."""
+    """Stub of a diagnosis with the attributes that the choice uses."""
 
     findings: tuple
 

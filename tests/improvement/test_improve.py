@@ -12,7 +12,7 @@ def causes(result):
     return [each["cause"] for each in result["diagnosis"]["findings"]]
 
 
-def test_a_hidden_cause_is_named_and_the_axis_points_better(improved_once):
+def test_a_hidden_cause_is_named_and_positioning_improves(improved_once):
     cell, result, out, err = improved_once
     assert result["schema"] == "hdbridge.improvement/1"
     assert causes(result) == ["motor_order"]
@@ -94,7 +94,7 @@ def test_from_a_recording_nothing_is_measured_first(improved):
     assert (improved.folder / "again" / "stepping-1-after.csv.gz").exists()
 
 
-def test_improved_already_there_is_nothing_left_to_find(improved):
+def test_an_improved_axis_yields_no_further_finding(improved):
     improved.run("model", "commit", "axis")
     profile = improved.files()
     result, *_ = improved.improve("--from", "rec", "--out", "again")
@@ -129,7 +129,7 @@ def test_compensable_causes_bring_stepping_back_to_the_floor(cell):
 
 
 def test_auto_runs_the_separating_experiment(cell):
-    """An eccentric disc of the load encoder, on four turns of the motor: a wrong ratio would look alike."""
+    """On four motor turns, an eccentric disc of the load encoder looks like a wrong ratio."""
     cell.hide("load_order", 12.0, seed=3)
     result, _, err = cell.improve("--plan", "narrow.yaml", "--auto", "--rounds", 1)
     (one,) = result["rounds"]

@@ -118,7 +118,7 @@ def both_ways(cw, ccw):
 
 
 def test_worsening_in_one_direction_is_reported():
-    """The two ways come together, so the whole is better; the way back alone is not."""
+    """The two directions converge, so the total improves; the backward direction alone does not."""
     before, after = both_ways((20.0, 1.0), (-20.0, 1.0)), both_ways((0.0, 1.0), (0.0, 2.0))
     checked = Validation(before, after, Floor(1.0, 0.5))
     assert checked.improves

@@ -16,7 +16,7 @@ _LONGEST = 20_000
 
 
 def numbers(least: float, most: float) -> st.SearchStrategy[float]:
-    """Mostly of use, sometimes anything that a float can be."""
+    """Mostly useful numbers, sometimes any float."""
     return st.floats(least, most) | st.sampled_from([least, most, 0.0]) | st.floats()
 
 
@@ -45,7 +45,7 @@ COMMANDS = st.one_of(
 
 
 def asked(set_point: SetPoint, command: tuple) -> None:
-    """Ask; a refusal must leave everything as it was."""
+    """Makes a request; a refusal must leave everything unchanged."""
     name, *arguments = command
     if name == "path":
         speed, count = arguments
@@ -59,7 +59,7 @@ def asked(set_point: SetPoint, command: tuple) -> None:
 
 
 def _knots(set_point: SetPoint, speed: float, count: int) -> None:
-    """A stream that speeds up as hard as it may and is left there: taken as far as the limits let it."""
+    """Streams knots of constant acceleration, as far as the limits permit, and no more after them."""
     try:
         set_point.stream(0.1)
         set_point.begin_stream()
@@ -79,7 +79,7 @@ def _seen(set_point: SetPoint) -> tuple:
 def follow(
     set_point: SetPoint, limits: MotionLimits, period_s: float, steps: int, check_jerk: bool = True
 ) -> None:
-    """Step and hold it to the laws of each step."""
+    """Steps, and checks the laws of each step."""
     for _ in range(steps):
         last, last_acceleration, mode = set_point.position_deg, set_point.acceleration_deg_s2, set_point.mode
         position = set_point.step()
@@ -90,7 +90,7 @@ def follow(
         assert abs(position - last) <= limits.velocity_deg_s * period_s * (1.0 + 2e-6) + grain
         assert abs(set_point.velocity_deg_s) <= limits.velocity_deg_s * (1.0 + 2e-6)
         assert abs(set_point.acceleration_deg_s2) <= 1.05 * limits.acceleration_deg_s2 * (1.0 + 1e-5)
-        # Velocity is that of the positions: what is cut off at a limit is rounding and no more.
+        # Velocity matches the positions; only rounding is clipped at a limit.
         drift = abs(position - last - set_point.velocity_deg_s * period_s)
         assert drift <= 1.1 * limits.acceleration_deg_s2 * period_s**2 + 1e-8
         if check_jerk and MotionMode.STREAM not in {mode, set_point.mode}:
@@ -139,7 +139,7 @@ def test_an_accepted_move_reaches_its_target_exactly_and_rests(limits, calls, sh
             break
         set_point.step()
     else:
-        assert set_point.velocity_deg_s != 0.0  # a long way at a low speed
+        assert set_point.velocity_deg_s != 0.0  # a long move at a low speed
         return
     assert set_point.position_deg == target
     assert set_point.at_rest

@@ -1,4 +1,4 @@
-"""Procedures are pure: walked through here with an ideal axis, without bus or clock."""
+"""Procedures on an ideal axis, without bus or clock."""
 
 import math
 from itertools import pairwise
@@ -23,7 +23,7 @@ PERIOD = 0.004
 
 
 def walk(procedure, error_arcsec=lambda load_deg, direction: 0.0, axis=AXIS):
-    """Run a procedure on an axis whose load is off by a known error; returns legs and outcome."""
+    """Runs a procedure on an axis whose load is off by a known error; returns legs and outcome."""
     legs, place, clock, direction = [], 0.0, 0.0, 1
     steps = procedure.moves(axis)
     reply = None

@@ -17,7 +17,7 @@ AXIS = AxisView(50.0, MotionLimits(-90.0, 90.0, 20.0, 200.0, 4000.0))
 
 
 def rounded(time_s):
-    """Ten degrees there, as a jerk-limited move goes: speed 9.4 deg/s, acceleration 14.8 deg/s2."""
+    """A jerk-limited move of ten degrees: speed 9.4 deg/s, acceleration 14.8 deg/s2."""
     share = min(time_s / 2.0, 1.0)
     return 10.0 * (share - math.sin(2.0 * math.pi * share) / (2.0 * math.pi))
 
@@ -67,7 +67,7 @@ def test_an_invalid_trajectory_is_refused_before_anything_moves(trajectory, comp
 def test_a_trajectory_within_the_limits_is_accepted(start_deg, end_deg, slower):
     """Differences over a millisecond never exceed the derivatives."""
     way = abs(end_deg - start_deg) or 1.0
-    # Largest of the rounded move of a way in a time: 2 w/t, 2 pi w/t2, 4 pi2 w/t3.
+    # Peaks of a rounded move over travel w in time t: 2 w/t, 2 pi w/t2, 4 pi2 w/t3.
     time_s = slower * max(
         2 * way / 20.0, (2 * math.pi * way / 200.0) ** 0.5, (4 * math.pi**2 * way / 4000.0) ** (1 / 3)
     )

@@ -1,6 +1,6 @@
 """A fleet of two measured joints: supported and refused statements.
 
-Four one-way moves of a second each, all within minutes: nothing can have changed, so nobody is to be listed.
+Four one-way moves of a second each, all within minutes: nothing can have changed, so no joint may be listed.
 """
 
 import os

@@ -49,7 +49,7 @@ def test_inseparable_causes_are_reported_briefly(tmp_path: Path, turns: float) -
 
 
 def moves(folder: Path, turns: float, phases_deg: tuple[float, ...], drag: float = 0.0) -> list[str]:
-    """A second of one move, again and again, each with a zero and a phase of its own."""
+    """Repeated moves of one second, each with a zero and a phase of its own."""
     rng = np.random.default_rng(2)
     part = np.arange(100) / 100.0
     paths = []

@@ -61,7 +61,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def commands(path: Path) -> list[list[str]]:
-    """The two commands that take anybody's records, asked to write all that they can."""
+    """The two commands that take foreign records, with all their outputs."""
     beside = path.parent
     out = ["--json", str(beside / "out.json"), "--html", str(beside / "out.html")]
     return [
@@ -184,7 +184,7 @@ WAVE = 5.0 / 3600.0 * np.sin(np.radians(8.0 * MOTOR))
 TURNED = 1440.0 - np.abs(np.linspace(-1440.0, 1440.0, COUNT))
 """There and back, with the reversal where the angle wraps."""
 ADVISED: dict[str, tuple[str, str, str]] = {
-    # content, what the message says, what it advises
+    # content, message, advice
     "a load counter of 16 bits, in degrees": (
         text(motor=LONG_MOTOR, load=(FINE_LOAD + 3.0) % 8.192),
         "a jump of 8.192 that the other angle does not make (",
@@ -301,7 +301,7 @@ def test_the_given_advice_works(folder: Path, content: str, expected: str, advic
         assert f"pass {advice}" in message
         assert not {"out.json", "out.html", "new.yaml"} & {each.name for each in folder.iterdir()}
         followed = CliRunner().invoke(app, [*command, *advice.split()])
-        problem = followed.exception  # a model that does not help is no fault of the record's
+        problem = followed.exception  # a model that does not help is not the record's fault
         assert problem is None or "not written: the model" in str(problem), problem
         for name in ("out.json", "out.html", "new.yaml"):
             (folder / name).unlink(missing_ok=True)

@@ -170,7 +170,7 @@ def test_return_point_memory_fits_the_damper_and_predicts_its_other_motion() -> 
 
 @pytest.mark.parametrize("name", ["sine", "earthquake"])
 def test_return_point_memory_of_the_damper_is_reported_if_visible(name: str) -> None:
-    """A sine turns at ever other places: no loop within a loop, and both laws leave the same of it."""
+    """A sine reverses at ever different angles without nested loops, so both laws leave the same residual."""
     time, angle, force = damper(name)
     record = Record(
         {"time_s": time, "motor_position_deg": angle, "load_position_deg": angle / 50.0 + force / 3600.0}
@@ -179,7 +179,7 @@ def test_return_point_memory_of_the_damper_is_reported_if_visible(name: str) -> 
     diagnosis = diagnose(record, TransmissionModel(50.0, (law,)))
     found = names(diagnosis)
     assert "unexplained" in found
-    if name == "earthquake":  # a damper obeys neither law, and what is left may outweigh the memory
+    if name == "earthquake":  # a damper obeys neither law, and the residual may outweigh the memory
         considered = {each.split(":")[0] for each in diagnosis.considered}
         assert set(found) <= {"hysteresis_memory", "unexplained"}
         assert "hysteresis_memory" in considered.union(found)
@@ -192,8 +192,8 @@ def test_return_point_memory_of_the_damper_is_reported_if_visible(name: str) -> 
 def test_command_worsens_no_record(joints: dict[int, list[Record]], joint: int) -> None:
     """The recordings end in motion, the command ahead of the motor by some degrees."""
     commanded = [Record.read_csv(each) for each in measured(f"cobot-command/joint{joint}-*.csv")]
-    without, beside = (
+    without, with_command = (
         diagnose(concatenate(each), NOTHING, independent_zeros=True) for each in (joints[joint], commanded)
     )
-    assert set(names(beside)) == set(names(without))
-    assert beside.extended.rms_arcsec < 1.02 * without.extended.rms_arcsec
+    assert set(names(with_command)) == set(names(without))
+    assert with_command.extended.rms_arcsec < 1.02 * without.extended.rms_arcsec

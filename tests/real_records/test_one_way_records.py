@@ -72,7 +72,7 @@ def test_no_confident_name_and_no_wild_model(seed: int) -> None:
     try:
         found = diagnose(record, model)
     except InputError:
-        return  # refused in words is right too
+        return  # a refusal is right, too
     named = [each for each in found.findings if each.cause != "unexplained"]
     assert all(each.probability <= 0.6 for each in named), named
     assert not {each.cause for each in named} & {"hysteresis_memory", "hysteresis_parameters", "backlash"}

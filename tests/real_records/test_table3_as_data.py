@@ -21,7 +21,7 @@ def row(error: np.ndarray) -> tuple[float, float]:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_the_ranges_hold_what_was_put_in(seed: int) -> None:
+def test_the_ranges_contain_the_true_values(seed: int) -> None:
     rng = np.random.default_rng(seed)
     count = 480
     share = rng.uniform(0.55, 0.98)

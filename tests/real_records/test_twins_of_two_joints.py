@@ -25,7 +25,7 @@ def recordings_of(joint: int) -> list[Recording]:
 
 @pytest.mark.parametrize("joint", [4, 5])
 def test_typical_values_do_not_match_a_robot_joint(joint: int) -> None:
-    """Its drive lags the command by 8 ms; a usual one follows within two or three."""
+    """Its drive lags the command by 8 ms; a typical one follows within two or three."""
     truth = translate(real_records.joint_axis()).truth
     for recording in recordings_of(joint):
         row = real_records.held_against(recording, truth).row("following_error")
@@ -37,7 +37,7 @@ def test_typical_values_do_not_match_a_robot_joint(joint: int) -> None:
 @pytest.mark.slow
 def test_a_twin_of_three_recordings_predicts_the_fourth() -> None:
     twin, compared = real_records.twin_of_others(recordings_of(4), 0)
-    assert twin.findings == (), "its following error is left, so no value is the axis's"
+    assert twin.findings == (), "its following error remains, so no value is that of the axis"
     for signal, share in (("load_error", 0.5), ("following_error", 0.5), ("motor_torque", 0.3)):
         usual, now = compared["usual values"].row(signal), compared["twin"].row(signal)
         assert usual is not None

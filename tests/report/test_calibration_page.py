@@ -143,7 +143,7 @@ def test_the_spectrum_shows_the_threshold_over_candidate_orders(plain):
 
 @pytest.mark.parametrize("order", [2, 15])
 def test_the_line_of_each_order_peaks_at_its_amplitude(order):
-    """Though four bins in ten hold no sample, and their width takes 2.2 % off order 15."""
+    """Four bins in ten are empty, and their width reduces order 15 by 2.2 %."""
     fit = fitted()
     wave = 5.0 * np.cos(np.radians(order * fit.traces.motor_deg + 20.0))
     drawn = dataclasses.replace(fit, traces=dataclasses.replace(fit.traces, orders_arcsec=wave))

@@ -1,4 +1,4 @@
-"""Numbers for people: as many digits as are known, and a small one is not nothing."""
+"""Numbers for readers: only significant digits, and no small number shown as zero."""
 
 import math
 

@@ -275,7 +275,7 @@ def test_every_state_of_the_simulation_is_known_to_the_compiler() -> None:
 
 
 def test_an_external_torque_acts_alike_compiled_or_not() -> None:
-    """The load yields as the spring does: this torque does not break the motor away."""
+    """The load yields with the spring alone, because this torque does not break the motor away."""
     made = truth({})
     outer_nm = np.concatenate([np.zeros(20), np.full(300, 0.2)])
     runs = [

@@ -1,4 +1,4 @@
-"""Causes that are hidden in the simulated axis: each really has the size that its description states."""
+"""Causes hidden in the simulated axis have the size that their description states."""
 
 import random
 from collections.abc import Callable
@@ -74,7 +74,7 @@ class Errors:
         return self._arcsec[first:last]
 
     def even(self) -> NDArray[np.float64]:
-        """Forth at even speed."""
+        """Returns the errors of the forward move at constant speed."""
         first, last = self._marks["forth"]
         ramp = round(0.3 * (last - first) / 13.0)  # the ramps take 0.55 s of 27 s each
         return self._arcsec[first + 2 * ramp : last - 2 * ramp]
@@ -86,7 +86,7 @@ def bare() -> Errors:
 
 
 def peak(there: Errors, here: Errors) -> float:
-    """Returns the amplitude of a wave about zero, while moving evenly."""
+    """Returns the amplitude of a wave about zero at constant speed."""
     change = there.even() - here.even()
     return float(np.quantile(np.abs(change - np.mean(change)), 0.995))
 
@@ -97,41 +97,41 @@ def moving(there: Errors, here: Errors) -> float:
 
 
 def change(there: Errors, here: Errors) -> float:
-    """From the start to the end, standing."""
+    """Returns the change at rest at the end, relative to the start."""
     apart = there.part("end") - here.part("end")
     return float(abs(np.median(apart[-50:]) - np.median((there.even() - here.even())[:50])))
 
 
 def at_a_turn(there: Errors, here: Errors) -> float:
-    """After a turn of the load, against the start."""
+    """Returns the change after a turn of the load, relative to the start."""
     apart = there.even() - here.even()
     return float(abs(np.median(apart[-200:]) - np.median(apart[:200])))
 
 
 def highest(there: Errors, here: Errors) -> float:
-    """Anywhere while moving evenly."""
+    """Returns the maximum at constant speed."""
     return float(np.max(np.abs(there.even() - here.even())))
 
 
 def ramping(there: Errors, here: Errors) -> float:
-    """In the ramps."""
+    """Returns the maximum in the ramps."""
     return float(np.max(np.abs(there.part("forth") - here.part("forth"))))
 
 
 def returning(there: Errors, here: Errors) -> float:
-    """In nested loops."""
+    """Returns the maximum in nested loops."""
     return float(np.max(np.abs(there.part("nested") - here.part("nested"))))
 
 
 def looping(there: Errors, here: Errors) -> float:
-    """Anywhere in a crossing, back or in nested loops."""
+    """Returns the maximum in a crossing, back or in nested loops."""
     back = float(np.max(np.abs(there.part("back") - here.part("back"))))
     return max(back, returning(there, here))
 
 
 Measure = Callable[[Errors, Errors], float]
-# Measure, and the least and the most that it may come to, in parts of the size stated. Second orders come on
-# top of first ones; orders of the motor are a tenth higher near the load's resonance.
+# Measure, and its smallest and largest result as shares of the stated size. Second orders add to first ones;
+# orders of the motor are a tenth higher near the load's resonance.
 EXPECTED: dict[str, tuple[Measure, float, float]] = {
     "motor_order": (peak, 0.95, 1.3),
     "motor_encoder_eccentricity": (peak, 0.95, 1.35),
@@ -180,7 +180,7 @@ def test_a_hidden_cause_has_its_stated_size(cause: str) -> None:
     assert hidden.cause == cause.split(":", maxsplit=1)[0]
     assert hidden.size_arcsec == pytest.approx(wanted, rel=0.05)
     here = bare()
-    if hidden.brings:  # what it brings along is not what is to be measured
+    if hidden.brings:  # side effects are not to be measured
         less = known.model_dump(by_alias=True)
         less["gear"]["torque_growth_per_nm"] = 0.0
         here = Errors(Truth.model_validate(less))

@@ -100,7 +100,7 @@ def test_load_friction_yields_before_it_slips(sense: float) -> None:
         errors.append(error_arcsec(machine))
         loads.append(machine.true_load_deg)
     rise = sense * np.diff(errors)
-    assert np.all(sense * np.diff(loads) < 0.0)  # it goes the motor's way, never the other
+    assert np.all(sense * np.diff(loads) < 0.0)  # it moves in the motor's direction, never the other
     assert rise[0] > 1.5 * rise[8] > 1.5 * abs(rise[-1])
     assert errors[-1] == pytest.approx(sense * held_arcsec, rel=0.01)
 

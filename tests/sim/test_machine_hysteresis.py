@@ -40,7 +40,7 @@ every_law = pytest.mark.parametrize("make", LAWS)
 
 
 def along(law: Law, turning_points: Iterable[float], step_deg: float = 0.05) -> list[tuple[float, float]]:
-    """Lead a law from zero through turning points in small steps: (angle, error) pairs."""
+    """Leads a law from zero through turning points in small steps; returns (angle, error) pairs."""
     here = 0.0
     trace = [(here, law.advance(here))]
     for target in turning_points:
@@ -114,7 +114,7 @@ def test_long_motion_ends_at_the_offset_of_its_direction(make: Callable[[], Law]
 
 
 @every_law
-def test_the_path_counts_not_its_steps(make: Callable[[], Law]) -> None:
+def test_the_error_depends_on_the_path_not_on_its_steps(make: Callable[[], Law]) -> None:
     turns = [30.0, 24.0, 29.0, 27.5, 45.0, 44.0]
     coarse = along(make(), turns, step_deg=0.5)[-1][1]
     fine = along(make(), turns, step_deg=0.003)[-1][1]
@@ -122,7 +122,7 @@ def test_the_path_counts_not_its_steps(make: Callable[[], Law]) -> None:
 
 
 def along_from(law: Law, start: float, end: float, pieces: int = 200) -> float:
-    """Lead a law straight from where it is; the error at the end."""
+    """Leads a law straight on from its present state; returns the error at the end."""
     error = 0.0
     for piece in range(1, pieces + 1):
         error = law.advance(start + (end - start) * piece / pieces)
@@ -147,7 +147,7 @@ def test_maxwell_slip_forgets_closed_excursions(back_deg: float) -> None:
 
 
 def test_the_article_s_law_forgets_all_but_the_last_reversal() -> None:
-    # The branch starts anew at the excursion's end: its value follows from that point alone.
+    # A new branch starts at the excursion's end, so its value follows from that point alone.
     law = rolling()
     along_from(law, 0.0, 60.0)
     along_from(law, 60.0, 52.0)

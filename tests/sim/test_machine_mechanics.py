@@ -85,7 +85,7 @@ def test_a_displacement_of_the_output_takes_no_energy_and_gives_none(gear: dict[
 
 @pytest.mark.parametrize("growth_per_nm", [0.0, 0.02])
 def test_at_rest_a_torque_on_the_load_reaches_the_motor_by_the_momentary_ratio(growth_per_nm: float) -> None:
-    """Least friction that holds a mass, by virtual work; of a growth with the torque, half counts."""
+    """The least friction that holds a mass follows from virtual work; growth with torque counts half."""
     torque_nm, slope = 5.0 * 9.80665 * 0.2, math.radians(600.0 / 3600.0)
     gear = {
         "gear__motor_orders": [{"order": 1, "amplitude_arcsec": 600.0, "phase_deg": -90.0}],

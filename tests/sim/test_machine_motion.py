@@ -56,7 +56,7 @@ class Axis:
         self.substeps = round(CYCLE_S / self.machine.dt_s)
 
     def move(self, distance_counts: int, settle_s: float = 0.3) -> None:
-        """Move by whole counts, and wait."""
+        """Moves by whole counts, and waits."""
         start, sense = self.target, math.copysign(1.0, distance_counts)
         end_deg = (start + distance_counts) * DEG_PER_COUNT
         self.overshoot_deg = 0.0
@@ -157,7 +157,7 @@ def test_loops_without_friction_feedforward_keep_their_integral_at_a_reversal() 
     forth = [loops.answer_nm(place, 40.0, 0.0) for place in places]
     back = [loops.answer_nm(place, -40.0, 0.0) for place in reversed(places)]  # still ahead of the motor
     steps = [abs(later - earlier) for earlier, later in pairwise([*forth, *back])]
-    # The speed wanted changes by twice that of the start.
+    # The demanded speed changes by twice the initial one.
     assert max(steps) < 2.2 * max(steps[:39])
 
 
@@ -203,7 +203,7 @@ def test_the_torque_stays_within_its_limit() -> None:
         axis.to(axis.target)
         peak = max(peak, abs(machine.torque_permille))
     assert peak == 120
-    assert abs(machine.motor_counts - axis.target) <= 1, "it comes to its target all the same"
+    assert abs(machine.motor_counts - axis.target) <= 1, "it reaches its target nevertheless"
 
 
 def test_the_torque_limit_cannot_be_set_beyond_the_drive_s_own() -> None:
@@ -326,7 +326,7 @@ def test_the_gear_has_the_hysteresis_law_of_the_truth_file(law: dict[str, Any] |
 
 
 def following_error_ms(**changes: Any) -> float:
-    """Following error at a constant speed over that speed, of an axis that has no friction by default."""
+    """Returns following error over speed at a constant speed; the axis has no friction by default."""
     smooth: dict[str, Any] = {
         "motor__coulomb_nm": 0.0, "motor__viscous_nm_s_per_rad": 0.0, "gear__motor_orders": (),
         "gear__hysteresis": None, "load__coulomb_nm": 0.0, "load__viscous_nm_s_per_rad": 0.0,
@@ -369,7 +369,7 @@ def test_a_disturbance_observer_supplies_its_share_of_the_friction(share: float)
 
 
 def test_an_integral_of_the_position_error_needs_no_feed_forward_at_a_constant_speed() -> None:
-    """PI on the speed is left with the speed over the position gain."""
+    """PI control of the speed leaves an error of the speed over the position gain."""
     filtered_ms = following_error_ms()
     gain = truth().servo.position_gain_per_s
     forward = {"servo__velocity_feedforward": 0.0, "servo__integral_time_ms": 60.0}
@@ -389,7 +389,7 @@ def test_a_notch_has_its_depth_at_its_frequency_and_nothing_far_off(frequency_hz
 
 @pytest.mark.parametrize("frequency_hz", [30.0, 480.0, 900.0])
 def test_a_notch_is_stable_at_any_frequency(frequency_hz: float) -> None:
-    """At a substep of 1 ms the last one is beyond half the rate."""
+    """At a substep of 1 ms the last frequency is beyond half the rate."""
     notch = Notch(TrueNotch(frequency_hz=frequency_hz, depth=0.0, width=5.0), 0.001)
     assert max(abs(notch.notched_nm(1.0 if number % 2 else -1.0)) for number in range(2000)) < 3.0
     assert [notch.notched_nm(1.0) for _ in range(2000)][-1] == pytest.approx(1.0)

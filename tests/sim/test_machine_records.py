@@ -1,4 +1,4 @@
-"""Records of the plant with every cause off: they stay as they are, bit for bit."""
+"""Records of the plant without causes are unchanged, bit for bit."""
 
 import hashlib
 import math

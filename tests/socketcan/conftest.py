@@ -73,7 +73,7 @@ def ip(*arguments: str) -> None:
 
 @pytest.fixture
 def interface() -> Iterator[str]:
-    """The interface, put back afterwards whatever a test has done to it."""
+    """The interface, restored afterwards whatever a test has done to it."""
     yield CHANNEL
     if not Path(f"/sys/class/net/{CHANNEL}").exists():
         ip("link", "add", "dev", CHANNEL, "type", "vcan")
@@ -98,7 +98,7 @@ def may_configure(interface: str) -> Callable[..., None]:
 
 @contextmanager
 def drive_process(channel: str) -> Iterator[subprocess.Popen[bytes]]:
-    """``hdbridge simulate`` on the interface, ended on the way out."""
+    """``hdbridge simulate`` on the interface, ended on exit."""
     command = [sys.executable, "-m", "hdbridge", "simulate", str(unhurried_profile())]
     process = subprocess.Popen(
         [*command, "--interface", "socketcan", "--channel", channel],
@@ -123,7 +123,7 @@ class Master:
     target: int = 0
 
     def boot(self) -> None:
-        """Boot the drive, waiting for its process to come up."""
+        """Boots the drive, waiting for its process to come up."""
         for attempt in range(40):
             try:
                 self.drive.boot()
@@ -135,7 +135,7 @@ class Master:
                 return
 
     def run(self, cycles: int) -> list[Feedback]:
-        """Enable, move at constant speed; once more from the start when a busy machine has stopped it."""
+        """Enables and moves at constant speed; starts again if a busy machine has stopped the axis."""
         for attempt in range(4):
             try:
                 if attempt:
@@ -193,7 +193,7 @@ def master_on(channel: str, profile: Path | None = None, *, shared: bool = False
 
 
 class Drives:
-    """The simulated drive in a process that is used for as long as it lives: it takes 3 s to begin."""
+    """The simulated drive in a process that is reused while it lives, because it takes 3 s to start."""
 
     def __init__(self) -> None:
         self._stack = ExitStack()

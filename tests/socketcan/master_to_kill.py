@@ -1,4 +1,4 @@
-"""A master that enables the drive and moves it for ever: to be killed by a test."""
+"""A master that enables the drive and moves it until a test kills it."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The whole daemon on a real Linux CAN stack: its bus spoilt or taken away, its processes killed."""
+"""The whole daemon on a real Linux CAN stack: a disturbed or lost bus, and killed processes."""
 
 import json
 import os
@@ -21,7 +21,7 @@ DISK_MB = 4
 
 
 class Benches:
-    """A daemon that is used for as many rows as it survives."""
+    """A daemon that is reused for as many rows as it survives."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._number = folder, 0
@@ -64,7 +64,7 @@ class Benches:
 
 @contextmanager
 def small_disk(folder: Path) -> Iterator[Path]:
-    """A file system that is soon full."""
+    """A small file system."""
     folder.mkdir(parents=True)
     command = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "tmpfs", str(folder)]
     if os.geteuid() != 0 or subprocess.run(command, check=False, capture_output=True).returncode:

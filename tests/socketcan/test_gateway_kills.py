@@ -40,7 +40,7 @@ STEP = 7200
 
 
 class Plc(threading.Thread):
-    """Sends a controlword and a target before each SYNC, whatever it is answered."""
+    """Sends a controlword and a target before each SYNC, whatever the answer."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -138,7 +138,7 @@ def enable(daemon: Daemon, plc: Plc) -> None:
 
 
 def stays_without_power(plc: Plc, witness: Witness) -> None:
-    """The drive gets no power for a second, in which the master still asks for motion."""
+    """Checks that the drive has no power for a second in which the master still requests motion."""
     witness.begin()
     with pytest.raises(AssertionError, match="not within"):
         witness.cycles_until(powered, 50)

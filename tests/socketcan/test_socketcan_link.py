@@ -96,7 +96,7 @@ def stuck_slcan(may_configure) -> Iterator[str]:
         may_configure("link", "set", "up", name)
         yield name
     finally:
-        # What is in the terminal has to go, or the daemon cannot end.
+        # The terminal must be drained, or the daemon cannot end.
         while select.select([ours], [], [], 0.1)[0]:
             os.read(ours, 65536)
         daemon.terminate()

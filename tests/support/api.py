@@ -79,7 +79,7 @@ def running(server: ApiServer) -> Iterator[None]:
 
 
 @asynccontextmanager
-async def served_beside(bridge: ServiceBridge, path: Path) -> AsyncIterator[None]:
+async def served_in_loop(bridge: ServiceBridge, path: Path) -> AsyncIterator[None]:
     """Serves a real service at a Unix socket, in its own event loop, until the end of the block."""
     metrics = Metrics()
     bridge.core.observer.add(metrics)

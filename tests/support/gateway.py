@@ -40,7 +40,7 @@ class Plc:
         *,
         syncs: bool = True,
     ) -> None:
-        """``syncs``: it is the one that produces SYNC."""
+        """``syncs``: this master produces SYNC."""
         self.bus = VirtualBus(channel)
         self.node, self._syncs = node, syncs
         self._clock = clock
@@ -136,20 +136,20 @@ class GatewayBench:
         self.start_gateway()
 
     def start_gateway(self) -> None:
-        """The keeper starts the gateway process."""
+        """Starts the gateway process, as the keeper does."""
         self.gateway = self._made()
         self._process = GatewayProcess(self.bus, self.gateway, self.daemon.clock)
         self.daemon.clock.nodes.append(self._process)
 
     def kill_gateway(self) -> None:
-        """The gateway process is gone."""
+        """Ends the gateway process."""
         self.daemon.clock.nodes.remove(self._process)
 
     async def wait(self, duration_s: float) -> None:
         await self.service.timing.sleep(duration_s)
 
     async def until(self, done: Callable[[], bool], timeout_s: float = 5.0) -> float:
-        """Let time pass until ``done``; how long that took."""
+        """Lets time pass until ``done``; returns how long that took."""
         begun_s = self.now_s
         while not done():
             assert self.now_s < begun_s + timeout_s, (
@@ -209,7 +209,7 @@ class GatewayBench:
         plc.target = await self.read(0x6064, signed=True)
 
     async def enable(self) -> float:
-        """Walk the states by the levels of the controlword; time from 'enable operation' to its answer."""
+        """Walks the states by controlword levels; returns the time from 'enable operation' to its answer."""
         plc = self.plc
         if not plc.cycling:
             plc.begin()
@@ -227,7 +227,7 @@ class GatewayBench:
 
 
 async def swing(bench: GatewayBench, amplitude_deg: float = 2.0, period_s: float = 2.0) -> None:
-    """Have the PLC swing the axis from where it stands."""
+    """Makes the PLC swing the axis from its present position."""
     plc, begun, centre = bench.plc, bench.plc.cycle, bench.plc.target
 
     def plan(cycle: int) -> int:

@@ -172,7 +172,7 @@ async def kill_daemon(bench: GatewayBench) -> None:
 
 
 def kill_keeper(bench: GatewayBench) -> None:
-    """Its processes get SIGTERM."""
+    """Ends the keeper's processes by SIGTERM."""
     bench.kill_gateway()
     bench.daemon.controller.end()
 

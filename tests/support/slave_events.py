@@ -46,7 +46,7 @@ class TimedStage(PowerStage):
 
 
 class WatchedMotor(IdealMotor):
-    """Holds every demand to the laws."""
+    """Checks every demand against the laws."""
 
     def __init__(self, rng: Random) -> None:
         super().__init__(0)
@@ -86,7 +86,7 @@ class Laws:
         self.set_points |= bool(word & 0x10)
 
     def interrupted(self) -> None:
-        """The master or the drive was lost: everything has to be asked for again."""
+        """The master or the drive was lost, so everything must be requested again."""
         self.enabling = self.targets = self.set_points = False
 
     def released(self) -> None:

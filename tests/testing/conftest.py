@@ -43,7 +43,7 @@ class Program:
         return answers[0] if answers else None
 
     def read(self, index: int, subindex: int = 0) -> int | None:
-        """None where there is no answer, or an abort."""
+        """Returns None without an answer, or on an abort."""
         answer = self.request(struct.pack("<BHBI", 0x40, index, subindex, 0))
         return int.from_bytes(answer[4:], "little") if answer and answer[0] != 0x80 else None
 
@@ -54,7 +54,7 @@ class Program:
         assert answer[0] == 0x60
 
     def start(self) -> None:
-        """To 'operation enabled' in cyclic synchronous position, with the drive's own watchdogs set."""
+        """Enables the drive in cyclic synchronous position, with its own watchdogs set."""
         for index, subindex, value, size in (
             (0x6060, 0, 8, 1), (0x1017, 0, 50, 2), (0x1400, 5, 20, 2),
             (0x6065, 0, 2000, 4), (0x6066, 0, 20, 2),

@@ -42,7 +42,7 @@ def tpdos(drive, program, name: str, **arguments) -> list[list[int]]:
     return [ids(program.cycle()) for _ in range(3)]
 
 
-# Each: what shows that the fault was made, on a drive under way.
+# Each: the symptom of the fault, on a drive in motion.
 
 
 def lost_tpdo(drive, program):
@@ -252,7 +252,7 @@ def bus_down(drive, program):
     with drive.fault("bus_down"):
         with pytest.raises(can.CanOperationError, match="Network is down"):
             program.bus.recv(0)
-        assert program.bus.recv(0.1) is None  # SocketCAN says it once
+        assert program.bus.recv(0.1) is None  # SocketCAN reports it once
         for _ in range(2):
             with pytest.raises(can.CanOperationError, match="Network is down"):
                 program.send(0x080)

@@ -1,4 +1,4 @@
-"""The fixture `hdbridge_drive` as a user's pytest has it."""
+"""The fixture `hdbridge_drive` in a user's pytest."""
 
 import shutil
 import subprocess
@@ -16,7 +16,7 @@ PASSES = "def test_it(hdbridge_drive):\n    assert hdbridge_drive.state == 'swit
 
 @pytest.fixture
 def session(pytester):
-    """Run one test file in this process."""
+    """Runs one test file in this process."""
 
     def run(text: str, *options: str) -> pytest.RunResult:
         pytester.makepyfile(text)

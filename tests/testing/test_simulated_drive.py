@@ -177,7 +177,7 @@ def test_a_second_drive_on_a_real_bus_is_refused_with_advice():
 
 
 def test_a_failed_bus_of_a_drive_is_reported(monkeypatch):
-    """Its thread has ended: the test does not go on as if nothing were."""
+    """The drive's thread has ended, so the test must not continue."""
     monkeypatch.setattr("hdbridge.device.run.PATIENCE_S", 0.0)
 
     def use() -> None:

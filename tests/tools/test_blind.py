@@ -44,7 +44,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def shorten(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-    """Everyday suites have work of some seconds, and a calibration of a minute."""
+    """Shortens everyday suites to some seconds of work and a calibration of a minute."""
     plan = folder / "tiny.yaml"
     plan.write_text(PLAN)
     axis_of = blindcase.axis_of
@@ -430,7 +430,7 @@ def test_a_suite_is_diagnosed_in_processes_and_reported_in_tables(
     assert "| d |" not in said
     assert score.main([str(folder), "--command", command, "--cases"]) == 0
     assert "| d | wear, creep | wear, backlash | missed creep; wrong backlash |" in capsys.readouterr().out
-    # Once each, and the fresh record only where something was named that had been hidden.
+    # Once each; the fresh record only if a hidden cause was named.
     runs = {path.parent.name: path.read_text().split() for path in folder.glob("*/runs")}
     assert runs["a"] == ["record.csv", "fresh.csv", "fresh.csv"]
     assert runs["c"] == runs["e"] == runs["g"] == ["record.csv"]

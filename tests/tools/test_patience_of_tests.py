@@ -12,7 +12,7 @@ EXCEPTIONS = {"support/patience.py", "support/daemon_faults.py"}
 
 
 def limits(tree: ast.AST) -> Iterator[int]:
-    """Line numbers of waits with a number of seconds, and of comparisons with a clock that are asserted."""
+    """Returns line numbers of waits with a number of seconds, and of asserted clock comparisons."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
             given = [each.value for each in node.keywords if each.arg == "timeout"]

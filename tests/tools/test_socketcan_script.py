@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(not IS_COMPLETE, reason="user-mode-linux is not 
 
 @pytest.fixture
 def run_with(tmp_path: Path):
-    """Runs a command with programs of one's own (name: shell text) in front of the machine's."""
+    """Runs a command with stub programs (name: shell text) in place of the machine's."""
 
     def run(*options: str, **programs: str) -> subprocess.CompletedProcess[str]:
         for name, text in programs.items():
@@ -69,7 +69,7 @@ def test_real_time_priority_is_given_on_request_only(run_with, options, policy) 
 def test_two_runs_get_a_processor_each(run_with, tmp_path: Path) -> None:
     if len(os.sched_getaffinity(0)) < 2:
         pytest.skip("this machine has one processor")
-    # Each waits for the other, and says where it was with its last words.
+    # Each waits for the other, then prints its processor.
     kernel = tmp_path / "linux.uml"
     kernel.write_text(
         f"#!/bin/sh\ncd {tmp_path}; touch $$.here\n"
@@ -84,9 +84,9 @@ def test_two_runs_get_a_processor_each(run_with, tmp_path: Path) -> None:
 
 
 def test_computing_takes_little_time_and_idle_time_is_skipped() -> None:
-    """Time is the guest's own: a machine that takes the processor away does not show in it.
+    """Time is the guest's own, so a busy machine does not affect it.
 
-    From the command's first moment, before anything has been idle: to count takes the machine a tenth of a
+    This holds from the start of the command, before any idle time. Counting takes the machine a tenth of a
     second at least. While the kernel boots, time passes eight times as fast.
     """
     counted = "i=0; while [ $i -lt 300000 ]; do i=$((i+1)); done"

@@ -1,4 +1,4 @@
-"""Two records of the same commands, compared by channel, and the verdict on a twin by them."""
+"""Comparison by channel of two records of the same commands, and the verdict on a twin."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_more_friction_shows_in_the_torque(measured: Record) -> None:
     comparison = against(measured, changed(motor={"coulomb_nm": 0.068}))
     row = comparison.row("motor_torque")
     assert row is not None
-    # 0.034 Nm while it moves, and what the integral holds at rest.
+    # 0.034 Nm in motion, and the torque of the integral at rest.
     assert 0.015 < row.difference < 0.045
     assert row.in_noise > 10.0
     load = comparison.row("load_error", "sweep")
@@ -126,7 +126,7 @@ def test_a_softer_spring_settles_later_and_beyond(measured: Record) -> None:
 
 @pytest.mark.parametrize("creeps_deg", [0.0, 0.3])
 def test_holding_torque_is_not_a_difference(measured: Record, creeps_deg: float) -> None:
-    """Friction holds it by any torque between two, by the past; also if it breaks away later."""
+    """Friction holds the motor at any torque in a range; it depends on the past, not on later creep."""
     target, time_s = measured.motor_target_deg, measured.time_s
     assert target is not None
     moved = np.diff(target, prepend=target[0]) != 0.0
@@ -208,10 +208,10 @@ def comparison(kind: str = HELD_OUT, **differences: float) -> Comparison:
         (HELD_OUT, {"load_error": 4.0, "motor_torque": 1.0}, {"load_error": 1.0, "motor_torque": 1.2}, False,
          "motor torque differs by 1.2 Nm, before by 1"),
         (HELD_OUT, {"load_error": 4.0}, {"load_error": 4.0}, False, "no nearer"),
-        # Below the noise nothing is lost.
+        # A loss below the noise does not count.
         (HELD_OUT, {"load_error": 4.0, "motor_torque": 0.02}, {"load_error": 1.0, "motor_torque": 0.04}, True,
          "29 % smaller"),
-        # Rounding, and what a reversal leaves in third differences: a replay of the true axis has both.
+        # A replay of the true axis has rounding errors and residuals of reversals in third differences.
         (HELD_OUT, {"motor_torque": 0.08}, {"motor_torque": 0.02}, True, "75 % smaller"),
     ],
 )  # fmt: skip
@@ -229,5 +229,5 @@ def test_a_temperature_counts_beyond_the_step_of_its_reading() -> None:
     assert "75 % smaller" in better(cold, near).text
     far = comparison(load_error=1.0, temperature=0.4)
     assert "temperature differs by 0.4 K, before by 0.05" in better(cold, far).text
-    # Each a quarter: of the temperature 0.4 to 0.1, for what is within a step is none.
+    # Both fall to a quarter: the temperature from 0.4 to 0.1, as a difference within a step counts as a step.
     assert "75 % smaller" in better(comparison(load_error=4.0, temperature=0.4), near).text

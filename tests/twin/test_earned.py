@@ -1,4 +1,4 @@
-"""A fit takes a part in only if the recording shows it: friction near rest, another loop, a limit."""
+"""A fit includes a part only if the recording shows it: friction near rest, another loop, a limit."""
 
 from __future__ import annotations
 
@@ -179,11 +179,11 @@ def test_a_gear_without_a_loop_has_none_by_another_law() -> None:
     bare = TRUTH.model_copy(update={"gear": gear})
     assert by_each_law(bare) == []
     assert by_law_of(bare, TRUTH) is bare
-    # A fit may make a loop lower than where it began.
+    # A fit may make a loop lower than at its start.
     assert TRUTH.gear.hysteresis.start_arcsec == -9.0  # type: ignore[union-attr]
     lower = with_values(by_each_law(TRUTH)[0], {"loop offset": 5.0})
     assert value_in(lower, BY_NAME["loop offset"]) == 5.0
 
 
-def test_the_loop_is_a_calibrations_unless_it_is_earned() -> None:
+def test_the_loop_is_that_of_the_calibration_unless_the_recording_shows_another() -> None:
     assert not {*LOOP} & {each.name for each in free_parameters(TRUTH)}

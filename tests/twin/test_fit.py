@@ -95,7 +95,7 @@ def test_wide_differences_average_out_replay_noise() -> None:
     where, rough = rng.uniform(size=400), 0.2
 
     def shape(place: Rows) -> Rows:
-        """Rows that break away sooner or later, however little the place has changed."""
+        """Rows that break away earlier or later after any change of the parameters, however small."""
         return TRUE @ place + rough * np.sin(2e3 * where * (1.0 + place.sum()))
 
     moves = 0.05 * np.eye(2)
@@ -127,7 +127,7 @@ SPRUNG = with_values(Truth.load(DEMO), {"load feed-forward frequency": 75.0})
 
 @cache
 def data() -> Data:
-    """Two quick steps, the load left to ring after each."""
+    """Two quick steps with free ringing of the load after each."""
 
     def lead(bench: Exercise) -> None:
         for distance in (60.0, -60.0):
@@ -228,7 +228,7 @@ def interrupted_at(least: float) -> Callable[[float], None]:
     return progress
 
 
-def test_a_fit_that_is_interrupted_keeps_the_best_place_so_far() -> None:
+def test_an_interrupted_fit_keeps_the_best_parameters_so_far() -> None:
     wrong = with_values(SPRUNG, {"Coulomb friction": 2.0 * SPRUNG.motor.coulomb_nm})
     with Replays(replace(data(), base=wrong), 1) as replays:
         found = fit(replays, interrupted_at(0.2))
@@ -237,7 +237,7 @@ def test_a_fit_that_is_interrupted_keeps_the_best_place_so_far() -> None:
     assert misfit(data(), found.residuals) < 0.5 * misfit(data(), before)
 
 
-def test_a_fit_that_is_interrupted_before_it_has_reached_anything_leaves_nothing() -> None:
+def test_a_fit_interrupted_before_its_first_result_leaves_nothing() -> None:
     with Replays(data(), 1) as replays, pytest.raises(KeyboardInterrupt):
         fit(replays, interrupted_at(0.0))
 
@@ -248,7 +248,7 @@ PARAMETERS = (BY_NAME["command filter"],)
 
 
 def sweeps(bench: Exercise) -> None:
-    """So many whole counts per cycle that the motor's encoder errs alike in every row."""
+    """Speeds in whole counts per cycle at which the motor's encoder has the same error in every row."""
     bench.hold(0.4)
     for speed_deg_s in (90.0, -90.0):
         bench.lead(lambda seconds, speed=speed_deg_s: speed * seconds, 4.0)
@@ -294,6 +294,6 @@ def test_quantised_readings_show_the_simulation_error(spread: float) -> None:
     rng = np.random.default_rng(0)
     angle = rng.uniform(-100.0, 100.0, 4000)
     read = np.round(angle + spread * rng.standard_normal(4000))
-    read[:60] += 20.0 * rng.standard_normal(60)  # some are nowhere near
+    read[:60] += 20.0 * rng.standard_normal(60)  # some are far off
     found, _ = deviation(read - angle, 1.0, 0.004)
     assert found == pytest.approx(spread, rel=0.15)

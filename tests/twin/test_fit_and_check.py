@@ -59,7 +59,7 @@ def benched(axis: AxisConfig, truth: Truth, seed: int, count: int) -> Recording:
 
 @cache
 def twin(filter_ms: float = TRUTH.servo.command_filter_ms) -> Truth:
-    """The demo axis as a fit knows it that began at its truth, with another command filter."""
+    """The twin of a fit that began at the truth of the demo axis, with another command filter."""
     parameters, start = (
         tuple(BY_NAME[name] for name in NAMES),
         with_values(TRUTH, {"command filter": filter_ms}),
@@ -133,7 +133,7 @@ def test_recorded_warmth_is_not_a_change() -> None:
 
 
 def disturbed(recording: Recording) -> Recording:
-    """As where a motor that has stuck breaks away at another time: some torques, a thousand scales off."""
+    """Shifts some torques by a thousand scales, as if a stuck motor broke away at another time."""
     torque = recording.record.columns["motor_torque_nm"].copy()
     torque[np.argmax(np.abs(torque)) :][:6] = 0.0
     return with_torque(recording, torque)
@@ -148,7 +148,7 @@ def with_torque(recording: Recording, torque: np.ndarray) -> Recording:
 def test_a_check_names_changes_not_misfit(
     seen: Callable[[Recording], Recording],
 ) -> None:
-    # Shorter by less than anybody would care for, but with more inertia other rows show it.
+    # The filter is shorter by an irrelevant amount, but with more inertia other rows show it.
     near = twin(0.9 * TRUTH.servo.command_filter_ms)
     changed = recorded(seed=2, count=1, load_inertia=1.5 * TRUTH.load_.inertia_kg_m2)
     checked = check(seen(changed), AXIS, near, workers=1)
@@ -159,7 +159,7 @@ def test_a_check_names_changes_not_misfit(
 
 
 def test_a_load_that_rings_out_of_step_has_changed() -> None:
-    """An inertia larger by half, at 8 Hz: the twin leaves so much that slopes are meaningless."""
+    """With 1.5 times the inertia, at 8 Hz, the residual is so large that slopes are meaningless."""
     gear, stiffness = TRUTH.gear, TRUTH.load_.whole_inertia_kg_m2 * (math.tau * 8.0) ** 2
     damping = 0.3 * gear.damping_nm_s_per_rad * math.sqrt(stiffness / gear.stiffness_nm_per_rad)
     soft = {"gear stiffness": stiffness, "gear damping": damping}
@@ -173,7 +173,7 @@ def test_a_load_that_rings_out_of_step_has_changed() -> None:
 
 @cache
 def replay_only() -> Truth:
-    """A twin with wrong loops: it leaves several times the noise, so its values are not the axis's."""
+    """A twin with wrong loops, whose residual is several times the noise."""
     wrong = with_values(TRUTH, {"position gain": 80.0, "integral time": 40.0, "motor inertia": 6e-5})
     parameters = tuple(BY_NAME[name] for name in NAMES)
     with Replays(prepare(recorded(), AXIS, wrong), 1) as replays:
@@ -183,7 +183,7 @@ def replay_only() -> Truth:
         return with_knowledge(fitted, replays.data, Values.REPLAY)
 
 
-def test_a_twin_with_values_of_its_own_is_checked_by_the_misfit_that_it_was_made_with() -> None:
+def test_a_replay_only_twin_is_checked_against_its_original_misfit() -> None:
     checked = check(recorded(seed=1), AXIS, replay_only(), workers=1)
     assert checked.changes == ()
     assert checked.sentence.startswith("Nothing has changed since the twin was made")
@@ -204,7 +204,7 @@ def test_a_change_that_the_twin_s_own_error_hides_is_not_ruled_out() -> None:
     assert "servo dead time" in checked.sentence
 
 
-def test_such_a_twin_names_a_change_by_its_ratio() -> None:
+def test_a_replay_only_twin_names_a_change_by_its_ratio() -> None:
     doubled = recorded(seed=2, Coulomb_friction=2.0 * TRUTH.motor.coulomb_nm)
     checked = check(doubled, AXIS, replay_only(), workers=1)
     assert [each.cause for each in checked.changes] == ["friction"]
@@ -215,7 +215,7 @@ def test_such_a_twin_names_a_change_by_its_ratio() -> None:
 
 @pytest.mark.parametrize("twin_of", [twin, replay_only])
 def test_increased_misfit_is_never_silent(twin_of: Callable[[], Truth]) -> None:
-    """A torque that hunts, which no parameter of the simulated drive brings about."""
+    """A hunting torque, which no parameter of the simulated drive can cause."""
     recording = recorded(seed=1, count=1)
     torque = recording.record.columns["motor_torque_nm"]
     hunts = torque + 0.05 * np.sin(np.arange(len(torque)) / 2.0) * (torque != 0.0)

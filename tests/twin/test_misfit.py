@@ -1,4 +1,4 @@
-"""Residuals of a replay: each channel has the part that is its own; the noise that they are held against."""
+"""Residuals of a replay by channel, and the noise that they are compared with."""
 
 from __future__ import annotations
 
@@ -68,11 +68,11 @@ def test_a_command_offset_is_not_a_following_error() -> None:
 
 
 def test_a_count_is_not_a_zero_offset() -> None:
-    """A motor may rest so far from its command; in motion it is a following error like any other."""
+    """A motor may rest a count from its command; in motion this is a following error like any other."""
     data = prepare(with_command_offset(1), AXIS, TRUTH)
     counts = np.concatenate([each.counts[FOLLOWING] for each in data.pieces]) > 0.0
     assert np.median(residuals(data, TRUTH)[FOLLOWING][counts]) == pytest.approx(COUNT_DEG, rel=0.3)
-    # Nor is it in a comparison.
+    # The same holds in a comparison.
     for recording in (recorded(), with_command_offset()):
         row = compare(recording.record, replay(recording, AXIS, TRUTH), (), 50.0).row(FOLLOWING_ERROR)
         assert row is not None
@@ -80,7 +80,7 @@ def test_a_count_is_not_a_zero_offset() -> None:
 
 
 def test_a_late_motor_does_not_affect_the_load_error() -> None:
-    """The load comes along: 3 ms at 600 degrees per second are 130 arcsec of it."""
+    """The load follows the motor: 3 ms at 600 degrees per second are 130 arcsec of load angle."""
     late = with_values(TRUTH, {"servo dead time": 3.0})
     assert left(late)[FOLLOWING] > 10.0 * left(TRUTH)[FOLLOWING]
     assert left(late)[LOAD] < 13.0
@@ -97,7 +97,7 @@ def test_a_wrong_spring_or_load_stays_in_the_load_error(name: str, factor: float
 
 
 def test_rest_does_not_scale_residuals_of_motion() -> None:
-    """Most of this recording is rest, where hardly anything is left."""
+    """Most of this recording is rest, with hardly any residual."""
     data = prepare(recorded(), AXIS, TRUTH)
     moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
     assert moving.mean() < 0.5
@@ -107,7 +107,7 @@ def test_rest_does_not_scale_residuals_of_motion() -> None:
 
 
 def test_a_small_change_of_a_parameter_changes_the_residuals_by_as_little() -> None:
-    """No step of an encoder comes between: the slopes of a fit are those of the plant."""
+    """No encoder step interferes, so the slopes of a fit are those of the plant."""
     data = prepare(recorded(), AXIS, TRUTH)
     here = residuals(data, TRUTH)
     inertia = TRUTH.motor.inertia_kg_m2
@@ -135,7 +135,7 @@ def test_a_resting_motor_contributes_one_load_residual_and_no_torque() -> None:
 
 
 def test_a_motor_sets_out_from_the_torque_that_held_it() -> None:
-    """The replay has not been where friction holds the axis in the sense in which it came."""
+    """The recording begins at rest, so the replay lacks the motion whose friction holds the axis."""
     stiff = with_values(TRUTH, {"Coulomb friction": 0.1})
 
     def forward_and_on(bench: Exercise) -> None:
@@ -198,7 +198,7 @@ def noisy(where: str) -> Data:
 
 def test_noise_in_motion_is_estimated_for_any_motion() -> None:
     assert noise_in_motion(noisy("motion")) == pytest.approx(NOISE, rel=0.25)
-    # At rest it says nothing of it, and none is less than the rounding.
+    # Noise at rest gives no estimate for motion, and no estimate is below the rounding.
     assert noise_in_motion(noisy("rest")) == pytest.approx(noise_in_motion(as_measured()), rel=0.1)
     still = [
         replace(each, measured={name: 0.0 * column for name, column in each.measured.items()})

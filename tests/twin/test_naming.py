@@ -23,9 +23,9 @@ ROWS, LEGS = 1200, 24
 
 
 class Known:
-    """In place of replays: a lag at some speeds, friction by the speed's sign, and noise.
+    """Replaces replays by a lag at some speeds, friction by the speed's sign, and noise.
 
-    Dead time and filter are one lag but for the share of the acceleration that a ``quick`` motion has.
+    Dead time and filter are one lag except for the share of acceleration in a ``quick`` motion.
     """
 
     def __init__(self, axis: Truth, quick: float) -> None:
@@ -59,7 +59,7 @@ class Known:
 
 
 def named(axis: Truth, quick: float) -> tuple[Explained, tuple[Alike, ...]]:
-    """Causes by which `TRUTH` is not the axis, and sets that slopes do not separate."""
+    """Returns the causes by which the axis differs from `TRUTH`, and sets that slopes do not separate."""
     replays: Any = Known(axis, quick)
     parameters = tuple(BY_NAME[name] for name in NAMES)
     noise = dict.fromkeys((FOLLOWING, TORQUE, LOAD), 1.0)
@@ -99,7 +99,7 @@ def test_changes_below_the_noise_keep_the_false_alarm_rate(size: float, least: f
 
 
 def test_correlated_residuals_hide_changes_that_white_noise_would_show() -> None:
-    """In each leg they are as large as the change, of a sign of its own; white ones are as large in all."""
+    """In each leg they are as large as the change, with a random sign; white ones are so only in total."""
     change = 0.5 * CHANGE
     signs = np.random.default_rng(3).choice([-1.0, 1.0], 12)
     together = (2.0 * change * signs[LEG_OF_ROW.astype(int)]) - change * (2.0 * np.mean(signs))

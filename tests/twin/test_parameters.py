@@ -36,14 +36,14 @@ def test_each_row_names_a_value_of_the_truth_file_within_its_bounds(parameter: P
 
 
 @pytest.mark.parametrize("truth", [DEMO, DAHL], ids=["demo", "dahl"])
-def test_coordinates_lead_there_and_back(truth: Truth) -> None:
+def test_coordinates_round_trip(truth: Truth) -> None:
     parameters = [each for each in PARAMETERS if value_in(truth, each) is not None]
     place = coordinates(truth, parameters)
     again = at_coordinates(truth, parameters, place)
     assert coordinates(again, parameters) == pytest.approx(place)
 
 
-def test_a_section_that_a_parameter_needs_is_as_good_as_none() -> None:
+def test_an_existing_section_needs_no_addition() -> None:
     assert DEMO.motor.stribeck is not None
     assert DEMO.motor.stribeck.rise == 0.0
     assert with_sections(DEMO, PARAMETERS) is DEMO

@@ -177,7 +177,7 @@ def test_commands_at_uneven_times_are_met_to_the_last_row() -> None:
 
 
 def test_a_late_stamp_changes_no_simulated_signal() -> None:
-    """The clock of a log is late now and then; the drive's cycles are not."""
+    """The clock of a log is occasionally late; the drive's cycles are not."""
     axis, truth = demo()
     recording = benched(axis, truth, Stepping(2, start_deg=0.0))
     time_s = recording.record.time_s.copy()
@@ -224,7 +224,7 @@ def bare() -> Record:
     lost=st.sets(st.integers(1, 498), max_size=5),
 )
 def test_rows_are_counted_whatever_their_stamps_are_late_by(late: dict[int, float], lost: set[int]) -> None:
-    """No stamp is earlier than the one before it, and rows that were not recorded are cycles still."""
+    """Stamps never decrease, and rows that were not recorded still count as cycles."""
     cycles = np.arange(500.0)
     stamps = cycles.copy()
     for row, share in late.items():
@@ -311,7 +311,7 @@ COUNT_DEG = 0.045
 
 
 def moved_twice(creeps_deg: float) -> tuple[Record, np.ndarray]:
-    """Half a second of motion, as much of rest in which the motor creeps, and motion again."""
+    """Half a second of motion, half a second of rest in which the motor creeps, and motion again."""
     target = np.concatenate([np.linspace(0.0, 20.0, 50), np.full(50, 20.0), np.linspace(20.4, 40.0, 49)])
     motor = target.copy()
     motor[60:100] += creeps_deg * np.linspace(0.0, 1.0, 40)
@@ -357,7 +357,7 @@ def ended_in_motion(first_s: float, then_s: float) -> Record:
 
 
 def test_a_load_rings_as_long_after_an_unknown_stop_however_short_the_procedure_after_it() -> None:
-    """A hardly damped one rings on in all of a procedure of a second."""
+    """A weakly damped load rings throughout a procedure of a second."""
     record = ended_in_motion(20.0, 1.2)
     unknown = unknown_rows(record, COUNT_DEG)
     assert not unknown[: record.starts[1]].any(), "it begins at rest"
@@ -428,13 +428,13 @@ def two_tasks() -> Recording:
 
 
 def without_noise() -> Truth:
-    """The load encoder's noise is another draw."""
+    """Returns the truth without load encoder noise, because a replay draws other noise."""
     encoder = TRUTH.load_.encoder.model_copy(update={"noise_arcsec": 0.0})
     return TRUTH.model_copy(update={"load_": TRUTH.load_.model_copy(update={"encoder": encoder})})
 
 
 def moved(recording: Recording, later_s: float) -> Recording:
-    """The second part later, as it would be in another recording."""
+    """Delays the second part, as in another recording."""
     record = recording.record
     time_s = record.time_s + later_s * (np.arange(len(record)) >= record.starts[1])
     return Recording(
@@ -479,7 +479,7 @@ def test_the_second_part_counts_from_its_first_row_where_it_is_known_what_came_b
     first, second = prepare(two_tasks(), AXIS, TRUTH).pieces
     judged = second.counts["following error"] > 0.0
     assert judged.sum() == len(two_tasks().record) - two_tasks().record.starts[1]
-    assert not judged[: -int(judged.sum())].any(), "what leads up to it does not count"
+    assert not judged[: -int(judged.sum())].any(), "the motion before it does not count"
     alone = prepare(moved(two_tasks(), 5.0), AXIS, TRUTH).pieces[1]
     assert second.counts[LOAD].sum() > alone.counts[LOAD].sum() + 50
     assert first.counts[LOAD].any()

@@ -1,4 +1,4 @@
-"""Fits of servos that are not the ones a fit assumes first."""
+"""Fits of servos that differ from the initial assumption of a fit."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ FRICTION = tuple(BY_NAME[name] for name in ("Coulomb friction", "viscous frictio
 
 
 def warmed(heat: TrueTemperature, seed: int, minutes: float, rests: float = 0.25) -> Recording:
-    """The demo axis with another body, at work of two kinds and at rest, read in tenths of a kelvin."""
+    """Records the demo axis with these thermal constants, at two kinds of work and at rest."""
     rng = np.random.default_rng(seed)
     truth = TRUTH.model_copy(update={"temperature": heat})
     machine = Machine(truth, seed, may_compile=True)
@@ -58,7 +58,7 @@ def warmed(heat: TrueTemperature, seed: int, minutes: float, rests: float = 0.25
 
 
 def fitted(recording: Recording) -> Fitted:
-    """Its friction, where it is, and how sure a fit of it is."""
+    """Fits the friction, without a step, for its uncertainty."""
     few = recording.record.rows(0, 500)
     with Replays(prepare(Recording(few), AXIS, TRUTH), 1) as replays:
         return solve(replays, TRUTH, FRICTION, 0)
@@ -119,7 +119,7 @@ def test_without_temperature_the_truth_is_unchanged() -> None:
 
 
 def test_warmth_dependent_terms_keep_their_reference() -> None:
-    """Its reference was the ambient temperature, which has become another one."""
+    """The reference was the former ambient temperature."""
     grows = TRUTH.temperature.model_copy(update={"friction_growth_per_k": -0.01})
     start = TRUTH.model_copy(update={"temperature": grows})
     heat = HEATS[0].model_copy(update={"friction_growth_per_k": -0.01, "reference_c": 22.0})

@@ -84,13 +84,13 @@ def stand(bench: Exercise) -> None:
 
 
 def brisk(bench: Exercise) -> None:
-    """Sines: much acceleration, no step of it that would make the load ring."""
+    """Sines with high acceleration, but without steps of it that would make the load ring."""
     bench.sine(200.0, 0.5, 3.0)
     bench.sine(100.0, 1.0, 3.0)
 
 
 def warming(truth: Truth) -> Truth:
-    """Surroundings that warm up by a kelvin a second, and an axis that began warmer."""
+    """An ambient temperature that rises by a kelvin a second, and an axis that starts warmer."""
     heat = {"ambient_k_per_hour": 3600.0, "time_constant_s": 0.5, "start_c": 25.0}
     return truth.model_copy(update={"temperature": truth.temperature.model_copy(update=heat)})
 
@@ -104,7 +104,7 @@ def hanging(truth: Truth) -> Truth:
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """An effect in its place in a model, a motion that shows it, and how much of it may be left."""
+    """An effect in a model, a motion that shows it, and its permitted residual."""
 
     parts: tuple[effects.Effect, ...]
     lead: Callable[[Exercise], None] = to_and_fro
@@ -271,7 +271,7 @@ def test_the_simulated_drive_errs_as_the_model_says(name: str, monkeypatch: pyte
     if case.in_python:
         monkeypatch.setenv(fast.SWITCH, "0")
     base = case.plant(default_truth(AXIS))
-    # A spring that nothing asks for would wind up without the model's knowledge.
+    # A spring that no effect needs would wind up without the model's knowledge.
     translation = translate(
         AXIS, TransmissionModel(N, case.parts), base if base != default_truth(AXIS) else None
     )
@@ -283,7 +283,7 @@ def test_the_simulated_drive_errs_as_the_model_says(name: str, monkeypatch: pyte
     left = float(np.sqrt(np.mean((error - prediction) ** 2)))
     allowed = case.left * size + case.floor_arcsec
     assert left < allowed, f"{left:.2f} arcsec of {size:.2f} are left"
-    assert allowed < 0.5 * size, "a drive that had nothing of it would pass"
+    assert allowed < 0.5 * size, "a drive without the effect would pass"
     assert [row.effect for row in translation.rows if row.counterpart is None] == []
 
 
@@ -319,7 +319,7 @@ def test_effects_beyond_the_plant_are_reported() -> None:
 
 
 def test_unreachable_spring_stages_are_omitted() -> None:
-    """A diagnosis names a linear spring so: the other stages begin beyond any torque."""
+    """A diagnosis describes a linear spring this way, with the other stages beyond any torque."""
     linear = effects.Compliance(
         c1_arcsec_per_nm=31.0,
         c2_arcsec_per_nm=0.0,

@@ -47,11 +47,11 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 TRIPS = ((400.0, 600.0), (-450.0, 600.0), (90.0, 120.0), (-150.0, 120.0), (700.0, 1500.0), (-600.0, 1500.0))
-"""Ways (degrees of the motor) and speeds (deg/s) by which a twin is known well enough to check the axis."""
+"""Moves (degrees of the motor) and speeds (deg/s) that determine a twin well enough to check the axis."""
 
 
 def trips(truth: Truth, folder: Path) -> Path:
-    """A recording of them, a leg for each."""
+    """Records the `TRIPS`, a leg for each."""
     ends = [0.0]
 
     def lead(bench: Exercise) -> None:
@@ -97,7 +97,7 @@ def test_simulation_errors_are_reported_by_channel(profile: Path, recording: Pat
     page = (profile / "page.html").read_text()
     assert "Twin of axis" in page
     assert "truth.yaml" in page
-    # Without a transmission error, its torque and following error would be taken for motor and loops.
+    # Without a transmission error, its torque and following error would be attributed to motor and loops.
     (profile / "truth.yaml").unlink()
     done = run_here(profile, "twin", profile, recording, "--compare")
     assert "no transmission error is simulated" in done.stderr
@@ -116,7 +116,7 @@ def test_the_active_model_explains_the_simulation_error(profile: Path, recording
         figures(json.loads((profile / name).read_text()), "before")["load_error"]["difference"]
         for name in ("without.json", "with.json")
     )
-    assert wrong > without + 15.0, "orders that the axis has not"
+    assert wrong > without + 15.0, "orders that the axis does not have"
     rows = json.loads((profile / "with.json").read_text())["from_model"]
     assert {row["effect"]: row["counterpart"] for row in rows} == {
         "synchronous": "gear.motor_orders",
@@ -218,7 +218,7 @@ def test_a_better_twin_is_kept_as_pending(profile: Path, recording: Path, run: R
 def test_a_twin_without_improvement_is_not_kept(profile: Path, run: Run) -> None:
     said, report, page = run(fitted(Truth.load(profile)))
     assert "not kept" in said
-    assert "Coulomb friction" not in said, "nothing is known of it"
+    assert "Coulomb friction" not in said, "its cause is unknown"
     assert "unexplained: motor torque" in said
     assert [each["cause"] for each in report["findings"]] == ["unexplained"]
     assert report["parameters"] == []
@@ -273,7 +273,7 @@ def test_from_usual_values_a_fit_gives_estimates_and_no_changes(run: Run) -> Non
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_an_axis_is_learned_and_a_later_change_of_it_is_named(profile: Path) -> None:
-    """The whole way, with the fit itself: some 150 seconds of CPU."""
+    """Runs the whole procedure including the fit, some 150 seconds of CPU time."""
     recording = trips(Truth.load(DEMO), profile / "recording")
     done = run_here(profile, "twin", profile, recording)
     assert done.returncode == 0, done.stderr

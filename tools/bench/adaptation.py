@@ -3,9 +3,8 @@
 python tools/bench/adaptation.py [--minutes 60] [--faulty-minutes 10]
 
 The simulated axis of the article steps without a pause over real frames; within an hour its loop's offset
-grows by a fifth, and its second order by 3 arcsec. Each line is one run: three sigma of where the load
-*really* stood less its target, over eight neighbouring stepping tests (256 stands): the first, the largest,
-the last.
+grows by a fifth, and its second order by 3 arcsec. Each line is one run: three sigma of the load's
+*true* error at rest over eight neighbouring stepping tests (256 stands): the first, the largest, the last.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ ON = AdaptationSettings(mode="on")
 
 
 def line(name: str, work: Work, until_s: float, told: str) -> None:
-    """A row of the table."""
+    """Prints a row of the table."""
     three_sigma = work.three_sigma_arcsec(NEIGHBOURS)
     figures = " | ".join(f"{each:.2f}" for each in (three_sigma[0], max(three_sigma), three_sigma[-1]))
     print(f"| {name} | {until_s / 60.0:.0f} | {figures} | {told} |", flush=True)
 
 
 def measure(name: str, settings: AdaptationSettings | None, until_s: float) -> None:
-    """A run without faults."""
+    """Measures a run without faults."""
     with at_work(truth_of(3600.0), settings) as work:
         work.until(until_s)
         told = "nothing" if work.adaptation is None else f"{len(work.history)} changes of the model"
@@ -40,7 +39,7 @@ def measure(name: str, settings: AdaptationSettings | None, until_s: float) -> N
 
 
 def measure_fault(name: str, until_s: float) -> None:
-    """A run in the middle of which the load encoder fails."""
+    """Measures a run in which the load encoder fails halfway."""
     with at_work(truth_of(3600.0), ON) as work:
         work.until(0.5 * until_s)
         failed_s = work.time_s

@@ -8,7 +8,7 @@
   1 story   moves, a re-target in motion, jogs, a queue, a stream, compensation off and on, now and then a
             quick stop and a reset: again and again
 
-They run until standard input ends; then what they saw is printed as JSON: samples, lost ones, requests,
+They run until standard input ends, then their observations are printed as JSON: samples, lost ones, requests,
 longest answer, errors.
 """
 

@@ -2,7 +2,7 @@
 
     python tools/bench/conformance.py [--only gateway,slave,drive,durand,canopen] [--failures]
 
-`gateway` is the whole of it: outer bus, gateway, daemon, inner bus and a simulated axis with its model.
+`gateway` is the complete chain: outer bus, gateway, daemon, inner bus and a simulated axis with its model.
 Prints a row for each node: checks, passed, failed, not applicable.
 """
 
@@ -105,7 +105,7 @@ def foreign(name: str, folder: Path) -> Iterator[NodeTester]:
 def results_of(name: str, folder: Path) -> list[Result]:
     if name == "gateway":
         return whole_gateway(checks(moves=True), folder)
-    if name in ("durand", "canopen"):  # without CiA 402, which neither has
+    if name in ("durand", "canopen"):  # without CiA 402, which both lack
         with foreign(name, folder) as tester:
             return run(tester, [each for each in checks(stores=True) if not each.id.startswith("402")])
     every = checks(moves=True, stores=True)

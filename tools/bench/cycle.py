@@ -14,11 +14,11 @@ One run measures, in interleaved blocks, the CPU time of the thread (`time.threa
 
 and prints medians over the blocks, and their ratios to the bare exchange.
 
-Nobody sleeps. On the virtual bus the answering node runs in the same thread; what it costs is measured in
+Nothing sleeps. On the virtual bus the answering node runs in the same thread; its cost is measured in
 the same blocks and subtracted from each alike. On SocketCAN the kernel's own gateway (can-gw, set up with
 cangw, as root) turns each SYNC into the two TPDOs, which costs no process any time; there wall time is
 measured, because the CPU clock of user-mode-linux counts in steps of 4 ms.
-Without --interface all are measured that this machine has.
+Without --interface, all interfaces of this machine are measured.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ One run measures, in interleaved blocks, the CPU time of the thread (`time.threa
   follow 1  the same for one axis that follows the set-points of a gateway
 
 all on the same path, and prints medians, the ratio to the bench, and the cost per axis. The answering nodes
-run in the same thread; what they cost is measured in the same blocks and subtracted. Nobody sleeps.
+run in the same thread; their cost is measured in the same blocks and subtracted. Nothing sleeps.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def bench_cycle(
     compensation.engage()
     observer, sensed = Observer(), Sensed(axis)
     needs, at_rest = bool(compensation.needs), Moment()
-    # Its path: the set-point of the same move, so that both loops follow the same.
+    # The set-point of the same move, so that both loops follow the same path.
     set_point = SetPoint(axis_view(axis).limits, axis.drive.cycle_s)
     goal = 300.0
     for _ in range(5):

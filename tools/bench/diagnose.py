@@ -3,7 +3,7 @@
 .venv/bin/python tools/bench/diagnose.py [samples ...]
 
 One axis (ratio 50) with two causes hidden goes through a bench plan; the record is laid end to end until
-there are enough samples. Processor time on one thread where OMP_NUM_THREADS=1 is set.
+there are enough samples. Processor time is that of one thread if OMP_NUM_THREADS=1 is set.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
     python tools/bench/endurance.py [--minutes 30] [--every SECONDS] [--idle SECONDS] [--json FILE]
 
-`hdbridge run --simulate` as it is, its processes, its flight recorder; first without clients, then with four
+`hdbridge run --simulate` with all its processes and the recorder; first without clients, then with four
 that poll, five that watch, a live page, and one that moves (the story of `clients.py`).
 
-A figure grows when its median over the last quarter of the run is above that over the second quarter by more
+A figure grows if its median over the last quarter of the run exceeds that over the second quarter by more
 than is allowed. The first quarter is for what fills up: rings, queues of bounded length, caches.
 
 Exit status 1 if something grows, or a cycle is missing without a report.
@@ -174,7 +174,7 @@ class RunningDaemon:
         """Opens the keeper's shared memory for reading, as the service does."""
         fds = Path(f"/proc/{self.process.pid}/fd")
         found = next(each for each in fds.iterdir() if str(each.readlink()).startswith("/memfd:hdbridge "))
-        with Memory.attach(os.open(found, os.O_RDWR)) as memory:  # which closes it
+        with Memory.attach(os.open(found, os.O_RDWR)) as memory:  # `Memory` closes it
             yield memory
 
     def close(self) -> None:

@@ -102,7 +102,7 @@ def _detectable(joint: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
 def prior(fleet: Path, out: Path) -> None:
     """Weighs the names of each joint's recordings by a prior from the other joints; counts right and wrong.
 
-    Recordings are not fitted again without the names that fall away, as `diagnose --prior` does.
+    Unlike `diagnose --prior`, this does not fit recordings again without the dropped names.
     """
     rows = [row for row in Dataset(out).recordings() if row["joint"]]
     truth = {each["name"]: each for each in json.loads((fleet / "answers.json").read_text())["joints"]}
@@ -158,7 +158,7 @@ def _count(
 
 
 def main() -> None:
-    """Prints the figures that were asked for."""
+    """Prints the requested figures."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

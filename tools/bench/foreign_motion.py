@@ -13,7 +13,7 @@ and filtered; and on how many axes the whole ripple is larger than without corre
 error and the time to settle without correction and with the one of the calibration; and the error at rest.
 
 With ``--retuned`` the position gains of simulated drives are multiplied by `GAINS` after the measurement of
-the response. FILE gets what is removed of the slow orders over all speeds, per cent, before and after
+the response. FILE gets the removed share of the slow orders over all speeds, per cent, before and after
 refinements by runs at the two speeds `WORK`, their number, and the difference by which the watch judges.
 """
 
@@ -126,7 +126,7 @@ def booted(axis: AxisConfig, folder: Path, seed: int) -> Iterator[Drive]:
 
 
 def retuned(seed: int, folder: Path) -> Iterator[dict[str, Any]]:
-    """One document per gain."""
+    """Returns one document per gain."""
     with simulated(seed, folder) as (drive, static):
         axis, model = drive.axis, replace(static, response=motion_test(drive, static).response)
     truth = yaml.safe_load((folder / "truth.yaml").read_text(encoding="utf-8"))
@@ -229,7 +229,7 @@ def _both_ways(values: list[float]) -> list[float]:
 
 
 def measure(kind: str, seed: int, exact: bool) -> dict[str, Any]:
-    """The figures of one axis, or the error that it ends with."""
+    """Returns the figures of one axis, or the error that ended its measurement."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:

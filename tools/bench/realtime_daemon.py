@@ -6,8 +6,8 @@
 Runs on the kernel of `tools/realtime/run.sh`, as `realtime_cycle.py`: one axis at 1 kHz, then six at 250 Hz,
 compensated, and before them the bench's cycle (`Cycle.tick`) with the same compensation and set-point. The
 loop (`Controller.turn`) is in this process, with SCHED_FIFO and locked memory. A second process is the
-service, on the same processor: it empties the rings of samples and events, and posts what clients ask for,
-all of it again and again:
+service, on the same processor: it empties the rings of samples and events, and posts requests of clients
+in a loop:
 
     moves, re-targeted in motion - jogs - stops - streams of knots - compensation off and on - another model
     in motion - SDO requests
@@ -15,7 +15,7 @@ all of it again and again:
   busy    from the wake-up to the next time that the loop sleeps: all of a turn, sample and commands included
   missed  turns that began more than half a period late or were busy beyond the next deadline
 
-It fails where a period was skipped, an axis stopped by itself, or a sample was lost.
+It fails if a period was skipped, an axis stopped without a request, or a sample was lost.
 """
 
 from __future__ import annotations

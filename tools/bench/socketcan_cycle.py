@@ -2,10 +2,10 @@
 
     tools/socketcan.sh .venv/bin/python tools/bench/socketcan_cycle.py [--cycles 5000] [--json FILE]
 
-First an empty loop of as many periods is timed: what it misses, no bus and no drive are to blame for. Then
+First an empty loop of as many periods is timed; neither bus nor drive causes the periods that it misses. Then
 `hdbridge simulate` is started, the drive is booted and enabled over the bus, and the axis swings with the
 compensation of the article's model at work in every cycle. Printed are the periods missed (begun more than
-half a period late), the cycles in which a TPDO was missing, and how late the cycles began. Exit status 0 when
+half a period late), the cycles in which a TPDO was missing, and how late the cycles began. Exit status 0 if
 nothing was missed, 1 otherwise.
 """
 

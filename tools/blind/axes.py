@@ -1,7 +1,7 @@
 """Draws the axes of blind cases: the truth without the cause.
 
 `drawn_axis` is an axis of the bench suite: of ordinary size, with a model file that is a few per cent wrong.
-`everyday_axes` spans what is built: soft and stiff springs, coarse and fine encoders, slow and fast buses.
+`everyday_axes` spans real machines: soft and stiff springs, coarse and fine encoders, slow and fast buses.
 Their models come from calibrations (`blind.plant`).
 """
 
@@ -305,7 +305,7 @@ def _everyday(
     }
     load: dict[str, Any] = {
         "inertia_kg_m2": load_inertia,
-        # Bearings of the load, apart from the gear's own: their wind-up is below what matters.
+        # Bearings of the load, in addition to the gear's own; their wind-up is insignificant.
         "coulomb_nm": wind_up_nm * _stretched(rng, 0.01, 0.3),
         "viscous_nm_s_per_rad": wind_up_nm * _stretched(rng, 0.01, 0.3) / math.radians(motor_deg_s / ratio),
         "encoder": {

@@ -61,8 +61,8 @@ BETWEEN_TASKS_S = 1.0
 """Pause between two tasks of a plan, in the recording's time."""
 MOST_BENCH_SAMPLES = 1_000_000
 
-# Structural look-alikes, by physics: whatever is measured at one axis without touching it, they read alike.
-# A diagnosis that names one of them and gives the other as an alias is right.
+# Structural aliases: no measurement on an unmodified axis separates them. A diagnosis that names one of them
+# and gives the other as an alias is right.
 TWINS = (
     ("motor_order", "motor_encoder_eccentricity"),
     ("load_order", "compliance"),
@@ -211,7 +211,7 @@ def _full_bench(case: Case, seed: int, folder: Path) -> dict[str, Any]:
         "noise_arcsec": round(axis.noise_arcsec, 4),
         "samples": len(readings.time_s),
         **_told(hidden, truth),
-        # Really there, though not hidden on purpose: to name them is neither right nor wrong.
+        # Present, but not hidden on purpose: to name them is neither right nor wrong.
         "also": [*_brought(hidden), *_always(truth, run, axis, hidden)],
     }
 

@@ -5,9 +5,9 @@
     python tools/blind/generate.py build/full --seed 4712 --suite bench
 
 Each case is a folder: the record and model.yaml are what a diagnosis is given, sealed.json is what it should
-find. A case that is there already is not made again, so the command continues where it was stopped. A folder
-is either whole or not there. The same seed and case give the same record. Suites with a seed of 1000 and more
-are held out: score.py prints rates of them and no cases, so that nobody develops on them.
+find. An existing case is not made again, so the command continues where it was stopped. A folder
+is either complete or absent. The same seed and case give the same record. Suites with a seed of 1000 and more
+are held out: score.py prints their rates and no cases, so that they are not used for development.
 
 A suite may also be a list such as ``fault=60,law=20``. ``single`` and ``power`` are numbers for each cause of
 the catalogue, ``flicker`` counts pairs, the others count cases.

@@ -1,6 +1,6 @@
 """True parameters of a finding: the hidden cause in the finding's units and conventions.
 
-The secret says what was hidden and what the plant is, model.yaml what the diagnosis compared it with. A
+The secret has the hidden cause and the plant, model.yaml the diagnosis's reference. A
 parameter is missing if the two do not mean the same, for the reasons given next to each cause.
 """
 

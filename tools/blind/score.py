@@ -1,12 +1,12 @@
-"""Diagnose every case of a blind suite and print how well it went.
+"""Diagnoses every case of a blind suite and prints the rates.
 
     python tools/blind/score.py build/blind             # rates
     python tools/blind/score.py build/blind --cases     # and cases, of a development suite (seed below 1000)
     python tools/blind/score.py build/blind --answers build/before --command 'OTHER/bin/hdbridge diagnose'
 
 Each case is diagnosed once by the command, in a process of its own. The answers are kept in a folder and
-judged again without running. Remove the folder, or name another, after a change of the code. A suite that is
-still being made can be scored so far. If a case of a hidden cause is given a name, the fresh record of the
+judged again without running. Remove the folder, or name another, after a change of the code. An incomplete
+suite can be scored so far. If a case of a hidden cause is given a name, the fresh record of the
 same plant is diagnosed too, with the given and with the written model. Exit status 1 if a command failed.
 """
 

@@ -1,8 +1,8 @@
 """Compares a diagnosis with the hidden causes: one verdict for each case.
 
 Only the published JSON of ``hdbridge diagnose`` and the model that it writes are read. A cause is *named* if
-its probability is above 0.5. A finding *meets* a hidden cause if it names it, or gives it as an alias. What
-the secret calls ``also`` is really there too: to name it is neither right nor wrong.
+its probability is above 0.5. A finding *meets* a hidden cause if it names it, or gives it as an alias. A
+cause that the secret lists in ``also`` is present too: to name it is neither right nor wrong.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def _detectable(diagnosis: Data | None, known: tuple[str, ...], secret: Data) ->
     """
     if diagnosis is None or len(known) != 1 or not secret.get("effect"):
         return None
-    # What the cause does here is not more of it than there is: a mass also winds up the spring, for example.
+    # A side effect here does not count as more of the cause: a mass also winds up the spring, for example.
     peak_arcsec = min(secret["effect"]["peak_arcsec"], secret["hidden"][0]["size_arcsec"])
     names = {known[0], *(each for twins in TWINS if known[0] in twins for each in twins)}
     reports = [diagnosis.get("identifiability", {}).get(each) for each in names]

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import asynccontextmanager
 
 import pytest
-from support.api import served_beside
+from support.api import served_in_loop
 from support.service import Service, play, stepped_service
 
 from hdbridge import Client, InputError, LeaseError, RefusedError
@@ -24,7 +24,7 @@ def service(tmp_path_factory):
 @asynccontextmanager
 async def served(service: Service):
     path = service.folder / "cell.sock"
-    async with service.ready(simulated=True) as bridge, served_beside(bridge, path):
+    async with service.ready(simulated=True) as bridge, served_in_loop(bridge, path):
         yield path
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
-from support.api import served_beside
+from support.api import served_in_loop
 from support.daemon import stepped_daemon
 from support.service import Service, article_profiles, play
 from support.two_channels import CHANNELS
@@ -161,7 +161,7 @@ def call_everything(machine: Machine, folder: Path) -> list[str]:
             bridge = await stack.enter_async_context(service.ready(simulated=True))
             for each in follow(machine, bridge, None, stack):
                 bridge.core.observer.add(each)
-            await stack.enter_async_context(served_beside(bridge, path))
+            await stack.enter_async_context(served_in_loop(bridge, path))
             await asyncio.to_thread(program, path)
 
     configs = [each.config for each in machine.axes]

@@ -172,7 +172,7 @@ def test_neither_token_nor_lease_is_logged(api, caplog, capfd):
     own = [each for each in caplog.records if each.name.startswith(("hdbridge", "uvicorn", "websockets"))]
     logged = "\n".join(f"{each.getMessage()} {each.args} {each.__dict__}" for each in own)
     logged += "".join(capfd.readouterr())
-    assert "enable" in logged, "what moves is logged, with who asked"
+    assert "enable" in logged, "motion is logged with its client"
     assert f"{lease}" not in logged
     assert TOKEN not in logged
 

@@ -16,7 +16,7 @@ from hdbridge.daemon.memory import SampleFlag
 
 QUICK = AdaptationSettings(mode="on", interval_s=2.0, rate_arcsec_per_hour=3600.0, half_life_turns=10.0)
 OFFSET, SECOND = 12, 2
-"""Places of the offset and the second order's cosine among what is followed of the article's model."""
+"""Indices of the offset and the second order's cosine among the followed parameters."""
 
 
 class Axis:

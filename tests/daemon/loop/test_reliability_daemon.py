@@ -73,7 +73,7 @@ def test_a_wrapping_position_has_no_effect(bench: DaemonBench) -> None:
     before = wrapped(bench.node.firmware.motion.machine.load_counts)
     daemon.run(2.0)
     after = wrapped(bench.node.firmware.motion.machine.load_counts)
-    assert before > 0 > after, "the counts were to pass the end"
+    assert before > 0 > after, "the counts must pass the end of their range"
     assert not faults(bench)
     assert bench.moves_on(0)
     further("the load encoder's counts pass the end of their 32 bits").show(0)
@@ -279,7 +279,7 @@ def test_a_jog_runs_out_when_the_service_dies(moving: DaemonBench) -> None:
     daemon.done(K.JOG, 0, a=10.0 * direction, b=0.5)
     turns = 0
     while not axis.set_point.at_rest:
-        daemon.controller.turn()  # nobody reads events, nobody posts
+        daemon.controller.turn()  # no events are read, no commands posted
         turns += 1
     daemon.run(0.5)
     assert daemon.states[0] is S.ENABLED

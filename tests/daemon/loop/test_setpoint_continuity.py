@@ -117,7 +117,7 @@ class Watch:
         if self.last is None:
             # The position that the drive reported last; the axis may have moved by some counts since.
             actual = self.daemon.nodes[0].firmware.motion.motor_counts
-            assert abs(target - actual) * DEG_PER_COUNT < 0.01, "power begins where the axis is"
+            assert abs(target - actual) * DEG_PER_COUNT < 0.01, "power begins at the position of the axis"
         else:
             self.compare((target - self.last) * DEG_PER_COUNT / PERIOD_S, axis.set_point.mode.name)
         self.last = target

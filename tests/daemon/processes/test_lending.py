@@ -145,7 +145,7 @@ def test_the_daemon_commits_the_model_that_a_borrower_proposed(daemon: Daemon) -
         borrower.wait()
     until_taken_back(daemon, loops)
     assert model_in_use(daemon)["reason"] == before["reason"] != "calibration"
-    # A request that meets the control process as it begins is refused, and nothing of it is done.
+    # A request during the start of the control process is refused and has no effect.
     until(lambda: committed().status_code == 200, lambda: str(daemon.state()))
     in_use = model_in_use(daemon)
     assert (in_use["reason"], in_use["version"]) == ("calibration", store.find(folder, store.ACTIVE).number)

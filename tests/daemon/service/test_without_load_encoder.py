@@ -26,7 +26,7 @@ def blind(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def at_work(blind: Path, folder: Path, **servo: float) -> tuple[messages.AxisState, list[str]]:
-    """Moves there and back, with these parameters of the servo; returns the state and all notes."""
+    """Moves in both directions with these servo parameters; returns the state and all notes."""
 
     async def story(service: Service) -> tuple[messages.AxisState, list[str]]:
         async with service.enabled() as (bridge, token):
