@@ -105,7 +105,7 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
         if robust_chi_square(estimator, fitted, place) < needed:
             return Gate(robust, needed, "not seen in enough independent stretches")
         return Gate(robust, needed, "may be an error in the law of another cause")
-    if robust_chi_square(estimator, fitted, place, laws=laws, free=True) < needed:
+    if shapes and robust_chi_square(estimator, fitted, place, laws=laws, free=True) < needed:
         return Gate(robust, needed, "the record does not determine its size and shape")
     if effect.tracker().memory_deg > 0.0:
         others = fitted.hypothesis.without(place)

@@ -6,7 +6,7 @@ A reversal counts only if the motor returns by more than the chatter.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -135,8 +135,7 @@ def _rested(
     driving: FloatArray, position: FloatArray, resting: BoolArray, window: int, band: float
 ) -> FloatArray:
     path = driving.copy()
-    edges = np.flatnonzero(np.diff(resting, prepend=False, append=False))
-    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+    for first, end in _rests(resting):
         path[first:end] = uniform_filter1d(position[first:end], 2 * window + 1, mode="nearest")
     return steadied(path, path, band)
 
@@ -171,26 +170,23 @@ def _driving(
     line = lag + (read / (read + missed) if read else 1.0) * (line - lag)
     # A motor that sticks at a reversal or overshoots a stop is where its encoder says.
     line = np.clip(line, lag - cell, lag + cell)
-    mean, flickers = _at_rest(lag, _resting(target, window), window, count, math.sqrt(read))
-    line = np.where(flickers, mean, line)
+    line = _averaged_at_rest(line, lag, _resting(target, window), window, count, math.sqrt(read))
     # The path may cross its cell without reversing, and the cell moves with a noisy reading.
     band = max(CHATTER_COUNTS * reading.resolution_deg, 4.0 * cell)
     return steadied(target + line, target + line, band)
 
 
-def _at_rest(
-    reading: FloatArray, resting: BoolArray, window: int, count: float, error: float
-) -> tuple[FloatArray, BoolArray]:
-    """Returns the mean reading of each rest, (n,), and a mask of the rests whose reading flickers.
+def _averaged_at_rest(
+    angle: FloatArray, reading: FloatArray, resting: BoolArray, window: int, count: float, error: float
+) -> FloatArray:
+    """Replaces an angle, (n,), by the mean reading in each rest whose reading flickers.
 
     A rest begins when the reading stays within half a count and three standard ``error`` of the mean of the
-    second half; later, single readings may be farther. Where a resting encoder flickers, the mean is the
-    angle. The largest of its readings would look like a reversal.
+    second half; later, single readings may be farther. The largest reading of a resting encoder would look
+    like a reversal.
     """
-    mean, flickers = reading.copy(), np.zeros(len(reading), dtype=np.bool_)
-    length = 2 * window + 1
-    edges = np.flatnonzero(np.diff(resting, prepend=False, append=False))
-    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+    result, length = angle.copy(), 2 * window + 1
+    for first, end in _rests(resting):
         rows = slice(max(first - window, 0), end + window)  # as long as the command is constant
         off = reading[rows] - np.mean(reading[(first + end) // 2 : end])
         smooth = uniform_filter1d(off, length, mode="nearest")
@@ -198,8 +194,14 @@ def _at_rest(
         begin = rows.start + _after_last(np.abs(off[:settled]) > 0.5 * count + 3.0 * error)
         rest = reading[begin : rows.stop]
         if np.any(rest != rest[:1]):
-            mean[begin : rows.stop], flickers[begin : rows.stop] = np.mean(rest), True
-    return mean, flickers
+            result[begin : rows.stop] = np.mean(rest)
+    return result
+
+
+def _rests(resting: BoolArray) -> Iterator[tuple[int, int]]:
+    """Yields the first sample of each rest, and the one after its last."""
+    edges = np.flatnonzero(np.diff(resting, prepend=False, append=False)).tolist()
+    yield from zip(edges[::2], edges[1::2], strict=True)
 
 
 def _after_last(mask: BoolArray) -> int:

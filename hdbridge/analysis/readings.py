@@ -96,7 +96,7 @@ def jitter_deg(angle_deg: FloatArray) -> float:
         return 0.0
     first = angle_deg[1:] - angle_deg[:-1]
     second = first[1:] - first[:-1]
-    third = np.abs(second[1:] - second[:-1])
+    third = second[1:] - second[:-1]
     changed = first != 0.0
     return trimmed_deviation(third[changed[:-2] | changed[1:-1] | changed[2:]])
 

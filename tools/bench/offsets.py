@@ -107,9 +107,8 @@ class Foreign:
         self.inertia_kg_m2 = truth.mechanics.motor_inertia_kg_m2
         orders = tuple(MotorOrder(**each._asdict()) for each in truth.mechanics.motor_orders)
         self.model = TransmissionModel(self.ratio, (Synchronous(orders=orders),))
-        self.feedforward = getattr(
-            truth.servo.law, "velocity_feedforward", 1.0
-        )  # a reference model has it all
+        # A servo with a reference model has no such parameter: it feeds all of the velocity forward.
+        self.feedforward = getattr(truth.servo.law, "velocity_feedforward", 1.0)
 
     def machine(self):
         return self.truth.machine()
