@@ -383,7 +383,7 @@ class Answers:
         self._response, self._orders, self._ratio = response, orders, ratio
         self._motor: dict[tuple[int, int], deque[Found]] = {}
         self._left: dict[tuple[int, int], deque[Left]] = {}
-        self._earlier = {} if earlier is None else earlier.by_frequency()
+        self._earlier = {} if earlier is None else earlier._by_order()
 
     def take(
         self,
@@ -392,8 +392,9 @@ class Answers:
         issued_deg: FloatArray,
         motor_deg: FloatArray,
         load_deg: FloatArray,
+        correction_arcsec: FloatArray,
     ) -> None:
-        """Adds a run: load target, motor set-points, both encoders; shape (n,) each.
+        """Adds a run: load target, motor set-points, both encoders, the filtered correction; shape (n,) each.
 
         A distrusted load encoder reads NaN.
         """
@@ -405,7 +406,8 @@ class Answers:
         for order, found in answers(*run, issued_deg, motor_deg, numbers, ratio):
             self._motor.setdefault(place_of(order, found), deque(maxlen=MAX_RUNS)).append(found)
         if stored.load_gain and np.isfinite(load_deg).all():
-            for order, left in _left(*run, load_deg, self._orders, ratio):
+            rounding_arcsec = ARCSEC_PER_DEG * (issued_deg / ratio - target_deg) + correction_arcsec
+            for order, left in _left(*run, load_deg, rounding_arcsec, self._orders, ratio):
                 self._left.setdefault(place_of(order, left), deque(maxlen=MAX_RUNS)).append(left)
 
     def _place(self, order: int, found: Found | Left) -> tuple[int, int]:
@@ -448,16 +450,22 @@ class Answers:
 
     def by_frequency(self) -> dict[int, _Seen]:
         """Returns the remainders, grouped by frequency."""
-        groups: dict[int, list[Left]] = {}
-        for (_, place), group in self._left.items():
-            groups.setdefault(place, []).extend(group)
+        groups: dict[int, list[_Seen]] = {}
+        for (_, place), seen in self._by_order().items():
+            groups.setdefault(place, []).append(seen)
+        return {place: _merged_seen(group) for place, group in groups.items()}
+
+    def _by_order(self) -> dict[tuple[int, int], _Seen]:
+        """Returns the mean remainder of each order at each frequency."""
         found = {}
-        for place, lefts in groups.items():
-            hertz, shares, sizes = (np.array(each) for each in zip(*lefts, strict=True))
-            weight = sizes**2 / np.sum(sizes**2)
-            at_hz = float(weight @ hertz)
-            at = gain(self._response.filter, np.array([at_hz]), self._response.cycle_ms / 1000.0)[0]
-            found[place] = _Seen(at_hz, complex(weight @ shares), math.sqrt(np.mean(sizes**2)), complex(at))
+        for key, group in self._left.items():
+            hertz, shares, sizes = (np.array(each) for each in zip(*group, strict=True))
+            at_hz = np.mean(hertz, keepdims=True)
+            at = gain(self._response.filter, at_hz, self._response.cycle_ms / 1000.0)[0]
+            size = math.sqrt(np.mean(sizes**2))
+            seen = _Seen(float(at_hz[0]), complex(np.mean(shares)), size, complex(at))
+            earlier = self._earlier.get(key)
+            found[key] = seen if earlier is None else seen._replace(error=_error(seen, earlier), certain=1.0)
         return found
 
     def refined(
@@ -476,9 +484,9 @@ class Answers:
         if len(seen) < 2:
             return None
         places = sorted(seen)
-        hertz, shares, sizes, _ = (np.array(each) for each in zip(*(seen[at] for at in places), strict=True))
-        error = np.array([_error(seen[at], self._earlier.get(at)) for at in places])
-        certain = np.array([1.0 if at in self._earlier else FIRST_STEP for at in places])
+        hertz, shares, sizes, _, error, certain = (
+            np.array(each) for each in zip(*(seen[at] for at in places), strict=True)
+        )
         factors = 1.0 + certain * _bounded(error / (error - shares) - 1.0, bound)
         stored = self._response
         points_hz, lag_s = np.array(stored.frequency_hz), median(self.lags_ms) / 1000.0
@@ -507,16 +515,27 @@ class _Seen(NamedTuple):
     share: complex
     size_arcsec: float
     gain: complex
+    error: complex = 1.0
+    """Error without correction, relative to that of the calibration."""
+    certain: float = FIRST_STEP
+    """Share of the change that is applied."""
 
 
-def _error(now: _Seen, earlier: _Seen | None) -> complex:
-    """Returns the error without correction, relative to that of the calibration, at one frequency.
+def _merged_seen(group: Sequence[_Seen]) -> _Seen:
+    """Returns the mean of several orders at one frequency, weighted by their mean squares."""
+    columns = np.array(group)
+    weight = columns[:, 2].real ** 2
+    hertz, share, _, at, error, certain = weight / weight.sum() @ columns
+    return _Seen(hertz.real, share, math.sqrt(np.mean(weight)), at, error, certain.real)
+
+
+def _error(now: _Seen, earlier: _Seen) -> complex:
+    """Returns an order's error without correction, relative to that of the calibration, at one frequency.
 
     The remainder is linear in the gain of the filter. Two points are weighed against the calibration, by the
-    noise of a share and the change of the error due to another servo.
+    noise of a share and the change of the error due to another servo. Both points are of one order, because
+    different orders at the same frequency differ more than two filters do.
     """
-    if earlier is None:
-        return 1.0
     rows = np.array([[1.0, now.gain], [1.0, earlier.gain], [SHARE_NOISE / ERROR_CHANGE, 0.0]])
     wanted = np.array([now.share, earlier.share, SHARE_NOISE / ERROR_CHANGE])
     return complex(np.linalg.lstsq(rows, wanted, rcond=None)[0][0])
@@ -570,17 +589,27 @@ def _left(
     lag_s: float,
     target_deg: FloatArray,
     load_deg: FloatArray,
+    rounding_arcsec: FloatArray,
     orders: Sequence[MotorOrder],
     ratio: float,
 ) -> Iterator[tuple[int, Left]]:
-    """Yields the remaining load error of a run by index of order, up to the known frequency."""
+    """Yields the remaining load error of a run by index of order, up to the known frequency.
+
+    The load's response to the rounding of the set-points, ``rounding_arcsec`` (n,), is subtracted. At speeds
+    with a simple fraction of a motor turn per cycle the rounding repeats with the orders, so that it does not
+    average out.
+    """
     numbers = [each.order for each in orders]
     error = ARCSEC_PER_DEG * (load_deg - target_deg)
-    rest = harmonics_of(speed_deg_s, target_deg, error, numbers, ratio).over_time
+    rest, rounding = (
+        harmonics_of(speed_deg_s, target_deg, each, numbers, ratio).over_time
+        for each in (error, rounding_arcsec)
+    )
     hertz = order_hz(numbers, speed_deg_s, ratio)
     load = np.array(stored.load_gain) * np.exp(1j * np.radians(stored.load_phase_deg))
     load = _between(hertz, stored.frequency_hz, load) * np.exp(-2j * math.pi * hertz * lag_s)
     expected = load * _over_time(orders, speed_deg_s)
+    rest = rest - load * _between(hertz, stored.frequency_hz, _points(stored)) * rounding
     for place in np.flatnonzero(hertz <= stored.known_to_hz).tolist():
         share = complex(rest[place] / expected[place])
         yield place, Left(float(hertz[place]), share, float(abs(expected[place])))

@@ -48,7 +48,11 @@ SEEDS = [int(each) for each in os.environ.get("HIDDEN_SEEDS", "1").split()]
 """More of them hide each cause more often: HIDDEN_SEEDS="1 2 3"."""
 MOST_OF_FLOOR = 1.3
 MOST_OF_FLOOR_WORN = 1.8
-"""The limit for a loop that grows during the test; 1.68 times the floor were measured."""
+"""The limit for wear; 1.68 times the floor was measured.
+
+In the sweeps the motor follows 36.41 counts behind its set-points. The rounding of its reading is therefore a
+bias of 0.3 arcsec in the direction of motion (0.2 in the driving angle). The fit takes it for 3 % more wear.
+"""
 Parts = tuple[Procedure[Any], ...]
 LOOP: Parts = (
     Precondition(0.0, 2.0),

@@ -135,7 +135,7 @@ class ServoWatch:
         if not believed:
             self.forget_load()
             load = np.full(len(run), np.nan)
-        answers.take(speed_deg_s, target, issued, motor, load)
+        answers.take(speed_deg_s, target, issued, motor, load, run["correction_arcsec"])
         if len(answers.lags_ms) < MIN_RUNS:
             return None
         apart, lag_ms = answers.difference, median(answers.lags_ms)

@@ -107,4 +107,5 @@ def test_adaptation_removes_the_ripple_of_a_retuned_servo(profile: Path, tmp_pat
     with stepped_service(tmp_path, profile=profile, truth=path) as service:
         before, after = play(story(service))
     assert before > 2.0
-    assert after < 0.8 * before  # 3.02 and 2.29; 1.3 with the calibrated servo, 19 without correction
+    # At 60 and 45 deg/s the rounding of the set-points to counts repeats with the orders.
+    assert after < 1.6  # 1.2 as with the calibrated servo, 16 without correction
