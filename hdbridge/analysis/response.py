@@ -392,11 +392,12 @@ class Answers:
         issued_deg: FloatArray,
         motor_deg: FloatArray,
         load_deg: FloatArray,
-        correction_arcsec: FloatArray,
+        correction_arcsec: FloatArray | None = None,
     ) -> None:
         """Adds a run: load target, motor set-points, both encoders, the filtered correction; shape (n,) each.
 
-        A distrusted load encoder reads NaN.
+        A distrusted load encoder reads NaN. Without the correction, the rounding of the set-points is not
+        subtracted from the remainder.
         """
         ratio, stored, place_of = self._ratio, self._response, self._place
         lag_s = float(np.mean(issued_deg - motor_deg)) / (ratio * speed_deg_s)
@@ -406,7 +407,9 @@ class Answers:
         for order, found in answers(*run, issued_deg, motor_deg, numbers, ratio):
             self._motor.setdefault(place_of(order, found), deque(maxlen=MAX_RUNS)).append(found)
         if stored.load_gain and np.isfinite(load_deg).all():
-            rounding_arcsec = ARCSEC_PER_DEG * (issued_deg / ratio - target_deg) + correction_arcsec
+            rounding_arcsec = np.zeros(len(target_deg))
+            if correction_arcsec is not None:
+                rounding_arcsec = ARCSEC_PER_DEG * (issued_deg / ratio - target_deg) + correction_arcsec
             for order, left in _left(*run, load_deg, rounding_arcsec, self._orders, ratio):
                 self._left.setdefault(place_of(order, left), deque(maxlen=MAX_RUNS)).append(left)
 
