@@ -505,7 +505,7 @@ class _Layout:
 
     def time_of(self, switched_on_s: float) -> float:
         """Converts a time since the axis was switched on to the record's time."""
-        cycles = np.concatenate(self._places()) * self.course.rig.axis.drive.cycle_s
+        cycles = (np.concatenate(self._places()) + 1) * self.course.rig.axis.drive.cycle_s  # read at its end
         return float(np.interp(switched_on_s, cycles, np.concatenate(self._times())))
 
     def write(self, folder: Path, name: str, seen: Mapping[str, Any], seed: int) -> int:
