@@ -28,6 +28,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from enum import Enum
+from itertools import accumulate
 from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -55,9 +56,12 @@ UNMODELLED_ARCSEC = 20.0
 UNMODELLED_DEG = 36.0
 """Motor travel of the largest unmodelled change of the gear's error: an order of 10 per turn with an
 amplitude of 10 arcsec (`effects.motor_order` is at most 3)."""
-SHAKE_S = 0.002
-"""Maximum time between a speed change and its effect on the error, through wind-up and skew between the
-encoders."""
+SOFTEST_S2, STIFFEST_S2 = (2.0 * math.pi * 10.0) ** -2, (2.0 * math.pi * 80.0) ** -2
+"""Wind-up of the load per acceleration, for loads that resonate at 10 and 80 Hz."""
+SWING = 3.0
+"""Largest step of the residual while the load oscillates, relative to its wind-up or to the usual step."""
+FADE_S = 0.4
+"""Time constant of the load's oscillation."""
 MEDIAN_DIFFERENCE = 1.0 / (0.6745 * np.sqrt(2.0))
 """Standard deviation of Gaussian values, relative to the median difference of neighbours."""
 ZERO_UNKNOWN: Final = (AxisState.UNVERIFIED, AxisState.LENT, AxisState.LATCHED)
@@ -66,7 +70,9 @@ TAIL = 64
 """Number of samples that are evaluated again with the next batch."""
 BLOCK_S = 0.25
 BLOCK_SAMPLES = 20
-"""Minimum number of usable samples in a block."""
+"""Minimum duration and number of samples of a block."""
+SETTLE_S = 0.1
+"""Time in which the load's oscillation after the start or end of a motion fades."""
 LEARNING_BLOCKS = 40
 """Blocks after which the usual jitter is known."""
 MAX_LEARNING_BLOCKS = 480
@@ -100,13 +106,19 @@ RESIDUAL: Final = np.dtype([
     ("velocity_deg_s", np.float64),  # of the load target
     ("predicted_arcsec", np.float64),  # at the motor's actual position
     ("residual_arcsec", np.float64),  # includes the difference of the encoders' zeros
+    ("shaken_deg_s2", np.float64),  # largest acceleration of the load target, fading with `FADE_S`
     ("fresh", np.bool_),
     ("usable", np.bool_),  # fresh, driven, hysteresis state known, no model change under way
 ])  # fmt: skip
 
 
-def residuals(samples: SampleArray, index: int, ratio: float, period_s: float) -> Residuals:
-    """Returns the residuals of the axis at ``index`` in consecutive samples; ``ratio`` is the gear ratio."""
+def residuals(
+    samples: SampleArray, index: int, ratio: float, period_s: float, shaken_deg_s2: float = 0.0
+) -> Residuals:
+    """Returns the residuals of the axis at ``index`` in consecutive samples; ``ratio`` is the gear ratio.
+
+    ``shaken_deg_s2`` is that of the first sample.
+    """
     axis: Any = samples["axes"][:, index]
     found = np.empty(len(samples), RESIDUAL)
     found["cycle"] = samples["cycle"]
@@ -114,6 +126,14 @@ def residuals(samples: SampleArray, index: int, ratio: float, period_s: float) -
     found["motor_deg"] = motor = axis["motor_position_deg"]
     found["load_deg"] = load = axis["load_position_deg"]
     found["velocity_deg_s"] = velocity = axis["velocity_deg_s"]
+    accelerations = np.abs(np.diff(velocity)) / period_s
+    found["shaken_deg_s2"] = list(
+        accumulate(
+            accelerations.tolist(),
+            lambda before, now: max(now, before * (1.0 - period_s / FADE_S)),
+            initial=shaken_deg_s2,
+        )
+    )
     predicted: FloatArray = axis["predicted_arcsec"]
     found["fresh"] = axis["flags"] & SampleFlag.FRESH
     needed = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN
@@ -152,11 +172,11 @@ class Jump(NamedTuple):
     allowed_arcsec: float
 
 
-def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float) -> Jump | None:
+def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float, swing_s2: float) -> Jump | None:
     """Returns the first step of the residual that neither noise nor motion nor model can cause.
 
     ``noise_arcsec`` is the standard deviation of one reading, ``count_arcsec`` a motor encoder count at the
-    load.
+    load, ``swing_s2`` the largest step per acceleration.
     """
     span = 2 * SIDE
     if len(found) < span:
@@ -167,12 +187,10 @@ def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float) -> Jum
     allowed = (
         SIGMAS * noise_arcsec * MEDIAN_ERROR * np.sqrt(2.0 / SIDE)
         + count_arcsec
-        + _motion_arcsec(found, span)
+        + _motion_arcsec(found, span, swing_s2)
         + UNMODELLED_ARCSEC * np.minimum(turned / UNMODELLED_DEG, 1.0)
     )
-    together = np.all(_windows(found["usable"], span), axis=0)
-    together &= found["cycle"][span - 1 :] - found["cycle"][: len(together)] < 2 * span
-    rows = np.flatnonzero(together & (np.abs(step) > allowed))
+    rows = np.flatnonzero(_together(found, span) & (np.abs(step) > allowed))
     if not len(rows):
         return None
     # Several windows contain the step; the one centred on it shows it best.
@@ -181,13 +199,32 @@ def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float) -> Jum
     return Jump(row + SIDE, float(step[row]), float(allowed[row]))
 
 
-def misread(found: Residuals, noise_arcsec: float, count_arcsec: float) -> int:
+def swing_s2(found: Residuals) -> float:
+    """Returns the largest step of the residual per acceleration; 0 without acceleration."""
+    span = 2 * SIDE
+    if len(found) < span:
+        return 0.0
+    middle = _median(found["residual_arcsec"])
+    step = np.abs(middle[SIDE:] - middle[:-SIDE]) / ARCSEC_PER_DEG
+    shaken = _windows(found["shaken_deg_s2"], span).max(axis=0)
+    rows = _together(found, span) & (shaken > 0.5 * np.max(shaken, initial=0.0))
+    return float(np.max(step[rows] / shaken[rows], initial=0.0))
+
+
+def _together(found: Residuals, span: int) -> BoolArray:
+    """Returns a mask of the windows of usable samples without a gap."""
+    usable = np.all(_windows(found["usable"], span), axis=0)
+    usable &= found["cycle"][span - 1 :] - found["cycle"][: len(usable)] < 2 * span
+    return np.asarray(usable)
+
+
+def misread(found: Residuals, noise_arcsec: float, count_arcsec: float, swing_s2: float) -> int:
     """Returns the number of samples that jump away and return with the next one or two."""
     if len(found) < SIDE:
         return 0
     middle = slice(SIDE // 2, len(found) - SIDE // 2)
     away = np.abs(found["residual_arcsec"][middle] - _median(found["residual_arcsec"]))
-    allowed = SIGMAS * noise_arcsec + count_arcsec + _motion_arcsec(found, SIDE)
+    allowed = SIGMAS * noise_arcsec + count_arcsec + _motion_arcsec(found, SIDE, swing_s2)
     return int(np.count_nonzero((away > allowed) & np.all(_windows(found["usable"], SIDE), axis=0)))
 
 
@@ -210,10 +247,11 @@ def _ranges(width: int, values: FloatArray) -> FloatArray:
     return np.asarray(windows.max(axis=0) - windows.min(axis=0))
 
 
-def _motion_arcsec(found: Residuals, width: int) -> FloatArray:
+def _motion_arcsec(found: Residuals, width: int, swing_s2: float) -> FloatArray:
     """Returns the change of the residual that motion permits in each window."""
-    predicted, speed = _ranges(width, found["predicted_arcsec"]), _ranges(width, found["velocity_deg_s"])
-    return PREDICTED_SHARE * predicted + SHAKE_S * ARCSEC_PER_DEG * speed
+    predicted = _ranges(width, found["predicted_arcsec"])
+    shaken = _windows(found["shaken_deg_s2"], width).max(axis=0)
+    return np.asarray(PREDICTED_SHARE * predicted + swing_s2 * ARCSEC_PER_DEG * shaken)
 
 
 class EncoderFault(Enum):
@@ -252,6 +290,10 @@ class EncoderHealth:
         """False without a prediction, in which case the gear's own error may look like an encoder fault."""
         self._jitters: dict[bool, list[float]] = {True: [], False: []}
         """Jitter of the first good blocks at rest (True) and in motion (False)."""
+        self._swings_s2: list[float] = []
+        """Largest step of the residual per acceleration in the first batches with motion."""
+        self._shaken_deg_s2 = 0.0
+        """Fading acceleration at the first sample of the tail."""
         self._spikes: deque[float] = deque()
         self._noisy_blocks = 0
         self._bad_s = -math.inf
@@ -260,8 +302,10 @@ class EncoderHealth:
         """Last samples, which are evaluated again with the next ones."""
         self._held: tuple[float, float] | None = None
         """Load reading that does not change, and the motor angle since when."""
-        self._pending: list[Residuals] = []
-        """Samples of an incomplete block."""
+        self._pending: dict[bool, list[Residuals]] = {True: [], False: []}
+        """Samples of the incomplete blocks at rest (True) and in motion (False)."""
+        self._since: tuple[bool, float] = (True, 0.0)
+        """True at rest, and the time since when."""
 
     def reset(self) -> None:
         """Ends a fault, after maintenance or after the encoder's zero was set."""
@@ -272,7 +316,8 @@ class EncoderHealth:
     def restart(self) -> None:
         """Forgets the last samples, for example after a change of the predicting model."""
         self._tail, self._held = None, None
-        self._pending = []
+        self._pending = {True: [], False: []}
+        self._since = (True, math.inf)
 
     def take(self, samples: SampleArray) -> EncoderStatus:
         """Judges the next samples of the loop, oldest first: a tenth of a second or more at a time."""
@@ -284,7 +329,8 @@ class EncoderHealth:
             tail = None
         together = samples if tail is None else joined_samples([tail, samples])
         self._tail = together[-TAIL:].copy()
-        found = residuals(together, self._index, self._ratio, self._period_s)
+        found = residuals(together, self._index, self._ratio, self._period_s, self._shaken_deg_s2)
+        self._shaken_deg_s2 = float(found["shaken_deg_s2"][-len(self._tail)])
         self._now_s = float(found["time_s"][-1])
         old = len(together) - len(samples)
         frozen = self._judge_frozen(found[old:])
@@ -339,7 +385,10 @@ class EncoderHealth:
         if len(found) > 1:
             steps = np.abs(np.diff(found["residual_arcsec"]))
             noise = max(noise, MEDIAN_DIFFERENCE * float(np.median(steps)))
-        jump = find_jump(found, noise, self._count_arcsec)
+        swing = SWING * SOFTEST_S2
+        if len(self._swings_s2) >= LEARNING_BLOCKS:
+            swing = SWING * float(np.clip(np.quantile(self._swings_s2, 0.9), STIFFEST_S2, SOFTEST_S2))
+        jump = find_jump(found, noise, self._count_arcsec, swing)
         # A frozen reading ends with a jump.
         if jump is not None and self.status.fault is not EncoderFault.FROZEN:
             moved = float(np.ptp(found["motor_deg"][jump.row - SIDE : jump.row + SIDE])) / self._ratio
@@ -349,8 +398,12 @@ class EncoderHealth:
                 f"moved by {moved * ARCSEC_PER_DEG:.1f} arcsec of the load (noise, counts and motion make "
                 f"at most {jump.allowed_arcsec:.1f})",
             )
+        if jump is None and len(self._swings_s2) < MAX_LEARNING_BLOCKS:
+            usual = swing_s2(found)
+            if usual:
+                self._swings_s2.append(usual)
         # Excludes the samples that the next batch repeats.
-        wild = misread(found[SIDE:], noise, self._count_arcsec)
+        wild = misread(found[SIDE:], noise, self._count_arcsec, swing)
         self._spikes.extend([self._now_s] * wild)
         while self._spikes and self._spikes[0] < self._now_s - 10.0:
             self._spikes.popleft()
@@ -360,21 +413,28 @@ class EncoderHealth:
             )
 
     def _judge_noise(self, found: Residuals) -> None:
-        """Collects samples into blocks of `BLOCK_S` or more and judges each complete block."""
-        self._pending.append(found)
-        if sum(map(len, self._pending)) < max(BLOCK_S / self._period_s, BLOCK_SAMPLES):
-            return
-        block = np.concatenate(self._pending)
-        self._pending = []
-        enough = np.count_nonzero(block["fresh"]) >= max(BLOCK_SAMPLES, 0.9 * len(block))
-        if not enough or not np.any(block["usable"]):
-            return
-        moving = ~_standing(block)
-        if np.any(moving) and not np.all(moving):
-            return  # the load oscillates after motion begins or ends
-        standing = not np.any(moving)
-        if not (standing or self._predicted):
-            return  # at speed the gear's own orders look like jitter
+        """Collects the settled samples at rest and in motion, and judges each complete block.
+
+        A block may span several rests or moves, so work of any rhythm is judged.
+        """
+        standing = _standing(found)
+        before, since_s = self._since
+        begins = np.flatnonzero(standing != np.append(before, standing[:-1]))
+        since = np.full(len(found), since_s)
+        for first in begins.tolist():
+            since[first:] = found["time_s"][first]
+        self._since = (bool(standing[-1]), float(since[-1]))
+        taken = found["usable"] & (found["time_s"] - since >= SETTLE_S)
+        for kind, pending in self._pending.items():
+            part = found[taken & (standing == kind)]
+            # At speed the gear's own orders look like jitter without a prediction.
+            if len(part) and (kind or self._predicted):
+                pending.append(part)
+                if sum(map(len, pending)) >= max(BLOCK_S / self._period_s, BLOCK_SAMPLES):
+                    self._judge_block(np.concatenate(pending), standing=kind)
+                    pending.clear()
+
+    def _judge_block(self, block: Residuals, *, standing: bool) -> None:
         # The load's own motion is slow or predicted; noise is in both differences.
         jitter = min(jitter_deg(block["load_deg"]) * ARCSEC_PER_DEG, jitter_deg(block["residual_arcsec"]))
         usual = self._usual(standing=standing)
