@@ -117,7 +117,7 @@ def residuals(
 ) -> Residuals:
     """Returns the residuals of the axis at ``index`` in consecutive samples; ``ratio`` is the gear ratio.
 
-    ``shaken_deg_s2`` is that of the first sample.
+    ``shaken_deg_s2`` is the value of that column in the first sample.
     """
     axis: Any = samples["axes"][:, index]
     found = np.empty(len(samples), RESIDUAL)
@@ -304,7 +304,7 @@ class EncoderHealth:
         """Load reading that does not change, and the motor angle since when."""
         self._pending: dict[bool, list[Residuals]] = {True: [], False: []}
         """Samples of the incomplete blocks at rest (True) and in motion (False)."""
-        self._since: tuple[bool, float] = (True, 0.0)
+        self._since: tuple[bool, float] = (True, -math.inf)
         """True at rest, and the time since when."""
 
     def reset(self) -> None:
@@ -317,7 +317,7 @@ class EncoderHealth:
         """Forgets the last samples, for example after a change of the predicting model."""
         self._tail, self._held = None, None
         self._pending = {True: [], False: []}
-        self._since = (True, math.inf)
+        self._since = (True, -math.inf)
 
     def take(self, samples: SampleArray) -> EncoderStatus:
         """Judges the next samples of the loop, oldest first: a tenth of a second or more at a time."""
