@@ -130,7 +130,7 @@ class DriveConfig(Strict):
     def _consistent(self) -> Self:
         if self.heartbeat_ms < 2 * self.cycle_ms:
             raise wrong(
-                f"a heartbeat of {self.heartbeat_ms} ms does not go with a cycle of {self.cycle_ms:g} ms; "
+                f"a heartbeat of {self.heartbeat_ms} ms is too short for a cycle of {self.cycle_ms:g} ms; "
                 f"expected heartbeat_ms of at least {math.ceil(2 * self.cycle_ms)}",
                 "heartbeat_ms",
             )

@@ -335,7 +335,7 @@ def gateway_axis(machine: str, name: str | None) -> tuple[AxisConfig, GatewaySet
             f"{found.path}: the gateway has several axes; give --axis with one of: {', '.join(names)}"
         )
     if name is not None and name not in names:
-        raise InputError(f"--axis {name}: is not in the gateway; expected one of: {', '.join(names)}")
+        raise InputError(f"--axis {name}: not in the gateway; expected one of: {', '.join(names)}")
     axis = found.axis(name or names[0])
     return axis.config, found.gateway, axis.model()
 

@@ -226,7 +226,9 @@ def _is_argument(parameter: inspect.Parameter) -> bool:
 def need_extra(subject: str, packages: Sequence[str], extra: str) -> None:
     """Raises `InputError` with the command that installs ``extra`` if one of its ``packages`` is missing."""
     if lacking := [name for name in packages if not _installed(name)]:
-        raise InputError(f"{subject} {', '.join(lacking)}: python -m pip install 'hdbridge[{extra}]'")
+        raise InputError(
+            f"{subject} {', '.join(lacking)}; install with: python -m pip install 'hdbridge[{extra}]'"
+        )
 
 
 def _installed(package: str) -> bool:

@@ -66,7 +66,7 @@ def find(
         )
     what = f"no daemon of the name {given!r} runs" if given else "no daemon runs"
     raise DaemonError(
-        f"{what} on this machine that this user may ask; start one with 'hdbridge run', or set "
+        f"{what} on this computer that this user can access; start one with 'hdbridge run', or set "
         "HDBRIDGE_SOCKET or HDBRIDGE_URL"
     )
 

@@ -185,7 +185,7 @@ class Heartbeat:
         return advanced
 
     def restart(self, value: int) -> None:
-        """Restarts with a restarted process, whose counter has this value."""
+        """Begins again with a restarted process; ``value`` is the present value of its counter."""
         self._last, self.misses, self.begun = value, 0, False
 
 

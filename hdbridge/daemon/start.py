@@ -133,7 +133,8 @@ def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
         found = folder.lstat()
     except OSError as problem:
         raise InputError(
-            f"{folder}: cannot be made: {problem.strerror}; it holds the daemon's socket, see XDG_RUNTIME_DIR"
+            f"{folder}: cannot create this folder: {problem.strerror}; it holds the daemon's socket, see "
+            "XDG_RUNTIME_DIR"
         ) from None
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
         raise InputError(

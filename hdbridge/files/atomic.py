@@ -143,7 +143,7 @@ def make_folder(path: Path | str) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as problem:
-        raise InputError(f"{path}: cannot make this folder: {problem.strerror}") from None
+        raise InputError(f"{path}: cannot create this folder: {problem.strerror}") from None
     try:
         _try_out(folder.resolve() / "tried")
     except OSError as problem:
@@ -190,7 +190,7 @@ def new_folder(path: Path) -> Path:
         except FileExistsError:
             continue
         except OSError as problem:
-            raise InputError(f"{folder}: cannot make this folder: {problem.strerror}") from None
+            raise InputError(f"{folder}: cannot create this folder: {problem.strerror}") from None
         return folder
     raise AssertionError("numbers do not end")
 

@@ -167,7 +167,7 @@ def _check_folder(output: Output, inputs: Sequence[Path]) -> None:
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
     if not existing.is_dir():
-        raise InputError(f"{folder}: cannot make this folder: {existing} is not a folder")
+        raise InputError(f"{folder}: cannot create this folder: {existing} is not a folder")
     check_writable(existing / "a file")
 
 

@@ -186,7 +186,7 @@ class Recording:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as problem:
-            raise InputError(f"{folder}: cannot be made: {problem.strerror}") from None
+            raise InputError(f"{folder}: cannot create this folder: {problem.strerror}") from None
         parts = self.record.parts()
         files = []
         for number, part in enumerate(parts, 1):

@@ -235,7 +235,8 @@ def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio:
         )
     if measured.motor_target_deg is None or simulated.motor_target_deg is None:
         raise InputError(
-            f"{measured.source or 'the record'}: no column motor_target_deg; expected the command in each row"
+            f"{measured.source or 'the record'}: no column motor_target_deg; expected the commanded motor "
+            "angle in each row"
         )
     ends = (*measured.starts[1:], len(measured))
     parts = [slice(start, end) for start, end in zip(measured.starts, ends, strict=True)]

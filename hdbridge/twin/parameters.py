@@ -21,7 +21,7 @@ from hdbridge.sim.truth.resonance import Resonance
 # Parameters of the simulated drive that a fit may change.
 
 RESOLVED = 0.98
-"""Maximum phase of the fastest resonance in a time step, in radians; the truth file permits one."""
+"""Maximum phase advance of the fastest resonance per time step, in radians; a truth file may have up to 1."""
 FOLLOWING, TORQUE, LOAD = "following error", "motor torque", "load error"
 """Channels in which a replay is compared with a recording."""
 

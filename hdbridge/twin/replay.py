@@ -303,7 +303,9 @@ def cycle_of(part: Record, axis: AxisConfig) -> float:
     """Returns a record's cycle in seconds, as 60C2h can express it, or the axis's cycle if they agree."""
     own_ms = 1e3 * float(np.median(np.diff(part.time_s)))
     if not own_ms > 0.0:
-        raise InputError(f"{part.source or 'the record'}: its time stands still; expected rising times")
+        raise InputError(
+            f"{part.source or 'the record'}: its time does not increase; expected increasing times"
+        )
     if abs(own_ms / axis.drive.cycle_ms - 1.0) < 0.02:
         return axis.drive.cycle_s
     rounded = round(own_ms, 1) if own_ms < 25.5 else float(round(own_ms))

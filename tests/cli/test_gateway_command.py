@@ -127,4 +127,4 @@ def test_a_machine_without_a_gateway_says_which_key_is_missing(tmp_path):
     assert "expected a machine file with a key 'gateway'" in done.stderr
     done = run_here(tmp_path, "gateway", "eds", machine(tmp_path), "--axis", "arm")
     assert done.returncode == 2
-    assert "--axis arm: is not in the gateway; expected one of: article" in done.stderr
+    assert "--axis arm: not in the gateway; expected one of: article" in done.stderr

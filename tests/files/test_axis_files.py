@@ -70,7 +70,7 @@ def test_a_valid_file_gives_nested_values_and_defaults(folder):
     [
         ("cycle_ms: 4", "cycle_ms: 4.25", "8:13: drive.cycle_ms: 60C2h cannot express 4.25 ms: expected 1 to 255 whole milliseconds, or 0.5 to 25.5 ms with one decimal"),
         ("cycle_ms: 4", "cycle_ms: 25.6", "8:13: drive.cycle_ms: 60C2h cannot express 25.6 ms: expected 1 to 255 whole milliseconds, or 0.5 to 25.5 ms with one decimal"),
-        ("cycle_ms: 4", "cycle_ms: 40", "5:3: drive: a heartbeat of 50 ms does not go with a cycle of 40 ms; expected heartbeat_ms of at least 80"),
+        ("cycle_ms: 4", "cycle_ms: 40", "5:3: drive: a heartbeat of 50 ms is too short for a cycle of 40 ms; expected heartbeat_ms of at least 80"),
         ("limits:", "realtime: {priority: 100}\nlimits:", "15:22: realtime.priority: found 100; expected an integer from 0 to 99 (SCHED_FIFO priority of the control loop; 0: none)"),
         ("limits:", "realtime: {cpus: [0, -1]}\nlimits:", "15:22: realtime.cpus[1]: found -1; expected an integer from 0 to 4095"),
         ("limits:", "realtime: {cpus: [3, 2, 3]}\nlimits:", "15:25: realtime.cpus[2]: processor 3 appears twice; expected it once"),

@@ -97,7 +97,7 @@ def _measure(profile: Path) -> Response:
 
 
 def measured_profile(folder: Path) -> Path:
-    """Makes a raised profile whose model has the measured response."""
+    """Writes a profile with raised speed limits and the measured response in its model."""
     profile = raised_profile(folder)
     model = TransmissionModel.load(profile / "model.yaml")
     replace(model, response=measured_response(profile)).save(profile / "model.yaml")

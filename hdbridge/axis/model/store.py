@@ -269,7 +269,7 @@ class Store(Generic[K]):
         try:
             folder.mkdir(exist_ok=True)
         except OSError as problem:
-            raise InputError(f"{folder}: cannot be made: {problem.strerror}") from None
+            raise InputError(f"{folder}: cannot create this folder: {problem.strerror}") from None
         return folder
 
     def _check(self, profile: Path, path: Path, identity: Identity | None) -> K:

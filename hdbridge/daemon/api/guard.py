@@ -68,7 +68,7 @@ class Policy:
         token = self.token
         if token is not None and not re.fullmatch(rf"[A-Za-z0-9._~-]{{{TOKEN_MINIMUM},200}}", token):
             raise InputError(
-                f"the token of the API: expected {TOKEN_MINIMUM} to 200 letters, digits, '-', '.', '_' or "
+                f"invalid API token; expected {TOKEN_MINIMUM} to 200 letters, digits, '-', '.', '_' or "
                 "'~'; make one with: python -c 'import secrets; print(secrets.token_urlsafe(32))'"
             )
 

@@ -239,9 +239,7 @@ class AxisLoop:
 
     def _seed(self, command: Command) -> None:
         if not 0 <= command.k <= 0xFFFF:
-            raise InputError(
-                f"{self.config.name}: statusword {command.k} is not a statusword; expected 16 bits"
-            )
+            raise InputError(f"{self.config.name}: invalid statusword {command.k}; expected 16 bits")
         self.image.seed(command.i, command.j, command.k)
 
     def _silence(self, _: Command) -> None:

@@ -41,9 +41,7 @@ class KnotFeed:
         last number.
         """
         if stream <= self._stream:
-            raise InputError(
-                f"a stream of number {stream} after number {self._stream}: expected a greater one"
-            )
+            raise InputError(f"stream number {stream} follows {self._stream}; expected a larger number")
         self._set_point.stream(timeout_s)
         self._set_point.begin_stream()
         self._stream, self._following, self._ending = stream, True, False

@@ -121,7 +121,9 @@ class AutoDiagnosis:
                 self._process = None
         if status:
             lines = (folder / "log.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-            raise HdbridgeError(lines[-1] if lines else f"'hdbridge {arguments[0]}' ended with {status}")
+            raise HdbridgeError(
+                lines[-1] if lines else f"'hdbridge {arguments[0]}' exited with status {status}"
+            )
 
 
 def summary(found: dict[str, Any]) -> str:

@@ -54,7 +54,7 @@ class FlightRecorder:
         try:
             flight = FlightLog(folder, settings or RecorderSettings(), about, notify=self._notify, free=free)
         except OSError as problem:
-            self._notify(f"{folder}: cannot be made: {problem.strerror}; nothing is recorded")
+            self._notify(f"{folder}: cannot create this folder: {problem.strerror}; nothing is recorded")
             return
         self.flight = flight
         # The duration of the mending does not matter: each file is mended completely or not at all.

@@ -63,7 +63,7 @@ class Lease:
         """
         if not client.strip() or len(client) > LONGEST_NAME:
             raise InputError(
-                f"a lease for {client[:LONGEST_NAME]!r}; expected the client's name in 1 to {LONGEST_NAME} "
+                f"lease: invalid client name {client[:LONGEST_NAME]!r}; expected 1 to {LONGEST_NAME} "
                 "characters"
             )
         holder = self.holder

@@ -59,7 +59,7 @@ class Latency:
                 found.clear()  # the axis no longer follows
 
     def of(self, place: int) -> tuple[float, float] | None:
-        """Returns median and 99th percentile of an axis; None while it follows nothing."""
+        """Returns an axis's median and 99th percentile, s; None while it follows no outer master."""
         found = self._found[place]
         if not found:
             return None

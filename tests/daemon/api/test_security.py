@@ -61,7 +61,7 @@ def test_an_unknown_group_is_refused_and_a_known_one_owns_the_socket(tmp_path):
     "token", ["", "short", "with spaces in the middle", "x" * 201, "line\nbreak-long-enough"]
 )
 def test_a_weak_or_unsendable_token_is_refused(token):
-    with pytest.raises(InputError, match="token of the API"):
+    with pytest.raises(InputError, match="invalid API token"):
         Policy(token=token)
 
 
