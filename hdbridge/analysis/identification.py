@@ -479,7 +479,7 @@ class State(NamedTuple):
         return self.under(self.precision(), self.columns()).fit(self.model())
 
     def information(self) -> System:
-        """Returns J' K^-1 J and J' K^-1 y of [candidates | zeros and nuisances | effects and their tangents].
+        """Returns the normal equations of [candidates | zeros and nuisances | effects and their tangents].
 
         With the tangents, the shapes are refitted with every candidate order.
         """
@@ -488,7 +488,7 @@ class State(NamedTuple):
         right = found.jacobian.T @ precision.apply(self.design.blocks.error_arcsec)
         mean, known = np.array(nuisances.prior).T
         right[: len(mean)] += known * mean
-        return found.information, right
+        return System(found.information, right, np.flatnonzero(known > 0.0))
 
     def selected(self, system: System | None = None) -> State:
         """Selects the orders that are significant at the current noise; ``system``: `information` if

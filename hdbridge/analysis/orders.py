@@ -17,13 +17,21 @@ from typing import NamedTuple
 import numpy as np
 
 from hdbridge.analysis.linear import seen_directions, solve_symmetric
-from hdbridge.axis.effects import FloatArray
+from hdbridge.axis.effects import FloatArray, IntArray
 
 NOT_APART = 0.95
 """Canonical correlation above which two orders or two causes are not separable in a record."""
 
-System = tuple[FloatArray, FloatArray]
-"""J' K^-1 J and J' K^-1 y of [cosine and sine pairs of the candidates | all other columns of the fit]."""
+
+class System(NamedTuple):
+    """Normal equations of [cosine and sine pairs of the candidates | all other columns of the fit]."""
+
+    information: FloatArray
+    """J' K^-1 J plus the prior information, shape (c, c)."""
+    right: FloatArray
+    """J' K^-1 y, shape (c,)."""
+    limited: IntArray
+    """Columns that are limited by a prior. They make an order less certain, but cannot take its place."""
 
 
 class Family(Enum):
@@ -137,27 +145,35 @@ class _Candidates:
     """Candidate orders, with all other columns of the fit eliminated once."""
 
     def __init__(self, number: int, system: System) -> None:
-        information, right = system
-        own, rest = slice(0, 2 * number), slice(2 * number, len(right))
-        explained = solve_symmetric(information[rest, rest], information[rest, own])
-        self._information = information[own, own] - information[own, rest] @ explained
+        information, right, limited = system
+        own, rest = np.arange(2 * number), np.arange(2 * number, len(right))
+
+        self._information, explained = _eliminated(information, own, rest)
         self._right = right[own] - explained.T @ right[rest]
+        self._if_limited_known, _ = _eliminated(information, own, np.setdiff1d(rest, limited))
         self._alone = np.diag(information)
         self.number = number
 
     def left(self, index: int, inside: Collection[int]) -> _Left:
         """Returns the part of a candidate that the others ``inside`` the fit do not explain."""
-        own = [2 * index, 2 * index + 1]
-        others = [2 * each + part for each in inside if each != index for part in (0, 1)]
-        cross = self._information[np.ix_(others, own)]
-        explained = solve_symmetric(self._information[np.ix_(others, others)], cross)
-        left = self._information[np.ix_(own, own)] - cross.T @ explained
+        own = 2 * index + np.arange(2)
+        others = np.array([2 * each + part for each in inside if each != index for part in (0, 1)], np.intp)
+        left, explained = _eliminated(self._information, own, others)
         moment = self._right[own] - explained.T @ self._right[others]
         cosine, sine = solve_symmetric(left, moment).tolist()
-        seen = np.diag(left) / np.maximum(self._alone[own], 1e-300)
+        seen = np.diag(_eliminated(self._if_limited_known, own, others)[0]) / np.maximum(
+            self._alone[own], 1e-300
+        )
         floor = np.maximum(np.diag(left), 1e-9 * self._alone[own])
         error = float(np.max(1.0 / np.sqrt(floor)))
         return _Left(float(np.min(seen)), float(moment @ [cosine, sine]), cosine, sine, error)
+
+
+def _eliminated(information: FloatArray, own: IntArray, others: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Returns the information of ``own`` columns beyond the ``others``, and their coefficients by these."""
+    cross = information[np.ix_(others, own)]
+    explained = solve_symmetric(information[np.ix_(others, others)], cross)
+    return information[np.ix_(own, own)] - cross.T @ explained, explained
 
 
 def select(

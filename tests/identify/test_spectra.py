@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hdbridge.analysis.orders import Order, select, spectrum, threshold
+from hdbridge.analysis.orders import Order, System, select, spectrum, threshold
 
 
 def waves(motor_deg, orders):
@@ -21,7 +21,7 @@ def system(motor_deg, error_arcsec, orders):
     angles = np.deg2rad(np.outer(motor_deg, [each.per_motor_turn for each in orders]))
     columns = np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(motor_deg), -1)
     columns = np.concatenate([columns, np.ones((len(motor_deg), 1))], axis=1)
-    return columns.T @ columns, columns.T @ error_arcsec
+    return System(columns.T @ columns, columns.T @ error_arcsec, np.array([], dtype=int))
 
 
 def all_fitted(motor_deg, error_arcsec, orders):
@@ -101,6 +101,24 @@ def test_selection_takes_all_that_are_there_and_prefers_the_one_that_explains():
     error = waves(motor, [(2, 5.0, 10.0), (5, 0.5, 0.0), (11, 0.3, 90.0)]) + rng.normal(size=2000)
     chosen = select(orders, system(motor, error, orders))
     assert [each.number for each in chosen.chosen] == [2, 5, 11]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_order_is_replaced_by_a_column_that_a_prior_limits(seed):
+    """At one speed, the swing of the load excited by the other orders resembles the largest fast order."""
+    rng = np.random.default_rng(seed)
+    motor = np.sort(rng.uniform(0.0, 3600.0, 2000))
+    orders = motor_orders(8)
+    true = [(2, 5.0, 10.0), (4, 4.0, -60.0), (6, 5.0, 100.0)]
+    swing = waves(motor, [(order, 0.01 * order**2 * size, phase) for order, size, phase in true])
+    error = waves(motor, true) + 0.1 * swing + rng.normal(size=2000)
+    plain = system(motor, error, orders)
+    angles = np.deg2rad(np.outer(motor, [each.per_motor_turn for each in orders]))
+    columns = np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(motor), -1)
+    cross = np.append(columns.T @ swing, np.sum(swing))
+    information = np.block([[plain.information, cross[:, np.newaxis]], [cross, swing @ swing + 0.2**-2]])
+    with_swing = System(information, np.append(plain.right, swing @ error), np.array([len(plain.right)]))
+    assert [each.number for each in select(orders, with_swing).chosen] == [2, 4, 6]
 
 
 def test_the_threshold_grows_with_the_number_of_candidates():
