@@ -12,6 +12,7 @@ import numpy as np
 
 from hdbridge.analysis.acceptance import Gate, gate, gate_of_change
 from hdbridge.analysis.capability import Capability, Identifiability, capability
+from hdbridge.analysis.changes import causes_of
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis, with_memory
 from hdbridge.analysis.linear import Effort, orthonormal, side_by_side
 from hdbridge.analysis.orders import NOT_APART
@@ -66,6 +67,7 @@ def identifiability(
             (math.sqrt(scales.penalty * example.rest.shape[1] + scales.enter) + POWER) / strength,
             estimator.floor_arcsec + POWER / strength,
             _named_from(_injected(estimator, fitted, example, base), context, scales),
+            _usual_arcsec(estimator, cause, base, fitted.hypothesis.start),
         )
         own = [*type(example.effect).proposals(estimator.data, ())]  # any of them may be the one
         waves = set(waves_alike(estimator, own, fitted.hypothesis.start))
@@ -184,6 +186,20 @@ def _named_from(injected: Gate, context: Context, scales: Scales) -> float:
         if robust >= injected.needed and probability(terms, scales) > 0.5:
             return float(peak_arcsec)
     return math.inf
+
+
+def _usual_arcsec(estimator: Estimator, cause: str, base: Sequence[Effect], start: Start) -> float:
+    """Returns the smallest change of a loop's parameters that counts as more than a usual deviation.
+
+    It is 0 for other causes.
+    """
+    scales = estimator.scales
+    for given in base:
+        larger = given.fitted(2.0 * given.coefficients())
+        if given.part is Part.LOOP and cause in [each.name for each in causes_of(given, larger)]:
+            peak_arcsec = 0.5 * float(np.ptp(estimator.does(given, start)))
+            return scales.calibrations * scales.calibrated * peak_arcsec
+    return 0.0
 
 
 class _Background:
