@@ -419,6 +419,8 @@ def motion(
             identity,
         )
         say(f"pending: {pending}; commit it with: hdbridge model commit {session.profile}")
+        if result.wind_up is not None:
+            say("calibrate again after that: with the wind-up compensated, the hysteresis at rest differs")
 
 
 def print_motion(result: MotionTest) -> None:
