@@ -163,7 +163,7 @@ def _driving(
     speed[_resting(target, window)] = 0.0
     columns = np.column_stack([np.ones(len(lag)), speed, acceleration])
     scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-12
-    line = _fitted(columns / scale, lag, count)
+    line = _fitted(columns / scale, lag, count, window)
     rest = lag - line
     noise = _noise(lag, target, count)
     if noise >= 0.5 * count and float(np.std(rest)) > 0.45 * count + 1e-6:
@@ -182,7 +182,7 @@ def _driving(
     return steadied(target + line, target + line, band)
 
 
-def _fitted(columns: FloatArray, lag: FloatArray, count: float) -> FloatArray:
+def _fitted(columns: FloatArray, lag: FloatArray, count: float, window: int) -> FloatArray:
     """Returns the combination of the columns, (n, m), that fits a counted lag, (n,).
 
     Readings are rounded. A motor that follows at a constant speed stays at one fraction of a count behind its
@@ -194,8 +194,9 @@ def _fitted(columns: FloatArray, lag: FloatArray, count: float) -> FloatArray:
     solution = np.linalg.lstsq(columns, lag, rcond=1e-9)[0]
     rounding = count**2 / 12.0
     if rounding:
-        misfit = max(float(np.mean((lag - columns @ solution) ** 2)) - rounding, 0.0)
-        weights = 1.0 / np.sqrt(lengths * rounding + misfit)
+        span = 2 * window + 1
+        square = uniform_filter1d((lag - columns @ solution) ** 2, span, mode="nearest")
+        weights = 1.0 / np.sqrt(lengths * rounding + span * np.maximum(square - rounding, 0.0))
         solution = np.linalg.lstsq(columns * weights[:, None], lag * weights, rcond=1e-9)[0]
     return np.asarray(columns @ solution)
 
