@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from hdbridge.analysis.readings import MOST_JITTER_DEG, Reading, quantum_deg, reading_of, trimmed_deviation
+from hdbridge.analysis.readings import (
+    MOST_JITTER_DEG,
+    ROUNDED_DEG,
+    Reading,
+    quantum_deg,
+    reading_of,
+    trimmed_deviation,
+)
 from hdbridge.axis.effects import FloatArray
 
 REVERSAL_DEG = 0.3
@@ -156,8 +163,7 @@ def _driving(
     speed[_resting(target, window)] = 0.0
     columns = np.column_stack([np.ones(len(lag)), speed, acceleration])
     scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-12
-    solution = np.linalg.lstsq(columns / scale, lag, rcond=1e-9)[0] / scale
-    line = columns @ solution
+    line = _fitted(columns / scale, lag, count, window)
     rest = lag - line
     noise = _noise(lag, target, count)
     if noise >= 0.5 * count and float(np.std(rest)) > 0.45 * count + 1e-6:
@@ -174,6 +180,25 @@ def _driving(
     # The path may cross its cell without reversing, and the cell moves with a noisy reading.
     band = max(CHATTER_COUNTS * reading.resolution_deg, 4.0 * cell)
     return steadied(target + line, target + line, band)
+
+
+def _fitted(columns: FloatArray, lag: FloatArray, count: float, window: int) -> FloatArray:
+    """Returns the combination of the columns, (n, m), that fits a counted lag, (n,).
+
+    Readings are rounded. A motor that follows at a constant speed stays at one fraction of a count behind its
+    set-points, so all its readings have the same rounding error. A run of equal lags is therefore a single
+    observation.
+    """
+    edges = np.flatnonzero(np.abs(np.diff(lag, prepend=np.inf, append=np.inf)) > ROUNDED_DEG)
+    lengths = np.repeat(np.diff(edges), np.diff(edges))
+    solution = np.linalg.lstsq(columns, lag, rcond=1e-9)[0]
+    rounding = count**2 / 12.0
+    if rounding:
+        span = 2 * window + 1
+        square = uniform_filter1d((lag - columns @ solution) ** 2, span, mode="nearest")
+        weights = 1.0 / np.sqrt(lengths * rounding + span * np.maximum(square - rounding, 0.0))
+        solution = np.linalg.lstsq(columns * weights[:, None], lag * weights, rcond=1e-9)[0]
+    return np.asarray(columns @ solution)
 
 
 def _averaged_at_rest(

@@ -374,10 +374,7 @@ class Search:
 
         ``without`` is the fit without that cause.
         """
-        # A residual above the noise means that neither is complete, so the margin is wider.
-        excess = max(fitted.chi_square / max(len(fitted.residual) - fitted.free(), 1), 1.0)
-        margin = self.scales.enter * excess + self.scales.alias * (without.chi_square - fitted.chi_square)
-        most = self.cost(fitted) + margin
+        most = self.cost(fitted) + self.margin(fitted, without)
         best: dict[str, Fitted] = {}
         for score in self._shortlist(without, self._scores(without), cause):
             name = score.effect.name
@@ -389,6 +386,14 @@ class Search:
             if not (self._too_small(trial, name) or self._refusal(trial, name, as_alias=True)):
                 best[name] = trial
         return sorted(best, key=lambda each: best[each].chi_square)
+
+    def margin(self, fitted: Fitted, without: Fitted) -> float:
+        """Returns the additional cost up to which another cause fits as well as the one left out in
+        ``without``.
+        """
+        # A residual above the noise means that neither is complete, so the margin is wider.
+        excess = max(fitted.chi_square / max(len(fitted.residual) - fitted.free(), 1), 1.0)
+        return self.scales.enter * excess + self.scales.alias * (without.chi_square - fitted.chi_square)
 
     def _with(self, fitted: Fitted, score: Score) -> Fitted:
         return self.estimator.fit(joined(fitted.hypothesis, score.effect, self.base))
@@ -444,7 +449,8 @@ def with_measured(search: Search, fitted: Fitted) -> Fitted:
                     continue
                 start = trial.hypothesis.start
                 lost = sum(estimator.channel_noise(each, start) @ each.coefficients() ** 2 for each in driven)
-                if search.cost(trial) - search.cost(fitted) < scales.enter + scales.noisy * float(lost):
+                margin = search.margin(fitted, estimator.fit(without))
+                if search.cost(trial) - search.cost(fitted) < margin + scales.noisy * float(lost):
                     return trial
                 break
     return fitted

@@ -47,12 +47,6 @@ from hdbridge.sim.truth import Truth
 SEEDS = [int(each) for each in os.environ.get("HIDDEN_SEEDS", "1").split()]
 """More of them hide each cause more often: HIDDEN_SEEDS="1 2 3"."""
 MOST_OF_FLOOR = 1.3
-MOST_OF_FLOOR_WORN = 1.8
-"""The limit for wear; 1.68 times the floor was measured.
-
-In the sweeps the motor follows 36.41 counts behind its set-points. The rounding of its reading is therefore a
-bias of 0.3 arcsec in the direction of motion (0.2 in the driving angle). The fit takes it for 3 % more wear.
-"""
 Parts = tuple[Procedure[Any], ...]
 LOOP: Parts = (
     Precondition(0.0, 2.0),
@@ -240,8 +234,7 @@ def test_the_extended_model_restores_accuracy_or_explains(cell: Cell) -> None:
     if left:
         return
     residual, floor = cell.step(extension.model), cell.floor_arcsec
-    most = MOST_OF_FLOOR_WORN if any(each.cause == "wear" for each in cell.hidden) else MOST_OF_FLOOR
-    assert residual < most * floor, f"{residual:.2f} over a floor of {floor:.2f}; {described(cell)}"
+    assert residual < MOST_OF_FLOOR * floor, f"{residual:.2f} over a floor of {floor:.2f}; {described(cell)}"
 
 
 @pytest.mark.parametrize("cell", of(LAGGING), indirect=True)

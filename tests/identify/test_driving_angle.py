@@ -88,6 +88,19 @@ def test_a_lag_of_unexpected_shape_does_not_lead_the_angle_in_its_counts(every_s
     assert abs(np.mean((path - motor) * forward)) < 0.1 * count
 
 
+def test_a_constant_fraction_of_a_count_in_a_sweep_is_little_bias():
+    """In the sweeps every reading is rounded by 0.4 counts; the sine shows the true lag at other speeds."""
+    count, sweep = 360.0 / 32_768, 364.0 * np.arange(1000.0)
+    sine = 18_000.0 * np.sin(np.arange(2000.0) / 57.3)
+    counts = np.concatenate([sine - sine[-1], sweep, sweep[::-1]])
+    command = np.round(counts)
+    motor = command - 0.1 * np.gradient(counts)
+    path = driving_angle(count * command, count * np.round(motor), 0.02)
+    forward, back = slice(2010, 2990), slice(3010, 3990)
+    lead = np.mean((path / count - motor)[forward]) - np.mean((path / count - motor)[back])
+    assert abs(lead) / 2.0 < 0.1
+
+
 @given(
     counts=st.sampled_from([8000, 20_000, 65_536, 2**18, 2**20]),
     flicker=st.sampled_from([0.0, 0.1, 0.2, 0.5]),
