@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,10 +71,8 @@ def spectrum_of(trace: Trace, parts: Sequence[slice]) -> Spectrum | None:
     frequency = np.empty(0)
     for part in parts:
         time_s = trace.time_s[part]
-        if len(time_s) < length:
-            continue
         grid = np.arange(time_s[0], time_s[-1], period_s)
-        if len(grid) < length:
+        if min(len(time_s), len(grid)) < length:
             continue
         values = (trace.measured[part], trace.simulated[part], trace.difference[part])
         even = np.stack([np.interp(grid, time_s, each) for each in values])
@@ -211,16 +209,6 @@ class Comparison:
         return {"figures": [asdict(each) for each in self.rows]}
 
 
-@dataclass(frozen=True, eq=False)
-class _Signals:
-    """Signals of one record; arrays of shape (n,)."""
-
-    time_s: FloatArray
-    command_deg: FloatArray
-    load_arcsec: FloatArray
-    by_name: Mapping[str, FloatArray]
-
-
 def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio: float) -> Comparison:
     """Compares two records by kind of leg and as a whole.
 
@@ -240,53 +228,53 @@ def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio:
         )
     ends = (*measured.starts[1:], len(measured))
     parts = [slice(start, end) for start, end in zip(measured.starts, ends, strict=True)]
-    real, twin = _signals(measured, ratio, parts), _signals(simulated, ratio, parts)
-    shared = [name for name in real.by_name if name in twin.by_name]
-    for part in parts:
-        offset = np.median(real.by_name[LOAD_ERROR][part] - twin.by_name[LOAD_ERROR][part])
-        twin.by_name[LOAD_ERROR][part] += offset
-    moves = _moving(real, parts)
+    time_s, command, motor = measured.time_s, measured.motor_target_deg, measured.motor_position_deg
+    moves = _moving(time_s, command, parts)
     calm = ~moves
     for part in parts:
-        moved_s = np.maximum.accumulate(np.where(moves[part], real.time_s[part], -np.inf))
-        calm[part] &= real.time_s[part] - moved_s > CALM_S
+        moved_s = np.maximum.accumulate(np.where(moves[part], time_s[part], -np.inf))
+        calm[part] &= time_s[part] - moved_s > CALM_S
+    real, twin = _signals(measured, ratio, parts), _signals(simulated, ratio, parts)
+    for part in parts:
+        twin[LOAD_ERROR][part] += np.median(real[LOAD_ERROR][part] - twin[LOAD_ERROR][part])
         if np.count_nonzero(calm[part]) >= LEAST_SAMPLES:
-            apart = real.by_name[FOLLOWING_ERROR][part] - twin.by_name[FOLLOWING_ERROR][part]
-            twin.by_name[FOLLOWING_ERROR][part] += np.median(apart[calm[part]])
-    motor = measured.motor_position_deg
+            apart = real[FOLLOWING_ERROR][part] - twin[FOLLOWING_ERROR][part]
+            twin[FOLLOWING_ERROR][part] += np.median(apart[calm[part]])
+    traces = {name: Trace(time_s, one, twin[name]) for name, one in real.items() if name in twin}
     count_deg = least_change(np.concatenate([np.diff(motor[part]) for part in parts]), motor)
-    groups = _groups(measured.time_s, legs, ~unknown_rows(measured, count_deg))
+    groups = _groups(time_s, legs, ~unknown_rows(measured, count_deg))
     # At rest, the torque depends on a thousandth of a count.
     rests = [standing(part, count_deg) for part in measured.parts()]
     goes = ~np.concatenate([each.stuck | each.still for each in rests])
     rows = [
         row
         for kind, inside in groups.items()
-        for name in shared
+        for name, trace in traces.items()
         for compared in (inside & goes if name == MOTOR_TORQUE else inside,)
-        for row in _of_signal(name, kind, compared, (inside & calm, inside & moves), real, twin, parts)
+        for row in _of_signal(name, kind, compared, (inside & calm, inside & moves), trace, parts)
     ]
-    stops = list(_stops(real, twin, parts))
+    loads = [each.load_position_deg * ARCSEC_PER_DEG for each in (measured, simulated)]
+    stops = list(_stops(Trace(time_s, *loads), command, moves, parts))
     for kind, inside in groups.items():
-        rows += _of_stops(kind, [stop for stop in stops if inside[stop.moved]], real.time_s)
-    traces = {name: Trace(real.time_s, real.by_name[name], twin.by_name[name]) for name in shared}
-    swings = (name for name in shared if name != TEMPERATURE)
+        rows += _of_stops(kind, [stop for stop in stops if inside[stop.moved]], time_s)
+    swings = (name for name in traces if name != TEMPERATURE)
     spectra = {name: found for name in swings if (found := spectrum_of(traces[name], parts)) is not None}
     return Comparison(tuple(rows), traces, spectra)
 
 
-def _signals(record: Record, ratio: float, parts: Sequence[slice]) -> _Signals:
-    command = record.motor_target_deg
-    assert command is not None
+def _signals(record: Record, ratio: float, parts: Sequence[slice]) -> dict[str, FloatArray]:
+    """Returns the signals of a record by name, the load error of each part about its mean."""
     error = record.transmission_error_arcsec(ratio).copy()
     for part in parts:
         error[part] -= np.mean(error[part])
-    by_name = {LOAD_ERROR: error, FOLLOWING_ERROR: command - record.motor_position_deg}
+    found = {
+        LOAD_ERROR: error,
+        FOLLOWING_ERROR: record.columns["motor_target_deg"] - record.motor_position_deg,
+    }
     for name, channel in ((MOTOR_TORQUE, Channel.MOTOR_TORQUE), (TEMPERATURE, Channel.TEMPERATURE)):
-        column = record.columns.get(channel.value)
-        if column is not None:
-            by_name[name] = column
-    return _Signals(record.time_s, command, record.load_position_deg * ARCSEC_PER_DEG, by_name)
+        if channel.value in record.columns:
+            found[name] = record.columns[channel.value]
+    return found
 
 
 def _groups(time_s: FloatArray, legs: Sequence[Segment], known: Rows) -> dict[str, Rows]:
@@ -298,13 +286,12 @@ def _groups(time_s: FloatArray, legs: Sequence[Segment], known: Rows) -> dict[st
     return {kind: inside for kind, inside in groups.items() if np.count_nonzero(inside) >= LEAST_SAMPLES}
 
 
-def _moving(real: _Signals, parts: Sequence[slice]) -> Rows:
+def _moving(time_s: FloatArray, command_deg: FloatArray, parts: Sequence[slice]) -> Rows:
     """Returns the mask of rows in which the command moves."""
-    moves = np.zeros(len(real.time_s), dtype=np.bool_)
+    moves = np.zeros(len(time_s), dtype=np.bool_)
     for part in parts:
         if part.stop - part.start > 1:
-            step = np.maximum(np.diff(real.time_s[part]), 1e-9)
-            speed = np.abs(np.diff(real.command_deg[part])) / step
+            speed = np.abs(np.diff(command_deg[part])) / np.maximum(np.diff(time_s[part]), 1e-9)
             moves[part] = np.concatenate([speed[:1], speed]) > MOVING_DEG_S
     return moves
 
@@ -314,12 +301,11 @@ def _of_signal(
     kind: str,
     inside: Rows,
     rest_and_motion: tuple[Rows, Rows],
-    real: _Signals,
-    twin: _Signals,
+    trace: Trace,
     parts: Sequence[slice],
 ) -> Iterator[Row]:
-    one, other = real.by_name[name], twin.by_name[name]
-    unit = UNITS[name]
+    """Yields the rms difference of a signal, and its noise at rest and in motion."""
+    one, other, unit = trace.measured, trace.simulated, UNITS[name]
     if count := int(np.count_nonzero(inside)):
         apart = rms(one[inside] - other[inside])
         noise = noise_of(one, inside, parts)
@@ -332,13 +318,10 @@ def _of_signal(
         yield Row(name, kind, unit, rms(one[inside]), rms(other[inside]), apart, noise, count)
     for channel, which in zip((NOISE_AT_REST, NOISE_IN_MOTION), rest_and_motion, strict=True):
         count = int(np.count_nonzero(which))
-        if count < LEAST_SAMPLES or name == TEMPERATURE:
-            continue
-        theirs, ours = noise_of(one, which, parts), noise_of(other, which, parts)
-        apart = abs(theirs - ours)
-        yield Row(
-            f"{channel}:{name}", kind, unit, theirs, ours, apart, theirs / math.sqrt(2.0 * count), count
-        )
+        if count >= LEAST_SAMPLES and name != TEMPERATURE:
+            noises = noise_of(one, which, parts), noise_of(other, which, parts)
+            own = noises[0] / math.sqrt(2.0 * count)
+            yield Row(f"{channel}:{name}", kind, unit, *noises, abs(noises[0] - noises[1]), own, count)
 
 
 def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
@@ -365,44 +348,48 @@ def least_change(changes: FloatArray, values: FloatArray) -> float:
     return float(np.min(size, where=size > beyond, initial=math.inf))
 
 
-@dataclass(frozen=True, slots=True)
-class _Stop:
+class _Stop(NamedTuple):
     """One stop in both records."""
 
     moved: int
     """Last row of the motion before the stop."""
-    settled_s: tuple[float, float]
-    overshoot_arcsec: tuple[float, float]
+    settled_s: list[float]
+    overshoot_arcsec: list[float]
     noise_arcsec: float
     scatter_s: float
     """Rms difference of the two settling times due to noise."""
 
 
-def _stops(real: _Signals, twin: _Signals, parts: Sequence[slice]) -> Iterator[_Stop]:
-    """Yields the stops, where the command comes to rest after a motion and stays at rest."""
-    moves = _moving(real, parts)
+def _stops(loads: Trace, command_deg: FloatArray, moves: Rows, parts: Sequence[slice]) -> Iterator[_Stop]:
+    """Yields the stops, where the command comes to rest after a motion and stays at rest.
+
+    ``loads`` are the load angles in arcsec, ``moves`` is the mask of rows in which the command moves.
+    """
+    time_s, both = loads.time_s, (loads.measured, loads.simulated)
     for part in parts:
         edges = np.flatnonzero(moves[part][:-1] & ~moves[part][1:]) + part.start + 1
         starts = np.flatnonzero(~moves[part][:-1] & moves[part][1:]) + part.start + 1
         for stop in edges.tolist():
             later = starts[starts > stop]
             end = int(later[0]) if len(later) else part.stop
-            end = min(end, int(np.searchsorted(real.time_s, real.time_s[stop] + SIGHT_S)), part.stop)
-            if end - stop < LEAST_SAMPLES or real.time_s[end - 1] - real.time_s[stop] < STAND_S:
+            end = min(end, int(np.searchsorted(time_s, time_s[stop] + SIGHT_S)), part.stop)
+            if end - stop < LEAST_SAMPLES or time_s[end - 1] - time_s[stop] < STAND_S:
                 continue
             earlier = starts[starts < stop]
             began = int(earlier[-1]) if len(earlier) else part.start
-            way = float(np.sign(real.command_deg[stop] - real.command_deg[began]))
-            rest = np.zeros(len(real.time_s), dtype=np.bool_)
+            way = float(np.sign(command_deg[stop] - command_deg[began]))
+            rest = np.zeros(len(time_s), dtype=np.bool_)
             rest[stop + (end - stop) // 2 : end] = True
-            noises = [noise_of(each.load_arcsec, rest, [part]) for each in (real, twin)]
-            loads = [each.load_arcsec[stop:end] for each in (real, twin)]
-            times = real.time_s[stop:end]
+            noises = [noise_of(each, rest, [part]) for each in both]
             band = max(SETTLED_ARCSEC, SETTLED_NOISE * noises[0])
-            settled = [settling_s(times, *each, band) for each in zip(loads, noises, strict=True)]
-            scatter = scatter_s(times, loads[1], noises[1], band, noises)
-            beyond = [overshoot_arcsec(each, way) for each in loads]
-            yield _Stop(stop - 1, (settled[0], settled[1]), (beyond[0], beyond[1]), noises[0], scatter)
+            times, after = time_s[stop:end], [each[stop:end] for each in both]
+            yield _Stop(
+                stop - 1,
+                [settling_s(times, *each, band) for each in zip(after, noises, strict=True)],
+                [overshoot_arcsec(each, way) for each in after],
+                noises[0],
+                scatter_s(times, after[1], noises[1], band, noises),
+            )
 
 
 def _of_stops(kind: str, stops: Sequence[_Stop], time_s: FloatArray) -> Iterator[Row]:

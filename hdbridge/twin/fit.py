@@ -9,7 +9,7 @@ white noise.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, Final
@@ -25,15 +25,15 @@ from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.hysteresis_laws import law_of
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.hysteresis import Hysteresis, MaxwellSlip
-from hdbridge.sim.truth.motor import TrueNotch, TrueObserver
+from hdbridge.sim.truth.motor import TrueObserver
 from hdbridge.twin.misfit import (
     CHANNELS,
     FINE,
     Data,
+    Mask,
     Replays,
     Scales,
     Values,
-    counted,
     expected,
     least_deviation,
     misfit,
@@ -58,6 +58,7 @@ from hdbridge.twin.parameters import (
     at_coordinates,
     coordinates,
     free_value,
+    named,
     value_in,
     with_sections,
     with_values,
@@ -90,7 +91,7 @@ def start_of(truth: Truth, data: Data) -> Truth:
 
 def _held_nm(data: Data) -> float:
     """Returns the highest torque if it is held for `HELD_ROWS`, else infinity; without rows at standstill."""
-    torque_nm = [np.abs(piece.measured[TORQUE]) * (piece.counts[TORQUE] > 0.0) for piece in data.pieces]
+    torque_nm = [np.abs(piece.measured[TORQUE]) * piece.counts[TORQUE] for piece in data.pieces]
     highest = max(float(np.max(each)) for each in torque_nm)
     for each in torque_nm:
         there = np.concatenate([[0.0], each > highest - 0.5 * rounding(data.axis)[TORQUE], [0.0]])
@@ -124,11 +125,11 @@ def lag_s(data: Data) -> float:
 
 LOOP: Final = ("loop offset", "loop width", "loop yield", "loop exponent")
 """Parameters of all hysteresis laws; each law has only some of them."""
-LAWS: Final[tuple[dict[str, Any], ...]] = (
-    {"law": "rolling_friction", "offset_arcsec": 1.0, "width_deg": 1.0, "exponent": 1.6},
-    {"law": "bouc_wen", "offset_arcsec": 1.0, "yield_deg": 1.0},
-    {"law": "dahl", "offset_arcsec": 1.0, "yield_deg": 1.0},
-)
+LAWS: Final[Mapping[str, dict[str, float]]] = {
+    "rolling_friction": {"offset_arcsec": 1.0, "width_deg": 1.0, "exponent": 1.6},
+    "bouc_wen": {"offset_arcsec": 1.0, "yield_deg": 1.0},
+    "dahl": {"offset_arcsec": 1.0, "yield_deg": 1.0},
+}
 """Unit loops of the laws with few parameters; the exponent of the first is that of a published gear."""
 LONG = 20.0
 """Travel after which each loop has reached its limit, in widths."""
@@ -137,7 +138,7 @@ _TRUE: Final[TypeAdapter[Hysteresis]] = TypeAdapter(Hysteresis)
 
 def loop_parameters(truth: Truth) -> tuple[Parameter, ...]:
     """Returns the loop parameters of the law of this truth."""
-    return tuple(BY_NAME[name] for name in LOOP if value_in(truth, BY_NAME[name]) is not None)
+    return tuple(each for each in named(*LOOP) if value_in(truth, each) is not None)
 
 
 def by_each_law(truth: Truth) -> list[Truth]:
@@ -148,7 +149,7 @@ def by_each_law(truth: Truth) -> list[Truth]:
     if own.law == "rolling_friction":
         # A fit may reduce the loop below its initial state, which has no effect after some travel.
         truth = _with_loop(truth, own.model_copy(update={"start_arcsec": 0.0}))
-    return [truth, *(_with_loop(truth, _like(own, each)) for each in LAWS if each["law"] != own.law)]
+    return [truth, *(_with_loop(truth, _like(own, law)) for law in LAWS if law != own.law)]
 
 
 def by_law_of(truth: Truth, other: Truth) -> Truth:
@@ -156,11 +157,12 @@ def by_law_of(truth: Truth, other: Truth) -> Truth:
     own, law = truth.gear.hysteresis, other.gear.hysteresis
     if own is None or law is None or own.law == law.law:
         return truth
-    return _with_loop(truth, _like(own, next(each for each in LAWS if each["law"] == law.law)))
+    return _with_loop(truth, _like(own, law.law))
 
 
-def _like(own: Hysteresis, unit: dict[str, Any]) -> Hysteresis:
+def _like(own: Hysteresis, law: str) -> Hysteresis:
     """Returns a loop of another law with the same height and the same travel to half crossing."""
+    unit: dict[str, Any] = {"law": law, **LAWS[law]}
     travel_deg = _half_crossed_deg(own) / _half_crossed_deg(_TRUE.validate_python(unit))
     size = "width_deg" if "width_deg" in unit else "yield_deg"
     offset_arcsec = (
@@ -209,7 +211,7 @@ def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
     return np.asarray(spread[:, None] * directions / np.sqrt(worth), dtype=np.float64)
 
 
-def sandwich(slopes: FloatArray, left: FloatArray, legs: FloatArray, spread: FloatArray) -> FloatArray:
+def sandwich(slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], spread: FloatArray) -> FloatArray:
     """Returns the covariance of the coordinates for correlated residuals within independent legs, (p, p).
 
     It is a jackknife over legs: the shift of the fit when one leg is left out (Bell and McCaffrey, Survey
@@ -223,7 +225,7 @@ def sandwich(slopes: FloatArray, left: FloatArray, legs: FloatArray, spread: Flo
     along = principal(slopes, spread)
     rows = slopes @ along
     left = left - slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
-    numbers = numbered(legs.astype(np.intp))
+    numbers = numbered(legs)
     order = np.argsort(numbers, kind="stable")
     drawn = []
     for leg in np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1):
@@ -286,7 +288,7 @@ class Fitted:
     """Covariance of the coordinates, shape (p, p)."""
     scales: Scales
     residuals: dict[str, FloatArray]
-    rows: NDArray[np.bool_]
+    rows: Mask
     """Mask of the fitted rows, one channel after the other."""
     vector: FloatArray
     """Softened scaled residuals of the fitted rows, shape (n,)."""
@@ -328,51 +330,49 @@ def intervals_of(
     }
 
 
+@dataclass(eq=False)
 class _Problem:
     """Residuals and slopes as functions of the coordinates, for one estimate of the scales."""
 
-    def __init__(
-        self,
-        replays: Replays,
-        start: Truth,
-        parameters: tuple[Parameter, ...],
-        prior: FloatArray,
-        rows: NDArray[np.bool_],
-    ) -> None:
-        self._replays, self._start, self._parameters = replays, start, parameters
-        self._prior, self._rows = prior, rows
-        self.spread = np.array([each.spread for each in parameters])
-        self.low, self.high = np.array([each.bounds for each in parameters]).T
-        self.along: FloatArray | None = None
-        """Latest slopes, which determine the directions of the next differences."""
-        self.scale = Scales({})
+    replays: Replays
+    start: Truth
+    parameters: tuple[Parameter, ...]
+    prior: FloatArray
+    rows: Mask
+    along: FloatArray | None
+    """Latest slopes, shape (n, p), which determine the directions of the next differences."""
+    scale: Scales
+
+    def __post_init__(self) -> None:
+        self.spread = np.array([each.spread for each in self.parameters])
+        self.low, self.high = np.array([each.bounds for each in self.parameters]).T
         self._found: dict[bytes, dict[str, FloatArray]] = {}
 
     def found(self, place: FloatArray) -> dict[str, FloatArray]:
         """Returns the residuals by channel, replaying each place only once."""
         key = place.tobytes()
         if key not in self._found:
-            self._found = {key: self._shown([place])[0]}
+            self._found = {key: self._replayed([place])[0]}
         return self._found[key]
 
     def residuals(self, place: FloatArray) -> FloatArray:
         """Returns the softened scaled residuals, followed by the distances from the prior."""
-        left = softened(self.found(place), self.scale, self._rows)
-        return np.concatenate([left, (place - self._prior) / self.spread])
+        left = softened(self.found(place), self.scale, self.rows)
+        return np.concatenate([left, (place - self.prior) / self.spread])
 
     def slopes(self, place: FloatArray, *, wide: bool = False) -> FloatArray:
-        """Returns the derivatives of `residuals` by the coordinates in spreads, shape (n + p, p)."""
+        """Returns the derivatives of the softened residuals by the coordinates, shape (n, p)."""
         moves = np.diag(STEP * self.spread) if self.along is None else _moves(self.along, self.spread)
-        now = self.scale.scaled(self.found(place))[self._rows]
+        now = self.scale.scaled(self.found(place))[self.rows]
         slopes = slopes_at(self._scaled, now, place, moves, (self.low, self.high), wide=wide)
-        self.along = slopes * counting(now, self.scale, self._rows)[1][:, None]
-        return np.concatenate([self.along * self.spread, np.eye(len(self.spread))])
+        self.along = slopes * counting(now, self.scale, self.rows)[1][:, None]
+        return self.along
 
     def stepped(self, place: FloatArray, steps: int) -> FloatArray:
         """Returns the best place after up to ``steps`` trust-region steps, the first of which has the length
         of a spread.
         """
-        left, latest = 1 + steps, np.empty(0)
+        left, prior = 1 + steps, np.eye(len(place))
 
         def at(move: FloatArray) -> FloatArray:
             there: FloatArray = np.clip(place + move * self.spread, self.low, self.high)
@@ -384,10 +384,9 @@ class _Problem:
             return self.residuals(at(move))
 
         def slopes(move: FloatArray) -> FloatArray:
-            nonlocal latest
-            if left:  # `least_squares` also asks for them after the last step, and does not use them
-                latest = self.slopes(at(move))
-            return latest
+            # `least_squares` also asks for them after the last step, and does not use them.
+            latest = self.slopes(at(move)) if left or self.along is None else self.along
+            return np.concatenate([latest * self.spread, prior])
 
         end = least_squares(
             residuals,
@@ -400,12 +399,10 @@ class _Problem:
         return at(np.asarray(end.x, dtype=np.float64))
 
     def _scaled(self, places: Sequence[FloatArray]) -> list[FloatArray]:
-        return [self.scale.scaled(each)[self._rows] for each in self._shown(places)]
+        return [self.scale.scaled(each)[self.rows] for each in self._replayed(places)]
 
-    def _shown(self, places: Sequence[FloatArray]) -> list[dict[str, FloatArray]]:
-        return self._replays(
-            [at_coordinates(self._start, self._parameters, each.tolist()) for each in places]
-        )
+    def _replayed(self, places: Sequence[FloatArray]) -> list[dict[str, FloatArray]]:
+        return self.replays([at_coordinates(self.start, self.parameters, each.tolist()) for each in places])
 
 
 def solve(
@@ -432,25 +429,23 @@ def solve(
     rows = fitted_rows(data, everything=everything)
     place = np.array(coordinates(start, parameters))
     prior = place if prior is None else prior
-    problem = _Problem(replays, start, parameters, prior, rows)
-    problem.along = None if near is None else near.jacobian
+    along = None if near is None else near.jacobian
+    problem = _Problem(replays, start, parameters, prior, rows, along, Scales({}))
     done = 0
-    while True:
+    while done < steps:
         found = problem.found(place)
-        problem.scale = known if known is not None else scales(data, found)
-        if done >= steps:
-            break
-        if known is not None:
-            problem.scale = _tempered(known, found, rows)
+        problem.scale = scales(data, found) if known is None else _tempered(known, found, rows)
         before = problem.residuals(place)
         taken = min(ROUND, steps - done)
         place = problem.stepped(place, taken)
         after = problem.residuals(place)
         done = done + taken if 0.5 * float(before @ before - after @ after) >= WORTH else steps
+    found = problem.found(place)
+    problem.scale = known or scales(data, found)
     left = softened(found, problem.scale, rows)
     slopes, covariance = problem.along, np.diag(problem.spread**2)
     if linear or slopes is None:
-        slopes = problem.slopes(place, wide=wide)[: -len(parameters)] / problem.spread
+        slopes = problem.slopes(place, wide=wide)
         covariance = sandwich(slopes, left, legs_of_rows(data, rows), problem.spread)
     truth = at_coordinates(start, parameters, place.tolist())
     return Fitted(truth, parameters, prior, place, covariance, problem.scale, found, rows, left, slopes)
@@ -467,23 +462,22 @@ def continued(
     return solve(replays, truth or best.truth, best.parameters, steps, best.prior, **options)
 
 
-def fitted_rows(data: Data, *, everything: bool = False) -> NDArray[np.bool_]:
+def fitted_rows(data: Data, *, everything: bool = False) -> Mask:
     """Returns the mask of the rows used in a fit, one channel after the other."""
-    out = 0.0 if everything else data.out
-    return np.concatenate([each * (1.0 - out) > 0.0 for each in counted(data).values()])
+    return np.concatenate([each if everything else each & ~data.out for each in data.counts.values()])
 
 
-def legs_of_rows(data: Data, rows: NDArray[np.bool_]) -> FloatArray:
+def legs_of_rows(data: Data, rows: Mask) -> NDArray[np.intp]:
     """Returns the leg number of each fitted row."""
     return np.concatenate([data.leg] * len(CHANNELS))[rows]
 
 
-def softened(found: dict[str, FloatArray], scale: Scales, rows: NDArray[np.bool_]) -> FloatArray:
+def softened(found: dict[str, FloatArray], scale: Scales, rows: Mask) -> FloatArray:
     """Returns the residuals of some rows, transformed by their likelihood and softened."""
     return counting(scale.scaled(found)[rows], scale, rows)[0]
 
 
-def counting(off: FloatArray, scale: Scales, rows: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+def counting(off: FloatArray, scale: Scales, rows: Mask) -> tuple[FloatArray, FloatArray]:
     """Transforms scaled residuals by their likelihood and softens them; also returns the derivative."""
     half, stray = (each[rows] for each in scale.halves(len(rows) // len(CHANNELS)))
     root, slope = rooted(off, half, stray)
@@ -493,7 +487,7 @@ def counting(off: FloatArray, scale: Scales, rows: NDArray[np.bool_]) -> tuple[F
     return np.where(size > 1.0, np.sign(root) * SOFT * soft, root), slope / soft
 
 
-def _tempered(known: Scales, found: dict[str, FloatArray], rows: NDArray[np.bool_]) -> Scales:
+def _tempered(known: Scales, found: dict[str, FloatArray], rows: Mask) -> Scales:
     """Returns scales enlarged by the overall rms of the scaled residuals, if that exceeds one.
 
     Far from the minimum, residuals are much larger than the noise, and the prior would have no weight. All
@@ -588,6 +582,8 @@ EQUAL_MOTORS: Final = 4.0
 by a factor of three to five (catalogues). Without this limit, observers and filters could replace the
 inertia."""
 NOTCH: Final = ("notch frequency", "notch depth", "notch width")
+AVERAGE: Final = "moving average"
+FRICTION: Final = "friction feed-forward"
 REACTION: Final = "loop reaction"
 OBSERVER: Final = ("observer frequency", "observer share", "observer inertia")
 MOST_DEAD_CYCLES: Final = 2.0
@@ -656,26 +652,16 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
     known[DEAD_TIME.name] = replace(DEAD_TIME, most=longest_ms)
     motor, usual = BY_NAME["motor inertia"], truth.motor.inertia_kg_m2
     known[motor.name] = replace(motor, least=usual / EQUAL_MOTORS, most=usual * EQUAL_MOTORS)
-    filtered_ms = truth.servo.command_filter_ms
-    averaged_ms = min(cycle_ms, BY_NAME["moving average"].most)
-    late_ms = max(_lag_ms(truth) - 0.5 * averaged_ms, 0.0)
-
-    def split(dead_time_ms: float, filter_ms: float) -> dict[str, float]:
-        """Returns the dead time within its limit, and the filter with the rest of the lag."""
-        dead_ms = min(dead_time_ms, longest_ms)
-        return {
-            "dead_time_ms": dead_ms,
-            "command_filter_ms": filter_ms + 0.5 * (dead_time_ms - dead_ms),
-        }
-
-    plain = split(truth.servo.dead_time_ms, filtered_ms)
-    averaged = {"moving_average_ms": averaged_ms, **split(max(late_ms - 2.0 * SHORT_MS, 0.0), SHORT_MS)}
+    averaged_ms = min(cycle_ms, BY_NAME[AVERAGE].most)
+    late_ms = max(_lag_ms(truth) - 0.5 * averaged_ms, 2.0 * SHORT_MS)
+    plain = _divided(_lag_ms(truth), min(truth.servo.dead_time_ms, longest_ms))
+    averaged = {AVERAGE: averaged_ms, **_divided(late_ms, min(late_ms - 2.0 * SHORT_MS, longest_ms))}
     whole = truth.motor.inertia_kg_m2 + truth.load_.whole_inertia_kg_m2 / truth.gear.ratio**2
     fastest = VELOCITY_BANDWIDTH_RAD_S * truth.motor.inertia_kg_m2
     commands = (
         (plain, 0.0, ()),
         (plain, whole, ("inertia feed-forward",)),
-        (averaged, whole, ("inertia feed-forward", "moving average")),
+        (averaged, whole, ("inertia feed-forward", AVERAGE)),
     )
     for gain, rate in BANDWIDTHS:
         for (command, forward, more), rejection in product(commands, REJECTIONS):
@@ -697,11 +683,11 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
                     "load_feedforward": None,
                     "viscous_feedforward_nm_s_per_rad": 0.0,
                     "friction_feedforward_nm": 0.0,
-                    **command,
                 }
             )
-            parameters = (*known.values(), *(BY_NAME[each] for each in more))
-            yield with_sections(truth.model_copy(update={"servo": servo}), parameters), parameters
+            parameters = (*known.values(), *named(*more))
+            begun = with_values(truth.model_copy(update={"servo": servo}), command)
+            yield with_sections(begun, parameters), parameters
 
 
 def more_blocks(best: Fitted) -> Iterator[Start]:
@@ -712,23 +698,20 @@ def more_blocks(best: Fitted) -> Iterator[Start]:
         motor = truth.motor.inertia_kg_m2 * truth.gear.ratio**2
         free_hz = math.sqrt(truth.gear.stiffness_nm_per_rad * (1.0 / load + 1.0 / motor)) / math.tau
         for place in PLACES:
-            notch = TrueNotch(frequency_hz=min(place * free_hz, 600.0), depth=0.5, width=0.7)
-            notched = servo.model_copy(update={"notch": notch})
-            parameters = (*best.parameters, *(BY_NAME[each] for each in NOTCH))
-            yield truth.model_copy(update={"servo": notched}), parameters
-    if BY_NAME["moving average"] not in best.parameters:
+            notch = dict(zip(NOTCH, (min(place * free_hz, 600.0), 0.5, 0.7), strict=True))
+            yield with_values(truth, notch), (*best.parameters, *named(*NOTCH))
+    if BY_NAME[AVERAGE] not in best.parameters:
         lag_ms = min(max(2.0 * servo.command_filter_ms, 0.5), 3.0)
-        averaged = servo.model_copy(update={"moving_average_ms": 2.0 * lag_ms, "command_filter_ms": SHORT_MS})
-        parameters = (*best.parameters, BY_NAME["moving average"])
-        yield truth.model_copy(update={"servo": averaged}), parameters
-    filters = tuple(BY_NAME[each] for each in ("speed filter", "torque filter"))
+        averaged = with_values(truth, {AVERAGE: 2.0 * lag_ms, FILTER.name: SHORT_MS})
+        yield averaged, (*best.parameters, BY_NAME[AVERAGE])
+    filters = named("speed filter", "torque filter")
     if not {*filters} & {*best.parameters}:
         yield with_sections(truth, filters), (*best.parameters, *filters)
     if truth.gear.hysteresis and BY_NAME[REACTION] not in best.parameters:
         yield with_values(truth, {REACTION: 0.5}), (*best.parameters, BY_NAME[REACTION])
-    if BY_NAME["friction feed-forward"] not in best.parameters:
-        with_friction = with_values(truth, {"friction feed-forward": 0.3 * truth.motor.coulomb_nm})
-        yield with_friction, (*best.parameters, BY_NAME["friction feed-forward"])
+    if BY_NAME[FRICTION] not in best.parameters:
+        fed_forward = with_values(truth, {FRICTION: 0.3 * truth.motor.coulomb_nm})
+        yield fed_forward, (*best.parameters, BY_NAME[FRICTION])
 
 
 # ----------------------------------------------------------------
@@ -801,8 +784,12 @@ def _lag_ms(truth: Truth) -> float:
 
 def _with_dead_time(truth: Truth, dead_time_ms: float) -> Truth:
     """Returns the truth with another dead time and the same lag."""
-    filter_ms = 0.5 * (_lag_ms(truth) - dead_time_ms)
-    return with_values(truth, {FILTER.name: filter_ms, DEAD_TIME.name: dead_time_ms})
+    return with_values(truth, _divided(_lag_ms(truth), dead_time_ms))
+
+
+def _divided(lag_ms: float, dead_time_ms: float) -> dict[str, float]:
+    """Returns a lag as this dead time and a command filter, by parameter name."""
+    return {FILTER.name: 0.5 * (lag_ms - dead_time_ms), DEAD_TIME.name: dead_time_ms}
 
 
 def feedforwards(truth: Truth, usual: Truth) -> list[Truth]:
@@ -854,7 +841,7 @@ LOOP_STEPS = 10
 def with_last(replays: Replays, best: Fitted) -> Fitted:
     """Adds the significant groups of `LAST`; the returned fit is not yet at its minimum."""
     for names in LAST:
-        extra = [BY_NAME[name] for name in names if BY_NAME[name] not in best.parameters]
+        extra = [each for each in named(*names) if each not in best.parameters]
         if not extra or (GROWTH in names and not _warms(replays.data)):
             continue
         wider, there = (*best.parameters, *extra), with_sections(best.truth, extra)

@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from scipy.special import log_ndtr, ndtr
+from scipy.special import log_ndtr
 
 from hdbridge.analysis.readings import median_deviation
 from hdbridge.axis import AxisConfig
@@ -53,6 +53,7 @@ FINEST_STEPS_PER_TURN = 2**40
 rated torque. With a drive's own steps, the smallest change of a parameter would disturb the torque as
 much as a relevant change."""
 CHANNELS = (FOLLOWING, TORQUE, LOAD)
+Mask = NDArray[np.bool_]
 UNKNOWN_DEG = 60.0
 """Motor travel after which the elastic state and the loops' integral no longer depend on the time before the
 recording, unless they are known (from a gear without such a state, or from the holding torque)."""
@@ -73,38 +74,60 @@ class Piece:
     commands: Commands
     measured: Mapping[str, FloatArray]
     """Following error in motor degrees, torque in Nm and load angle in arcsec, by channel."""
-    counts: Mapping[str, FloatArray]
-    """1 for each row that counts, else 0, by channel."""
-    leg: FloatArray
+    counts: Mapping[str, Mask]
+    """Mask of the rows that count, by channel."""
+    leg: NDArray[np.intp]
     """Leg number of each row, from zero."""
     kind: tuple[str, ...]
-    out: FloatArray
-    """1 for each row of a held-out leg, else 0."""
-    rest: FloatArray
-    """1 for each row at which the command has been at rest for `RINGING_S`, else 0."""
+    out: Mask
+    """Mask of the rows of held-out legs."""
+    rest: Mask
+    """Mask of the rows at which the command has been at rest for `RINGING_S`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """Recordings prepared for replays of truths like ``base``."""
+    """Recordings prepared for replays of truths like ``base``; columns contain the rows of all pieces."""
 
     axis: AxisConfig
     base: Truth
     pieces: tuple[Piece, ...]
 
-    @property
-    def leg(self) -> FloatArray:
+    @cached_property
+    def parts(self) -> list[slice]:
+        """Rows of each piece."""
+        ends = np.cumsum([len(each.out) for each in self.pieces]).tolist()
+        return [slice(first, end) for first, end in pairwise([0, *ends])]
+
+    @cached_property
+    def measured(self) -> dict[str, FloatArray]:
+        """Measured signals by channel, like `Piece.measured`."""
+        return {name: np.concatenate([each.measured[name] for each in self.pieces]) for name in CHANNELS}
+
+    @cached_property
+    def counts(self) -> dict[str, Mask]:
+        """Mask of the rows that count, by channel."""
+        return {name: np.concatenate([each.counts[name] for each in self.pieces]) for name in CHANNELS}
+
+    @cached_property
+    def leg(self) -> NDArray[np.intp]:
         """Leg number of each row, consecutive over all pieces."""
         firsts = np.cumsum([0, *(len(each.kind) for each in self.pieces)])[:-1]
         return np.concatenate([first + each.leg for first, each in zip(firsts, self.pieces, strict=True)])
 
-    @property
-    def out(self) -> FloatArray:
-        """1 for each row of a held-out leg, else 0."""
+    @cached_property
+    def out(self) -> Mask:
+        """Mask of the rows of held-out legs."""
         return np.concatenate([each.out for each in self.pieces])
+
+    @cached_property
+    def moving(self) -> Mask:
+        """Mask of the rows at which the command moves, or has rested for less than `RINGING_S`."""
+        return ~np.concatenate([each.rest for each in self.pieces])
 
     @property
     def kinds(self) -> tuple[str, ...]:
+        """Kinds of all legs, by leg number."""
         return tuple(kind for each in self.pieces for kind in each.kind)
 
 
@@ -167,20 +190,14 @@ def _replayed_s(piece: Piece) -> float:
     return len(piece.commands.counts) * piece.commands.cycle_s
 
 
-def traces_of(data: Data, truth: Truth) -> list[dict[str, FloatArray]]:
-    """Replays a truth smoothly; returns its traces by piece and channel, like `Piece.measured`."""
+def traces_of(data: Data, truth: Truth) -> dict[str, FloatArray]:
+    """Replays a truth smoothly; returns its traces by channel, like `Data.measured`."""
     simulated, shown = smooth(truth), []
     for piece in data.pieces:
-        commands = piece.commands
-        traces = run(commands, data.axis, simulated, smooth=True)
-        shown.append(
-            {
-                FOLLOWING: demand_deg(commands, data.axis) - traces["motor_position_deg"],
-                TORQUE: traces["motor_torque_nm"],
-                LOAD: traces["load_position_deg"] * ARCSEC_PER_DEG,
-            }
-        )
-    return shown
+        traces = run(piece.commands, data.axis, simulated, smooth=True)
+        following = demand_deg(piece.commands, data.axis) - traces["motor_position_deg"]
+        shown.append((following, traces["motor_torque_nm"], traces["load_position_deg"] * ARCSEC_PER_DEG))
+    return {name: np.concatenate(each) for name, each in zip(CHANNELS, zip(*shown, strict=True), strict=True)}
 
 
 def residuals(data: Data, truth: Truth) -> dict[str, FloatArray]:
@@ -191,18 +208,18 @@ def residuals(data: Data, truth: Truth) -> dict[str, FloatArray]:
     constant following error of more than a count at rest means that the command has another zero. The part of
     the load residual that follows from the motor's is removed, because a lag of the motor delays the load.
     """
-    found: dict[str, list[FloatArray]] = {name: [] for name in CHANNELS}
+    shown = traces_of(data, truth)
+    found = {name: data.measured[name] - shown[name] for name in CHANNELS}
     step_deg = rounding(data.axis)[FOLLOWING]
-    for piece, shown in zip(data.pieces, traces_of(data, truth), strict=True):
-        for name in CHANNELS:
-            off = piece.measured[name] - shown[name]
-            if name == FOLLOWING and piece.rest.any():
-                rest = piece.rest > 0.0
-                if abs(np.median(piece.measured[name][rest])) > STANDS_COUNTS * step_deg:
-                    off = off - np.median(off[rest])
-            found[name].append(off * piece.counts[name])
+    for piece, rows in zip(data.pieces, data.parts, strict=True):
+        if piece.rest.any() and abs(np.median(piece.measured[FOLLOWING][piece.rest])) > (
+            STANDS_COUNTS * step_deg
+        ):
+            found[FOLLOWING][rows] -= np.median(found[FOLLOWING][rows][piece.rest])
+    for name, counts in data.counts.items():
+        found[name] *= counts
     found[LOAD] = _not_taken_along(data, found[FOLLOWING], found[LOAD])
-    return {name: np.concatenate(each) for name, each in found.items()}
+    return found
 
 
 def beyond(values: FloatArray, least: float) -> FloatArray:
@@ -210,35 +227,27 @@ def beyond(values: FloatArray, least: float) -> FloatArray:
     return np.asarray(np.sign(values) * np.maximum(np.abs(values) - least, 0.0), dtype=np.float64)
 
 
-def _not_taken_along(
-    data: Data, following: Sequence[FloatArray], load: Sequence[FloatArray]
-) -> list[FloatArray]:
-    """Returns the load's residuals by piece, without the part due to the motor and without their zeros.
+def _not_taken_along(data: Data, following: FloatArray, load: FloatArray) -> FloatArray:
+    """Returns the load's residuals without the part due to the motor and without their zeros.
 
     The motor's residuals enter with a regression coefficient between 0 and 1, which is one if the loops are
     wrong and both shafts are late. The motor encoder's rounding is excluded.
     """
-    inside = [piece.counts[LOAD] > 0.0 for piece in data.pieces]
-    rounded_deg = 0.5 * rounding(data.axis)[FOLLOWING]
-    ahead = [-beyond(each, rounded_deg) * ARCSEC_PER_DEG / data.axis.gear.ratio for each in following]
-    motor, shaft = (
-        np.concatenate([each[i] - np.mean(each[i]) for each, i in zip(whole, inside, strict=True) if i.any()])
-        if any(i.any() for i in inside)
-        else np.zeros(0)
-        for whole in (ahead, load)
-    )
+    ahead = -beyond(following, 0.5 * rounding(data.axis)[FOLLOWING]) * ARCSEC_PER_DEG / data.axis.gear.ratio
+    motor, shaft = (_about(np.mean, each, data) for each in (ahead, load))
     size = float(motor @ motor)
     share = min(max(float(motor @ shaft) / size, 0.0), 1.0) if size > 0.0 else 0.0
-    left = []
-    for off, taken, i in zip(load, ahead, inside, strict=True):
-        alone = off - share * taken
-        left.append((alone - np.median(alone[i])) * i if i.any() else np.zeros(len(off)))
+    return _about(np.median, load - share * ahead, data)
+
+
+def _about(centre: Callable[[FloatArray], Any], load: FloatArray, data: Data) -> FloatArray:
+    """Subtracts the centre of each piece from a column of the load; zero for rows that do not count."""
+    left, counts = np.zeros(len(load)), data.counts[LOAD]
+    for rows in data.parts:
+        inside = counts[rows]
+        if inside.any():
+            left[rows] = (load[rows] - centre(load[rows][inside])) * inside
     return left
-
-
-def counted(data: Data) -> dict[str, FloatArray]:
-    """Returns 1 for each row that counts, else 0, by channel."""
-    return {name: np.concatenate([each.counts[name] for each in data.pieces]) for name in CHANNELS}
 
 
 def rounding(axis: AxisConfig) -> dict[str, float]:
@@ -272,19 +281,18 @@ def _piece(
     part: Record,
     legs: Sequence[Segment],
     held_out: Sequence[Segment],
-    judged: NDArray[np.bool_],
-    unknown: NDArray[np.bool_],
+    judged: Mask,
+    unknown: Mask,
     axis: AxisConfig,
     base: Truth,
 ) -> Piece:
     """Prepares a part; only ``judged`` rows that are not ``unknown`` count."""
     commands = commands_of(part, axis, base)
     leg, kinds = _legs(part, legs)
-    out = np.zeros(len(part))
+    out = np.zeros(len(part), dtype=np.bool_)
     for each in held_out:
-        out[(part.time_s >= each.start_s) & (part.time_s <= each.end_s)] = 1.0
+        out |= (part.time_s >= each.start_s) & (part.time_s <= each.end_s)
     travelled = np.abs(np.diff(part.motor_position_deg, prepend=part.motor_position_deg[0]))
-    everywhere = np.where(judged, 1.0, 0.0)
     elastic = unknown | (np.cumsum(travelled) < (UNKNOWN_DEG if remembers(base) else 0.0))
     # Between two parts the drive's loops may have been restarted.
     loops = elastic | (np.cumsum(np.where(judged, travelled, 0.0)) <= UNKNOWN_DEG)
@@ -303,11 +311,11 @@ def _piece(
     # The rest position within a count is one reading, not one for each row; likewise for the load.
     again = np.append(rests[:-1] & rests[1:], False)
     counts = {
-        FOLLOWING: np.where(unknown | rests, 0.0, everywhere),
-        TORQUE: np.where(stuck | still | loops, 0.0, everywhere) if torque is not None else 0.0 * everywhere,
-        LOAD: np.where(elastic | again, 0.0, everywhere),
+        FOLLOWING: judged & ~(unknown | rests),
+        TORQUE: judged & ~(stuck | still | loops) & (torque is not None),
+        LOAD: judged & ~(elastic | again),
     }
-    return Piece(commands, measured, counts, leg, kinds, out, np.where(stuck, 1.0, 0.0))
+    return Piece(commands, measured, counts, leg, kinds, out, stuck)
 
 
 def remembers(truth: Truth) -> bool:
@@ -319,7 +327,7 @@ def remembers(truth: Truth) -> bool:
     )  # fmt: skip
 
 
-def _legs(part: Record, legs: Sequence[Segment]) -> tuple[FloatArray, tuple[str, ...]]:
+def _legs(part: Record, legs: Sequence[Segment]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
     """Returns the leg number of each row, from zero, and the legs' kinds; gaps belong to the leg before."""
     starts: list[tuple[float, str]] = []
     for each in legs:
@@ -331,7 +339,7 @@ def _legs(part: Record, legs: Sequence[Segment]) -> tuple[FloatArray, tuple[str,
         starts = [(float(part.time_s[0]), "motion")]
     starts.sort(key=lambda each: each[0])
     places = np.searchsorted([start for start, _ in starts], part.time_s, side="right") - 1
-    return np.maximum(places, 0).astype(np.float64), tuple(kind for _, kind in starts)
+    return np.maximum(places, 0), tuple(kind for _, kind in starts)
 
 
 # ----------------------------------------------------------------
@@ -401,13 +409,10 @@ def rooted(off: FloatArray, half: FloatArray, stray: FloatArray) -> tuple[FloatA
 
 def surprise(size: FloatArray, half: FloatArray, stray: FloatArray) -> FloatArray:
     """Returns the negative log probability of a reading at distance ``size`` >= 0."""
-    outer, inner = -size - half, size - half
-    near = np.log1p(-np.minimum(ndtr(outer) + ndtr(inner), 1.0 - 1e-15))
-    tail = log_ndtr(-inner)
-    beyond = tail + np.log1p(-np.exp(np.minimum(log_ndtr(outer) - tail, -1e-12)))
+    nearer = log_ndtr(half - size)
+    inside = nearer + np.log1p(-np.exp(np.minimum(log_ndtr(-size - half) - nearer, -1e-12)))
     with np.errstate(divide="ignore"):
-        anyhow = np.log(stray)
-    return np.asarray(-np.logaddexp(np.where(inner < -1.0, near, beyond), anyhow), dtype=np.float64)
+        return np.asarray(-np.logaddexp(inside, np.log(stray)), dtype=np.float64)
 
 
 def deviation(off: FloatArray, step: float, least: float) -> tuple[float, float]:
@@ -508,12 +513,10 @@ def scales(data: Data, found: Mapping[str, FloatArray]) -> Scales:
 
     Residuals at rest are excluded, because they would dominate a recording that rests half of the time.
     """
-    least, counts, steps = least_deviation(data), counted(data), rounding(data.axis)
-    moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
+    least, steps = least_deviation(data), rounding(data.axis)
     given, stray = dict(least), dict.fromkeys(CHANNELS, 0.0)
-    for name in CHANNELS:
-        rows = moving & (counts[name] > 0.0)
-        inside = found[name][rows]
+    for name, counts in data.counts.items():
+        inside = found[name][data.moving & counts]
         if len(inside):
             # At least half of the readings in motion are not outliers.
             typical = median_deviation(beyond(inside, 0.5 * steps[name]))
@@ -531,14 +534,11 @@ def noise_in_motion(data: Data) -> dict[str, float]:
 
     At rest, count and torque are constant, so rest is no reference for a simulation in motion.
     """
-    floor, ends = noise_floor(data), np.cumsum([len(each.rest) for each in data.pieces]).tolist()
-    parts = [slice(first, end) for first, end in pairwise([0, *ends])]
-    moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
-    found = {}
-    for name in CHANNELS:
-        values = np.concatenate([each.measured[name] for each in data.pieces])
-        found[name] = max(floor[name], noise_of(values, moving, parts))
-    return found
+    floor = noise_floor(data)
+    return {
+        name: max(floor[name], noise_of(values, data.moving, data.parts))
+        for name, values in data.measured.items()
+    }
 
 
 def expected(data: Data) -> Scales:
@@ -574,13 +574,12 @@ Misfit = Mapping[str, Mapping[str, float]]
 
 
 def misfit_of(
-    data: Data, residuals: Mapping[str, FloatArray], rows: Mapping[str, NDArray[np.bool_]] | None = None
+    data: Data, residuals: Mapping[str, FloatArray], rows: Mapping[str, Mask] | None = None
 ) -> dict[str, dict[str, float]]:
     """Returns the rms of the residuals of each recorded channel by kind of leg; all ``rows`` by default."""
-    kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
+    kinds = np.array(data.kinds)[data.leg]
     found: dict[str, dict[str, float]] = {}
-    for name, counts in counted(data).items():
-        inside = counts > 0.0 if rows is None else rows[name]
+    for name, inside in (rows or data.counts).items():
         for kind in dict.fromkeys(kinds[inside].tolist()):
             each = rms(residuals[name][inside & (kinds == kind)])
             found.setdefault(name, {})[kind] = float(f"{each:.6g}")
@@ -589,16 +588,10 @@ def misfit_of(
 
 def signals_of(data: Data) -> dict[str, FloatArray]:
     """Returns the measured signals by channel, in its unit; for the load, its error without the zero."""
-    per_motor_deg = ARCSEC_PER_DEG / data.axis.gear.ratio
-    found = {name: list[FloatArray]() for name in CHANNELS}
-    for piece in data.pieces:
-        inside = piece.counts[LOAD] > 0.0
-        motor_deg = demand_deg(piece.commands, data.axis) - piece.measured[FOLLOWING]
-        error = piece.measured[LOAD] - per_motor_deg * motor_deg
-        found[LOAD].append(error - (np.mean(error[inside]) if inside.any() else 0.0))
-        for name in (FOLLOWING, TORQUE):
-            found[name].append(piece.measured[name])
-    return {name: np.concatenate(each) for name, each in found.items()}
+    demanded_deg = np.concatenate([demand_deg(each.commands, data.axis) for each in data.pieces])
+    motor_deg = demanded_deg - data.measured[FOLLOWING]
+    error = data.measured[LOAD] - ARCSEC_PER_DEG / data.axis.gear.ratio * motor_deg
+    return {**data.measured, LOAD: _about(np.mean, error, data)}
 
 
 SHARE: Final = 0.01
@@ -607,19 +600,19 @@ SHARE: Final = 0.01
 
 def units(data: Data) -> dict[str, float]:
     """Returns a hundredth of the signal, or the noise if larger, by channel, in its unit."""
-    noise, counts, found = noise_in_motion(data), counted(data), {}
-    for name, measured in signals_of(data).items():
-        found[name] = max(noise[name], SHARE * rms(measured[counts[name] > 0.0]))
-    return found
+    noise = noise_in_motion(data)
+    return {
+        name: max(noise[name], SHARE * rms(measured[data.counts[name]]))
+        for name, measured in signals_of(data).items()
+    }
 
 
-def judged_rows(data: Data) -> dict[str, NDArray[np.bool_]]:
+def judged_rows(data: Data) -> dict[str, Mask]:
     """Returns the mask of the rows that judge a twin, by channel: held-out rows, or else all."""
-    rows = {}
-    for name, counts in counted(data).items():
-        held_out = (counts > 0.0) & (data.out > 0.0)
-        rows[name] = held_out if held_out.any() else counts > 0.0
-    return rows
+    return {
+        name: counts & data.out if np.any(counts & data.out) else counts
+        for name, counts in data.counts.items()
+    }
 
 
 def misfit(data: Data, left: Mapping[str, FloatArray]) -> float:

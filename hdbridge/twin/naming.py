@@ -13,6 +13,7 @@ from itertools import compress
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from hdbridge.analysis.linear import counted as numbered
@@ -21,7 +22,7 @@ from hdbridge.analysis.readings import median_deviation
 from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import Fitted, fitted_rows, legs_of_rows, solve
-from hdbridge.twin.misfit import CHANNELS, Data, Misfit, Replays, Scales, counted
+from hdbridge.twin.misfit import CHANNELS, Data, Misfit, Replays, Scales
 from hdbridge.twin.parameters import Parameter, at_coordinates, by_cause, coordinates, free_value
 from hdbridge.units import figure
 
@@ -45,7 +46,7 @@ def scales_by_kind(data: Data, known: Misfit, noise: Mapping[str, float]) -> dic
         before = known.get(name, {})
         otherwise = max(before.values(), default=0.0)
         by_leg = np.array([max(before.get(kind, otherwise), noise[name]) for kind in data.kinds])
-        found[name] = by_leg[data.leg.astype(np.intp)]
+        found[name] = by_leg[data.leg]
     return found
 
 
@@ -56,8 +57,7 @@ def growth(data: Data, residuals: Mapping[str, FloatArray], was: Mapping[str, An
     wrong, but not a whole leg.
     """
     found = {}
-    for name, counts in counted(data).items():
-        inside = counts > 0.0
+    for name, inside in data.counts.items():
         if inside.any():
             scale, now, legs = was[name][inside], np.abs(residuals[name][inside]), data.leg[inside]
             typical = np.zeros_like(now)
@@ -68,14 +68,14 @@ def growth(data: Data, residuals: Mapping[str, FloatArray], was: Mapping[str, An
     return found
 
 
-def worse_than_chance(left: FloatArray, change: FloatArray, legs: FloatArray) -> bool:
+def worse_than_chance(left: FloatArray, change: FloatArray, legs: NDArray[np.intp]) -> bool:
     """Returns True if a rival's residuals are larger than by chance.
 
     ``left`` are the simulation's residuals by row, in units of the noise; ``change`` is the rival's residuals
     minus ``left``; ``legs`` is the leg number of each row.
     """
     loss = float(change @ (change + 2.0 * left))
-    within = sandwich((left * change)[:, None], numbered(legs.astype(np.intp)))
+    within = sandwich((left * change)[:, None], numbered(legs))
     white = max(1.0, float(left @ left) / max(len(left), 1)) * float(change @ change)
     scatter = 2.0 * math.sqrt(max(float(within[0, 0]), white))
     return loss > -float(ndtri(FALSE_ALARM)) * scatter
@@ -303,7 +303,7 @@ def findings(
     )
 
 
-def alike(fitted: Fitted, legs: FloatArray) -> tuple[Alike, ...]:
+def alike(fitted: Fitted, legs: NDArray[np.intp]) -> tuple[Alike, ...]:
     """Returns sets of parameters that can change together by the prior's width without a significant effect.
 
     ``legs`` contains the leg number of each fitted row.

@@ -14,7 +14,6 @@ from typing import Any, Final
 from hdbridge.axis import AxisConfig
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.encoder import TrueCoupling
-from hdbridge.sim.truth.motor import TrueNotch, TrueObserver
 from hdbridge.sim.truth.resonance import Resonance
 
 # ----------------------------------------------------------------
@@ -156,6 +155,11 @@ def by_cause(parameters: Iterable[Parameter]) -> dict[str, tuple[Parameter, ...]
     for each in parameters:
         groups[each.cause] = (*groups.get(each.cause, ()), each)
     return groups
+
+
+def named(*names: str) -> tuple[Parameter, ...]:
+    """Returns the parameters of these names."""
+    return tuple(BY_NAME[name] for name in names)
 
 
 def value_in(truth: Truth, parameter: Parameter) -> float | None:
@@ -327,22 +331,24 @@ def default_truth(axis: AxisConfig) -> Truth:
 
 def with_sections(truth: Truth, parameters: Iterable[Parameter]) -> Truth:
     """Returns the truth with the sections of these parameters added, without effect where possible."""
-    wanted = {section for each in parameters for section in each.path.split(".")}
-    if truth.motor.stribeck is None and "stribeck" in wanted:
-        truth = with_values(truth, {"friction's rise at rest": 0.0, "Stribeck speed": STRIBECK_RAD_S})
-    if truth.load_.encoder.coupling is None and "coupling" in wanted:
+    names = {each.name for each in parameters}
+    if truth.load_.encoder.coupling is None and "encoder coupling" in names:
         rigid = TrueCoupling(frequency_hz=COUPLING_HZ, damping_ratio=COUPLING_DAMPING)
         truth = with_load_encoder(truth, coupling=rigid)
-    servo: dict[str, Any] = {}
-    if truth.servo.notch is None and "notch" in wanted:
-        servo["notch"] = TrueNotch(frequency_hz=NOTCH_HZ, depth=1.0, width=1.0)
-    if truth.servo.observer is None and "observer" in wanted:
-        inertia_kg_m2 = truth.motor.inertia_kg_m2
-        servo["observer"] = TrueObserver(frequency_hz=OBSERVER_HZ, share=0.0, inertia_kg_m2=inertia_kg_m2)
-    for name in ("speed_filter_ms", "torque_filter_ms"):
-        if name in wanted and not getattr(truth.servo, name):
-            servo[name] = SHORTEST_FILTER_MS
-    return truth.model_copy(update={"servo": truth.servo.model_copy(update=servo)}) if servo else truth
+    inertia_kg_m2, values = truth.motor.inertia_kg_m2, dict[str, float]()
+    for section, added in (
+        (truth.motor.stribeck, {"friction's rise at rest": 0.0, "Stribeck speed": STRIBECK_RAD_S}),
+        (truth.servo.notch, {"notch frequency": NOTCH_HZ, "notch depth": 1.0, "notch width": 1.0}),
+        (
+            truth.servo.observer,
+            {"observer frequency": OBSERVER_HZ, "observer share": 0.0, "observer inertia": inertia_kg_m2},
+        ),
+        (truth.servo.speed_filter_ms, {"speed filter": SHORTEST_FILTER_MS}),
+        (truth.servo.torque_filter_ms, {"torque filter": SHORTEST_FILTER_MS}),
+    ):
+        if not section and names & {*added}:
+            values |= added
+    return with_values(truth, values) if values else truth
 
 
 def _encoder(encoder: Any) -> dict[str, Any]:

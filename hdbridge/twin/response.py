@@ -58,23 +58,21 @@ def _added(truth: Truth, data: Data, found: dict[str, FloatArray], ridge: float,
     """Returns the truth with the response that explains most of a channel's residuals."""
     cycle_s = data.pieces[0].commands.cycle_s
     lengths = [math.ceil(SPEED_S / cycle_s), math.ceil(DIRECTION_S / cycle_s)]
-    tables, wanted, first = [], [], 0
-    for piece in data.pieces:
-        end = first + len(piece.out)
-        rows = (piece.counts[channel] > 0.0) & (piece.out == 0.0)
+    tables, wanted = [], []
+    for piece, part in zip(data.pieces, data.parts, strict=True):
+        rows = piece.counts[channel] & ~piece.out
         if channel == FOLLOWING:
             turned = np.radians(demand_deg(piece.commands, data.axis) - piece.measured[channel])
-            turned = turned + np.radians(found[channel][first:end])  # the simulated motor
+            turned = turned + np.radians(found[channel][part])  # the simulated motor
             speed = np.gradient(turned, piece.commands.time_s)
             tables.append(_lagged(speed, lengths[0])[rows])
-            wanted.append(-np.radians(found[channel][first:end][rows]))
+            wanted.append(-np.radians(found[channel][part][rows]))
         else:
             speed = _command_speed(piece, data)
             at = piece.commands.lead + np.round(piece.commands.row_cycles).astype(np.intp)
             table = [_lagged(speed, lengths[0]), _lagged(np.sign(speed), lengths[1])]
             tables.append(np.concatenate(table, axis=1)[at][rows])
-            wanted.append(found[channel][first:end][rows])
-        first = end
+            wanted.append(found[channel][part][rows])
     taps = _ridge(np.concatenate(tables), np.concatenate(wanted), ridge)
     own = truth.servo.response or TrueResponse(cycle_ms=1e3 * cycle_s)
     if channel == FOLLOWING:

@@ -173,8 +173,7 @@ def _fit(
         number = (STEP_S * each.rows[each.firsts] // together_s).astype(np.intp)
         numbers.append(goes_on + number)
         goes_on += int(number[-1]) + 1
-    legs = np.concatenate(numbers).astype(np.float64)
-    covariance = sandwich(slopes, off, legs, spread)
+    covariance = sandwich(slopes, off, np.concatenate(numbers), spread)
     return place[:count], covariance[:count, :count]
 
 

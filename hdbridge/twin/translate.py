@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
@@ -180,14 +180,28 @@ def ratio_error(effect: effects.RatioError, draft: Draft) -> None:
 
 
 def orders(key: str, effect: Any, draft: Draft) -> None:
-    """Sets the tooth error over the angle of this key; orders in two effects are added."""
-    _add_orders(effect.orders, draft, key)
+    """Adds the effect's orders to the tooth error over the angle of this key."""
+    sums: dict[int, complex] = {
+        each["order"]: cmath.rect(each["amplitude_arcsec"], math.radians(each["phase_deg"]))
+        for each in draft.gear.get(key, ())
+    }
+    beyond = [str(each.order) for each in effect.orders if each.order > HIGHEST_ORDER]
+    for each in effect.orders:
+        if each.order <= HIGHEST_ORDER:
+            phasor = cmath.rect(each.amplitude_arcsec, math.radians(each.phase_deg))
+            sums[each.order] = sums.get(each.order, 0j) + phasor
+    draft.gear[key] = [
+        {"order": order, "amplitude_arcsec": abs(phasor), "phase_deg": math.degrees(cmath.phase(phasor))}
+        for order, phasor in sorted(sums.items())
+    ]
+    draft.place = f"gear.{key}"
+    if beyond:
+        draft.note(f"without order {', '.join(beyond)}: the plant's go up to {HIGHEST_ORDER}")
 
 
 def direction_phase(effect: effects.DirectionPhase, draft: Draft) -> None:
     """Sets two flanks. The model's orders are the mean of both flanks, the plant's orders those of each."""
-    held = []
-    flanks: list[dict[str, Any]] = []
+    held, flanks = list[str](), list[dict[str, Any]]()
     for each in draft.gear.get("motor_orders", ()):
         shift = math.radians(each["order"] * effect.shift_deg)
         share = math.cos(shift)
@@ -237,29 +251,6 @@ def local_defect(effect: effects.LocalDefect, draft: Draft) -> None:
         draft.note("no wider than half a turn")
 
 
-def _add_orders(more: Sequence[effects.MotorOrder], draft: Draft, key: str) -> None:
-    sums: dict[int, complex] = {
-        each["order"]: cmath.rect(each["amplitude_arcsec"], math.radians(each["phase_deg"]))
-        for each in draft.gear.get(key, ())
-    }
-    beyond = [str(each.order) for each in more if each.order > HIGHEST_ORDER]
-    for each in more:
-        if each.order <= HIGHEST_ORDER:
-            phasor = cmath.rect(each.amplitude_arcsec, math.radians(each.phase_deg))
-            sums[each.order] = sums.get(each.order, 0j) + phasor
-    draft.gear[key] = [
-        {
-            "order": order,
-            "amplitude_arcsec": abs(sums[order]),
-            "phase_deg": math.degrees(cmath.phase(sums[order])),
-        }
-        for order in sorted(sums)
-    ]
-    draft.place = f"gear.{key}"
-    if beyond:
-        draft.note(f"without order {', '.join(beyond)}: the plant's go up to {HIGHEST_ORDER}")
-
-
 # ----------------------------------------------------------------
 # Encoder errors.
 
@@ -291,14 +282,14 @@ def load_orders(effect: effects.LoadOrders, draft: Draft) -> None:
     if effect.origin != "load_encoder":
         if effect.origin == "unknown":
             draft.note("origin unknown: taken for the gear's")
-        _add_orders(effect.orders, draft, "load_orders")
+        orders("load_orders", effect, draft)
         return
     few = [each for each in effect.orders if each.order <= 2]
-    more = [each for each in effect.orders if each.order > 2]
+    more = tuple(each for each in effect.orders if each.order > 2)
     # sin(a - a0) = cos(a - a0 - 90 deg)
     draft.part("load", "encoder")["disc"] = _disc(few, 1.0, lambda phase_deg: -90.0 - phase_deg)
     if more:
-        _add_orders(more, draft, "load_orders")
+        orders("load_orders", effect.model_copy(update={"orders": more}), draft)
         draft.notes.insert(0, "orders beyond 2 go to gear.load_orders: a disc has none")
     draft.notes.insert(0, f"radius assumed as {RADIUS_MM:g} mm")
     draft.place = "load.encoder.disc"

@@ -19,12 +19,12 @@ from typing import Any, Final, Self
 
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.axis.model.binding import binding, check_binding
-from hdbridge.axis.model.difference import Difference, flat
-from hdbridge.axis.model.file import Provenance
+from hdbridge.axis.model.difference import Difference, differences, flat
+from hdbridge.axis.model.file import Provenance, hexadecimal
 from hdbridge.axis.model.store import Store
 from hdbridge.errors import InputError
 from hdbridge.files.profile import TWIN_NAME
-from hdbridge.files.yamlfile import Hex, Line, dump_yaml, write_atomically
+from hdbridge.files.yamlfile import Line, dump_yaml, write_atomically
 from hdbridge.records.record import WRONG_RATIO
 from hdbridge.records.recording import Recording, versions_here
 from hdbridge.sim.truth import Truth
@@ -199,20 +199,15 @@ def better(before: Comparison, after: Comparison) -> Verdict:
     step_k = max((each.noise for each in pairs.get(TEMPERATURE, ())), default=0.0)
     if max((each.difference for each in pairs.get(TEMPERATURE, ())), default=0.0) <= step_k:
         pairs.pop(TEMPERATURE, None)
-    worse = [
-        f"{TITLES[name]} differs by {now.difference:.3g} {now.unit}, before by {was.difference:.3g}"
-        for name, (was, now) in pairs.items()
-        if now.difference > WORSE * was.difference and now.difference > max(now.noise, 1e-12)
-    ]
-    # Noise is in both differences. Differences below these limits are equal.
-    least = {
-        name: step_k if name == TEMPERATURE else max(EQUAL * now.noise, 1e-12)
-        for name, (_, now) in pairs.items()
-    }
-    ratios = [
-        math.log(max(now.difference, least[name]) / max(was.difference, least[name]))
-        for name, (was, now) in pairs.items()
-    ]
+    worse, ratios = [], []
+    for name, (was, now) in pairs.items():
+        if now.difference > max(WORSE * was.difference, now.noise, 1e-12):
+            worse.append(
+                f"{TITLES[name]} differs by {now.difference:.3g} {now.unit}, before by {was.difference:.3g}"
+            )
+        # Noise is in both differences. Differences below this limit are equal.
+        least = step_k if name == TEMPERATURE else max(EQUAL * now.noise, 1e-12)
+        ratios.append(math.log(max(now.difference, least) / max(was.difference, least)))
     gain = 1.0 - math.exp(sum(ratios) / len(ratios)) if ratios else 0.0
     if worse:
         return Verdict(False, f"{where}, {'; '.join(worse)}")
@@ -231,19 +226,13 @@ SECTIONS = ("motor", "servo", "gear", "load", "temperature")
 
 def diff(before: Truth | None, after: Truth) -> list[Difference]:
     """Returns all non-default parameters of both twins, changed or not, in the order of the file."""
-    old, new = dict(_parameters(before)) if before else {}, dict(_parameters(after))
+    twins = [each for each in (before, after) if each is not None]
     widths = {
-        place: 0.5 * (upper - lower)
-        for twin in (before, after)
-        if twin is not None
-        for place, (lower, upper) in twin.intervals.items()
+        (place.partition(".")[0], place.partition(".")[2]): 0.5 * (upper - lower)
+        for each in twins
+        for place, (lower, upper) in each.intervals.items()
     }
-    keys = list(dict.fromkeys([*old, *new]))
-    keys.sort(key=lambda key: SECTIONS.index(key[0]) if key[0] else -1)
-    return [
-        Difference(*key, old.get(key), new.get(key), widths.get(".".join(part for part in key if part)))
-        for key in keys
-    ]
+    return differences(dict(_parameters(before)) if before else {}, dict(_parameters(after)), widths)
 
 
 def _parameters(truth: Truth) -> Iterator[tuple[tuple[str, str], Any]]:
@@ -308,12 +297,8 @@ class KeptTwin:
     def dump(self) -> str:
         """Returns the file's text, from which the same twin is read; default values are omitted."""
         data = self.truth.model_dump(by_alias=True, mode="json", exclude_defaults=True)
-        provenance = data.get("provenance", {})
-        drive = provenance.get("drive")
-        if isinstance(drive, dict):
-            provenance["drive"] = {
-                name: Hex(value) if isinstance(value, int) else value for name, value in drive.items()
-            }
+        if "provenance" in data:
+            data["provenance"] = hexadecimal(data["provenance"])
         if "intervals" in data:
             data["intervals"] = {place: Line(pair) for place, pair in data["intervals"].items()}
         return HEADER + dump_yaml(data)

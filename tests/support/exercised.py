@@ -32,6 +32,18 @@ def record_of(truth: Truth, lead: Callable[[Exercise], None], seed: int = 0) -> 
     )
 
 
+def moved(*rows: tuple[float, float, float, float]) -> Callable[[Exercise], None]:
+    """Leads a bench by distances (degrees of the motor), speeds, accelerations, and rests after them (s)."""
+
+    def lead(bench: Exercise) -> None:
+        for distance, speed, acceleration, rest_s in rows:
+            bench.move(distance, speed, acceleration)
+            if rest_s:
+                bench.hold(rest_s)
+
+    return lead
+
+
 @contextmanager
 def booted(axis: AxisConfig, truth: Truth | Path, seed: int = 0) -> Iterator[tuple[Drive, DriveNode]]:
     """Provides a booted drive with a simulated axis, and its node."""

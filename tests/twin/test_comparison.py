@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support.demo import TRUTH
 from support.exercised import record_of
 
 from hdbridge.errors import InputError
@@ -28,8 +28,14 @@ from hdbridge.twin.compare import (
 )
 from hdbridge.twin.twin import HELD_OUT, better
 
-TRUTH = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
 N = 50.0
+
+
+def row_of(compared: Comparison, channel: str, kind: str = ALL) -> Row:
+    """Returns the figure of a channel that both records have."""
+    row = compared.row(channel, kind)
+    assert row is not None
+    return row
 
 
 def steps_and_a_sweep(bench: Exercise) -> None:
@@ -72,37 +78,30 @@ def test_the_same_axis_differs_by_its_noise(measured: Record) -> None:
     assert all(np.isfinite(each["difference"]) for each in figures)
     for channel in ("load_error", "following_error", "motor_torque"):
         for kind in (ALL, "step", "sweep"):
-            row = comparison.row(channel, kind)
-            assert row is not None
+            row = row_of(comparison, channel, kind)
             assert row.difference <= 2.0 * row.noise
-    settling = comparison.row("settling_time")
-    assert settling is not None
+    settling = row_of(comparison, "settling_time")
     assert settling.count == 5
     assert settling.difference <= 2.0 * settling.noise
-    at_rest = comparison.row("noise_at_rest:load_error")
-    assert at_rest is not None
+    at_rest = row_of(comparison, "noise_at_rest:load_error")
     # Noise of the load encoder (0.3 arcsec) and its count (0.45 arcsec).
     assert at_rest.measured == pytest.approx(np.hypot(0.3, 0.45 / np.sqrt(12.0)), rel=0.2)
 
 
 def test_more_friction_shows_in_the_torque(measured: Record) -> None:
     comparison = against(measured, changed(motor={"coulomb_nm": 0.068}))
-    row = comparison.row("motor_torque")
-    assert row is not None
+    row = row_of(comparison, "motor_torque")
     # 0.034 Nm in motion, and the torque of the integral at rest.
     assert 0.015 < row.difference < 0.045
     assert row.in_noise > 10.0
-    load = comparison.row("load_error", "sweep")
-    assert load is not None
-    assert load.difference < 1.5
+    assert row_of(comparison, "load_error", "sweep").difference < 1.5
 
 
 def test_temperature_is_compared_if_its_resolution_allows(measured: Record) -> None:
     warm_c = 20.0 + 0.1 * np.floor(measured.time_s)
     theirs, ours = (Record({**measured.columns, "temperature_c": each}) for each in (warm_c, warm_c + 0.07))
     compared = compare(theirs, ours, legs_of(measured), N)
-    row = compared.row("temperature")
-    assert row is not None
+    row = row_of(compared, "temperature")
     assert row.noise == pytest.approx(0.1)
     assert row.difference == pytest.approx(0.07)
     assert "temperature" not in compared.spectra
@@ -114,11 +113,9 @@ def test_a_softer_spring_settles_later_and_beyond(measured: Record) -> None:
     comparison = against(
         measured, changed(gear={"stiffness_nm_per_rad": 7000.0, "damping_nm_s_per_rad": 6.0})
     )
-    settling, overshoot = comparison.row("settling_time"), comparison.row("overshoot")
-    assert settling is not None
-    assert overshoot is not None
-    assert settling.simulated > 1.5 * settling.measured
-    assert overshoot.simulated > 1.5 * overshoot.measured
+    for name in ("settling_time", "overshoot"):
+        row = row_of(comparison, name)
+        assert row.simulated > 1.5 * row.measured, name
     spectrum = comparison.spectra["load_error"]
     peak_hz = spectrum.frequency_hz[np.argmax(spectrum.difference * (spectrum.frequency_hz > 10.0))]
     assert peak_hz == pytest.approx(np.sqrt(7000.0 / 0.25) / (2.0 * np.pi), rel=0.15)
@@ -136,8 +133,7 @@ def test_holding_torque_is_not_a_difference(measured: Record, creeps_deg: float)
     torque = measured.columns["motor_torque_nm"]
     crept = Record({**measured.columns, "motor_position_deg": motor})
     held = Record({**crept.columns, "motor_torque_nm": torque + 0.03 * stuck})
-    row = compare(crept, held, (), N).row("motor_torque")
-    assert row is not None
+    row = row_of(compare(crept, held, (), N), "motor_torque")
     assert row.difference == 0.0
     assert 0 < row.count <= len(measured) - np.count_nonzero(stuck)
 
@@ -147,10 +143,7 @@ def test_different_zeros_of_parts_are_not_a_difference(measured: Record) -> None
     load = twice.load_position_deg.copy()
     load[twice.starts[1] :] += 0.5
     shifted = Record({**twice.columns, "load_position_deg": load}, starts=twice.starts)
-    comparison = compare(shifted, twice, (), N)
-    row = comparison.row("load_error")
-    assert row is not None
-    assert row.difference < 1e-6
+    assert row_of(compare(shifted, twice, (), N), "load_error").difference < 1e-6
 
 
 def test_records_of_other_rows_are_refused(measured: Record) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
+from support.demo import AXIS as DEMO
+from support.demo import TRUTH
 from support.exercised import booted
 
-from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import Bench
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.record import Record
@@ -34,18 +34,15 @@ from hdbridge.twin.fit import (
     with_loop,
 )
 from hdbridge.twin.misfit import Replays, prepare
-from hdbridge.twin.parameters import BY_NAME, value_in, with_load_encoder, with_values
+from hdbridge.twin.parameters import BY_NAME, named, value_in, with_load_encoder, with_values
 
-DEMO = Path(__file__).parents[2] / "profiles" / "demo"
-_DEMO = AxisConfig.load(DEMO)
-AXIS = _DEMO.model_copy(update={"drive": _DEMO.drive.model_copy(update={"following_error_deg": 60.0})})
+AXIS = DEMO.model_copy(update={"drive": DEMO.drive.model_copy(update={"following_error_deg": 60.0})})
 """A limited drive falls behind."""
-TRUTH = Truth.load(DEMO)
 NAMES = ("Coulomb friction", "load inertia", "servo dead time")
 LIMIT = "current limit"
 LIMIT_PERCENT = 15.0
 """The demo axis needs 19 % for the steps."""
-PARAMETERS = tuple(BY_NAME[name] for name in NAMES)
+PARAMETERS = named(*NAMES)
 
 
 def recorded(truth: Truth = TRUTH) -> Recording:
@@ -157,7 +154,7 @@ def test_a_sufficient_loop_is_unchanged() -> None:
         assert with_loop(replays, fitted(replays, TRUTH)) is None
 
 
-@pytest.mark.parametrize("law", [each["law"] for each in LAWS])
+@pytest.mark.parametrize("law", LAWS)
 def test_a_loop_by_another_law_is_as_high_and_crossed_half_after_the_same_travel(law: str) -> None:
     there = next(
         each for each in by_each_law(TRUTH) if each.gear.hysteresis and each.gear.hysteresis.law == law

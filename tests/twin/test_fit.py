@@ -6,15 +6,15 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.special import ndtr
-from support.exercised import record_of
+from support.demo import AXIS
+from support.demo import TRUTH as DEMO
+from support.exercised import moved, record_of
 
-from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
@@ -41,7 +41,7 @@ from hdbridge.twin.parameters import BY_NAME, FOLLOWING, coordinates, free_value
 def test_remaining_descent_is_not_scatter_of_the_legs() -> None:
     rng = np.random.default_rng(1)
     slopes = rng.standard_normal((600, 1)) + 0.01 * rng.standard_normal((600, 3))  # a valley
-    spread, legs = np.full(3, 0.7), np.repeat([0.0, 1.0], 300)
+    spread, legs = np.full(3, 0.7), np.repeat([0, 1], 300)
     white = rng.standard_normal(600)
     for left in (white, white + 5.0 * slopes[:, 0]):
         covariance = sandwich(slopes, left, legs, spread)
@@ -54,13 +54,13 @@ def test_remaining_descent_is_not_scatter_of_the_legs() -> None:
 
 def test_intervals_cover_the_truth_with_a_dominant_leg() -> None:
     """Each leg has a value of its own, and one of eight has as much information as four others."""
-    legs = np.repeat(np.arange(8.0), 50)
-    slopes = np.where(legs == 0.0, 2.0, 1.0)[:, None]
+    legs = np.repeat(np.arange(8), 50)
+    slopes = np.where(legs == 0, 2.0, 1.0)[:, None]
     off = []
     for seed in range(300):
         rng = np.random.default_rng(seed)
         own = rng.standard_normal(8)
-        seen = slopes[:, 0] * own[legs.astype(int)] + rng.standard_normal(400)
+        seen = slopes[:, 0] * own[legs] + rng.standard_normal(400)
         found = np.linalg.lstsq(slopes, seen, rcond=None)[0]
         covariance = sandwich(slopes, seen - slopes @ found, legs, np.full(1, 10.0))
         off.append(float(found[0]) / float(np.sqrt(covariance[0, 0])))
@@ -75,10 +75,6 @@ def test_a_nearly_unstable_simulation_informs_one_direction_only() -> None:
     lengths = np.sort(np.linalg.norm(along, axis=0))
     assert lengths[0] < 1e-9
     np.testing.assert_allclose(lengths[1:], 0.7, rtol=1e-6)
-
-
-DEMO = Path(__file__).parents[2] / "profiles" / "demo"
-AXIS = AxisConfig.load(DEMO)
 
 
 Rows = NDArray[np.float64]
@@ -122,19 +118,15 @@ def test_slopes_are_taken_within_the_bounds_and_where_the_loops_are_stable(
     np.testing.assert_allclose(found, TRUE, atol=1e-9)
 
 
-SPRUNG = with_values(Truth.load(DEMO), {"load feed-forward frequency": 75.0})
+SPRUNG = with_values(DEMO, {"load feed-forward frequency": 75.0})
 
 
 @cache
 def data() -> Data:
     """Two quick steps with free ringing of the load after each."""
 
-    def lead(bench: Exercise) -> None:
-        for distance in (60.0, -60.0):
-            bench.move(distance, 1500.0, 60_000.0)
-            bench.hold(0.25)
-
-    record = record_of(SPRUNG, lead)
+    steps = moved(*((each, 1500.0, 60_000.0, 0.25) for each in (60.0, -60.0)))
+    record = record_of(SPRUNG, steps)
     legs = (Segment(kind="step", start_s=0.0, end_s=float(record.time_s[-1])),)
     return prepare(Recording(record, legs, axis="demo", ratio=50.0), AXIS, SPRUNG)
 
@@ -214,7 +206,7 @@ def test_position_gain_and_integral_rate_exchanged_are_the_same_loop_while_the_a
     softer = with_values(SPRUNG, {"position gain": other.servo.position_gain_per_s})
     with Replays(data(), 1) as replays:
         own, same, wrong = (each[FOLLOWING] for each in replays([SPRUNG, other, softer]))
-    moving = np.concatenate([each.rest for each in data().pieces]) == 0.0
+    moving = data().moving
     assert np.std((same - own)[moving]) < 0.1 * np.std((wrong - own)[moving])
     assert other.servo.position_gain_per_s < 0.5 * SPRUNG.servo.position_gain_per_s
     assert exchanged(other).servo.position_gain_per_s == pytest.approx(SPRUNG.servo.position_gain_per_s)
@@ -242,7 +234,7 @@ def test_a_fit_interrupted_before_its_first_result_leaves_nothing() -> None:
         fit(replays, interrupted_at(0.0))
 
 
-TRUTH = with_values(Truth.load(DEMO), {"command filter": 1.06})
+TRUTH = with_values(DEMO, {"command filter": 1.06})
 """At 90 motor degrees per second the motor lags by 4.24 counts; its encoder reads 4."""
 PARAMETERS = (BY_NAME["command filter"],)
 

@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
+from support.demo import AXIS, TRUTH
 from support.exercised import booted
 
 from hdbridge.axis import AxisConfig
@@ -25,7 +25,6 @@ from hdbridge.twin.misfit import (
     CHANNELS,
     Replays,
     Values,
-    counted,
     noise_floor,
     noise_in_motion,
     prepare,
@@ -34,12 +33,9 @@ from hdbridge.twin.misfit import (
     what_is_left,
 )
 from hdbridge.twin.naming import growth, scales_by_kind
-from hdbridge.twin.parameters import BY_NAME, value_in, with_values
+from hdbridge.twin.parameters import BY_NAME, named, value_in, with_values
 from hdbridge.twin.twin import with_knowledge
 
-DEMO = Path(__file__).parents[2] / "profiles" / "demo"
-AXIS = AxisConfig.load(DEMO)
-TRUTH = Truth.load(DEMO)
 SENSOR = ChannelSource(index=0x2100, type="int16", via="tpdo")
 WITH_SENSOR = AXIS.model_copy(update={"temperature": Temperature(source=SENSOR, celsius_per_count=0.1)})
 NAMES = ("Coulomb friction", "load inertia", "servo dead time")
@@ -61,7 +57,7 @@ def benched(axis: AxisConfig, truth: Truth, seed: int, count: int) -> Recording:
 def twin(filter_ms: float = TRUTH.servo.command_filter_ms) -> Truth:
     """The twin of a fit that began at the truth of the demo axis, with another command filter."""
     parameters, start = (
-        tuple(BY_NAME[name] for name in NAMES),
+        named(*NAMES),
         with_values(TRUTH, {"command filter": filter_ms}),
     )
     with Replays(prepare(recorded(), AXIS, start), 1) as replays:
@@ -79,7 +75,7 @@ def test_a_replay_of_the_true_axis_leaves_rounding_and_noise() -> None:
 def test_torque_counts_after_the_motor_leaves_its_initial_state() -> None:
     data = prepare(recorded(), AXIS, TRUTH)
     travelled_deg = np.cumsum(np.abs(np.diff(recorded().record.motor_position_deg, prepend=0.0)))
-    counts = counted(data)["motor torque"]
+    counts = data.counts["motor torque"]
     assert not counts[travelled_deg < 59.0].any()
     assert counts[(travelled_deg > 61.0) & (travelled_deg < 0.9 * travelled_deg[-1])].any()
 
@@ -90,7 +86,7 @@ def test_the_age_of_the_demand_is_read_from_the_recording() -> None:
 
 
 def test_least_squares_lead_from_wrong_values_to_the_true_ones() -> None:
-    parameters = tuple(BY_NAME[name] for name in NAMES)
+    parameters = named(*NAMES)
     wrong = with_values(TRUTH, {"Coulomb friction": 0.045, "load inertia": 0.18, "servo dead time": 0.6})
     with Replays(prepare(recorded(), AXIS, wrong), 1) as replays:
         fitted = solve(replays, wrong, parameters, 8)
@@ -175,7 +171,7 @@ def test_a_load_that_rings_out_of_step_has_changed() -> None:
 def replay_only() -> Truth:
     """A twin with wrong loops, whose residual is several times the noise."""
     wrong = with_values(TRUTH, {"position gain": 80.0, "integral time": 40.0, "motor inertia": 6e-5})
-    parameters = tuple(BY_NAME[name] for name in NAMES)
+    parameters = named(*NAMES)
     with Replays(prepare(recorded(), AXIS, wrong), 1) as replays:
         fitted = solve(replays, wrong, parameters, 6)
         left = what_is_left(replays.data, fitted.residuals, noise_in_motion(replays.data))

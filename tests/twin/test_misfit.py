@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
+from support.demo import AXIS, TRUTH
 from support.exercised import record_of
 
-from hdbridge.axis import AxisConfig
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
@@ -31,9 +30,6 @@ from hdbridge.twin.misfit import (
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, free_value, with_values
 from hdbridge.twin.replay import replay
 
-DEMO = Path(__file__).parents[2] / "profiles" / "demo"
-AXIS = AxisConfig.load(DEMO)
-TRUTH = Truth.load(DEMO)
 ZERO_COUNTS = 45
 COUNT_DEG = 360.0 / 8000
 
@@ -52,9 +48,9 @@ def recorded() -> Recording:
 
 def with_command_offset(counts: int = ZERO_COUNTS) -> Recording:
     """Command of a controller whose zero differs from the drive's."""
-    columns = dict(recorded().record.columns)
-    columns["motor_target_deg"] = columns["motor_target_deg"] + counts * COUNT_DEG
-    return Recording(Record(columns), axis="demo", ratio=50.0)
+    columns = recorded().record.columns
+    offset = {"motor_target_deg": columns["motor_target_deg"] + counts * COUNT_DEG}
+    return Recording(Record({**columns, **offset}), axis="demo", ratio=50.0)
 
 
 def left(truth: Truth, recording: Recording | None = None) -> dict[str, float]:
@@ -70,8 +66,9 @@ def test_a_command_offset_is_not_a_following_error() -> None:
 def test_a_count_is_not_a_zero_offset() -> None:
     """A motor may rest a count from its command; in motion this is a following error like any other."""
     data = prepare(with_command_offset(1), AXIS, TRUTH)
-    counts = np.concatenate([each.counts[FOLLOWING] for each in data.pieces]) > 0.0
-    assert np.median(residuals(data, TRUTH)[FOLLOWING][counts]) == pytest.approx(COUNT_DEG, rel=0.3)
+    assert np.median(residuals(data, TRUTH)[FOLLOWING][data.counts[FOLLOWING]]) == pytest.approx(
+        COUNT_DEG, rel=0.3
+    )
     # The same holds in a comparison.
     for recording in (recorded(), with_command_offset()):
         row = compare(recording.record, replay(recording, AXIS, TRUTH), (), 50.0).row(FOLLOWING_ERROR)
@@ -99,7 +96,7 @@ def test_a_wrong_spring_or_load_stays_in_the_load_error(name: str, factor: float
 def test_rest_does_not_scale_residuals_of_motion() -> None:
     """Most of this recording is rest, with hardly any residual."""
     data = prepare(recorded(), AXIS, TRUTH)
-    moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
+    moving = data.moving
     assert moving.mean() < 0.5
     off = residuals(data, with_values(TRUTH, {"servo dead time": 3.0}))
     size = float(np.median(np.abs(off[FOLLOWING][moving])))
@@ -153,7 +150,7 @@ def test_a_motor_sets_out_from_the_torque_that_held_it() -> None:
     columns["load_position_deg"] = columns["load_position_deg"] - 360.0 / 50.0
     data = prepare(Recording(Record(columns), axis="demo", ratio=50.0), AXIS, stiff)
     (piece,) = data.pieces
-    first = int(np.flatnonzero(piece.rest == 0.0)[0])
+    first = int(np.argmin(piece.rest))
     setting_out = slice(first, first + 8)
     assert piece.counts[TORQUE][setting_out].all()
     unheld = replace(data, pieces=(replace(piece, commands=replace(piece.commands, held=())),))
@@ -167,7 +164,7 @@ def test_without_memory_the_load_counts_at_once() -> None:
     for truth, at_once in ((TRUTH, False), (plain.model_copy(update={"gear": gear}), True)):
         assert remembers(truth) is not at_once
         (piece,) = prepare(recorded(), AXIS, truth).pieces
-        first = int(np.flatnonzero(piece.rest == 0.0)[0])
+        first = int(np.argmin(piece.rest))
         assert bool(piece.counts[LOAD][first]) is at_once
         assert piece.counts[LOAD][-1]
 
@@ -186,7 +183,7 @@ def noisy(where: str) -> Data:
     rng = np.random.default_rng(1)
     pieces = []
     for piece in as_measured().pieces:
-        rows = piece.rest == (1.0 if where == "rest" else 0.0)
+        rows = piece.rest if where == "rest" else ~piece.rest
         assert 0 < rows.sum() < len(rows)
         measured = {
             name: column + rows * NOISE[name] * rng.standard_normal(len(column))

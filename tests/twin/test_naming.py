@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from support.demo import TRUTH
 
 from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import fitted_rows, legs_of_rows, solve
 from hdbridge.twin.misfit import Scales
 from hdbridge.twin.naming import Alike, Explained, alike, explain, worse_than_chance
-from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, with_values
+from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, named, with_values
 
-TRUTH = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
 NAMES = ("Coulomb friction", "servo dead time", "command filter")
 ROWS, LEGS = 1200, 24
 
@@ -34,13 +33,10 @@ class Known:
         self.quick = quick * np.cos(np.arange(ROWS) / 9.0)
         shown = self._shown(axis)
         self.measured = {name: each + rng.standard_normal(ROWS) for name, each in shown.items()}
-        leg = np.repeat(np.arange(float(LEGS)), ROWS // LEGS)
-        ones = {name: np.ones(ROWS) for name in shown}
-        out = np.where(leg % 4.0 == 3.0, 1.0, 0.0)
+        leg = np.repeat(np.arange(LEGS), ROWS // LEGS)
+        counts = {name: np.ones(ROWS, dtype=np.bool_) for name in shown}
         self.rough = self
-        self.data: Any = SimpleNamespace(
-            leg=leg, out=out, pieces=(SimpleNamespace(counts=ones, leg=leg, out=out),)
-        )
+        self.data: Any = SimpleNamespace(leg=leg, out=leg % 4 == 3, counts=counts)
 
     def __call__(self, truths: Iterable[Truth]) -> list[dict[str, FloatArray]]:
         return [
@@ -58,10 +54,10 @@ class Known:
         }
 
 
-def named(axis: Truth, quick: float) -> tuple[Explained, tuple[Alike, ...]]:
+def diagnosed(axis: Truth, quick: float) -> tuple[Explained, tuple[Alike, ...]]:
     """Returns the causes by which the axis differs from `TRUTH`, and sets that slopes do not separate."""
     replays: Any = Known(axis, quick)
-    parameters = tuple(BY_NAME[name] for name in NAMES)
+    parameters = named(*NAMES)
     noise = dict.fromkeys((FOLLOWING, TORQUE, LOAD), 1.0)
     fitted = solve(replays, TRUTH, parameters, 12, known=Scales(noise))
     found = explain(replays, TRUTH, parameters, dict.fromkeys(noise, np.ones(ROWS)))
@@ -69,22 +65,24 @@ def named(axis: Truth, quick: float) -> tuple[Explained, tuple[Alike, ...]]:
 
 
 def test_nothing_is_named_for_a_correct_start() -> None:
-    assert named(TRUTH, quick=50.0)[0].causes == ()
+    assert diagnosed(TRUTH, quick=50.0)[0].causes == ()
 
 
 def test_only_wrong_values_are_named_if_the_motion_shows_them() -> None:
-    found, sets = named(with_values(TRUTH, {"servo dead time": 1.0, "Coulomb friction": 0.06}), quick=50.0)
+    found, sets = diagnosed(
+        with_values(TRUTH, {"servo dead time": 1.0, "Coulomb friction": 0.06}), quick=50.0
+    )
     assert set(found.causes) == {"servo dead time", "friction"}
     assert found.rivals == sets == ()
 
 
 def test_dead_time_and_filter_are_a_set_if_inseparable() -> None:
-    found, sets = named(with_values(TRUTH, {"servo dead time": 1.5}), quick=0.01)
+    found, sets = diagnosed(with_values(TRUTH, {"servo dead time": 1.5}), quick=0.01)
     assert {*found.causes, *found.rivals} == {"servo dead time", "command filter"}
     assert {"servo dead time", "command filter"} in [set(each.names) for each in sets]
 
 
-LEG_OF_ROW = np.repeat(np.arange(12.0), 100)
+LEG_OF_ROW = np.repeat(np.arange(12), 100)
 CHANGE = np.sin(np.arange(len(LEG_OF_ROW)) / 7.0)
 
 
@@ -102,7 +100,7 @@ def test_correlated_residuals_hide_changes_that_white_noise_would_show() -> None
     """In each leg they are as large as the change, with a random sign; white ones are so only in total."""
     change = 0.5 * CHANGE
     signs = np.random.default_rng(3).choice([-1.0, 1.0], 12)
-    together = (2.0 * change * signs[LEG_OF_ROW.astype(int)]) - change * (2.0 * np.mean(signs))
+    together = (2.0 * change * signs[LEG_OF_ROW]) - change * (2.0 * np.mean(signs))
     white = np.random.default_rng(4).permutation(together)
     assert not worse_than_chance(together, change, LEG_OF_ROW)
     assert worse_than_chance(white, change, LEG_OF_ROW)

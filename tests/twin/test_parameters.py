@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
+from support.demo import TRUTH
 
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import by_each_law
@@ -19,7 +18,7 @@ from hdbridge.twin.parameters import (
     with_values,
 )
 
-DEMO = with_sections(Truth.load(Path(__file__).parents[2] / "profiles" / "demo"), PARAMETERS)
+DEMO = with_sections(TRUTH, PARAMETERS)
 DAHL = by_each_law(DEMO)[-1]
 """With a loop that has a yield in place of a width."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,8 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from support.exercised import booted, record_of
+from support.demo import AXIS, DEMO, TRUTH
+from support.exercised import booted, moved, record_of
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import ChannelSource, Temperature
@@ -23,11 +23,10 @@ from hdbridge.motion.procedures.moves import MoveTo
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording, Segment
-from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.misfit import Replays, coarse, prepare, residuals
-from hdbridge.twin.parameters import LOAD, with_values
+from hdbridge.twin.parameters import LOAD, with_load_encoder, with_values
 from hdbridge.twin.replay import (
     HELD_S,
     LARGEST_UNKNOWN,
@@ -42,8 +41,6 @@ from hdbridge.twin.replay import (
     unknown_rows,
 )
 
-DEMO = Path(__file__).parents[2] / "profiles" / "demo"
-AXIS, TRUTH = AxisConfig.load(DEMO), Truth.load(DEMO)
 SENSOR = ChannelSource(index=0x2100, type="int16", via="tpdo")
 CHANNELS = ("time_s", "motor_target_deg", "motor_position_deg", "load_position_deg", "motor_torque_nm")
 
@@ -188,13 +185,8 @@ def test_a_late_stamp_changes_no_simulated_signal() -> None:
         assert np.array_equal(again[name], straight[name]), name
 
 
-def moves(bench: Exercise) -> None:
-    bench.move(400.0, 600.0, 6000.0)
-    bench.hold(1.5)
-
-
 def recorded() -> Recording:
-    return Recording(record_of(TRUTH, moves), axis="demo", ratio=50.0)
+    return Recording(record_of(TRUTH, moved((400.0, 600.0, 6000.0, 1.5))), axis="demo", ratio=50.0)
 
 
 def test_two_threads_give_the_same_result() -> None:
@@ -207,10 +199,7 @@ def test_two_threads_give_the_same_result() -> None:
                 assert all(np.array_equal(one[name], other[name]) for name in one)
 
 
-def there_and_back(bench: Exercise) -> None:
-    for distance in (200.0, -150.0, 90.0, -140.0, 60.0):
-        bench.move(distance, 600.0, 6000.0)
-        bench.hold(0.4)
+there_and_back = moved(*((each, 600.0, 6000.0, 0.4) for each in (200.0, -150.0, 90.0, -140.0, 60.0)))
 
 
 @pytest.fixture(scope="module")
@@ -333,9 +322,7 @@ def test_a_resting_motor_reports_torque_repeatedly(creeps_deg: float, count: int
 
 def test_a_standing_motor_is_held_by_its_recorded_torque_in_the_replay_that_judges_a_twin() -> None:
     """Soft loops that have not settled would wind up, and begin the next motion with another torque."""
-    rests = record_of(
-        TRUTH, lambda bench: [bench.move(40.0, 300.0, 3000.0), bench.hold(1.0), bench.move(9.0, 90.0, 900.0)]
-    )
+    rests = record_of(TRUTH, moved((40.0, 300.0, 3000.0, 1.0), (9.0, 90.0, 900.0, 0.0)))
     servo = TRUTH.servo.model_copy(
         update={"position_gain_per_s": 8.0, "integral_of": "position", "integral_time_ms": 45.0}
     )
@@ -427,13 +414,7 @@ def two_tasks() -> Recording:
         return Recording.joined([bench.run(Stepping(2, start_deg=0.0)) for _ in range(2)])
 
 
-def without_noise() -> Truth:
-    """Returns the truth without load encoder noise, because a replay draws other noise."""
-    encoder = TRUTH.load_.encoder.model_copy(update={"noise_arcsec": 0.0})
-    return TRUTH.model_copy(update={"load_": TRUTH.load_.model_copy(update={"encoder": encoder})})
-
-
-def moved(recording: Recording, later_s: float) -> Recording:
+def delayed(recording: Recording, later_s: float) -> Recording:
     """Delays the second part, as in another recording."""
     record = recording.record
     time_s = record.time_s + later_s * (np.arange(len(record)) >= record.starts[1])
@@ -445,13 +426,13 @@ def moved(recording: Recording, later_s: float) -> Recording:
 def test_parts_soon_after_each_other_follow_and_later_ones_do_not() -> None:
     assert len(two_tasks().record.starts) == 2
     assert len(continuous(two_tasks().record)) == 1
-    assert len(continuous(moved(two_tasks(), 5.0).record)) == 2
+    assert len(continuous(delayed(two_tasks(), 5.0).record)) == 2
 
 
 def test_a_replay_switches_the_drive_off_between_parts_as_the_bench_does() -> None:
     """Otherwise a load that rings or a spring that is wound up would start again from rest."""
     recording = two_tasks()
-    again = replay(recording, AXIS, without_noise())
+    again = replay(recording, AXIS, with_load_encoder(TRUTH, noise_arcsec=0.0))
     for name in ("motor_target_deg", "motor_position_deg", "motor_torque_nm"):
         assert np.array_equal(again.columns[name], recording.record.columns[name]), name
 
@@ -477,10 +458,10 @@ def test_a_part_that_ends_in_motion_slows_down_as_before_and_is_switched_off() -
 
 def test_the_second_part_counts_from_its_first_row_where_it_is_known_what_came_before() -> None:
     first, second = prepare(two_tasks(), AXIS, TRUTH).pieces
-    judged = second.counts["following error"] > 0.0
+    judged = second.counts["following error"]
     assert judged.sum() == len(two_tasks().record) - two_tasks().record.starts[1]
     assert not judged[: -int(judged.sum())].any(), "the motion before it does not count"
-    alone = prepare(moved(two_tasks(), 5.0), AXIS, TRUTH).pieces[1]
+    alone = prepare(delayed(two_tasks(), 5.0), AXIS, TRUTH).pieces[1]
     assert second.counts[LOAD].sum() > alone.counts[LOAD].sum() + 50
     assert first.counts[LOAD].any()
 

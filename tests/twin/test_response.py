@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.exercised import record_of
+from support.demo import AXIS, TRUTH
+from support.exercised import moved, record_of
 
-from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording
-from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.response import Response
 from hdbridge.sim.truth import Truth
@@ -23,9 +21,6 @@ from hdbridge.twin.misfit import Data, Replays, misfit, prepare
 from hdbridge.twin.parameters import BY_NAME
 from hdbridge.twin.response import with_response
 
-DEMO = Path(__file__).parents[2] / "profiles" / "demo"
-AXIS = AxisConfig.load(DEMO)
-TRUTH = Truth.load(DEMO)
 FOREIGN = TrueResponse(
     cycle_ms=4.0,
     demand_ms=(0.0, -0.6, -0.4, 0.2),
@@ -38,10 +33,8 @@ def with_own(response: TrueResponse) -> Truth:
     return TRUTH.model_copy(update={"servo": TRUTH.servo.model_copy(update={"response": response})})
 
 
-def moves(bench: Exercise) -> None:
-    for distance in (200.0, -150.0, 90.0, -140.0, 120.0, -60.0, 75.0, -130.0):
-        bench.move(distance, 900.0, 9000.0)
-        bench.hold(0.2)
+TRAVELS = (200.0, -150.0, 90.0, -140.0, 120.0, -60.0, 75.0, -130.0)
+moves = moved(*((each, 900.0, 9000.0, 0.2) for each in TRAVELS))
 
 
 @cache

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import yaml
 from foreign.draw import draw
 from scipy.optimize import least_squares
+from support.demo import AXIS
 from twin_foreign_axes import axis_of, bench, start
 
 from hdbridge.axis import AxisConfig
@@ -22,7 +21,6 @@ from hdbridge.twin.misfit import (
     Data,
     Replays,
     Values,
-    counted,
     misfit,
     prepare,
     residuals,
@@ -69,7 +67,7 @@ def plain_fit(data: Data, start: Truth, steps: int = 25) -> Truth:
     spread = np.array([each.spread for each in parameters])
     low, high = np.array([each.bounds for each in parameters]).T
     scale = units(data)
-    rows = {name: (each > 0.0) & (data.out == 0.0) for name, each in counted(data).items()}
+    rows = {name: each & ~data.out for name, each in data.counts.items()}
 
     def left(place: np.ndarray) -> np.ndarray:
         found = residuals(data, at_coordinates(truth, parameters, place.tolist()))
@@ -95,8 +93,7 @@ def shares(other: Recording, axis: AxisConfig, truth: Truth) -> dict[str, float]
 @pytest.mark.parametrize("cycle_ms", [1.0, 4.0])
 @pytest.mark.parametrize("dead_time_ms", [0.5, 15.0])
 def test_a_start_uses_the_measured_lag_and_a_feasible_dead_time(cycle_ms: float, dead_time_ms: float) -> None:
-    usual = default_truth(AxisConfig.load(Path(__file__).parents[2] / "profiles" / "demo"))
-    late = with_values(usual, {"servo dead time": dead_time_ms, "command filter": 2.0})
+    late = with_values(default_truth(AXIS), {"servo dead time": dead_time_ms, "command filter": 2.0})
     for truth, parameters in starts(late, cycle_ms):
         servo = truth.servo
         assert servo.dead_time_ms <= MOST_DEAD_CYCLES * cycle_ms

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from support.demo import AXIS, TRUTH
 
-from hdbridge.axis import AxisConfig
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.machine import Machine
-from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.truth import TrueTemperature
 from hdbridge.twin.fit import Fitted, solve
 from hdbridge.twin.misfit import Replays, prepare
-from hdbridge.twin.parameters import BY_NAME
+from hdbridge.twin.parameters import named
 from hdbridge.twin.thermal import THERMAL, with_warmth
 
-DEMO = Path(__file__).parents[2] / "profiles" / "demo"
-AXIS = AxisConfig.load(DEMO)
-TRUTH = Truth.load(DEMO)
 SENSOR_K = 0.1
-FRICTION = tuple(BY_NAME[name] for name in ("Coulomb friction", "viscous friction"))
+FRICTION = named("Coulomb friction", "viscous friction")
 
 
 def warmed(heat: TrueTemperature, seed: int, minutes: float, rests: float = 0.25) -> Recording:

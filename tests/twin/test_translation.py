@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.demo import AXIS as DEMO
+from support.demo import TRUTH
 from support.effect_examples import EXAMPLES
-from support.exercised import record_of
+from support.exercised import moved, record_of
 
 from hdbridge.axis import AxisConfig, effects
 from hdbridge.axis.model import TransmissionModel
@@ -22,19 +23,17 @@ from hdbridge.sim import fast
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.parameters import default_truth
+from hdbridge.twin.parameters import default_truth, with_load_encoder
 from hdbridge.twin.translate import TABLE, translate
 
-PROFILE = Path(__file__).parents[2] / "profiles" / "demo"
 N = 50.0
 
 
 def fine_axis() -> AxisConfig:
     """The demo's axis with encoders whose counts do not show, one of them counting down."""
-    axis = AxisConfig.load(PROFILE)
-    motor = axis.motor_encoder.model_copy(update={"counts_per_turn": 800_000, "direction": -1})
-    load = axis.load_encoder.model_copy(update={"counts_per_turn": 28_800_000})
-    return axis.model_copy(update={"motor_encoder": motor, "load_encoder": load})
+    motor = DEMO.motor_encoder.model_copy(update={"counts_per_turn": 800_000, "direction": -1})
+    load = DEMO.load_encoder.model_copy(update={"counts_per_turn": 28_800_000})
+    return DEMO.model_copy(update={"motor_encoder": motor, "load_encoder": load})
 
 
 AXIS = fine_axis()
@@ -48,18 +47,6 @@ FURTHER = tuple(
 )
 LOOP = {"offset_arcsec": 30.0, "width_deg": 25.0, "exponent": 1.7}
 BASIC: tuple[effects.Effect, ...] = (effects.Synchronous(orders=ORDERS), effects.Hysteresis(**LOOP))
-
-
-def moved(*rows: tuple[float, float, float, float]) -> Callable[[Exercise], None]:
-    """Leads a bench by distances (degrees of the motor), speeds, accelerations, and rests after them (s)."""
-
-    def lead(bench: Exercise) -> None:
-        for distance, speed, acceleration, rest_s in rows:
-            bench.move(distance, speed, acceleration)
-            if rest_s:
-                bench.hold(rest_s)
-
-    return lead
 
 
 to_and_fro = moved(*((each, 60.0, 200.0, 0.5) for each in (150.0, -200.0, 100.0, -10.0, 12.0, -20.0, 150.0)))
@@ -225,11 +212,6 @@ BEFORE_DEG = 60.0
 """First move, which determines the state of the loop; before it, model and plant begin differently."""
 
 
-def quiet(truth: Truth) -> Truth:
-    encoder = truth.load_.encoder.model_copy(update={"noise_arcsec": 0.0})
-    return truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": encoder})})
-
-
 def exercised(truth: Truth, lead: Callable[[Exercise], None]) -> Record:
     """Record of a first move and of the motion after it."""
 
@@ -275,7 +257,7 @@ def test_the_simulated_drive_errs_as_the_model_says(name: str, monkeypatch: pyte
     translation = translate(
         AXIS, TransmissionModel(N, case.parts), base if base != default_truth(AXIS) else None
     )
-    record = exercised(quiet(translation.truth), case.lead)
+    record = exercised(with_load_encoder(translation.truth, noise_arcsec=0.0), case.lead)
     error = after(record, record.transmission_error_arcsec(N))
     prediction = predicted(case.parts, record)
     own = prediction - predicted(tuple(each for each in case.parts if each.name != name), record)
@@ -294,7 +276,7 @@ LAG = {"offset_arcsec": -25.0, "width_deg": 25.0, "exponent": 2.5}
 def test_a_loop_in_which_the_load_lags_is_friction_at_the_load(law: type[effects.Effect]) -> None:
     parts = (law(**LAG),)
     translation = translate(AXIS, TransmissionModel(N, parts))
-    record = exercised(quiet(translation.truth), to_and_fro)
+    record = exercised(with_load_encoder(translation.truth, noise_arcsec=0.0), to_and_fro)
     error, prediction = after(record, record.transmission_error_arcsec(N)), predicted(parts, record)
     assert np.std(error - prediction) < 0.08 * np.std(prediction)
     assert translation.truth.gear.hysteresis is None
@@ -365,19 +347,18 @@ def test_any_effect_makes_a_plant_that_moves(name: str, data: st.DataObject) -> 
 
 
 def test_values_outside_the_model_are_unchanged() -> None:
-    given = Truth.load(PROFILE)
-    translation = translate(AXIS, TransmissionModel(N, BASIC), given)
+    translation = translate(AXIS, TransmissionModel(N, BASIC), TRUTH)
     truth = translation.truth
-    assert truth.servo == given.servo
-    assert truth.load_.inertia_kg_m2 == given.load_.inertia_kg_m2
-    assert truth.gear.stiffness_nm_per_rad == given.gear.stiffness_nm_per_rad
+    assert truth.servo == TRUTH.servo
+    assert truth.load_.inertia_kg_m2 == TRUTH.load_.inertia_kg_m2
+    assert truth.gear.stiffness_nm_per_rad == TRUTH.gear.stiffness_nm_per_rad
     assert [each.order for each in truth.gear.motor_orders] == [1, 2]
     assert (truth.motor.encoder.counts_per_turn, truth.motor.encoder.direction) == (800_000, -1)
-    assert translate(AXIS, None, given).truth.gear == given.gear
+    assert translate(AXIS, None, TRUTH).truth.gear == TRUTH.gear
 
 
 def test_a_plant_of_usual_values_follows_its_axis_file() -> None:
-    truth = translate(AxisConfig.load(PROFILE)).truth
+    truth = translate(DEMO).truth
     record = exercised(truth, to_and_fro)
     behind = record.columns["motor_target_deg"] - record.motor_position_deg
     assert np.max(np.abs(behind)) < 1.0, "motor degrees"

@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 from support.command import run_here
-from support.exercised import record_of
+from support.demo import AXIS, DEMO, TRUTH
+from support.exercised import moved, record_of
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Hysteresis, MotorOrder, Synchronous
@@ -27,20 +28,14 @@ from hdbridge.twin.parameters import with_values
 from hdbridge.twin.replay import replay
 from hdbridge.twin.twin import KeptTwin, Twin, impossible
 
-DEMO = Path(__file__).parents[2] / "profiles" / "demo"
-
-
-def moves(bench: Exercise) -> None:
-    for distance in (400.0, -450.0):
-        bench.move(distance, 600.0, 6000.0)
-        bench.hold(0.6)
+moves = moved((400.0, 600.0, 6000.0, 0.6), (-450.0, 600.0, 6000.0, 0.6))
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo's own axis, recorded."""
     folder = tmp_path_factory.mktemp("recorded") / "recording"
-    record = record_of(Truth.load(DEMO), moves)
+    record = record_of(TRUTH, moves)
     legs = (Segment(kind="step", start_s=0.0, end_s=float(record.time_s[-1])),)
     Recording(record, legs, axis="demo", ratio=50.0).save(folder)
     return folder
@@ -63,7 +58,7 @@ def trips(truth: Truth, folder: Path) -> Path:
     led = record_of(truth, lead)
     legs = tuple(Segment(kind="step", start_s=a, end_s=b) for a, b in pairwise(ends))
     # A drive receives whole counts; the command here has fractions of them.
-    record = replay(Recording(led, legs, axis="demo", ratio=50.0), AxisConfig.load(DEMO), truth)
+    record = replay(Recording(led, legs, axis="demo", ratio=50.0), AXIS, truth)
     Recording(record, legs, axis="demo", ratio=50.0).save(folder)
     return folder
 
@@ -142,7 +137,7 @@ def test_invalid_options_are_refused(
 
 
 def test_a_recording_of_another_axis_or_without_commands_is_refused(profile: Path, tmp_path: Path) -> None:
-    record = record_of(Truth.load(DEMO), moves)
+    record = record_of(TRUTH, moves)
     Recording(record, axis="arm", ratio=50.0).save(tmp_path / "other")
     bare = {name: column for name, column in record.columns.items() if name != "motor_target_deg"}
     write_columns(tmp_path / "bare.csv", bare)
@@ -200,7 +195,7 @@ def run(profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 
 
 def test_a_better_twin_is_kept_as_pending(profile: Path, recording: Path, run: Run) -> None:
-    said, report, page = run(fitted(Truth.load(DEMO)))
+    said, report, page = run(fitted(TRUTH))
     assert "friction: Coulomb friction 0.068 -> 0.034 Nm" in said
     assert "unexplained: motor torque is left with 2.5 times its noise" in said
     assert f"hdbridge model commit {profile} --twin" in said
@@ -227,7 +222,7 @@ def test_a_twin_without_improvement_is_not_kept(profile: Path, run: Run) -> None
 
 
 def test_values_fitting_the_replay_only_are_offered_as_such(profile: Path, run: Run) -> None:
-    said, report, page = run(fitted(Truth.load(DEMO), "replay", 22.0))
+    said, report, page = run(fitted(TRUTH, "replay", 22.0))
     headline = (
         "The twin replays this drive (motor torque to 4 %), but its values are not the axis's: motor torque "
         "is left with 22 times its noise; the twin is kept as pending:"
@@ -247,23 +242,22 @@ def test_values_fitting_the_replay_only_are_offered_as_such(profile: Path, run: 
 
 
 def test_implausible_values_are_refused(profile: Path, run: Run) -> None:
-    demo = Truth.load(DEMO)
     for values, complaint in (
         ({"friction feed-forward": 3.0}, "friction feed-forward 3 Nm; expected at most the friction"),
         ({"motor inertia": 1e-3}, "motor inertia 0.001 kg m2; expected within a decade"),
         ({"load inertia": 10.0}, "load inertia seen by the motor"),
     ):
-        said, *_ = run(fitted(with_values(demo, values), "replay"))
+        said, *_ = run(fitted(with_values(TRUTH, values), "replay"))
         assert said.startswith("The twin is not kept: no axis has these values:")
         assert complaint in said
         assert not (profile / "pending-twin.yaml").exists()
-    late, axis = with_values(demo, {"servo dead time": 5.0}), AxisConfig.load(DEMO)
-    assert impossible(late, axis, 0.0025) == ()
-    assert impossible(late, axis, 0.002) == ("dead time 5 ms; expected at most two cycles, 4",)
+    late = with_values(TRUTH, {"servo dead time": 5.0})
+    assert impossible(late, AXIS, 0.0025) == ()
+    assert impossible(late, AXIS, 0.002) == ("dead time 5 ms; expected at most two cycles, 4",)
 
 
 def test_from_usual_values_a_fit_gives_estimates_and_no_changes(run: Run) -> None:
-    said, report, _ = run(fitted(Truth.load(DEMO)), "--afresh")
+    said, report, _ = run(fitted(TRUTH), "--afresh")
     assert "estimate: Coulomb friction 0.034 Nm (0.033 to 0.035)" in said
     assert "->" not in said
     (friction,) = report["parameters"]
@@ -274,7 +268,7 @@ def test_from_usual_values_a_fit_gives_estimates_and_no_changes(run: Run) -> Non
 @pytest.mark.timeout(1200)
 def test_an_axis_is_learned_and_a_later_change_of_it_is_named(profile: Path) -> None:
     """Runs the whole procedure including the fit, some 150 seconds of CPU time."""
-    recording = trips(Truth.load(DEMO), profile / "recording")
+    recording = trips(TRUTH, profile / "recording")
     done = run_here(profile, "twin", profile, recording)
     assert done.returncode == 0, done.stderr
     learned = KeptTwin.load(profile / "pending-twin.yaml").truth
@@ -286,7 +280,7 @@ def test_an_axis_is_learned_and_a_later_change_of_it_is_named(profile: Path) -> 
     run_here(profile, "model", "commit", profile, "--twin")
     same = run_here(profile, "twin", profile, recording, "--check")
     assert same.stdout.startswith("Nothing has changed since the twin was made")
-    stiffer = Truth.load(DEMO).model_dump(by_alias=True)
+    stiffer = TRUTH.model_dump(by_alias=True)
     stiffer["motor"]["coulomb_nm"] = 0.068
     later = trips(Truth.model_validate(stiffer), profile / "later")
     changed = run_here(profile, "twin", profile, later, "--check")

@@ -1,9 +1,11 @@
 """Differences between two models, parameter by parameter. Pure."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 from hdbridge.axis.model import TransmissionModel
+
+Place = tuple[str, str]
 
 
 class Difference(NamedTuple):
@@ -26,13 +28,21 @@ class Difference(NamedTuple):
 
 def diff(before: TransmissionModel, after: TransmissionModel) -> list[Difference]:
     """Returns all parameters of both models in file order, changed or not."""
-    old, new = dict(_parameters(before)), dict(_parameters(after))
     widths = {**dict(_half_widths(before)), **dict(_half_widths(after))}
+    return differences(dict(_parameters(before)), dict(_parameters(after)), widths)
+
+
+def differences(
+    old: Mapping[Place, Any], new: Mapping[Place, Any], half_widths: Mapping[Place, float]
+) -> list[Difference]:
+    """Returns all parameters of two files, in the order of the older one; keys are effect and parameter.
+
+    Parameters that only the later file has are placed with the rest of their effect.
+    """
     keys = list(dict.fromkeys([*old, *new]))
-    # Parameters that only the later model has are placed with the rest of their effect.
     effects = list(dict.fromkeys(effect for effect, _ in keys))
     keys.sort(key=lambda key: effects.index(key[0]))
-    return [Difference(*key, old.get(key), new.get(key), widths.get(key)) for key in keys]
+    return [Difference(*key, old.get(key), new.get(key), half_widths.get(key)) for key in keys]
 
 
 def _parameters(model: TransmissionModel) -> Iterator[tuple[tuple[str, str], Any]]:

@@ -78,7 +78,7 @@ def text_of(document: Mapping[str, Any]) -> str:
     """Returns the text of a model file, from which the same model is read."""
     data = dict(document)
     if "provenance" in data:
-        data["provenance"] = _hexadecimal(data["provenance"])
+        data["provenance"] = hexadecimal(data["provenance"])
     if "response" in data:
         data["response"] = _in_lines(data["response"])
     return _HEADER + dump_yaml(data)
@@ -107,7 +107,7 @@ def _effect(document: Document, number: int, entry: EffectEntry, before: list[st
     return document.validate(kind, (*at, "parameters"))
 
 
-def _hexadecimal(provenance: Mapping[str, Any]) -> dict[str, Any]:
+def hexadecimal(provenance: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the provenance with the drive's identity in hexadecimal, as in data sheets."""
     data = dict(provenance)
     if isinstance(data.get("drive"), Mapping):
