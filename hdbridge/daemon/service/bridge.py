@@ -36,7 +36,7 @@ from hdbridge.daemon.service.core import ANSWER_S, Core
 from hdbridge.daemon.service.eventlog import Entry
 from hdbridge.daemon.service.lending import Lending
 from hdbridge.daemon.service.moves import run_together
-from hdbridge.daemon.service.observer import PERIOD_S, Subscription
+from hdbridge.daemon.service.observer import PERIOD_S
 from hdbridge.daemon.service.outermaster import Latency, OuterMaster
 from hdbridge.daemon.service.timing import Timing
 from hdbridge.errors import HdbridgeError, InputError
@@ -44,6 +44,7 @@ from hdbridge.errors import HdbridgeError, InputError
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Machine
     from hdbridge.daemon.memory import Memory
+    from hdbridge.daemon.memory.channels import SampleReader
     from hdbridge.daemon.service.following import Following
     from hdbridge.daemon.service.lease import Lease
 
@@ -315,9 +316,9 @@ class ServiceBridge:
             newest=newest,
         )
 
-    def subscribe(self, most: int = 512) -> Subscription:
-        """Subscribes to samples; at most the newest ``most`` wait to be fetched."""
-        return Subscription(self.core.observer, most)
+    def reader(self) -> SampleReader:
+        """Returns a reader of samples from now on."""
+        return self.core.memory.reader()
 
     # ---------------------------------------------------------------- requests
 
