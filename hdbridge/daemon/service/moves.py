@@ -87,9 +87,7 @@ class AxisMotion:
         self._check(holder)
         activity = Activity(Kind.JOG, holder)
         async with self.commanding:
-            activity.since = self._link.core.log.newest
-            answer = await self._link.do(CommandKind.JOG, a=float(velocity_deg_s), b=float(timeout_s))
-            activity.command_id = answer.id
+            await self._link.begin(activity, CommandKind.JOG, a=float(velocity_deg_s), b=float(timeout_s))
             self.replace(activity, "a jog took its place")
 
     async def stream(self, holder: str, timeout_s: float = 0.5) -> ServiceStream:
@@ -172,14 +170,13 @@ class AxisMotion:
     async def _goto(
         self, activity: Activity, target_deg: float, velocity: float | None, acceleration: float | None
     ) -> None:
-        activity.since = self._link.core.log.newest
-        answer = await self._link.do(
+        await self._link.begin(
+            activity,
             CommandKind.MOVE,
             a=float(target_deg),
             b=math.nan if velocity is None else float(velocity),
             c=math.nan if acceleration is None else float(acceleration),
         )
-        activity.command_id = answer.id
 
     async def _run(self, activity: Activity, before: Activity | None) -> None:
         """Runs the way points in turn, until none is left or another activity replaces the queue."""
