@@ -22,11 +22,11 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.clock import Clock
 from hdbridge.commissioning.evaluation.stepping import Scheme
-from hdbridge.control.bench import compensation_for
 from hdbridge.control.buscycle import BusCycle
+from hdbridge.daemon.loop.axisloop import AxisLoop
 from hdbridge.daemon.loop.controller import Controller
-from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, Memory
 from hdbridge.daemon.service.commissioning import Commissioning
 from hdbridge.daemon.service.core import Arguments, Core
@@ -238,16 +238,26 @@ def article_axes(count: int = 1, profile: Path = PROFILE) -> list[AxisConfig]:
     ]
 
 
+def compensated(axis: AxisLoop, model: TransmissionModel) -> None:
+    """Compensates an axis at rest by a model, with the load loop on."""
+    setting = CompensationSetting(model.bound_to(axis.config), Scheme.EXTENDED, load_loop=True)
+    axis.follower.use(setting, moving=False)
+
+
 @contextmanager
 def stepped_daemon(
     axes: int | Sequence[AxisConfig] = 1,
     model: TransmissionModel | None = None,
-    setup: Callable[[AxisConfig, AxisSetup], AxisSetup] = lambda _, made: made,
+    setup: Callable[[AxisLoop], None] = lambda _: None,
+    load_loop: LoadLoopSettings | None = None,
     truth: Path | Truth = PROFILE / "truth.yaml",
     character: Character = FRIENDLY,
     bitrate_bps: int | None = 1_000_000,
 ) -> Iterator[SteppedDaemon]:
-    """Provides a control loop with simulated axes, none verified yet; with the article's model by default."""
+    """Provides a control loop with simulated axes, none verified yet; with the article's model by default.
+
+    ``setup`` changes an axis of each control process before its first turn.
+    """
     configs = [character.of_axis(each) for each in (article_axes(axes) if isinstance(axes, int) else axes)]
     plant = character.of_truth(truth if isinstance(truth, Truth) else Truth.load(truth))
     known = model if model is not None else TransmissionModel.load(PROFILE / "model.yaml")
@@ -267,10 +277,11 @@ def stepped_daemon(
 
         def begin() -> Controller:
             cycle = BusCycle(Link(spoilt, clock), clock, memory.period_s, bitrate_bps=bitrate_bps)
-            setups = [
-                setup(each, AxisSetup(each, compensation_for(each, known.bound_to(each)))) for each in configs
-            ]
-            return Controller(cycle, setups, memory, reopen)
+            controller = Controller(cycle, [(each, load_loop) for each in configs], memory, reopen)
+            for axis in controller.axes:
+                compensated(axis, known)
+                setup(axis)
+            return controller
 
         daemon = SteppedDaemon(begin, memory, clock, spoilt, nodes, intruder)
         yield daemon

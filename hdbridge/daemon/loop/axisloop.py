@@ -9,11 +9,13 @@ import math
 from collections.abc import Callable
 from typing import Final
 
+from hdbridge.axis import AxisConfig
 from hdbridge.control.axiscycle import STILL_CYCLES, AxisCycle
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Report
 from hdbridge.daemon.loop.feeds import KnotFeed, OuterFeed
-from hdbridge.daemon.loop.follower import AxisSetup, Follower
+from hdbridge.daemon.loop.follower import Follower
 from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, AxisState, Cause, Happening, refusal, target_of
+from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory.cells import OuterCells, SettingSlot
 from hdbridge.daemon.memory.channels import Queue
 from hdbridge.daemon.memory.layout import (
@@ -53,7 +55,8 @@ class AxisLoop:
     def __init__(
         self,
         index: int,
-        setup: AxisSetup,
+        config: AxisConfig,
+        load_loop: LoadLoopSettings | None,
         knots: Queue[Knot],
         slot: SettingSlot,
         report: Report,
@@ -64,14 +67,13 @@ class AxisLoop:
         """``followed`` has the gateway's set-points, ``outer`` its states; ``due_s`` returns the due time of
         the present turn.
         """
-        config = setup.config
         self.index = index
         self.config = config
         self.state = AxisState.UNVERIFIED
         self.image = ProcessImage(config)
         self.supervision = Supervision()
         self.cycle = AxisCycle(self.image, self.supervision, name=config.name)
-        self.follower = Follower(setup, self.image)
+        self.follower = Follower(config, load_loop, self.image)
         self.set_point = self.follower.set_point
         self.group: frozenset[int] = frozenset()
         """Indices of the axes that began the same stream, which stop together with this axis."""
