@@ -74,6 +74,10 @@ class FakeAxis:
         if not -180 <= target_deg <= 180:
             raise InputError(f"found {target_deg:g} deg; expected from -180 to 180 deg")
 
+    def followed(self, holder: str) -> FakeAxis:
+        self._bridge.lease.check(holder)
+        return self
+
     async def switch_load_loop(self, holder: str, *, on: bool) -> None:
         self._moved(holder, "load loop", on)
 
@@ -207,10 +211,10 @@ class FakeReader:
 class FakeBridge:
     """Machine with some axes; ``moved`` lists requests that needed the lease, ``stopped`` all others."""
 
-    def __init__(self, *names: str, lease_s: float = 10.0) -> None:
+    def __init__(self, *names: str) -> None:
         self.now_s: float | None = None
         """Time of the lease if the test sets it; None for the computer's clock."""
-        self.lease = Lease(lease_s, lambda: time.monotonic() if self.now_s is None else self.now_s)
+        self.lease = Lease(10.0, lambda: time.monotonic() if self.now_s is None else self.now_s)
         self.axes = {name: FakeAxis(self, name) for name in names or ("joint-1", "joint-2")}
         self.moved: list[tuple[Any, ...]] = []
         self.stopped: list[tuple[str, str]] = []
@@ -236,10 +240,6 @@ class FakeBridge:
     def events(self, since: int = 0) -> messages.Events:
         newest = self.logged[-1].sequence if self.logged else 0
         return messages.Events(events=[each for each in self.logged if each.sequence > since], newest=newest)
-
-    def followed(self, holder: str, name: str) -> FakeAxis:
-        self.lease.check(holder)
-        return self.axes[name]
 
     async def lend_bus(self, holder: str) -> None:
         self.lease.check(holder)

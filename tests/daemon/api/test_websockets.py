@@ -97,11 +97,10 @@ def test_a_slow_client_loses_only_its_own_samples(api):
                 assert samples.cycle[0] == last + 1 + samples.lost or samples.lost
                 last = samples.cycle[-1]
             seen = lost = 0
-            while lost == 0:
+            while lost <= seen:
                 samples = batch(sleeper)
                 seen += len(samples.cycle)
                 lost += samples.lost
-    assert lost > seen
     assert lost_by_reader < lost
 
 
