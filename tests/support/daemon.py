@@ -166,9 +166,9 @@ class SteppedDaemon:
         model = model or TransmissionModel.load(PROFILE / "model.yaml").bound_to(config)
         return CompensationSetting(model, scheme, load_loop=load_loop)
 
-    def use(self, setting: CompensationSetting, axis: int = 0) -> None:
-        """Makes the loop compensate by a setting."""
-        self.done(CommandKind.CHANGE, axis, i=self.memory.settings[axis].put(setting.to_json()))
+    def use(self, setting: CompensationSetting) -> None:
+        """Makes the first axis compensate by a setting."""
+        self.done(CommandKind.CHANGE, i=self.memory.settings[0].put(setting.to_json()))
 
     def commissioning(self, axis: int) -> Commissioning:
         """Returns the service's access to the drive of an axis, over the relay."""
@@ -227,9 +227,9 @@ class SteppedDaemon:
         self.clock.sleep_until(self.clock.now() + duration_s)
 
 
-def article_axes(count: int = 1, profile: Path = PROFILE) -> list[AxisConfig]:
+def article_axes(count: int = 1) -> list[AxisConfig]:
     """Returns ``count`` axes of one kind on one bus: nodes 1, 2, ..."""
-    first = AxisConfig.load(profile)
+    first = AxisConfig.load(PROFILE)
     return [
         first.model_copy(
             update={"name": f"axis{node}", "drive": first.drive.model_copy(update={"node_id": node})}

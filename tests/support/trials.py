@@ -90,9 +90,7 @@ PAIRS = (
 LOOPS = {"hysteresis_memory", "hysteresis_parameters"}
 
 
-def planted(
-    name: str, seed: int, plan: plant.Plan | None = None
-) -> tuple[set[str], Record, TransmissionModel]:
+def planted(name: str, seed: int) -> tuple[set[str], Record, TransmissionModel]:
     """Returns the causes present, the record, and the model to be tested."""
     rng = np.random.default_rng(1000 * seed + 17)
     effects: dict[str, dict[str, object]] = {}
@@ -116,7 +114,7 @@ def planted(
             axis |= needs
             there.add(each)
     truth = plant.Truth(effects=effects, **axis)  # type: ignore[arg-type]
-    columns = plant.record(truth, plan or plant.Plan(), seed)
+    columns = plant.record(truth, SHORT, seed)
     return there, Record(columns), TransmissionModel.from_text(plant.model_text(seed, truth=nominal))
 
 

@@ -16,7 +16,7 @@ from typing import Final
 from hdbridge.axis import AxisConfig
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.daemon.loop.axisloop import AxisLoop
-from hdbridge.daemon.loop.relay import incoming_ids, nodes_of, why_refused
+from hdbridge.daemon.loop.relay import incoming_ids, why_refused
 from hdbridge.daemon.loop.states import AxisState, label
 from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import Cell, Command, CommandKind, Event, EventKind, Memory, RelayedFrame
@@ -77,11 +77,7 @@ class Controller:
         """True once `end` has switched off the power of all axes; no more turns are due."""
 
         self._reopen = reopen
-        self._axis_of_node = {
-            node: axis
-            for axis in self.axes
-            for node in nodes_of(axis.config.drive.node_id, axis.config.load_encoder.source.node)
-        }
+        self._axis_of_node = {node: axis for axis in self.axes for node in axis.config.nodes}
         self._wanted = incoming_ids(self._axis_of_node)
         self._down = False
         self._reopen_in = 0

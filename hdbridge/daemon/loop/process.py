@@ -69,9 +69,8 @@ def listen(link: Link, axes: tuple[AxisConfig, ...]) -> None:
         return
     masters = {axis.drive.master_node_id for axis in axes} | {USUAL_MASTER}
     drives = {axis.drive.node_id for axis in axes}
-    encoders = {node for axis in axes if (node := axis.load_encoder.source.node) is not None}
     duration_s = listening_s(max(axis.drive.heartbeat_ms for axis in axes))
-    ear = Ear(drives, masters, drives | encoders)
+    ear = Ear(drives, masters, {node for axis in axes for node in axis.nodes})
     ear.listen(link, duration_s)
     ear.refuse(link.name, duration_s)
 
