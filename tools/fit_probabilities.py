@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from blind.case import record_of, unsealed
 from blind.tables import CALIBRATION, Pair, brier, calibration, table
-from support.trials import CAUSES, LOOPS, NONE, PAIRS, SHORT, SPECIAL, SYNONYMS, UNKNOWN, planted
+from support.trials import CAUSES, LOOPS, NONE, PAIRS, SPECIAL, SYNONYMS, UNKNOWN, planted
 
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
@@ -98,7 +98,7 @@ def from_trials(seeds: int, first: int) -> Iterator[Row]:
     """Yields the findings in short records from formulas."""
     for seed in range(first, first + seeds):
         for name in (*CAUSES, *SPECIAL, *NONE, *UNKNOWN, *PAIRS):
-            there, record, model = planted(name, seed, SHORT)
+            there, record, model = planted(name, seed)
             loop = name.startswith("none:") or bool(there & LOOPS)
             result = diagnose(record, model, scales=Scales(named_from=0.0))
             yield from judged("trials", f"{name} {seed}", result, there - {"unexplained"}, set(), loop)

@@ -305,6 +305,12 @@ class AxisConfig(OtherChannels):
         axis._eds_path = found.resolve()
         return axis
 
+    @property
+    def nodes(self) -> tuple[int, ...]:
+        """Node ids of the axis: that of the drive, and of a load encoder that is a node of its own."""
+        encoder = self.load_encoder.source.node
+        return (self.drive.node_id,) if encoder is None else (self.drive.node_id, encoder)
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         node = self.load_encoder.source.node

@@ -408,10 +408,8 @@ class AsyncAxis:
 
     async def write(self, object_: str, value: int | float | str) -> SdoValue:
         """Writes an object of the drive; refused while the axis is enabled."""
-        path, body = (
-            f"{self._path}/objects/{quote(object_, safe='')}",
-            messages.SdoWrite.given(value=str(value)),
-        )
+        path = f"{self._path}/objects/{quote(object_, safe='')}"
+        body = messages.SdoWrite.given(value=str(value))
         return await self.client.ask("PUT", path, SdoValue, body, moving=True)
 
     def _need_lease(self, what: str) -> None:

@@ -145,9 +145,7 @@ class _Bus:
 
     def __init__(self, axis: AxisConfig, *, all_states: bool) -> None:
         self._axis, self._od, self._all_states = axis, dictionary_of(axis), all_states
-        self._nodes = [axis.drive.node_id]
-        if axis.load_encoder.source.node is not None:
-            self._nodes.append(axis.load_encoder.source.node)
+        self._nodes = axis.nodes
         self._requests = {objects.COB_SDO_REQUEST + each: each for each in self._nodes}
         self._answers = {objects.COB_SDO_ANSWER + each: each for each in self._nodes}
         self._boots = {objects.COB_HEARTBEAT + each for each in self._nodes}

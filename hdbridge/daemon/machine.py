@@ -122,11 +122,11 @@ class Machine:
             return self.state_folder(environment) / "recordings"
         return (self.folder / "recordings" / "daemon").absolute()
 
-    def axis_folder(self, axis: Axis, name: str, environment: Mapping[str, str] = os.environ) -> Path:
+    def axis_folder(self, axis: Axis, name: str) -> Path:
         """Returns a folder for data of an axis: in its profile if writable, else in the state folder."""
         if _writable(axis.profile.folder):
             return axis.profile.folder / name
-        return self.state_folder(environment) / axis.name / name
+        return self.state_folder() / axis.name / name
 
     def state_folder(self, environment: Mapping[str, str] = os.environ) -> Path:
         """Returns the service manager's state folder, else the user's."""

@@ -107,7 +107,7 @@ def follow(
         folder = machine.beside(given) if given is not None else machine.axis_folder(axis, "adaptation")
         worker = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix=f"following-{axis.name}"))
         made = Following(index, port, axis.adaptation, folder, worker, recorder, diagnosis)
-        bridge.following[axis.name] = made
+        port.following = made
         following.append(made)
         stack.callback(made.close)
     return following

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 import pytest
 from support.filters import least
-from support.trials import CAUSES, NONE, PAIRS, SHORT, SPECIAL, UNKNOWN, Verdict, planted, verdict
+from support.trials import CAUSES, NONE, PAIRS, SPECIAL, UNKNOWN, Verdict, planted, verdict
 
 from hdbridge.analysis.diagnosis import diagnose
 
@@ -23,7 +23,7 @@ def judged(names: Iterable[str], seeds: Iterable[int]) -> dict[str, Verdict]:
     verdicts = {}
     for name in names:
         for seed in seeds:
-            there, record, model = planted(name, seed, SHORT)
+            there, record, model = planted(name, seed)
             found = diagnose(record, model).findings
             verdicts[f"{name} {seed}"] = verdict(
                 name, there, {each.cause: set(each.aliases) for each in found}

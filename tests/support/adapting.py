@@ -126,8 +126,8 @@ def packed(times_s: np.ndarray, axis: np.ndarray) -> SampleArray:
 class History:
     """Files of an adaptation, in memory."""
 
-    def __init__(self, learned: Learned | None = None) -> None:
-        self.learned = learned
+    def __init__(self) -> None:
+        self.learned: Learned | None = None
         self.entries: list[Entry] = []
 
     def load(self) -> Learned | None:

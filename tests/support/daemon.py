@@ -1,16 +1,18 @@
 """Control loop of the daemon with simulated drives, in one thread on virtual time: `SteppedDaemon`.
 
-Waiting on the service's side turns the loop: `SteppedClock.sleep_until` and `SteppedRelay.recv` run as many
+Waiting on the service's side turns the loop: `SteppedClock.sleep_until` and `SteppedTiming.sleep` run as many
 turns as fit. So the service runs here unchanged, as fast as the processor allows.
 """
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 from uuid import uuid4
 
 import can
@@ -18,13 +20,16 @@ from can.interfaces.virtual import VirtualBus
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
+from hdbridge.clock import Clock
 from hdbridge.commissioning.evaluation.stepping import Scheme
-from hdbridge.control.bench import compensation_for
 from hdbridge.control.buscycle import BusCycle
+from hdbridge.daemon.loop.axisloop import AxisLoop
 from hdbridge.daemon.loop.controller import Controller
-from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, Memory, RelayedFrame
+from hdbridge.daemon.machinefile import LoadLoopSettings
+from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, Memory
+from hdbridge.daemon.service.commissioning import Commissioning
+from hdbridge.daemon.service.core import Arguments, Core
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.device.node import DriveNode
 from hdbridge.drive.drive import Drive
@@ -33,6 +38,9 @@ from hdbridge.sim.lockstep import SimulatedAxis, VirtualClock, simulated_benches
 from hdbridge.sim.truth import Truth
 from support.characters import FRIENDLY, Character
 from support.spoilt import SpoiltBus
+
+Params = ParamSpec("Params")
+Result = TypeVar("Result")
 
 PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
 EVENTS_KEPT = 1000
@@ -52,35 +60,24 @@ class SteppedClock:
             self._daemon.turn()
 
 
-class SteppedRelay(can.BusABC):
-    """Service's end of the relay: the loop sends its frames, and turns while it waits."""
+class SteppedTiming:
+    """Timing in which waiting turns the loop, and blocking calls run in the same thread."""
 
     def __init__(self, daemon: SteppedDaemon) -> None:
-        super().__init__(channel=None)
-        self.channel_info = "the relay"
-        self.private = True
         self._daemon = daemon
-        self._reader = daemon.memory.incoming_reader()
-        self._waiting: deque[can.Message] = deque()
+        self.clock: Clock = SteppedClock(daemon)
 
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        if msg.arbitration_id >= 0x700:
-            return  # the loop sends the master's heartbeat
-        self._daemon.memory.outgoing.add(RelayedFrame(0, msg.arbitration_id, bytes(msg.data)))
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        clock = self._daemon.clock
-        deadline_s = clock.now() + (math.inf if timeout is None else timeout)
-        while True:
-            for frame in self._reader.read()[0]:
-                self._waiting.append(
-                    can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
-                )
-            if self._waiting:
-                return self._waiting.popleft()
-            if clock.now() >= deadline_s:
-                return None
+    async def sleep(self, duration_s: float) -> None:
+        end_s = self.clock.now() + duration_s
+        await asyncio.sleep(0)
+        while self.clock.now() < end_s:
             self._daemon.turn()
+            await asyncio.sleep(0)
+
+    async def work(
+        self, function: Callable[Params, Result], *args: Params.args, **kwargs: Params.kwargs
+    ) -> Result:
+        return function(*args, **kwargs)
 
 
 class SteppedDaemon:
@@ -100,13 +97,12 @@ class SteppedDaemon:
         self.controller = begin()
         self.axes = self.controller.axes
         self.period_s = self.controller.cycle.period_s
-        self.service_clock = SteppedClock(self)
+        self.timing = SteppedTiming(self)
         self.samples = memory.reader()
         self._events = memory.event_reader()
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         """Newest events of the loop."""
-        self.drives: list[Drive] = []
-        self._relay = SteppedRelay(self)
+        self.drives: list[Commissioning] = []
         self._streams = 0
 
     # ---------------------------------------------------------------- time
@@ -170,35 +166,28 @@ class SteppedDaemon:
         model = model or TransmissionModel.load(PROFILE / "model.yaml").bound_to(config)
         return CompensationSetting(model, scheme, load_loop=load_loop)
 
-    def use(self, setting: CompensationSetting, axis: int = 0) -> None:
-        """Makes the loop compensate by a setting."""
-        self.done(CommandKind.CHANGE, axis, i=self.memory.settings[axis].put(setting.to_json()))
+    def use(self, setting: CompensationSetting) -> None:
+        """Makes the first axis compensate by a setting."""
+        self.done(CommandKind.CHANGE, i=self.memory.settings[0].put(setting.to_json()))
 
-    def drive(self, axis: int) -> Drive:
-        """Returns the service's drive object of an axis, over the relay."""
+    def commissioning(self, axis: int) -> Commissioning:
+        """Returns the service's access to the drive of an axis, over the relay."""
         while len(self.drives) <= axis:
-            config = self.axes[len(self.drives)].config
-            self.drives.append(Drive(self._relay, config, self.service_clock, force=True))
+            core = Core(self.memory, self.timing, lease_s=10.0)  # type: ignore[arg-type]
+            self.drives.append(Commissioning(self.axes[len(self.drives)].config, core))
         return self.drives[axis]
 
-    def seeds(self, axis: int) -> dict[str, int]:
-        """Returns both encoders' counts and the statusword, by SDO: the fields of VERIFIED and ENABLE."""
-        drive = self.drive(axis)
-        positions = drive.read_positions()
-        drive.state()
-        return {"i": positions.motor_counts, "j": positions.load_counts, "k": drive.image.statusword or 0}
+    def drive(self, axis: int) -> Drive:
+        """Returns the service's drive object of an axis."""
+        return self.commissioning(axis)._drive
 
     def verify(self, axis: int = 0) -> None:
         """Boots the drive by SDO over the relay, and reports it as verified."""
-        self.drive(axis).boot()
-        self.done(CommandKind.VERIFIED, axis, **self.seeds(axis))
+        self.done(CommandKind.VERIFIED, axis, **self.commissioning(axis).verify())
 
-    def prepare(self, axis: int = 0) -> dict[str, int]:
+    def prepare(self, axis: int = 0) -> Arguments:
         """Prepares the drive by SDO for ENABLE; returns the command's fields."""
-        drive = self.drive(axis)
-        drive.enable()
-        image = drive.image
-        return {"i": image.motor_counts, "j": image.load_counts, "k": image.statusword or 0}
+        return self.commissioning(axis).prepare()
 
     def enable(self, axis: int = 0) -> None:
         self.done(CommandKind.ENABLE, axis, **self.prepare(axis))
@@ -238,9 +227,9 @@ class SteppedDaemon:
         self.clock.sleep_until(self.clock.now() + duration_s)
 
 
-def article_axes(count: int = 1, profile: Path = PROFILE) -> list[AxisConfig]:
+def article_axes(count: int = 1) -> list[AxisConfig]:
     """Returns ``count`` axes of one kind on one bus: nodes 1, 2, ..."""
-    first = AxisConfig.load(profile)
+    first = AxisConfig.load(PROFILE)
     return [
         first.model_copy(
             update={"name": f"axis{node}", "drive": first.drive.model_copy(update={"node_id": node})}
@@ -249,16 +238,26 @@ def article_axes(count: int = 1, profile: Path = PROFILE) -> list[AxisConfig]:
     ]
 
 
+def compensated(axis: AxisLoop, model: TransmissionModel) -> None:
+    """Compensates an axis at rest by a model, with the load loop on."""
+    setting = CompensationSetting(model.bound_to(axis.config), Scheme.EXTENDED, load_loop=True)
+    axis.follower.use(setting, moving=False)
+
+
 @contextmanager
 def stepped_daemon(
     axes: int | Sequence[AxisConfig] = 1,
     model: TransmissionModel | None = None,
-    setup: Callable[[AxisConfig, AxisSetup], AxisSetup] = lambda _, made: made,
+    setup: Callable[[AxisLoop], None] = lambda _: None,
+    load_loop: LoadLoopSettings | None = None,
     truth: Path | Truth = PROFILE / "truth.yaml",
     character: Character = FRIENDLY,
     bitrate_bps: int | None = 1_000_000,
 ) -> Iterator[SteppedDaemon]:
-    """Provides a control loop with simulated axes, none verified yet; with the article's model by default."""
+    """Provides a control loop with simulated axes, none verified yet; with the article's model by default.
+
+    ``setup`` changes an axis of each control process before its first turn.
+    """
     configs = [character.of_axis(each) for each in (article_axes(axes) if isinstance(axes, int) else axes)]
     plant = character.of_truth(truth if isinstance(truth, Truth) else Truth.load(truth))
     known = model if model is not None else TransmissionModel.load(PROFILE / "model.yaml")
@@ -278,11 +277,13 @@ def stepped_daemon(
 
         def begin() -> Controller:
             cycle = BusCycle(Link(spoilt, clock), clock, memory.period_s, bitrate_bps=bitrate_bps)
-            setups = [
-                setup(each, AxisSetup(each, compensation_for(each, known.bound_to(each)))) for each in configs
-            ]
-            return Controller(cycle, setups, memory, reopen)
+            controller = Controller(cycle, [(each, load_loop) for each in configs], memory, reopen)
+            for axis in controller.axes:
+                compensated(axis, known)
+                setup(axis)
+            return controller
 
         daemon = SteppedDaemon(begin, memory, clock, spoilt, nodes, intruder)
-        stack.callback(daemon._relay.shutdown)
         yield daemon
+        for each in daemon.drives:
+            each.close()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -18,7 +18,6 @@ from hdbridge.client import messages
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.memory import sample_dtype
 from hdbridge.daemon.service.lease import Lease
-from hdbridge.daemon.service.observer import Batch
 from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.values import Object, Value
 from hdbridge.errors import InputError, RefusedError
@@ -74,6 +73,10 @@ class FakeAxis:
     def _within(self, target_deg: float) -> None:
         if not -180 <= target_deg <= 180:
             raise InputError(f"found {target_deg:g} deg; expected from -180 to 180 deg")
+
+    def followed(self, holder: str) -> FakeAxis:
+        self._bridge.lease.check(holder)
+        return self
 
     async def switch_load_loop(self, holder: str, *, on: bool) -> None:
         self._moved(holder, "load loop", on)
@@ -193,13 +196,25 @@ class FakeStream:
         self._axis.target_deg = self.points[-1].position_deg
 
 
+class FakeReader:
+    """Reads `FakeBridge.rows` cycles for each `FakeBridge.batch_s` since its creation."""
+
+    def __init__(self, bridge: FakeBridge) -> None:
+        self._bridge, self._begun_s, self._cycle = bridge, time.monotonic(), 0
+
+    def read(self) -> tuple[Any, int]:
+        batches = (time.monotonic() - self._begun_s) / self._bridge.batch_s
+        before, self._cycle = self._cycle, int(batches * self._bridge.rows)
+        return self._bridge.samples(range(before + 1, self._cycle + 1)), 0
+
+
 class FakeBridge:
     """Machine with some axes; ``moved`` lists requests that needed the lease, ``stopped`` all others."""
 
-    def __init__(self, *names: str, lease_s: float = 10.0) -> None:
+    def __init__(self, *names: str) -> None:
         self.now_s: float | None = None
         """Time of the lease if the test sets it; None for the computer's clock."""
-        self.lease = Lease(lease_s, lambda: time.monotonic() if self.now_s is None else self.now_s)
+        self.lease = Lease(10.0, lambda: time.monotonic() if self.now_s is None else self.now_s)
         self.axes = {name: FakeAxis(self, name) for name in names or ("joint-1", "joint-2")}
         self.moved: list[tuple[Any, ...]] = []
         self.stopped: list[tuple[str, str]] = []
@@ -208,8 +223,6 @@ class FakeBridge:
         self.alive = True
         self.batch_s = 0.005
         self.rows = 5
-        self.sent_cycles = 0
-        """Number of cycles that were offered to subscribers."""
 
     def state(self) -> messages.MachineState:
         holder = self.lease.holder
@@ -227,10 +240,6 @@ class FakeBridge:
     def events(self, since: int = 0) -> messages.Events:
         newest = self.logged[-1].sequence if self.logged else 0
         return messages.Events(events=[each for each in self.logged if each.sequence > since], newest=newest)
-
-    def followed(self, holder: str, name: str) -> FakeAxis:
-        self.lease.check(holder)
-        return self.axes[name]
 
     async def lend_bus(self, holder: str) -> None:
         self.lease.check(holder)
@@ -250,34 +259,8 @@ class FakeBridge:
         for name, target_deg in moves.items():
             await self.axes[name].move(holder, target_deg, wait=wait)
 
-    async def subscribe(self, most: int = 512) -> AsyncIterator[Batch]:
-        """Yields batches without end; of rows not fetched in time only the newest ``most`` are kept."""
-        queue: asyncio.Queue[None] = asyncio.Queue(1)
-        waiting: list[int] = []
-        cycle = lost = 0
-
-        async def produce() -> None:
-            nonlocal cycle, lost
-            while True:
-                waiting.extend(range(cycle + 1, cycle + self.rows + 1))
-                cycle += self.rows
-                self.sent_cycles = max(cycle, self.sent_cycles)
-                lost += max(0, len(waiting) - most)
-                del waiting[:-most]
-                if queue.empty():
-                    queue.put_nowait(None)
-                await asyncio.sleep(self.batch_s)
-
-        producing = asyncio.ensure_future(produce())
-        try:
-            while True:
-                await queue.get()
-                batch = Batch(self.samples(waiting), lost)
-                waiting.clear()
-                lost = 0
-                yield batch
-        finally:
-            producing.cancel()
+    def reader(self) -> FakeReader:
+        return FakeReader(self)
 
     def samples(self, cycles: Sequence[int]) -> Any:
         found = np.zeros(len(cycles), sample_dtype(len(self.axes)))

@@ -3,13 +3,12 @@
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
-from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment
 from hdbridge.control.compensation import Compensation, CompensationLimits
-from hdbridge.daemon.loop.follower import AxisSetup
+from hdbridge.control.switchover import Correction
+from hdbridge.daemon.loop.axisloop import AxisLoop
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind
 from hdbridge.daemon.service.axis import ServiceAxis
@@ -169,10 +168,10 @@ def free(axis: ServiceAxis) -> bool:
     return True
 
 
-def _wrong_once(config: AxisConfig, made: AxisSetup) -> AxisSetup:
-    caps = config.compensation
+def _wrong_once(axis: AxisLoop) -> None:
+    caps, model = axis.config.compensation, axis.follower.correction.model
     limits = CompensationLimits(caps.maximum_arcsec, caps.slew_arcsec_s, caps.ramp_s)
-    return replace(made, compensation=WrongOnce(made.compensation.model, limits, config.drive.cycle_s))
+    axis.follower.correction = Correction(WrongOnce(model, limits, axis.config.drive.cycle_s))
 
 
 @contextmanager

@@ -124,9 +124,9 @@ class Daemon:
         state = self.state()
         return int(state["cycle"]["cycle"]) if state else -1
 
-    def until_axis(self, state: str, place: int = 0) -> dict[str, Any]:
-        """Waits until an axis is in a state of the loop."""
-        return dict(self.until(lambda: (found := self.axis(place)).get("state") == state and found, state))
+    def until_axis(self, state: str) -> dict[str, Any]:
+        """Waits until the first axis is in a state of the loop."""
+        return dict(self.until(lambda: (found := self.axis()).get("state") == state and found, state))
 
     def ask(self, name: str, **body: object) -> httpx.Response:
         """Sends a request to the first axis, with the lease; AssertionError if it is refused.

@@ -8,39 +8,17 @@ from concurrent.futures import Executor, Future
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.clock import Clock
 from hdbridge.daemon.machine import Axis, Machine
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.files.profile import Profile
 from support.characters import FRIENDLY, Character
 from support.daemon import PROFILE, SteppedDaemon, stepped_daemon
 
-Params = ParamSpec("Params")
 Result = TypeVar("Result")
-
-
-class SteppedTiming:
-    """Timing in which waiting turns the loop, and blocking calls run in the same thread."""
-
-    def __init__(self, daemon: SteppedDaemon) -> None:
-        self._daemon = daemon
-        self.clock: Clock = daemon.service_clock
-
-    async def sleep(self, duration_s: float) -> None:
-        end_s = self.clock.now() + duration_s
-        await asyncio.sleep(0)
-        while self.clock.now() < end_s:
-            self._daemon.turn()
-            await asyncio.sleep(0)
-
-    async def work(
-        self, function: Callable[Params, Result], *args: Params.args, **kwargs: Params.kwargs
-    ) -> Result:
-        return function(*args, **kwargs)
 
 
 class AtOnce(Executor):
@@ -77,7 +55,7 @@ class Service:
         self.daemon = daemon
         self.machine = machine
         self.folder = folder
-        self.timing = SteppedTiming(daemon)
+        self.timing = daemon.timing
 
     def bridge(self, **options: Any) -> ServiceBridge:
         """Returns a new service."""

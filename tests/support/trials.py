@@ -20,12 +20,12 @@ FORMS = frozenset({"at", "width", "tau", "hz", "lines", "reference", "shear", "t
 """Parameters of an effect that are not a size."""
 
 
-def drawn(cause: str, rng: np.random.Generator) -> tuple[dict[str, dict[str, object]], dict[str, object]]:
-    """Draws an effect of about three arcsec or more; returns it and the axis properties that it needs."""
+def _options(rng: np.random.Generator) -> dict[str, tuple[dict[str, object], dict[str, object]]]:
+    """Draws an effect of about three arcsec or more per cause, with the axis properties that it needs."""
     size = float(3.0 * (1 + rng.random()) * rng.choice([-1, 1]))
     phase = float(rng.uniform(0, 360))
     big = abs(size)
-    options: dict[str, tuple[dict[str, object], dict[str, object]]] = {
+    return {
         "motor_order": ({"orders": [(int(rng.choice([5, 7, 10, 12])), big, phase)]}, {}),
         "motor_encoder_eccentricity": ({"orders": [(1, big, phase)]}, {}),
         "load_order": ({"orders": [(1, 2 * big, phase), (2, big, phase + 50)]}, {}),
@@ -57,7 +57,11 @@ def drawn(cause: str, rng: np.random.Generator) -> tuple[dict[str, dict[str, obj
             {},
         ),
     }
-    effect, axis = options[cause]
+
+
+def drawn(cause: str, rng: np.random.Generator) -> tuple[dict[str, dict[str, object]], dict[str, object]]:
+    """Draws an effect of one cause; returns it and the axis properties that it needs."""
+    effect, axis = _options(rng)[cause]
     return {cause: effect}, axis
 
 
@@ -74,29 +78,7 @@ def times(effects: Mapping[str, Mapping[str, Any]], factor: float) -> dict[str, 
     }
 
 
-CAUSES = [
-    "motor_order",
-    "motor_encoder_eccentricity",
-    "load_order",
-    "flexspline_order",
-    "direction_phase",
-    "torque_modulation",
-    "compliance",
-    "inertial_windup",
-    "velocity_windup",
-    "channel_skew",
-    "backlash",
-    "rate_dependence",
-    "subdivisional_error",
-    "zero_drift",
-    "amplitude_drift",
-    "wear",
-    "creep",
-    "ratio_error",
-    "count_loss",
-    "vibration",
-    "local_defect",
-]
+CAUSES = list(_options(np.random.default_rng(0)))
 SPECIAL = ("hysteresis_memory", "hysteresis_parameters")
 NONE = ("none", "none:memory", "none:bouc_wen", "none:dahl")
 UNKNOWN = tuple(f"unknown:{kind}" for kind in ("saw", "square", "chirp", "one_way", "beat", "bursts"))
@@ -108,9 +90,7 @@ PAIRS = (
 LOOPS = {"hysteresis_memory", "hysteresis_parameters"}
 
 
-def planted(
-    name: str, seed: int, plan: plant.Plan | None = None
-) -> tuple[set[str], Record, TransmissionModel]:
+def planted(name: str, seed: int) -> tuple[set[str], Record, TransmissionModel]:
     """Returns the causes present, the record, and the model to be tested."""
     rng = np.random.default_rng(1000 * seed + 17)
     effects: dict[str, dict[str, object]] = {}
@@ -134,7 +114,7 @@ def planted(
             axis |= needs
             there.add(each)
     truth = plant.Truth(effects=effects, **axis)  # type: ignore[arg-type]
-    columns = plant.record(truth, plan or plant.Plan(), seed)
+    columns = plant.record(truth, SHORT, seed)
     return there, Record(columns), TransmissionModel.from_text(plant.model_text(seed, truth=nominal))
 
 

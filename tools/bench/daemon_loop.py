@@ -26,14 +26,15 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment, Observer
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.clock import Clock
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.control.cycle import Cycle
 from hdbridge.control.sensed import Sensed
 from hdbridge.daemon.loop.controller import Controller
-from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Memory, OuterKnot
+from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
@@ -112,8 +113,10 @@ def controller_of(
     """
     configs = configs_of(memory.axes)
     cycle = BusCycle(Link(bus, NeverSleeping()), NeverSleeping(), memory.period_s, bitrate_bps=1_000_000)
-    setups = [AxisSetup(each, compensation_for(each, model.bound_to(each))) for each in configs]
-    controller = Controller(cycle, setups, memory)
+    controller = Controller(cycle, [(each, None) for each in configs], memory)
+    for each in controller.axes:
+        setting = CompensationSetting(model.bound_to(each.config), Scheme.EXTENDED)
+        each.follower.use(setting, moving=False)
     for axis in range(memory.axes):
         memory.commands.post(CommandKind.VERIFIED, axis, k=STATUS_OFF)
         memory.commands.post(CommandKind.ENABLE, axis, k=STATUS_OFF)

@@ -42,11 +42,9 @@ from realtime_cycle import WARM_UP, Figures, table
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scheme
-from hdbridge.control.bench import compensation_for
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.control.realtime import prepare_realtime
 from hdbridge.daemon.loop.controller import Controller
-from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind, Knot, Memory, RelayedFrame
 from hdbridge.daemon.setting import CompensationSetting
@@ -229,8 +227,10 @@ def measured(axes: int, cycle_ms: float, turns: int, channel: str) -> tuple[Figu
         bus = stack.enter_context(can.Bus(interface="socketcan", channel=channel, ignore_config=True))
         memory = stack.enter_context(Memory.create(axes, configs[0].drive.cycle_s))
         cycle = BusCycle(Link(bus, clock), clock, memory.period_s, bitrate_bps=1_000_000)
-        setups = [AxisSetup(each, compensation_for(each, model.bound_to(each))) for each in configs]
-        controller = Controller(cycle, setups, memory)
+        controller = Controller(cycle, [(each, None) for each in configs], memory)
+        for each in controller.axes:
+            setting = CompensationSetting(model.bound_to(each.config), Scheme.EXTENDED)
+            each.follower.use(setting, moving=False)
         process = stack.enter_context(service(memory))
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"

@@ -87,10 +87,8 @@ def rest_deg(axis: AxisConfig, model: TransmissionModel | None) -> float:
     counts, and of the model's residual on held-out data, are added. Without a model, the error may be as
     large as the largest correction that the axis file permits.
     """
-    motor_deg, load_deg = (
-        abs(axis.motor_encoder.degrees(1)) / axis.gear.ratio,
-        abs(axis.load_encoder.degrees(1)),
-    )
+    motor_deg = abs(axis.motor_encoder.degrees(1)) / axis.gear.ratio
+    load_deg = abs(axis.load_encoder.degrees(1))
     if model is None or not model.effects:
         return motor_deg + axis.compensation.maximum_arcsec / ARCSEC_PER_DEG
     held_out = model.provenance.get("held_out")

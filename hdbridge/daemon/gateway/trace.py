@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass
 from statistics import median
 from typing import Final
@@ -75,11 +74,7 @@ class Trace:
 
     def __init__(self, node_id: int, od: ObjectDictionary) -> None:
         self._node, self._od = node_id, od
-        self._values = {
-            (each.index, each.subindex): each.default
-            for each in _variables(od)
-            if isinstance(each.default, int)
-        }
+        self._values = _defaults(od)
         self.written: dict[tuple[int, int], int] = {}
         """Parameters written by the master, in the order of the first write."""
         self._pending: tuple[int, int, bytes | None] | None = None
@@ -362,11 +357,7 @@ class Trace:
 
     def _on_own_heartbeat(self, time_s: float, state: int) -> None:
         if state == 0:
-            self._values = {
-                (each.index, each.subindex): each.default
-                for each in _variables(self._od)
-                if isinstance(each.default, int)
-            }
+            self._values = _defaults(self._od)
             self.written.clear()
             self._say(time_s, "boot-up: parameters that were not saved (1010h) are those of the EDS")
         elif state & 0x7F != self._nmt:
@@ -448,6 +439,11 @@ def _command(word: int) -> str:
     return ", ".join([name, *extra])
 
 
-def _variables(od: ObjectDictionary) -> Iterator[ODVariable]:
+def _defaults(od: ObjectDictionary) -> dict[tuple[int, int], int]:
+    """Returns the default values of the integers, by index and sub-index."""
+    found: dict[tuple[int, int], int] = {}
     for item in od.values():
-        yield from [item] if isinstance(item, ODVariable) else item.subindices.values()
+        for each in [item] if isinstance(item, ODVariable) else item.subindices.values():
+            if isinstance(each.default, int):
+                found[each.index, each.subindex] = each.default
+    return found

@@ -9,11 +9,13 @@ import math
 from collections.abc import Callable
 from typing import Final
 
+from hdbridge.axis import AxisConfig
 from hdbridge.control.axiscycle import STILL_CYCLES, AxisCycle
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Report
 from hdbridge.daemon.loop.feeds import KnotFeed, OuterFeed
-from hdbridge.daemon.loop.follower import AxisSetup, Follower
+from hdbridge.daemon.loop.follower import Follower
 from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, AxisState, Cause, Happening, refusal, target_of
+from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory.cells import OuterCells, SettingSlot
 from hdbridge.daemon.memory.channels import Queue
 from hdbridge.daemon.memory.layout import (
@@ -35,6 +37,11 @@ from hdbridge.motion import MotionMode
 
 _OFF: Final = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
 _FOLLOW: Final = MotionMode.FOLLOW
+_LASTING: Final = {
+    CommandKind.ENABLE: (AxisState.ENABLING, AxisState.ENABLED),
+    CommandKind.DISABLE: (AxisState.STOPPING, AxisState.DISABLED),
+}
+"""State while a command that takes several turns is pending, and the state that completes it."""
 _POWER_INDEX: Final = {state: place for place, state in enumerate(State)}
 # Plain integers: combining enum flags would cost more than the rest of the sample.
 _FRESH, _COMPENSATING, _LIMITED, _MEMORY_KNOWN, _CHANGING, _AT_REST, _UNDERRUN, _DOUBTED, _KNOWN0, _KNOWN1 = (
@@ -48,7 +55,8 @@ class AxisLoop:
     def __init__(
         self,
         index: int,
-        setup: AxisSetup,
+        config: AxisConfig,
+        load_loop: LoadLoopSettings | None,
         knots: Queue[Knot],
         slot: SettingSlot,
         report: Report,
@@ -59,14 +67,13 @@ class AxisLoop:
         """``followed`` has the gateway's set-points, ``outer`` its states; ``due_s`` returns the due time of
         the present turn.
         """
-        config = setup.config
         self.index = index
         self.config = config
         self.state = AxisState.UNVERIFIED
         self.image = ProcessImage(config)
         self.supervision = Supervision()
         self.cycle = AxisCycle(self.image, self.supervision, name=config.name)
-        self.follower = Follower(setup, self.image)
+        self.follower = Follower(config, load_loop, self.image)
         self.set_point = self.follower.set_point
         self.group: frozenset[int] = frozenset()
         """Indices of the axes that began the same stream, which stop together with this axis."""
@@ -89,7 +96,9 @@ class AxisLoop:
         self._changing = self._underrun = self._unfed = False
         self._doubt = ""
         """Last reported states of the compensation change, the stream underrun and the load loop."""
-        self._enable_id = self._disable_id = self._motion_id = 0
+        self._pending: dict[CommandKind, int] = {}
+        """Ids of the pending commands of `_LASTING`."""
+        self._motion_id = 0
         self._mode = MotionMode.HOLD
         self._powering_off = False
         self._left = 0
@@ -132,8 +141,8 @@ class AxisLoop:
         target = target_of(self.state, kind)
         assert target is not None
         if kind is CommandKind.DISABLE and target is AxisState.STOPPING:
-            self._refuse_waiting(CommandKind.DISABLE, "another one came")
-            self._disable_id = command.id
+            self._refuse_pending(kind, "another one came")
+            self._pending[kind] = command.id
         elif kind is not CommandKind.ENABLE:
             self._done(command.id)
         self._enter(target)
@@ -189,28 +198,15 @@ class AxisLoop:
             self._still = 0
             self._left = self._turns(STOP_TIMEOUT_S)
         self._report(EventKind.STATE, 0, state)
-        self._answer_waiting(state)
+        for kind, (during, done) in _LASTING.items():
+            if state is done:
+                self._done(self._pending.pop(kind, 0))
+            elif state is not during:
+                stop = self.cycle.stopped
+                self._refuse_pending(kind, str(stop) if stop is not None else self._why)
 
-    def _answer_waiting(self, state: AxisState) -> None:
-        """Answers pending ENABLE and DISABLE commands."""
-        if self._enable_id and state is not AxisState.ENABLING:
-            if state is AxisState.ENABLED:
-                self._done(self._enable_id)
-                self._enable_id = 0
-            self._refuse_waiting(CommandKind.ENABLE, self._stop_words())
-        if self._disable_id and state is not AxisState.STOPPING:
-            if state is AxisState.DISABLED:
-                self._done(self._disable_id)
-                self._disable_id = 0
-            self._refuse_waiting(CommandKind.DISABLE, self._stop_words())
-
-    def _refuse_waiting(self, kind: CommandKind, why: str) -> None:
-        """Refuses a pending ENABLE or DISABLE command."""
-        if kind is CommandKind.ENABLE:
-            id_, self._enable_id = self._enable_id, 0
-        else:
-            id_, self._disable_id = self._disable_id, 0
-        if id_:
+    def _refuse_pending(self, kind: CommandKind, why: str) -> None:
+        if id_ := self._pending.pop(kind, 0):
             self._report(EventKind.REFUSED, id_, kind, why)
 
     def _stand(self) -> None:
@@ -257,7 +253,7 @@ class AxisLoop:
         self.image.halt = False
         self.image.power.go(State.OPERATION_ENABLED)
         self._why = ""
-        self._enable_id = command.id
+        self._pending[CommandKind.ENABLE] = command.id
         rarest = max((each.every_cycles for each in self.config.channels.values()), default=0)
         self._left = self._turns(2 * ENABLE_TIMEOUT_S) + 2 * rarest
         self.cycle.command = self._enabling
@@ -471,10 +467,6 @@ class AxisLoop:
             self._why += "; the drive did not obey it, so its voltage is disabled"
             self._aim_off()
         return True
-
-    def _stop_words(self) -> str:
-        stop = self.cycle.stopped
-        return str(stop) if stop is not None else self._why
 
     # ---------------------------------------------------------------- the sample of a turn
 

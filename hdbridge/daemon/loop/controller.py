@@ -13,11 +13,12 @@ from contextlib import suppress
 from functools import partial
 from typing import Final
 
+from hdbridge.axis import AxisConfig
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.daemon.loop.axisloop import AxisLoop
-from hdbridge.daemon.loop.follower import AxisSetup
-from hdbridge.daemon.loop.relay import incoming_ids, nodes_of, why_refused
+from hdbridge.daemon.loop.relay import incoming_ids, why_refused
 from hdbridge.daemon.loop.states import AxisState, label
+from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import Cell, Command, CommandKind, Event, EventKind, Memory, RelayedFrame
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.states import State
@@ -41,23 +42,26 @@ class Controller:
     def __init__(
         self,
         cycle: BusCycle,
-        setups: Sequence[AxisSetup],
+        axes: Sequence[tuple[AxisConfig, LoadLoopSettings | None]],
         memory: Memory,
         reopen: Callable[[], Link | None] = lambda: None,
     ) -> None:
-        """``reopen`` reopens the interface after a failure; it returns None while the interface is down.
+        """``axes`` are the axis files, each with the settings of its load loop, if any.
+
+        ``reopen`` reopens the interface after a failure; it returns None while the interface is down.
 
         Raises InputError if the axes cannot share one bus, or if the shared memory is for another number of
         axes.
         """
-        if memory.axes != len(setups):
-            raise InputError(f"shared memory for {memory.axes} axes, but the machine has {len(setups)}")
+        if memory.axes != len(axes):
+            raise InputError(f"shared memory for {memory.axes} axes, but the machine has {len(axes)}")
         self.cycle = cycle
         self.memory = memory
         self.axes = tuple(
             AxisLoop(
                 index,
-                setup,
+                config,
+                load_loop,
                 memory.knots[index],
                 memory.settings[index],
                 partial(self._report, index),
@@ -65,7 +69,7 @@ class Controller:
                 memory.outer[index],
                 lambda: cycle.due_s,
             )
-            for index, setup in enumerate(setups)
+            for index, (config, load_loop) in enumerate(axes)
         )
         for axis in self.axes:
             cycle.join(axis.cycle)
@@ -73,11 +77,7 @@ class Controller:
         """True once `end` has switched off the power of all axes; no more turns are due."""
 
         self._reopen = reopen
-        self._axis_of_node = {
-            node: axis
-            for axis in self.axes
-            for node in nodes_of(axis.config.drive.node_id, axis.config.load_encoder.source.node)
-        }
+        self._axis_of_node = {node: axis for axis in self.axes for node in axis.config.nodes}
         self._wanted = incoming_ids(self._axis_of_node)
         self._down = False
         self._reopen_in = 0

@@ -6,14 +6,13 @@ load target -> + load loop -> inverse of the model -> motor counts -> checked ag
 """
 
 import math
-from dataclasses import dataclass
 from typing import Final
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment, Observer
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scheme
-from hdbridge.control.bench import axis_view
-from hdbridge.control.compensation import Compensation
+from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.loadloop import LoadLoop
 from hdbridge.control.sensed import Sensed
 from hdbridge.control.switchover import Correction
@@ -30,26 +29,14 @@ ROUNDING_COUNTS: Final = 2
 _AT_REST: Final = Moment()
 
 
-@dataclass(frozen=True, slots=True)
-class AxisSetup:
-    """Initial setting of an axis."""
-
-    config: AxisConfig
-    compensation: Compensation
-    compensating: bool = True
-    """If True, the correction is faded in when the axis is enabled."""
-    load_loop: LoadLoopSettings | None = None
-
-
 class Follower:
-    """Computes the target of one axis, turn by turn."""
+    """Computes the target of one axis, turn by turn; uncompensated until `use`."""
 
-    def __init__(self, setup: AxisSetup, image: ProcessImage) -> None:
-        config = setup.config
+    def __init__(self, config: AxisConfig, load_loop: LoadLoopSettings | None, image: ProcessImage) -> None:
         view = axis_view(config)
         self.set_point = SetPoint(view.limits, config.drive.cycle_s)
-        self.correction = Correction(setup.compensation)
-        self.compensating = setup.compensating
+        self.correction = Correction(compensation_for(config, TransmissionModel(view.ratio)))
+        self.compensating = False
         """True if the correction is faded in or fading in."""
         self.target_deg = 0.0
         """Load target of the last turn, without the load loop's correction."""
@@ -60,10 +47,10 @@ class Follower:
         self._has_channels = bool(image.channels)
         self._observer = Observer()
         self._needs = bool(self.correction.needs)
-        self._load_loop = _load_loop(setup)
+        self._load_loop = _load_loop(config, load_loop) if load_loop is not None else None
         self._load_loop_on = True
         self._issued = 0
-        self._most = fastest_counts(setup)
+        self._most = fastest_counts(config, load_loop)
 
     # ---------------------------------------------------------------- what compensates
 
@@ -181,29 +168,22 @@ class Follower:
         return min(max(trimmed, least), greatest)
 
 
-def fastest_counts(setup: AxisSetup) -> int:
+def fastest_counts(config: AxisConfig, load_loop: LoadLoopSettings | None) -> int:
     """Returns the largest step of the target in one cycle within the velocity and slew limits; counts."""
-    config = setup.config
     slew_arcsec_s = config.compensation.slew_arcsec_s
-    if setup.load_loop is not None:
-        slew_arcsec_s += setup.load_loop.slew_arcsec_s
+    if load_loop is not None:
+        slew_arcsec_s += load_loop.slew_arcsec_s
     load_deg = (config.limits.velocity_deg_s + slew_arcsec_s / ARCSEC_PER_DEG) * config.drive.cycle_s
     counts = abs(config.motor_encoder.counts(load_deg * config.gear.ratio))
     return math.ceil(1.000_01 * counts) + ROUNDING_COUNTS
 
 
-def _load_loop(setup: AxisSetup) -> LoadLoop | None:
-    settings = setup.load_loop
-    if settings is None:
-        return None
-    config = setup.config
+def _load_loop(config: AxisConfig, settings: LoadLoopSettings) -> LoadLoop:
     motor_count_deg = abs(config.motor_encoder.degrees(1)) / config.gear.ratio
-    loop = LoadLoop(
+    return LoadLoop(
         settings.gain_1_s,
         settings.maximum_arcsec,
         settings.slew_arcsec_s,
         config.drive.cycle_s,
         counts_arcsec=ARCSEC_PER_DEG * (motor_count_deg + abs(config.load_encoder.degrees(1))),
     )
-    loop.use_models(setup.compensation.model, setup.compensation.model)
-    return loop

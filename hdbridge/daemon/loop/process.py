@@ -11,15 +11,12 @@ from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from typing import Final
 
 from hdbridge.axis import AxisConfig, BusConfig
-from hdbridge.axis.model import TransmissionModel
 from hdbridge.clock import Clock, MonotonicClock
-from hdbridge.control.bench import compensation_for
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.control.realtime import prepare_realtime
 from hdbridge.daemon.logs import log_once
 from hdbridge.daemon.loop.controller import Controller
-from hdbridge.daemon.loop.follower import AxisSetup
-from hdbridge.daemon.machine import Axis, Machine
+from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Cell, Memory
 from hdbridge.daemon.start import Simulation, Start, run_child, when_terminated
 from hdbridge.drive.link import Link, open_bus
@@ -72,9 +69,8 @@ def listen(link: Link, axes: tuple[AxisConfig, ...]) -> None:
         return
     masters = {axis.drive.master_node_id for axis in axes} | {USUAL_MASTER}
     drives = {axis.drive.node_id for axis in axes}
-    encoders = {node for axis in axes if (node := axis.load_encoder.source.node) is not None}
     duration_s = listening_s(max(axis.drive.heartbeat_ms for axis in axes))
-    ear = Ear(drives, masters, drives | encoders)
+    ear = Ear(drives, masters, {node for axis in axes for node in axis.nodes})
     ear.listen(link, duration_s)
     ear.refuse(link.name, duration_s)
 
@@ -86,13 +82,13 @@ def run(start: Start) -> None:
     """
     machine = start.machine
     terminated = when_terminated()
-    setups = [setup_of(axis) for axis in machine.axes]
     realtime = machine.realtime
     bitrate = machine.bus.bitrate_bps if start.simulation is None else SIMULATED_BITRATE_BPS
     with Memory.attach(start.memory_fd) as memory, _bus(start) as (link, clock, interface):
         cycle = BusCycle(link, clock, machine.cycle_s, bitrate_bps=bitrate)
         reopen = interface.reopen if interface is not None else lambda: None
-        controller = Controller(cycle, setups, memory, reopen)
+        axes = [(axis.config, axis.load_loop) for axis in machine.axes]
+        controller = Controller(cycle, axes, memory, reopen)
         status = memory.status
         # No real-time priority for a simulation: a late one never sleeps and would starve its processor.
         real = interface is not None
@@ -107,12 +103,6 @@ def run(start: Start) -> None:
                 if terminated() or status[Cell.STOP_ASKED]:
                     controller.end(at_once=status[Cell.STOP_ASKED] >= AT_ONCE)
                 controller.turn()
-
-
-def setup_of(axis: Axis) -> AxisSetup:
-    """Returns an uncompensated setup; the service sends the setting before the axis can be enabled."""
-    nothing = compensation_for(axis.config, TransmissionModel(axis.config.gear.ratio))
-    return AxisSetup(axis.config, nothing, compensating=False, load_loop=axis.load_loop)
 
 
 @contextmanager

@@ -17,11 +17,6 @@ READING: Final = frozenset({_UPLOAD, _UPLOAD_SEGMENT, _ABORT, _BLOCK_UPLOAD})
 """Command specifiers (CiA 301) of SDO requests that change nothing in the node."""
 
 
-def nodes_of(drive: int, load_encoder: int | None) -> tuple[int, ...]:
-    """Returns the node ids of an axis."""
-    return (drive,) if load_encoder is None else (drive, load_encoder)
-
-
 def incoming_ids(nodes: Iterable[int]) -> frozenset[int]:
     """Returns the identifiers that the service receives: SDO answers, emergencies, all heartbeats."""
     own = {base + node for node in nodes for base in (COB_SDO_ANSWER, COB_EMCY)}

@@ -18,6 +18,7 @@ sequence number, counted from 1. Any change here requires a new `VERSION`.
 import logging
 import math
 import struct
+from collections.abc import Iterable
 from enum import IntEnum, IntFlag
 from typing import Any, Final, NamedTuple, Self
 
@@ -293,8 +294,7 @@ class Axis(NamedTuple):
 _AXIS_FORMATS: Final = ("u1", "u1", "u1", "u1", "u2", "u2", *("f8",) * 15, "u2", "u2", "u2", "u1", "u1")
 AXIS_SAMPLE: Final = np.dtype(list(zip(Axis._fields, _AXIS_FORMATS, strict=True)))
 """One axis of a sample."""
-_AXIS_CODE: Final = "BBBBHH15dHHHBB"
-_HEAD: Final[tuple[tuple[str, str], ...]] = (
+SAMPLE_HEAD: Final[tuple[tuple[str, str], ...]] = (
     ("sequence", "u8"),
     ("cycle", "i8"),
     ("time_ns", "i8"),
@@ -303,7 +303,7 @@ _HEAD: Final[tuple[tuple[str, str], ...]] = (
     ("bus_load", "f4"),
     ("skipped", "u4"),
 )
-_HEAD_CODE: Final = "QqqfffI"
+"""Fields of a sample before those of its axes."""
 _TAIL: Final[tuple[tuple[str, str], ...]] = (("check", "u4"), ("unused", "u4"), ("last", "u8"))
 TAIL_CODE: Final = "I4xQ"
 TAIL_BYTES: Final = 16
@@ -311,7 +311,13 @@ TAIL_BYTES: Final = 16
 
 def sample_struct(axes: int) -> struct.Struct:
     """Returns the struct for packing a sample of ``axes`` axes."""
-    return struct.Struct(f"@{_HEAD_CODE}{_AXIS_CODE * axes}{TAIL_CODE}")
+    head, axis = (_codes(kinds) for kinds in ((kind for _, kind in SAMPLE_HEAD), _AXIS_FORMATS))
+    return struct.Struct(f"@{head}{axis * axes}{TAIL_CODE}")
+
+
+def _codes(kinds: Iterable[str]) -> str:
+    """Returns the codes of `struct` for numpy types."""
+    return "".join(np.dtype(each).char for each in kinds)
 
 
 def sample_dtype(axes: int) -> np.dtype[Any]:
@@ -320,7 +326,7 @@ def sample_dtype(axes: int) -> np.dtype[Any]:
     ``time_ns`` is the monotonic clock at SYNC (virtual time on a virtual clock), ``bus_load`` a share,
     ``axes`` an array of `AXIS_SAMPLE`, shape (axes,). The fields after ``axes`` belong to the slot.
     """
-    return np.dtype([*_HEAD, ("axes", AXIS_SAMPLE, (axes,)), *_TAIL])
+    return np.dtype([*SAMPLE_HEAD, ("axes", AXIS_SAMPLE, (axes,)), *_TAIL])
 
 
 EVENT: Final = struct.Struct(f"@QqqiiqiI{TEXT_BYTES}s{TAIL_CODE}")

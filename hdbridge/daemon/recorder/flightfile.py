@@ -256,18 +256,29 @@ class FlightFile:
         axes = self._about.axes
         name = axes[event.axis].name if 0 <= event.axis < len(axes) else self._about.machine
         kind = EventKind(event.kind)
-        self._add_note(
-            event.time_ns,
-            name,
-            kind.name,
-            event.text,
-            max(LEVELS.get(kind, logging.INFO), logging.INFO),
-            event,
-        )
+        level = max(LEVELS.get(kind, logging.INFO), logging.INFO)
+        facts = {"cycle": event.cycle, "id": event.id, "code": event.code, "axis": event.axis}
+        self.note(event.time_ns, kind.name, event.text, level, name, **facts)
 
-    def note(self, time_ns: int, kind: str, text: str, level: int = logging.INFO) -> None:
-        """Adds a note of the recorder or a client; ``level`` is that of a log record."""
-        self._add_note(time_ns, self._about.machine, kind, text, level)
+    def note(
+        self, time_ns: int, kind: str, text: str, level: int = logging.INFO, name: str = "", **facts: int
+    ) -> None:
+        """Adds a note of the recorder, a client or the loop; ``level`` is that of a log record.
+
+        ``name`` is that of the axis, by default of the machine.
+        """
+        seconds, rest = divmod(time_ns + self._about.offset_ns, 1_000_000_000)
+        content = {
+            "timestamp": {"sec": seconds, "nsec": rest},
+            "level": level // 10,  # Foxglove counts from DEBUG, 1
+            "message": text or kind,
+            "name": name or self._about.machine,
+            "file": "",
+            "line": 0,
+            "kind": kind,
+            "text": text,
+        }
+        self._put(self._events, time_ns, content | facts)
 
     def add_model(self, time_ns: int, axis: str, version: str, text: str) -> None:
         """Adds the model that an axis uses from now on."""
@@ -292,24 +303,6 @@ class FlightFile:
         if self._stream.descriptor >= 0:
             os.close(self._stream.descriptor)
             self._stream.descriptor = -1
-
-    def _add_note(
-        self, time_ns: int, name: str, kind: str, text: str, level: int, event: Event | None = None
-    ) -> None:
-        seconds, rest = divmod(time_ns + self._about.offset_ns, 1_000_000_000)
-        content = {
-            "timestamp": {"sec": seconds, "nsec": rest},
-            "level": level // 10,  # Foxglove counts from DEBUG, 1
-            "message": text or kind,
-            "name": name,
-            "file": "",
-            "line": 0,
-            "kind": kind,
-            "text": text,
-        }
-        if event is not None:
-            content |= {"cycle": event.cycle, "id": event.id, "code": event.code, "axis": event.axis}
-        self._put(self._events, time_ns, content)
 
     def _put(self, channel: int, time_ns: int, content: dict[str, Any]) -> None:
         at = time_ns + self._about.offset_ns

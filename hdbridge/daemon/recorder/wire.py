@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from hdbridge.cia301 import NmtState
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SampleArray
+from hdbridge.daemon.memory.layout import SAMPLE_HEAD
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import InputError
 from hdbridge.motion.modes import MotionMode
 
 PACKAGE: Final = "hdbridge"
-Bytes = NDArray[np.void]
 _FIXED: Final = {
     "f8": (FieldDescriptorProto.TYPE_DOUBLE, 1),
     "f4": (FieldDescriptorProto.TYPE_FLOAT, 5),
@@ -72,15 +72,7 @@ AXIS_FIELDS: Final = (
         for name in _AXIS_NAMES
     ),
 )
-MACHINE_FIELDS: Final = (
-    Field("sequence", "u8"),
-    Field("cycle", "i8"),
-    Field("time_ns", "i8"),
-    Field("late_us", "f4"),
-    Field("busy_us", "f4"),
-    Field("bus_load", "f4"),
-    Field("skipped", "u4"),
-)
+MACHINE_FIELDS: Final = tuple(Field(name, kind) for name, kind in SAMPLE_HEAD)
 
 
 class Message:

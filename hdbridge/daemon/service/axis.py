@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from hdbridge.client import messages
 from hdbridge.commissioning.evaluation.stepping import Scheme
-from hdbridge.daemon.loop.states import MAY_MOVE, UNKNOWN, AxisState
+from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, UNKNOWN, AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind
 from hdbridge.daemon.service.axislink import AxisLink
 from hdbridge.daemon.service.commissioning import Commissioning
@@ -24,12 +24,15 @@ from hdbridge.daemon.service.models import AxisModels
 from hdbridge.daemon.service.moves import AxisMotion
 from hdbridge.drive.states import State
 from hdbridge.drive.values import Object, Value
-from hdbridge.errors import DriveError, HdbridgeError, RefusedError
+from hdbridge.errors import DriveError, HdbridgeError, InputError, RefusedError
 
 if TYPE_CHECKING:
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.daemon.machine import Axis
+    from hdbridge.daemon.memory import Event
     from hdbridge.daemon.service.core import Core
+    from hdbridge.daemon.service.eventlog import Entry
+    from hdbridge.daemon.service.following import Following
     from hdbridge.daemon.setting import CompensationSetting
 
 CHANGE_S: Final = 120.0
@@ -43,7 +46,7 @@ class ServiceAxis:
     """One axis of the machine. Methods that change it require the lease; stopping and reading do not."""
 
     def __init__(
-        self, index: int, axis: Axis, core: Core, report: Callable[[str], messages.AxisState]
+        self, index: int, axis: Axis, core: Core, report: Callable[[ServiceAxis], messages.AxisState]
     ) -> None:
         """``report`` returns the state of an axis."""
         self.axis = axis
@@ -55,6 +58,12 @@ class ServiceAxis:
         self.is_prepared = False
         """True if all SDO work before power is done, and no SDO transfer has followed."""
         self.motion = AxisMotion(self.link, self.check_may)
+        self.stopped: Entry | None = None
+        """Last stop, once the axis stands; None before."""
+        self.loop_doubt = "the reason is in the log of an earlier service"
+        """Text of the last event of the load loop."""
+        self.following: Following | None = None
+        """Watch and adaptation; None without."""
         self._report = report
         self._work = core.timing.work
         self._changing = asyncio.Lock()
@@ -67,7 +76,16 @@ class ServiceAxis:
 
     def state(self) -> messages.AxisState:
         """Returns the state of the axis in the newest cycle."""
-        return self._report(self.name)
+        return self._report(self)
+
+    def hear(self, entry: Entry, event: Event) -> None:
+        """Takes an event of the axis, with its entry in the log."""
+        if event.kind is EventKind.STOPPED:
+            self.stopped = entry
+        elif event.kind is EventKind.STATE and event.code in STOPPED:
+            self.stopped = None  # the reason is reported once it stands
+        elif event.kind is EventKind.LOAD_LOOP:
+            self.loop_doubt = event.text
 
     def check_may(self, holder: str) -> None:
         """Raises LeaseError unless ``holder`` has the lease, RefusedError if a request uses the drive."""
@@ -263,6 +281,15 @@ class ServiceAxis:
         """Compensates with the adapted parameters of the chosen model, whose version does not change."""
         async with self._changing:
             await self._use(await self._work(self.models.moved, model))
+
+    def followed(self, holder: str) -> Following:
+        """Returns the adaptation for a change; InputError if there is none."""
+        self.core.lease.check(holder)
+        if self.following is None:
+            raise InputError(
+                f"{self.name}: nothing adapts on this axis; give it an adaptation in the machine file"
+            )
+        return self.following
 
     async def switch_load_loop(self, holder: str, *, on: bool) -> None:
         """Switches the load loop on or off."""

@@ -28,15 +28,14 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from hdbridge.client import messages
-from hdbridge.daemon.loop.states import STOPPED, UNKNOWN
+from hdbridge.daemon.loop.states import UNKNOWN
 from hdbridge.daemon.memory import Cell, CommandKind, EventKind
 from hdbridge.daemon.service import reports
 from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.daemon.service.core import ANSWER_S, Core
-from hdbridge.daemon.service.eventlog import Entry
 from hdbridge.daemon.service.lending import Lending
 from hdbridge.daemon.service.moves import run_together
-from hdbridge.daemon.service.observer import PERIOD_S, Subscription
+from hdbridge.daemon.service.observer import PERIOD_S
 from hdbridge.daemon.service.outermaster import Latency, OuterMaster
 from hdbridge.daemon.service.timing import Timing
 from hdbridge.errors import HdbridgeError, InputError
@@ -44,7 +43,7 @@ from hdbridge.errors import HdbridgeError, InputError
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Machine
     from hdbridge.daemon.memory import Memory
-    from hdbridge.daemon.service.following import Following
+    from hdbridge.daemon.memory.channels import SampleReader
     from hdbridge.daemon.service.lease import Lease
 
 VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
@@ -75,20 +74,15 @@ class ServiceBridge:
             against = "its axes are simulated; a command has a simulated axis of its own with --simulate"
         self.lending = Lending(self.core, machine.bus, against)
         self.axes: dict[str, ServiceAxis] = {
-            axis.name: ServiceAxis(index, axis, self.core, self.axis_state)
+            axis.name: ServiceAxis(index, axis, self.core, self._axis_state)
             for index, axis in enumerate(machine.axes)
         }
         self.recorder: Callable[[], messages.RecorderState] = lambda: messages.RecorderState(on=False)
         self.marks: list[Callable[[str], None]] = []
         """Receivers of remarks, such as the recorder."""
-        self.following: dict[str, Following] = {}
-        """Watch and adaptation of each axis."""
         self._names = tuple(self.axes)
         self._simulated = simulated
         self._started = datetime.now(UTC)
-        self._stopped: dict[str, Entry] = {}
-        self._loop_doubts: dict[str, str] = {}
-        """Text of the last event of each axis's load loop."""
         self._seen = 0
         self._bus_up = True
         self._loop_pid = 0
@@ -165,17 +159,10 @@ class ServiceBridge:
             event = entry.event
             if event is None:
                 continue
-            name = self._names[event.axis] if event.axis >= 0 else ""
-            if event.kind is EventKind.STOPPED:
-                self._stopped[name] = entry
-            elif event.kind is EventKind.STATE and event.code in STOPPED:
-                self._stopped.pop(name, None)  # the reason is reported once it stands
-            elif event.kind is EventKind.LOAD_LOOP:
-                self._loop_doubts[name] = event.text
-            elif event.kind is EventKind.BUS_DOWN:
-                self._bus_up = False
-            elif event.kind is EventKind.BUS_UP:
-                self._bus_up = True
+            if event.axis >= 0:
+                self.axes[self._names[event.axis]].hear(entry, event)
+            elif event.kind in (EventKind.BUS_DOWN, EventKind.BUS_UP):
+                self._bus_up = event.kind is EventKind.BUS_UP
         pid = self.core.memory.status.loop_pid
         if pid and pid != self._loop_pid:
             if self._loop_pid:
@@ -242,7 +229,7 @@ class ServiceBridge:
             version=version("hdbridge"),
             started=self._started,
             simulated=self._simulated,
-            axes=[self.axis_state(name) for name in self.axes],
+            axes=[self._axis_state(axis) for axis in self.axes.values()],
             bus=messages.BusState(
                 interface=self.machine.bus.interface,
                 channel=str(self.machine.bus.channel),
@@ -265,24 +252,18 @@ class ServiceBridge:
             warnings=self._warnings(),
         )
 
-    def axis_state(self, name: str) -> messages.AxisState:
+    def _axis_state(self, axis: ServiceAxis) -> messages.AxisState:
         """Returns the state of one axis in the newest cycle."""
         self._look()
-        return reports.axis_state(
-            self._axis(name),
-            self._stopped.get(name),
-            self._loop_doubts.get(name, "the reason is in the log of an earlier service"),
-            self.following.get(name),
-            self._outer(name),
-        )
+        return reports.axis_state(axis, self._outer(axis))
 
-    def _outer(self, name: str) -> messages.OuterState | None:
+    def _outer(self, axis: ServiceAxis) -> messages.OuterState | None:
         gateway, memory = self.machine.gateway, self.core.memory
-        node_id = gateway.nodes.get(name) if gateway is not None else None
+        node_id = gateway.nodes.get(axis.name) if gateway is not None else None
         if node_id is None:
             return None
         alive_ns = memory.status[Cell.GATEWAY_TIME_NS]
-        place = self._axis(name).link.index
+        place = axis.link.index
         return reports.outer_state(memory.outer[place], node_id, alive_ns, self._latency.of(place))
 
     def _warnings(self) -> list[str]:
@@ -315,9 +296,9 @@ class ServiceBridge:
             newest=newest,
         )
 
-    def subscribe(self, most: int = 512) -> Subscription:
-        """Subscribes to samples; at most the newest ``most`` wait to be fetched."""
-        return Subscription(self.core.observer, most)
+    def reader(self) -> SampleReader:
+        """Returns a reader of samples from now on."""
+        return self.core.memory.reader()
 
     # ---------------------------------------------------------------- requests
 
@@ -340,15 +321,6 @@ class ServiceBridge:
             raise InputError("a coordinated move without an axis; expected a target for at least one")
         axes = [self._axis(name) for name in moves]
         await run_together(holder, axes, moves, speed, wait=wait)
-
-    def followed(self, holder: str, name: str) -> Following:
-        """Returns the adaptation of an axis for a change."""
-        self.core.lease.check(holder)
-        if name not in self.following:
-            raise InputError(
-                f"{name}: nothing adapts on this axis; give it an adaptation in the machine file"
-            )
-        return self.following[name]
 
     def mark(self, text: str, axis: int = -1) -> None:
         """Adds a remark to the event log and the flight recorder, which keeps the time around it."""

@@ -118,9 +118,7 @@ class Commissioning:
     """Drive of one axis, as seen by the service."""
 
     def __init__(self, axis: AxisConfig, core: Core) -> None:
-        source = axis.load_encoder.source.node
-        nodes = {axis.drive.node_id} | ({source} if source is not None else set())
-        self.bus = RelayBus(core, nodes, f"{axis.bus.interface}:{axis.bus.channel}")
+        self.bus = RelayBus(core, axis.nodes, f"{axis.bus.interface}:{axis.bus.channel}")
         self._drive = Drive(self.bus, axis, core.timing.clock, force=True)
         self._busy = threading.Lock()
         self._doing = ""

@@ -47,17 +47,8 @@ class EventLog:
         self._entries: deque[Entry] = deque(maxlen=KEPT)
         self._public: deque[Entry] = deque(maxlen=KEPT)
         self._answers: dict[int, Event] = {}
-        self._number = self._public_number = 0
-
-    @property
-    def newest(self) -> int:
-        """Number of the newest entry; 0 before the first."""
-        return self._number
-
-    @property
-    def newest_public(self) -> int:
-        """Number of the newest entry for clients; 0 before the first."""
-        return self._public_number
+        self.newest = self.newest_public = 0
+        """Numbers of the newest entry, and of the newest for clients; 0 before the first."""
 
     def poll(self) -> None:
         """Reads new events of the control process."""
@@ -82,12 +73,12 @@ class EventLog:
     def since(self, number: int) -> list[Entry]:
         """Returns the retained entries after ``number``, oldest first."""
         with self._lock:
-            return _newest(self._entries, self._number - number)
+            return _newest(self._entries, self.newest - number)
 
     def public(self, number: int) -> list[Entry]:
         """Returns the entries for clients after ``number``, oldest first."""
         with self._lock:
-            return _newest(self._public, self._public_number - number)
+            return _newest(self._public, self.newest_public - number)
 
     def of_axis(self, axis: int, since: int) -> list[Event]:
         """Returns the control process's events of one axis and of the machine after number ``since``."""
@@ -96,11 +87,11 @@ class EventLog:
 
     def _add(self, axis: int, event: Event | None, text: str) -> None:
         date = datetime.now(UTC)
-        self._number += 1
-        self._entries.append(Entry(self._number, date, axis, event, text))
+        self.newest += 1
+        self._entries.append(Entry(self.newest, date, axis, event, text))
         if event is None or not _routine(event):
-            self._public_number += 1
-            self._public.append(Entry(self._public_number, date, axis, event, text))
+            self.newest_public += 1
+            self._public.append(Entry(self.newest_public, date, axis, event, text))
 
 
 def _newest(entries: deque[Entry], count: int) -> list[Entry]:

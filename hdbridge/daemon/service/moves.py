@@ -49,10 +49,10 @@ class AxisMotion:
         """Number of waiting way points."""
         return len(self._points)
 
-    def busy(self, *kinds: Kind) -> bool:
-        """Returns True if an activity of one of these kinds is in progress."""
+    def under_way(self, *kinds: Kind) -> Activity | None:
+        """Returns the activity in progress if it is of one of these kinds."""
         activity = self.activity
-        return activity is not None and not activity.over and activity.kind in kinds
+        return activity if activity is not None and not activity.over and activity.kind in kinds else None
 
     def replace(self, activity: Activity | None, why: str) -> None:
         """Replaces the present activity by another or by none, and clears the queue."""
@@ -87,9 +87,7 @@ class AxisMotion:
         self._check(holder)
         activity = Activity(Kind.JOG, holder)
         async with self.commanding:
-            activity.since = self._link.core.log.newest
-            answer = await self._link.do(CommandKind.JOG, a=float(velocity_deg_s), b=float(timeout_s))
-            activity.command_id = answer.id
+            await self._link.begin(activity, CommandKind.JOG, a=float(velocity_deg_s), b=float(timeout_s))
             self.replace(activity, "a jog took its place")
 
     async def stream(self, holder: str, timeout_s: float = 0.5) -> ServiceStream:
@@ -117,19 +115,15 @@ class AxisMotion:
         name = self._link.name
         for point in points:
             self._check_target(point.target_deg)
-        if self.busy(Kind.JOG, Kind.STREAM, Kind.COORDINATED):
-            assert self.activity is not None
-            raise RefusedError(
-                f"{name}: {self.activity.kind.value} is under way; stop it, or wait for its end"
-            )
+        if (other := self.under_way(Kind.JOG, Kind.STREAM, Kind.COORDINATED)) is not None:
+            raise RefusedError(f"{name}: {other.kind.value} is under way; stop it, or wait for its end")
         if self.queued + len(points) > QUEUE_MOST:
             raise RefusedError(f"{name}: {self.queued} way points wait; more than {QUEUE_MOST} are not taken")
         if points and self._link.state is not AxisState.ENABLED:
             await self.move(holder, points[0].target_deg)  # refused, with the reason
         self._points.extend(points)
-        if self.busy(Kind.QUEUE):
-            assert self.activity is not None
-            self.activity.holder = holder
+        if (present := self.under_way(Kind.QUEUE)) is not None:
+            present.holder = holder
         elif points:
             before, self.activity = self.activity, Activity(Kind.QUEUE, holder)
             self._start(self._run(self.activity, before))
@@ -144,12 +138,12 @@ class AxisMotion:
 
     async def end_without_lease(self) -> None:
         """Stops an activity that must end with its lease, if that lease has ended."""
-        if not self._is_without_lease():
+        if self._without_lease() is None:
             return
         async with self.commanding:
             # Another client's motion may have replaced it meanwhile; that one continues.
-            activity, link = self.activity, self._link
-            if activity is None or not self._is_without_lease():
+            activity, link = self._without_lease(), self._link
+            if activity is None:
                 return
             self.replace(None, "the lease has ended")
             if activity.kind is Kind.JOG and link.value("mode") == MotionMode.HOLD:
@@ -159,9 +153,9 @@ class AxisMotion:
             )
             await link.do(CommandKind.STOP)
 
-    def _is_without_lease(self) -> bool:
-        activity, lease = self.activity, self._link.core.lease
-        return activity is not None and self.busy(*ENDS_WITH_LEASE) and not lease.holds(activity.holder)
+    def _without_lease(self) -> Activity | None:
+        activity, lease = self.under_way(*ENDS_WITH_LEASE), self._link.core.lease
+        return None if activity is None or lease.holds(activity.holder) else activity
 
     async def close(self) -> None:
         """Ends the queue; the axis completes its present motion."""
@@ -172,14 +166,13 @@ class AxisMotion:
     async def _goto(
         self, activity: Activity, target_deg: float, velocity: float | None, acceleration: float | None
     ) -> None:
-        activity.since = self._link.core.log.newest
-        answer = await self._link.do(
+        await self._link.begin(
+            activity,
             CommandKind.MOVE,
             a=float(target_deg),
             b=math.nan if velocity is None else float(velocity),
             c=math.nan if acceleration is None else float(acceleration),
         )
-        activity.command_id = answer.id
 
     async def _run(self, activity: Activity, before: Activity | None) -> None:
         """Runs the way points in turn, until none is left or another activity replaces the queue."""

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from hdbridge.daemon.memory import OuterCells
     from hdbridge.daemon.service.axis import ServiceAxis
-    from hdbridge.daemon.service.following import Following
     from hdbridge.daemon.service.lease import Lease
     from hdbridge.daemon.setting import CompensationSetting
 
@@ -142,18 +141,9 @@ def outer_state(
     )
 
 
-def axis_state(
-    axis: ServiceAxis,
-    stopped: Entry | None,
-    loop_doubt: str,
-    following: Following | None = None,
-    outer: messages.OuterState | None = None,
-) -> messages.AxisState:
-    """Returns the state of an axis.
-
-    ``stopped`` is the entry of its last stop, ``loop_doubt`` the text of its load loop's last event.
-    """
-    link, config = axis.link, axis.axis.config
+def axis_state(axis: ServiceAxis, outer: messages.OuterState | None) -> messages.AxisState:
+    """Returns the state of an axis; ``outer`` is that of its node in a gateway."""
+    link, config, following = axis.link, axis.axis.config, axis.following
     flags = int(link.value("flags"))
     known = link.core.observer.newest is not None
     in_use = axis.models.in_use
@@ -181,13 +171,13 @@ def axis_state(
         readings=readings,
         scheme=messages.Scheme(in_use.scheme.value),
         limits=messages.Limits.model_validate(config.limits, from_attributes=True),
-        fault=_fault(axis, stopped),
+        fault=_fault(axis),
         model=model_in_use(in_use),
         load_loop=messages.LoadLoopState(
             configured=axis.axis.load_loop is not None,
             on=in_use.load_loop,
             correction_arcsec=link.value("loop_arcsec"),
-            doubt=loop_doubt if flags & SampleFlag.LOOP_DOUBTED else None,
+            doubt=axis.loop_doubt if flags & SampleFlag.LOOP_DOUBTED else None,
         ),
         adaptation=following.state if following is not None else messages.AdaptationState(),
         outer=outer,
@@ -196,9 +186,9 @@ def axis_state(
     )
 
 
-def _fault(axis: ServiceAxis, stopped: Entry | None) -> messages.Fault | None:
+def _fault(axis: ServiceAxis) -> messages.Fault | None:
     """Returns the cause of a latched stop or a drive fault; None without either."""
-    link = axis.link
+    link, stopped = axis.link, axis.stopped
     code = int(link.value("fault")) if link.core.observer.newest is not None else NO_FAULT
     fault = fault_of(code)
     latched = link.state in STOPPED

@@ -30,67 +30,52 @@ class Knots:
 
     def __init__(self, stream: int, begin_deg: float) -> None:
         self._stream = stream
-        self._begin_deg = begin_deg
-        self._before: StreamPoint | None = None
-        """Last point with a knot."""
-        self._held: StreamPoint | None = None
-        """Newest point while its velocity is unknown."""
+        self._begin = StreamPoint(time_s=0.0, position_deg=begin_deg, velocity_deg_s=0.0)
+        self._last: list[StreamPoint] = []
+        """Last point with a knot, and the newest point while its velocity is unknown."""
 
     def add(self, points: Sequence[StreamPoint]) -> list[Knot]:
         """Returns the knots that these points complete. InputError if any is invalid; none is then used."""
-        newest = self._held or self._before
-        chain = [*([newest] if newest else []), *points]
-        self._check(points, chain)
-        knots: list[Knot] = []
-        before, held = self._before, self._held
-        for point in points:
-            if before is None and held is None:
-                knots.append(Knot(self._stream, 0.0, self._begin_deg, 0.0))
-                before = StreamPoint(time_s=0.0, position_deg=self._begin_deg, velocity_deg_s=0.0)
-                if point.time_s == 0.0:
-                    continue
-            if held is not None:
-                assert before is not None
-                knots.append(self._knot(held, _slope(before, point)))
-                before, held = held, None
-            if point.velocity_deg_s is None:
-                held = point
-            else:
-                knots.append(self._knot(point, point.velocity_deg_s))
-                before = point
-        self._before, self._held = before, held
-        return knots
-
-    def end(self) -> list[Knot]:
-        """Returns the last knot, at rest, if it was held back."""
-        held, self._held = self._held, None
-        if held is None:
+        if not points:
             return []
-        self._before = held
-        return [self._knot(held, 0.0)]
-
-    def _knot(self, point: StreamPoint, velocity_deg_s: float) -> Knot:
-        return Knot(self._stream, float(point.time_s), float(point.position_deg), float(velocity_deg_s))
-
-    def _check(self, points: Sequence[StreamPoint], chain: Sequence[StreamPoint]) -> None:
-        if points and self._before is None and self._held is None:
-            first = points[0]
-            if first.time_s == 0.0 and abs(first.position_deg - self._begin_deg) > BEGIN_DEG:
-                raise InputError(
-                    f"a stream begins at {first.position_deg:.9g} deg, but the axis stands at "
-                    f"{self._begin_deg:.9g}: begin there, or move there first"
-                )
-            if first.time_s == 0.0 and first.velocity_deg_s:
-                raise InputError(
-                    f"a stream begins with {first.velocity_deg_s:g} deg/s, but the axis is at rest: begin "
-                    f"at rest"
-                )
+        knots: list[Knot] = []
+        chain = [*self._last, *points]
+        if not self._last:
+            self._check_begin(points[0])
+            knots.append(self._knot(self._begin, 0.0))
+            chain = [self._begin, *points[points[0].time_s == 0.0 :]]
         for one, next_ in pairwise(chain):
             if not next_.time_s > one.time_s:
                 raise InputError(
                     f"a set-point at {next_.time_s:g} s after one at {one.time_s:g} s: each must be later "
                     "than the one before; none of these was accepted"
                 )
+        for before, point, after in zip(chain, chain[1:], [*chain[2:], None], strict=False):
+            if point.velocity_deg_s is not None:
+                knots.append(self._knot(point, point.velocity_deg_s))
+            elif after is not None:
+                knots.append(self._knot(point, _slope(before, after)))
+        self._last = chain[-1:] if chain[-1].velocity_deg_s is not None else chain[-2:]
+        return knots
+
+    def end(self) -> list[Knot]:
+        """Returns the last knot, at rest, if it was held back."""
+        return [self._knot(each, 0.0) for each in self._last[1:]]
+
+    def _knot(self, point: StreamPoint, velocity_deg_s: float) -> Knot:
+        return Knot(self._stream, float(point.time_s), float(point.position_deg), float(velocity_deg_s))
+
+    def _check_begin(self, first: StreamPoint) -> None:
+        begin_deg = self._begin.position_deg
+        if first.time_s == 0.0 and abs(first.position_deg - begin_deg) > BEGIN_DEG:
+            raise InputError(
+                f"a stream begins at {first.position_deg:.9g} deg, but the axis stands at {begin_deg:.9g}: "
+                "begin there, or move there first"
+            )
+        if first.time_s == 0.0 and first.velocity_deg_s:
+            raise InputError(
+                f"a stream begins with {first.velocity_deg_s:g} deg/s, but the axis is at rest: begin at rest"
+            )
 
 
 def _slope(one: StreamPoint, other: StreamPoint) -> float:
@@ -108,7 +93,7 @@ class ServiceStream:
         self._number = link.core.next_stream()
         self._knots: Knots | None = None
         self._queue = link.core.memory.knots[link.index]
-        self._begun_cycle: int | None = None
+        self._has_begun = False
         self._last_s = 0.0
         """Time of the last knot that was sent."""
         self._ended = False
@@ -120,7 +105,7 @@ class ServiceStream:
             await self._link.until(lambda: True, 0.0)
             self._knots = Knots(self._number, self._link.value("load_target_deg"))
         await self._hand_over(self._knots.add(points))
-        if self._begun_cycle is None and self._last_s >= LEAD_S:
+        if not self._has_begun and self._last_s >= LEAD_S:
             await self._begin()
 
     async def end(self) -> None:
@@ -131,18 +116,16 @@ class ServiceStream:
             self._activity.end("it came to its end")
             return
         await self._hand_over(self._knots.end())
-        if self._begun_cycle is None:
+        if not self._has_begun:
             await self._begin()
         self._ended = True
         await self._link.do(CommandKind.STREAM_END)
         await self._link.arrival(self._activity)
 
     async def _begin(self) -> None:
-        core = self._link.core
-        self._activity.since = core.log.newest
-        answer = await self._link.do(CommandKind.STREAM_BEGIN, a=float(self._timeout_s), j=self._number)
-        self._activity.command_id = answer.id
-        self._begun_cycle = answer.cycle
+        begin = CommandKind.STREAM_BEGIN
+        await self._link.begin(self._activity, begin, a=float(self._timeout_s), j=self._number)
+        self._has_begun = True
 
     async def _hand_over(self, knots: Sequence[Knot]) -> None:
         while knots:
@@ -151,7 +134,7 @@ class ServiceStream:
                 self._last_s = knots[taken - 1].time_s
             knots = knots[taken:]
             if knots:
-                if self._begun_cycle is None:
+                if not self._has_begun:
                     await self._begin()
                 await self._link.core.timing.sleep(ROOM_POLL_S)
                 self._check_open()
@@ -159,7 +142,7 @@ class ServiceStream:
     def _check_open(self) -> None:
         """Raises RefusedError with the reason if the stream has ended, LeaseError if the lease has."""
         self._link.core.lease.check(self._activity.holder)
-        if self._begun_cycle is not None and not self._ended:
+        if self._has_begun and not self._ended:
             self._link.look(self._activity)
         if self._activity.over or self._ended:
             why = self._activity.over or "it was ended"

@@ -1,7 +1,6 @@
 """An axis from unknown to moving and back, by commands through the memory and frames on the bus."""
 
 import struct
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,8 +8,6 @@ from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scheme
-from hdbridge.control.bench import compensation_for
-from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import CommandKind, EventKind, Knot, SampleFlag
@@ -267,7 +264,7 @@ def test_a_model_of_another_axis_is_refused(enabled: SteppedDaemon) -> None:
 
 
 def test_the_compensation_may_begin_switched_off() -> None:
-    with stepped_daemon(setup=lambda _, made: replace(made, compensating=False)) as daemon:
+    with stepped_daemon(setup=lambda axis: axis.follower.engage(False)) as daemon:
         daemon.verify()
         daemon.enable()
         daemon.run(1.0)
@@ -282,11 +279,7 @@ def test_a_new_loop_ignores_earlier_commands(enabled: SteppedDaemon) -> None:
     cycle = enabled.controller.cycle
     for axis in cycle.axes:
         cycle.leave(axis)
-    setups = []
-    for axis in enabled.axes:
-        model = TransmissionModel(axis.config.gear.ratio)
-        setups.append(AxisSetup(axis.config, compensation_for(axis.config, model)))
-    again = Controller(cycle, setups, enabled.memory)
+    again = Controller(cycle, [(axis.config, None) for axis in enabled.axes], enabled.memory)
     assert len(enabled.memory.commands) == 0
     assert len(enabled.memory.knots[0]) == 0
     for _ in range(50):
@@ -294,13 +287,10 @@ def test_a_new_loop_ignores_earlier_commands(enabled: SteppedDaemon) -> None:
     assert [axis.state for axis in again.axes] == [S.UNVERIFIED]
 
 
-def with_load_loop(made: AxisSetup) -> AxisSetup:
-    return replace(made, load_loop=LoadLoopSettings(gain_1_s=2.0, maximum_arcsec=40.0, slew_arcsec_s=40.0))
-
-
 def test_the_load_loop_removes_the_remaining_error_and_fades_out() -> None:
     without = TransmissionModel(50.0)
-    with stepped_daemon(model=without, setup=lambda _, made: with_load_loop(made)) as daemon:
+    settings = LoadLoopSettings(gain_1_s=2.0, maximum_arcsec=40.0, slew_arcsec_s=40.0)
+    with stepped_daemon(model=without, load_loop=settings) as daemon:
         daemon.verify()
         daemon.enable()
         id_ = daemon.move(7.3)
@@ -342,7 +332,7 @@ def test_a_sound_load_encoder_raises_no_doubt() -> None:
     """Reversals at rest, by one count and more, and in motion; the load loop corrects all hysteresis."""
     maximum_arcsec = 60.0
     settings = LoadLoopSettings(gain_1_s=0.5, maximum_arcsec=maximum_arcsec)
-    with stepped_daemon(setup=lambda _, made: replace(made, load_loop=settings)) as daemon:
+    with stepped_daemon(load_loop=settings) as daemon:
         daemon.verify()
         daemon.enable()
         daemon.use(daemon.setting(scheme=Scheme.SYNCHRONOUS, load_loop=True))

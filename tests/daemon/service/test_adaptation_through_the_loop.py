@@ -53,7 +53,7 @@ async def adapting(service: Service) -> AsyncIterator[tuple[ServiceBridge, str, 
 def begin(service: Service, bridge: ServiceBridge) -> Following:
     axis = service.machine.axes[0]
     made = Following(0, bridge.axes["axis1"], axis.adaptation, axis.profile.folder / "adaptation", AtOnce())
-    bridge.following["axis1"] = made
+    bridge.axes["axis1"].following = made
     bridge.core.observer.add(made)
     return made
 
@@ -90,17 +90,17 @@ async def test_the_model_in_the_loop_is_adapted_and_reverted(service: Service) -
         assert 0.0 < float(np.max(changed)) < 0.5  # a cycle: four arcsec are faded in, never at once
         assert offset_arcsec(bridge) == pytest.approx(44.0, abs=1.0)
         assert service.daemon.reported(EventKind.CHANGED)
-        state = bridge.axis_state("axis1").adaptation
+        state = bridge.axes["axis1"].state().adaptation
         assert state.mode == messages.AdaptationMode.ON
         assert state.frozen is None
         assert state.updated is not None
         assert state.parameters["hysteresis.offset_arcsec"] == pytest.approx(4.0, abs=1.0)
 
-        await bridge.followed(token, "axis1").revert()
+        await bridge.axes["axis1"].followed(token).revert()
         assert offset_arcsec(bridge) == 40.0
         await work(bridge, token, 20, seed=1)
         assert offset_arcsec(bridge) == 40.0
-        assert bridge.axis_state("axis1").adaptation.mode == messages.AdaptationMode.OBSERVE
+        assert bridge.axes["axis1"].state().adaptation.mode == messages.AdaptationMode.OBSERVE
 
 
 async def test_the_adaptation_survives_another_scheme_and_a_new_loop(service: Service) -> None:
@@ -124,6 +124,6 @@ async def test_an_impossible_adaptation_does_not_block_the_axis(service: Service
     service.machine = replace(service.machine, axes=axes)
     async with adapting(service) as (bridge, token, _):
         await work(bridge, token, 1)
-        frozen = bridge.axis_state("axis1").adaptation.frozen
+        frozen = bridge.axes["axis1"].state().adaptation.frozen
         assert frozen is not None
         assert "'backlash.gap_arcsec' is not a parameter that wear or temperature changes" in frozen

@@ -32,7 +32,7 @@ def following(bridge: ServiceBridge, settings: AdaptationSettings, folder: Path)
     (axis,) = bridge.axes.values()
     made = Following(0, axis, settings, folder, ThreadPoolExecutor(1))
     bridge.core.observer.add(made)
-    bridge.following[axis.name] = made
+    axis.following = made
     return made
 
 

@@ -291,9 +291,7 @@ def test_a_setting_reads_back_exactly(data: st.DataObject) -> None:
 LOAD_LOOP = LoadLoopSettings(gain_1_s=0.5, maximum_arcsec=20.0)
 
 
-@pytest.mark.parametrize(
-    "service", [{"setup": lambda _, made: replace(made, load_loop=LOAD_LOOP)}], indirect=True, ids=["loop"]
-)
+@pytest.mark.parametrize("service", [{"load_loop": LOAD_LOOP}], indirect=True, ids=["loop"])
 async def test_an_inactive_load_loop_reports_its_reason(service: Service) -> None:
     service.machine = replace(service.machine, axes=(replace(service.machine.axes[0], load_loop=LOAD_LOOP),))
     async with service.enabled() as (bridge, token):

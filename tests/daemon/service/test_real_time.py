@@ -55,14 +55,9 @@ def test_many_concurrent_requests(tmp_path: Path, slower: int) -> None:
             token = bridge.lease.take("test")
             await asyncio.gather(*(each.enable(token) for each in bridge.axes.values()))
             first, second = bridge.axes.values()
-            feed = bridge.subscribe(most=20)
             await asyncio.gather(first.motion.move(token, 3.0), second.motion.move(token, -2.0))
             assert first.state().load_target_deg == pytest.approx(3.0)
             assert second.state().load_target_deg == pytest.approx(-2.0)
-            batch = await anext(feed)
-            assert len(batch.samples) <= 20
-            assert batch.lost > 0  # clients that do not fetch lose samples
-            feed.close()
 
             # One client waits for a move, others look, read, and take its place.
             waiting = asyncio.create_task(first.motion.move(token, 60.0))

@@ -32,7 +32,7 @@ def at_work(blind: Path, folder: Path, **servo: float) -> tuple[messages.AxisSta
         async with service.enabled() as (bridge, token):
             axis = bridge.axes["axis1"]
             made = Following(0, axis, AdaptationSettings(mode="on"), folder / "state", AtOnce())
-            bridge.following["axis1"] = made
+            bridge.axes["axis1"].following = made
             bridge.core.observer.add(made)
             for target in (FAR_DEG, -FAR_DEG, FAR_DEG):
                 bridge.lease.check(token)

@@ -127,18 +127,16 @@ async def switch_load_loop(
 
 
 @routes.post("/adaptation", tags=["Compensate"], responses=refusals(MOVING))
-async def adapt(
-    bridge: Bridge, axis: FoundAxis, adapt: messages.Adapt, holder: Holder = ""
-) -> messages.AxisState:
+async def adapt(axis: FoundAxis, adapt: messages.Adapt, holder: Holder = "") -> messages.AxisState:
     """Set the adaptation mode: apply changes of parameters, only report them, or neither."""
-    await bridge.followed(holder, axis.name).set_mode(adapt.mode)
+    await axis.followed(holder).set_mode(adapt.mode)
     return axis.state()
 
 
 @routes.delete("/adaptation", tags=["Compensate"], responses=refusals(MOVING))
-async def take_adaptation_back(bridge: Bridge, axis: FoundAxis, holder: Holder = "") -> messages.AxisState:
+async def take_adaptation_back(axis: FoundAxis, holder: Holder = "") -> messages.AxisState:
     """Discard the changes by the adaptation since the model was activated."""
-    await bridge.followed(holder, axis.name).revert()
+    await axis.followed(holder).revert()
     return axis.state()
 
 

@@ -32,6 +32,8 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 M = TypeVar("M", bound=BaseModel)
 BATCH_S: Final = 0.05
+BATCH_MAXIMUM: Final = 512
+"""Maximum number of cycles in a message; older ones count as lost."""
 SEND_S: Final = 30.0
 """Time-out for sending to a client."""
 BEGIN_S: Final = 10.0
@@ -69,17 +71,20 @@ async def live(bridge: Bridge, websocket: WebSocket) -> None:
             options = wanted
 
     async def send() -> None:
-        """Sends batches; during a transmission, the subscription keeps only the newest samples."""
+        """Sends batches; a client that was slow to take one receives only the newest samples after it."""
+        reader = bridge.reader()
         lost, known = 0, bridge.events(_NEWEST).newest
-        async for batch in bridge.subscribe():
-            lost += batch.lost
+        while True:
+            await asyncio.sleep(BATCH_S)  # collects samples, so that messages are fewer and larger
+            samples, overwritten = reader.read()
+            lost += overwritten + max(len(samples) - BATCH_MAXIMUM, 0)
             happened = bridge.events(known)
             known = max(known, happened.newest)
-            data = columns(batch.samples, list(bridge.axes), options, happened.events, lost)
+            names = list(bridge.axes)
+            data = columns(samples[-BATCH_MAXIMUM:], names, options, happened.events, lost)
             if data.time_s or data.events:
                 await _send(websocket, data)
                 lost = 0
-            await asyncio.sleep(BATCH_S)  # collects samples, so that messages are fewer and larger
 
     sides = asyncio.ensure_future(listen()), asyncio.ensure_future(send())
     await asyncio.wait(sides, return_when=asyncio.FIRST_COMPLETED)
