@@ -488,7 +488,8 @@ class State(NamedTuple):
         right = found.jacobian.T @ precision.apply(self.design.blocks.error_arcsec)
         mean, known = np.array(nuisances.prior).T
         right[: len(mean)] += known * mean
-        return System(found.information, right, np.flatnonzero(known > 0.0))
+        zeros = [at for at, name in enumerate(nuisances.names) if name.startswith("zero ")]
+        return System(found.information, right, np.flatnonzero(known > 0.0), np.array(zeros))
 
     def selected(self, system: System | None = None) -> State:
         """Selects the orders that are significant at the current noise; ``system``: `information` if

@@ -32,6 +32,8 @@ class System(NamedTuple):
     """J' K^-1 y, shape (c,)."""
     limited: IntArray
     """Columns that are limited by a prior. They make an order less certain, but cannot take its place."""
+    zeros: IntArray
+    """Columns of the absolute zeros."""
 
 
 class Family(Enum):
@@ -145,13 +147,15 @@ class _Candidates:
     """Candidate orders, with all other columns of the fit eliminated once."""
 
     def __init__(self, number: int, system: System) -> None:
-        information, right, limited = system
+        information, right, limited, _ = system
         own, rest = np.arange(2 * number), np.arange(2 * number, len(right))
 
         self._information, explained = _eliminated(information, own, rest)
         self._right = right[own] - explained.T @ right[rest]
         self._if_limited_known, _ = _eliminated(information, own, np.setdiff1d(rest, limited))
-        self._alone = np.diag(information)
+        # About the zeros, because a long standstill at one angle does not determine any order.
+        centred, _ = _eliminated(information, own, system.zeros)
+        self._alone = np.maximum(np.diag(centred), 1e-9 * np.diag(information)[own])
         self.number = number
 
     def left(self, index: int, inside: Collection[int]) -> _Left:

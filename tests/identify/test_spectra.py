@@ -21,7 +21,8 @@ def system(motor_deg, error_arcsec, orders):
     angles = np.deg2rad(np.outer(motor_deg, [each.per_motor_turn for each in orders]))
     columns = np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(motor_deg), -1)
     columns = np.concatenate([columns, np.ones((len(motor_deg), 1))], axis=1)
-    return System(columns.T @ columns, columns.T @ error_arcsec, np.array([], dtype=int))
+    mean = np.array([columns.shape[1] - 1])
+    return System(columns.T @ columns, columns.T @ error_arcsec, np.array([], dtype=int), mean)
 
 
 def all_fitted(motor_deg, error_arcsec, orders):
@@ -103,6 +104,15 @@ def test_selection_takes_all_that_are_there_and_prefers_the_one_that_explains():
     assert [each.number for each in chosen.chosen] == [2, 5, 11]
 
 
+def test_a_long_standstill_hides_no_order():
+    rng = np.random.default_rng(6)
+    motor = np.append(np.full(50_000, 77.0), rng.uniform(0.0, 3600.0, 1000))
+    orders = motor_orders(12)
+    error = waves(motor, [(2, 5.0, 10.0), (6, 3.0, 90.0)]) + rng.normal(size=len(motor))
+    chosen = select(orders, system(motor, error, orders))
+    assert [each.number for each in chosen.chosen] == [2, 6]
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_no_order_is_replaced_by_a_column_that_a_prior_limits(seed):
     """At one speed, the swing of the load excited by the other orders resembles the largest fast order."""
@@ -117,7 +127,8 @@ def test_no_order_is_replaced_by_a_column_that_a_prior_limits(seed):
     columns = np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(motor), -1)
     cross = np.append(columns.T @ swing, np.sum(swing))
     information = np.block([[plain.information, cross[:, np.newaxis]], [cross, swing @ swing + 0.2**-2]])
-    with_swing = System(information, np.append(plain.right, swing @ error), np.array([len(plain.right)]))
+    right, limited = np.append(plain.right, swing @ error), np.array([len(plain.right)])
+    with_swing = System(information, right, limited, plain.zeros)
     assert [each.number for each in select(orders, with_swing).chosen] == [2, 4, 6]
 
 
