@@ -29,7 +29,7 @@ JUMP_DEG = 30.0
 SPIKE_ARCSEC = 900.0
 """Change of the error to a single sample and back that no gear can produce."""
 SLOWEST_S = 1.0
-"""Shortest implausible sample period; a record needs a few samples per motor turn."""
+"""Sample period from which on a record is implausible; a record needs a few samples per motor turn."""
 MISREAD_ROWS = 2
 """Maximum duration of a misreading, samples."""
 MISREAD_SHARE = 0.01

@@ -176,7 +176,7 @@ class Samples:
 
     @property
     def motor_deg(self) -> FloatArray:
-        """Angle that drives the effects."""
+        """Motor angle at which the effects are evaluated, degrees."""
         return self.motion.motor_deg
 
     @property

@@ -42,7 +42,7 @@ _UNIFORM = np.sqrt(12.0)
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Resolution of an angle, degrees."""
+    """Resolution and noise of the readings of an angle, degrees."""
 
     count_deg: float
     """One count of the encoder; 0 if not visible."""

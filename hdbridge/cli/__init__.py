@@ -93,7 +93,7 @@ _MODULES: Final = {
     "positioning": ("demo", "move", "step", "motion"),
     "recordings": ("record",),
 }
-"""Modules with several commands; every other command is the module of its name.
+"""Modules with several commands; every other command is in the module of the same name.
 
 ``COMMANDS`` of a module contains the function of a command, or the functions of a group of commands."""
 SIGNED: Final = {"move", "sdo set", "ctl move", "ctl jog", "ctl queue", "ctl set"}

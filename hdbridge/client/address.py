@@ -41,7 +41,7 @@ class Address:
 def find(
     text: str | Path | None = None, token: str | None = None, environment: Mapping[str, str] = os.environ
 ) -> Address:
-    """Returns the address of a daemon, given by socket, URL or machine name, or omitted if only one runs.
+    """Returns the address of a daemon, by its socket, URL or machine name; by none of them if only one runs.
 
     Without ``text``, ``$HDBRIDGE_SOCKET`` is used, then ``$HDBRIDGE_URL`` (with the token
     ``$HDBRIDGE_TOKEN``), then the sockets of this user's daemons and of the service manager's. Raises

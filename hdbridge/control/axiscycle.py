@@ -383,7 +383,7 @@ class AxisCycle:
         return self._still >= STILL_CYCLES or self._left == 0
 
     def _note(self, stop: Event | None) -> None:
-        """Notes that a stop was latched or released since the last turn."""
+        """Records that a stop was latched or released since the last cycle."""
         self._ridden = stop
         self._still, self._left = 0, self._stop_cycles
         if stop is not None:

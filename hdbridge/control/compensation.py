@@ -240,7 +240,7 @@ class Inverse:
             # Points before a reversal do not predict the slope after it, so only the chord is used.
             s = s1 + bend if -0.5 < bend / s1 < 1.0 else s1
             before, x0, x1, f0, s0 = x0, x1, x1 - f1 / s, f1, s1
-        # The error falls at most by `fall` per degree, so the root is at most this far.
+        # The predicted error falls at most by `fall` per degree. This limits the slope, and so the root.
         far = last + gap / (slope - weight * self._fall) * (1.0 + 1e-9)
         return self._bracketed(goal, moment, weight, last, -gap, far)
 

@@ -257,7 +257,7 @@ class _Reader:
     def _write_object(self, written: list[str], index: int, parts: Mapping[int | None, _Section]) -> None:
         members = {sub: section for sub, section in parts.items() if sub is not None}
         section = parts.get(None)
-        if section is None:  # its members suffice as a description
+        if section is None:  # the sections of its sub-indices describe it
             section = _Section(f"{index:04X}", next(iter(members.values())).line)
         kind = self._number(section, "ObjectType", _RECORD if members else _VAR)
         if kind not in _OBJECT_TYPES:

@@ -236,7 +236,7 @@ class _Run:
         return self._state()
 
     def _unchanged(self, source: Source) -> Mapping[str, Any] | None:
-        """Returns the row of a recording that need not be read again if its model is the same, or None."""
+        """Returns the stored row of an unchanged recording; None for a new or a changed one."""
         row = self._stored.row(source)
         if row is None or source.stamp is None or row["reason"] in self._retried:
             return None

@@ -180,7 +180,7 @@ def _advice(manifest: str) -> str:
 
 
 def _recordings(files: Mapping[str, str], described: Collection[str]) -> dict[str, str]:
-    """Returns the recordings among files, with the marks of their own files joined."""
+    """Returns the recordings among files, each with the joined marks of its files (`_listing`)."""
     found = recordings_among(files)
     found |= {each: [each] for each in files if each.endswith(FLIGHT) or each in described}
     return {path: "\n".join(f"{each} {files[each]}" for each in own) for path, own in found.items()}
@@ -209,7 +209,7 @@ def _listing(place: str, timeout_s: float) -> dict[str, str]:
 
     try:
         system, root = fsspec.core.url_to_fs(place)
-        host = place.rstrip("/").removesuffix(root)  # protocol and host, which `system` paths lack
+        host = place.rstrip("/").removesuffix(root)  # protocol and host, which the paths of `system` lack
         system.invalidate_cache()
         if system.async_impl:  # the others have time-outs of their own, of 15 s for SFTP
             try:
@@ -230,7 +230,7 @@ def _listing(place: str, timeout_s: float) -> dict[str, str]:
         return {
             host + file: " ".join(str(about.get(each)) for each in MARKS) for file, about in files.items()
         }
-    except Exception as problem:  # each file system raises its own
+    except Exception as problem:  # each file system raises exceptions of its own
         raise InputError(one_line(f"{place}: cannot be listed: {problem}")) from None
 
 
@@ -387,6 +387,6 @@ def fetched(path: str) -> Iterator[Path]:
         try:
             system, place = fsspec.core.url_to_fs(path)
             system.get(place, str(target), recursive=system.isdir(place))
-        except Exception as problem:  # each file system raises its own
+        except Exception as problem:  # each file system raises exceptions of its own
             raise NotFetchedError(f"{path}: cannot be fetched: {problem}") from None
         yield target

@@ -23,7 +23,7 @@ _ROUNDING_DEG = 1e-9
 
 
 _NEAR_END = 0.999
-"""Share of a path's duration at which the motion still has its final direction."""
+"""Fraction of a path's duration, just before its end, at which its final direction is evaluated."""
 _HALVINGS = 30
 _At = Callable[[float], tuple[list[float], list[float], list[float]]]
 

@@ -63,7 +63,7 @@ class RecordedFile(Strict):
 
     @classmethod
     def of(cls, path: Path, samples: int) -> Self:
-        """Describes a written file."""
+        """Returns the description of a file that was written."""
         return cls(name=path.name, sha256=sha256_of(path), samples=samples)
 
 

@@ -178,7 +178,7 @@ def unknown_rows(record: Record, count_deg: float) -> NDArray[np.bool_]:
 # Commands of a part of a recording, on the grid of its own cycle, preceded by an approach.
 
 STANDING_S = 0.3
-"""Standstill before the approach, and between it and a recording that begins at rest."""
+"""Duration of the standstill before the approach, and after it if the recording begins at rest."""
 SETTLING_S = 0.75
 """Standstill before a recording that begins with the drive on, long enough for loops with a gain of 8/s. At
 25/s, halving it changes no residual by more than 2e-5 of the noise."""

@@ -53,7 +53,7 @@ class Draft:
     """Differences between the present effect and its counterpart in the truth file."""
 
     def note(self, difference: str) -> None:
-        """Notes a difference of the present effect from its counterpart, once."""
+        """Records a difference between the present effect and its counterpart; repeated ones are ignored."""
         if difference not in self.notes:
             self.notes.append(difference)
 
@@ -433,7 +433,7 @@ def _warm_up(effect: Warmed, draft: Draft) -> None:
 
 
 # ----------------------------------------------------------------
-# Effects of spring, friction, play and loop.
+# Effects of stiffness, friction, backlash and hysteresis.
 
 NODES: Final = 24
 """Number of nodes of a branch; linear interpolation is then accurate to a hundredth of the offset."""

@@ -108,7 +108,7 @@ def acceleration(motion: Motion) -> Coordinate:
 
 
 def time(motion: Motion) -> Coordinate:
-    """Returns the time on the record's clock; the sample number if there is none."""
+    """Returns the time on the record's clock; the sample number without a clock."""
     values = motion.time_s
     if values is None:
         return Coordinate("sample", "", np.arange(len(motion), dtype=np.float64), bins=100)
@@ -116,7 +116,7 @@ def time(motion: Motion) -> Coordinate:
 
 
 def measured(motion: Motion, channel: Channel) -> Coordinate:
-    """Returns a measured channel; `time` if it was not measured."""
+    """Returns a measured channel; the time if the channel was not recorded."""
     values = motion.measured.get(channel)
     if values is None:
         return time(motion)

@@ -21,7 +21,7 @@ _TO_FILL_IN = {
 }
 """Required keys of an axis file that the drive may not provide; `hdbridge check` stops at missing values."""
 _TAIL = """
-# At the load. Begin with little; `hdbridge doctor` moves within these.
+# Limits at the load. Begin with small ones; `hdbridge doctor` moves within them.
 limits:
   position_min_deg: -5
   position_max_deg: 5

@@ -320,7 +320,8 @@ class ServoCheck:
     stored_lag_ms: float
     lag_ms: float
     difference: float
-    """`Answers.difference`."""
+    """Rms difference of the motor's response from the stored one, as a fraction of the ripple
+    (`Answers.difference`)."""
 
     @property
     def agrees(self) -> bool:

@@ -1,4 +1,4 @@
-"""Selection of the findings for the proposed model, and of the causes to separate them from."""
+"""Selection of the findings for the proposed model, and of the causes that each must be separated from."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -19,7 +19,7 @@ class IdealAxis:
 
     @property
     def load_counts(self) -> int:
-        """Motor encoder reading, which is that of the second encoder of this drive."""
+        """Reading of the motor encoder, which this drive also reports as its second encoder."""
         return round(self.motor_counts * self._scale)
 
     def follow(self, start_counts: float, end_counts: float, substeps: int) -> None:

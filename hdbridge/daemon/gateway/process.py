@@ -81,7 +81,7 @@ def serve(start: Start) -> None:
                     make_folder(machine.axis_folder(machine.axis(axis.name), "gateway")) / "parameters.json"
                 )
             except (HdbridgeError, OSError):
-                return None  # 1010h lasts until the process ends
+                return None  # parameters stored by 1010h are lost when the process ends
 
         simulation = start.simulation
         clock: Clock = MonotonicClock() if simulation is None else SimulatedClock(memory, simulation.speed)
@@ -106,7 +106,7 @@ def serve(start: Start) -> None:
                 status[Cell.GATEWAY_TIME_NS] = time.monotonic_ns()
             return terminated()
 
-        # One below the control loop, which is not to wait for it on a shared processor.
+        # A real-time priority below that of the control loop, which must not wait on a shared processor.
         priority, cpus = max(machine.realtime.priority - 1, 0), machine.realtime.cpus
         with prepare_realtime(priority, cpus) if simulation is None else nullcontext() as conditions:
             _LOG.info("gateway process", {"conditions": str(conditions or "simulated")})

@@ -98,7 +98,7 @@ class Following:
             return
         try:
             await self._axis.follow(model)
-        except HdbridgeError as problem:  # not in this state; it is tried again
+        except HdbridgeError as problem:  # refused in this state; tried again later
             if str(problem) != self._not_applied:
                 _log.warning("adaptation not applied", {"axis": self._axis.name, "why": str(problem)})
             self._not_applied = str(problem)

@@ -19,7 +19,7 @@ POLL_S = 0.005
 CREDIT_S: Final = 0.25
 """Maximum simulated time that can accumulate, because the clock is read between turns of the loop."""
 STEP_S: Final = 0.1
-"""Maximum interval between two readings that counts; beyond it, the service itself was suspended."""
+"""Maximum interval between two readings that counts; after a longer one, the service itself was suspended."""
 HANG_S: Final = 5.0
 """Time without a turn after which the loop counts as hung or dead, and real time passes."""
 SHORTEST_WAIT_S: Final = 0.001
