@@ -1,4 +1,4 @@
-"""Measurements of one control cycle, and waiting for power in it."""
+"""Measurements of one control cycle, and the wait for 'operation enabled' in the cycle."""
 
 import math
 from collections.abc import Callable

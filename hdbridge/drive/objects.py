@@ -95,7 +95,7 @@ class Mode(IntEnum):
         return 1 << (self.value - 1)
 
 
-# Function codes of the predefined connection set (CiA 301); the node id is added where there is one.
+# Function codes of the predefined connection set (CiA 301), to which the node id is added for most services.
 COB_NMT: Final = 0x000
 COB_SYNC: Final = 0x080
 COB_EMCY: Final = 0x080

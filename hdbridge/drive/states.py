@@ -288,7 +288,7 @@ class PowerWalk:
         if self._reset == _RESET_HIGH:
             return Command.FAULT_RESET.word
         if self._aim is _QUICK_STOP and self._state is not _QUICK_STOP:
-            # Also if nothing is known about the drive: a quick stop does no harm in any state.
+            # Sent even if the drive's state is unknown: a quick stop does no harm in any state.
             return Command.QUICK_STOP.word
         return _WORDS[self._state][self._aim]
 
