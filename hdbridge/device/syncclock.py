@@ -23,11 +23,11 @@ class SyncClock:
         self.period_s = period_s
         self.time_s = self._received_s = -float("inf")
         self._interval_s = self.jitter_s = 0.0
-        """Mean deviation of a SYNC from its time without jitter, over the last 20 or so."""
+        """Mean absolute deviation of SYNC from its filtered time, over about the last 20 SYNCs."""
         self._count = self._agreeing = 0
 
     def take(self, now_s: float) -> None:
-        """Takes a received SYNC; ``time_s`` is then its time without jitter."""
+        """Takes a received SYNC; ``time_s`` is then its filtered time, without jitter."""
         before_s, self._interval_s = self._interval_s, now_s - self._received_s
         self._received_s = now_s
         interval_s = self._interval_s
