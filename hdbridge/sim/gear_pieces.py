@@ -162,7 +162,7 @@ class Creep:
 
 @state
 class Jumps:
-    """Jumped teeth, each over its duration."""
+    """Tooth jumps, each spread over its duration."""
 
     by_motor_only: ClassVar[bool] = False
     _dt: float
