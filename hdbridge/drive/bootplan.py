@@ -17,7 +17,7 @@ from hdbridge.errors import InputError
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """Object that is left to the drive, with the reason and the consequence."""
+    """Object that the boot-up does not write, so that the drive keeps its own value."""
 
     index: int
     sub: int

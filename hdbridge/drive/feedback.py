@@ -20,7 +20,7 @@ class Feedback(NamedTuple):
     load_counts: int
     demand_counts: int
     torque_permille: float
-    """NaN if the drive does not send it (6077h)."""
+    """Torque in per mille of the rated torque (6077h); NaN if the drive does not send it."""
     fresh: bool
     """False if a TPDO was missing or implausible; the values are then the last good values."""
     readings: tuple[float | None, ...]

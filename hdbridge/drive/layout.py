@@ -73,7 +73,7 @@ class _Offer(NamedTuple):
 
     number: int
     capacity: int
-    """Number of objects that it can map."""
+    """Number of objects that the PDO can map."""
     fixed: tuple[PdoEntry, ...] | None
     """Entries of a read-only mapping; None if the mapping can be written."""
     can_id: int | None

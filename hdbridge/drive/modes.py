@@ -26,9 +26,9 @@ CHANGE_AT_ONCE: Final = 0x0020
 START_HOMING: Final = 0x0010
 TARGET_REACHED: Final = 0x0400
 ACKNOWLEDGED: Final = 0x1000
-"""PP: set-point acknowledged; HM: homing attained."""
+"""Bit 12 of the statusword. PP: set-point acknowledged; HM: homing attained."""
 FAILED: Final = 0x2000
-"""PP: following error; HM: homing error."""
+"""Bit 13 of the statusword. PP: following error; HM: homing error."""
 HOMED: Final = ACKNOWLEDGED | TARGET_REACHED
 STALE_READINGS: Final = 50
 """Number of statusword readings, at least `POLL_S` apart, after which a drive has cleared the bits of an

@@ -14,7 +14,7 @@ from hdbridge.drive.layout import cyclic_mode
 from hdbridge.drive.objects import Address
 
 Readings = Mapping[Address, int]
-"""Values read from the drive, without the objects that it lacks."""
+"""Values read from the drive, by address; objects that the drive lacks are missing."""
 
 IDENTITY: Final[tuple[tuple[Address, str], ...]] = (
     (objects.VENDOR_ID, "vendor_id"),

@@ -32,17 +32,17 @@ class IntegerType(Enum):
 
     @property
     def signed(self) -> bool:
-        """True if the type has a sign."""
+        """True for a signed type."""
         return not self.value.startswith("u")
 
     @property
     def minimum(self) -> int:
-        """Smallest value."""
+        """Smallest value of the type."""
         return -(1 << (self.bits - 1)) if self.signed else 0
 
     @property
     def maximum(self) -> int:
-        """Largest value."""
+        """Largest value of the type."""
         return (1 << (self.bits - self.signed)) - 1
 
     def encode(self, value: int) -> bytes:
@@ -171,7 +171,7 @@ CYCLE_EXPONENT: Final = Address(0x60C2, 2, _I8, "interpolation time index")
 SUPPORTED_MODES: Final = Address(0x6502, 0, _U32, "supported drive modes")
 
 ADDITIONAL_POSITIONS: Final = 0x60E4
-"""Array of additional encoders; the sub-index is the encoder's number."""
+"""Index of the array of additional encoder positions; the sub-index is the encoder's number."""
 
 
 def additional_resolution(sub: int) -> tuple[Address, Address]:

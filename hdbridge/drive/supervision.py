@@ -114,7 +114,7 @@ EXPLAINED_HINT: Final = f"remove that cause, then reset the fault: {RESET}"
 
 
 class Event(NamedTuple):
-    """Occurrence of a fault."""
+    """Occurrence of a fault, with the reaction to it."""
 
     cycle: int
     fault: Fault
@@ -139,7 +139,7 @@ class Supervision:
         self._runs: dict[Fault, int] = {}
         self._frozen = False
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
-        """Newest events, oldest first."""
+        """Newest `EVENTS_KEPT` events, oldest first."""
         self.noted = 0
         """Number of all events, including those dropped."""
         self.counts: dict[Fault, int] = dict.fromkeys(Fault, 0)

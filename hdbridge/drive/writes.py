@@ -35,7 +35,7 @@ _LARGEST_MANTISSA: Final = 255
 
 @dataclass(frozen=True, slots=True)
 class PlannedWrite:
-    """Required value of one object."""
+    """One write of the boot-up: the required value of one object."""
 
     node_id: int
     index: int
