@@ -253,11 +253,11 @@ class Dictionary:
         self._indices = {entry.index for entry in self}
 
     def __getitem__(self, key: tuple[int, int]) -> Entry:
-        """Returns an entry to the firmware, hidden or not."""
+        """Returns an entry for the firmware, even if it is hidden."""
         return self._entries[key]
 
     def open(self, index: int, sub: int) -> Entry:
-        """Returns an entry to the bus; refuses missing and hidden entries."""
+        """Returns an entry for the bus; refuses missing and hidden entries."""
         entry = self._entries.get((index, sub))
         if entry is None or entry.hidden:
             code = Abort.NO_SUBINDEX if index in self._indices else Abort.NO_OBJECT

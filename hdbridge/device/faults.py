@@ -40,9 +40,9 @@ class Faults:
     muted_ids: frozenset[int] = frozenset()
     """Identifiers of frames that are not sent, for example those of one TPDO or of the SDO answers."""
     load_jump_counts: int = 0
-    """Added to the load encoder from the next sample on."""
+    """Counts added to the load encoder from the next sample on."""
     motor_jump_counts: int = 0
-    """Added to the motor encoder from the next sample on; the servo loops act on it."""
+    """Counts added to the motor encoder from the next sample on; the servo loops act on them."""
     load_reading: Callable[[int], int] | None = None
     """Maps the counts of the load encoder to its reading from the next sample on: drift, freeze, noise."""
     ignore_lost_heartbeat: bool = False

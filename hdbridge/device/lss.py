@@ -13,7 +13,7 @@ ANSWER: Final = 0x7E4
 UNCONFIGURED: Final = 255
 """Node id of an unconfigured node, which answers only to LSS."""
 BIT_RATES_BPS: Final = (1_000_000, 800_000, 500_000, 250_000, 125_000, 100_000, 50_000, 20_000, 10_000)
-"""Bit rates of table 0, by index."""
+"""Bit rates of the standard bit timing table (table 0 of CiA 305), by index."""
 _NUMBER: Final = struct.Struct("<BI3x")
 _FAST_SCAN: Final = struct.Struct("<BIBBB")
 _RESTART_SCAN: Final = 0x80

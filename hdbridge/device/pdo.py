@@ -150,7 +150,7 @@ class Pdo:
 
 
 class TransmitPdo(Pdo):
-    """Transmit PDO."""
+    """Transmit PDO: packs the mapped values and decides when they are sent."""
 
     def __init__(self, dictionary: Dictionary, number: int, changed: Callable[[], None]) -> None:
         self.pack: Callable[[], bytes] = bytes
