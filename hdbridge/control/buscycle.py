@@ -87,9 +87,9 @@ class BusCycle:
         self.on_frame: Callable[[Frame], None] | None = None
         self.outgoing: Callable[[], tuple[int, bytes] | None] | None = None
         self.axes: tuple[AxisCycle, ...] = ()
-        """Axes in the order of their replies."""
+        """Axes, in the order in which they are judged and their RPDOs are sent."""
         self.histogram = Histogram()
-        """Lateness of the start of each period."""
+        """Histogram of the lateness with which the periods started."""
         self.overruns = 0
         """Number of cycles skipped because they began too late."""
         self.skipped = 0

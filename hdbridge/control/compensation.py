@@ -127,7 +127,7 @@ class Inverse:
         self.memory_deg = self._tracker.memory_deg
         """Motor travel in one direction after which the state no longer depends on the start."""
         self._forward: bool | None = None
-        """Direction of the last motion."""
+        """True if the last motion was forward; None before the first motion."""
         self._known = not self.memory_deg
         """True if an earlier run in one direction was longer than the memory."""
         self._turns = deque([0.0], _TURNS)
@@ -135,7 +135,7 @@ class Inverse:
 
     @property
     def error_arcsec(self) -> float:
-        """Model's error at the last motor target."""
+        """Model's error at the last motor target, arcsec at the load."""
         return self._error + self._offset
 
     @property
@@ -317,11 +317,11 @@ class Compensation:
         self._inverse = Inverse(model)
         self._ratio = model.ratio
         self.maximum_arcsec = limits.maximum_arcsec
-        """Cap on the correction."""
+        """Cap on the correction, arcsec at the load."""
         self.step_arcsec = limits.slew_arcsec_s * period_s
-        """Maximum change of the correction in one cycle."""
+        """Maximum change of the correction in one cycle, arcsec at the load."""
         self.ramp_step = period_s / limits.ramp_s if limits.ramp_s > 0.0 else 1.0
-        """Change of a weight in one cycle."""
+        """Maximum change of a weight in one cycle."""
         self.weight = 0.0
         """Weight of the ramp: 0 off, 1 fully on."""
         self._target = 0.0
@@ -339,7 +339,7 @@ class Compensation:
         self._known = LOSABLE
         self._fading = False
         self.needs = self._inverse.needs
-        """Channels required in a `Moment`, which may be omitted if this is empty."""
+        """Channels required in a `Moment`; if empty, the moment may be omitted."""
         self.limited = 0
         """Number of cycles in which a cap or the slew limit acted."""
 

@@ -49,7 +49,7 @@ class Histogram:
         self.total = 0
         """Number of recorded values."""
         self.maximum_us = 0
-        """Exact maximum."""
+        """Exact maximum of the lateness, us."""
 
     def record(self, late_s: float) -> None:
         """Counts one lateness in seconds; an early wake-up counts as zero."""
@@ -170,7 +170,7 @@ class LatencyReport:
 
     @property
     def verdict(self) -> str:
-        """Result in one line."""
+        """Shortest cycle that the computer sustains, as a sentence with the rule."""
         if self.carried_s is None:
             return (
                 f"this computer sustains none of these cycle times ({RULE}); "

@@ -51,7 +51,7 @@ _AGREEMENT: Final = 1.0 / 3.0
 _MODEL_ERROR: Final = 0.25
 """Possible relative error of a model's hysteresis."""
 _PLACES: Final = 24
-"""Positions at which the width of a hysteresis loop is evaluated."""
+"""Number of intervals between the positions at which the width of a hysteresis loop is evaluated."""
 _BOTH: Final = frozenset({-1, 1})
 
 
