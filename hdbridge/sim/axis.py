@@ -19,9 +19,9 @@ class Measured(NamedTuple):
     """Measurements at the end of a cycle."""
 
     motor_reading: float
-    """Motor encoder in counts, before rounding."""
+    """Reading of the motor encoder in counts, before rounding."""
     load_reading: float
-    """Load encoder in counts, before rounding; includes noise."""
+    """Reading of the load encoder in counts, before rounding; includes noise."""
     torque_nm: float
     """Motor torque, not rounded, in the direction of the motor encoder."""
     torque_permille: int
@@ -33,9 +33,12 @@ class Measured(NamedTuple):
     that the truth file states. Friction of the gear's bearings and the load's inertia are not included.
     """
     motor_counts: int
-    """Motor encoder in whole counts, multi-turn, never wrapped; a count means the angle at its middle."""
+    """Reading of the motor encoder in whole counts, multi-turn, never wrapped.
+
+    A count represents the angle at its middle.
+    """
     load_counts: int
-    """Load encoder in whole counts, multi-turn, never wrapped."""
+    """Reading of the load encoder in whole counts, multi-turn, never wrapped."""
     velocity_counts_s: float
     """Motor speed as measured by the drive."""
     elapsed_s: float

@@ -315,9 +315,9 @@ def _fill_union(record: Any, protocol: Any, value: Any) -> None:
 
 
 _CLASSES: Final[dict[Any, type]] = {}
-"""Class of each record type of numba."""
+"""State class of each numba record type."""
 _UNIONS: Final[dict[Any, Any]] = {}
-"""Protocol of each record type of numba that may be one of several classes."""
+"""Protocol of each numba record type that can hold an object of one of several classes."""
 
 
 @cache

@@ -15,7 +15,7 @@ from hdbridge.sim.truth.encoder import TrueDisc
 
 @state
 class Loops:
-    """Servo axis, substep by substep."""
+    """Servo loops and mechanics of the axis, run substep by substep."""
 
     servo: Servo
     plant: Plant

@@ -44,7 +44,7 @@ class MovingAverage:
         self._late_integral.begin(0.0)
 
     def mean_deg(self) -> float:
-        """Returns the present mean."""
+        """Returns the present mean of the demand."""
         return self._start_deg + (self._integral - self._late_integral.deg) / self._duration_s
 
     def add_up(self, demand_deg: float, duration_s: float) -> None:
@@ -80,7 +80,7 @@ class Notch:
         self._second = (self._b2 - self._a2) * torque_nm
 
     def notched_nm(self, torque_nm: float) -> float:
-        """Filters one sample."""
+        """Filters one sample of the torque."""
         notched = self._b0 * torque_nm + self._first
         self._first = self._a1 * (torque_nm - notched) + self._second
         self._second = self._b2 * torque_nm - self._a2 * notched

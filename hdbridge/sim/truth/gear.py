@@ -112,7 +112,7 @@ class TrueSeat(Strict):
 
 
 class TrueGear(Strict):
-    """Harmonic gear: its output, beyond motor angle / ratio."""
+    """Harmonic gear: ratio, elasticity, and the causes of transmission error."""
 
     ratio: float = Field(ge=1, le=1_000, description="motor turns per load turn")
     stiffness_nm_per_rad: float = Field(gt=0, le=1e9, description="flexspline's spring to the load")

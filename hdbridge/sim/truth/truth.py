@@ -53,7 +53,7 @@ class TrueTemperature(Strict):
 
     @property
     def unchanged_c(self) -> float:
-        """Temperature at which no parameter has changed."""
+        """Reference temperature, at which all parameters have the values of the truth file."""
         return self.ambient_c if self.reference_c is None else self.reference_c
 
 
