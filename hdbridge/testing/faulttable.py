@@ -86,7 +86,7 @@ class Needs(Enum):
 
 @dataclass(frozen=True)
 class Row:
-    """One fault."""
+    """One fault that a test can cause by name."""
 
     name: str
     what: str

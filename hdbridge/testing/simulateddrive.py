@@ -96,7 +96,7 @@ class SimulatedDrive:
 
     @property
     def truth(self) -> TrueState:
-        """Present true angles."""
+        """Present true angles of motor and load."""
         with self._node.lock:
             return self._node.true_state()
 
