@@ -31,8 +31,8 @@ _ENABLED: Final = State.OPERATION_ENABLED
 _ENABLE_OPERATION: Final = Command.ENABLE_OPERATION.word
 HALT_BIT: Final = 0x0100
 HEARTBEATS_PER_TIMEOUT: Final = 2
-"""Number of heartbeats that the master sends within the drive's time-out, and of heartbeat periods that it
-waits for the drive."""
+"""Number of heartbeats that the master sends within the drive's time-out; also the master's time-out for the
+drive, in periods of the drive's heartbeat."""
 
 
 def drive_heartbeat_ms(axis: AxisConfig, od: ObjectDictionary | None = None) -> int:

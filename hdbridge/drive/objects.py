@@ -192,7 +192,7 @@ class CyclicMode(NamedTuple):
     mode: Mode
     target: Address
     enabling: int
-    """Controlword bits set only in 'operation enabled', without which the drive holds its position."""
+    """Controlword bits set only in 'operation enabled'; without them the drive holds its position."""
 
 
 CYCLIC: Final = {
