@@ -10,7 +10,7 @@ _ASTRAY: Final = 0.5
 """Deviation above which tracking restarts at the present SYNC; periods."""
 _ANOTHER: Final = 0.1
 _AGREEING: Final = 3
-"""Number of successive intervals, equal within `_ANOTHER`, that replace a different period."""
+"""Number of successive intervals, equal within `_ANOTHER`, after which they replace a different period."""
 
 
 class SyncClock:
