@@ -263,7 +263,7 @@ class LoadLoop:
             self._noise += noise_share * (max(abs(deviation) - abs(moved), 0.0) - self._noise)
 
     def _explained(self) -> float:
-        """Returns the difference of the encoders at rest that is explicable without motion of the load."""
+        """Returns the largest encoder difference at rest that counts and noise can explain."""
         return self._counts + _SIGMAS * _SIGMA_OF_MEAN_DEVIATION * self._noise
 
     # ---------------------------------------------------------------- doubt about the encoder
