@@ -186,7 +186,7 @@ class LoadedPlant(Plant):
         self._turn_encoder(load, new_load)
 
     def _outer_nm(self, load_deg: float, load_speed: float) -> float:
-        """Returns the torque on the load from outside, gravity, viscous drag, sliders and vibration, Nm."""
+        """Returns the torque on the load without the spring: external, gravity, drag, sliders, vibration."""
         outer = self.outer_nm
         if self._arm_nm:
             outer += self.weight_nm(load_deg)

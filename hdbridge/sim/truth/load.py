@@ -27,7 +27,7 @@ class TrueStribeck(Strict):
 
 
 class TrueThinning(Strict):
-    """Grease that thins when sheared: viscous friction / (1 + speed / its speed)^exponent."""
+    """Grease that thins when sheared: viscous friction / (1 + speed / ``speed_rad_s``)^exponent."""
 
     speed_rad_s: float = Field(gt=0, le=1_000, description="load speed at which it sets in")
     exponent: float = Field(0.5, gt=0, le=1, description="how much; 1 ends at a constant torque")
