@@ -25,7 +25,7 @@ _Function = Callable[[NodeTester, list[int]], None]
 
 
 def _ask(t: NodeTester, command: int, *values: int, number: int | None = None) -> bytes | None:
-    """Sends a request with bytes, or with a number of 32 bits first; returns the answer, None without one."""
+    """Sends a request, with a 32-bit number before the bytes if given; returns the answer or None."""
     data = bytes(values) if number is None else struct.pack("<I", number) + bytes(values)
     since = t.mark()
     t.send(_REQUEST, (bytes((command,)) + data).ljust(8, b"\0"))
@@ -68,13 +68,15 @@ def _check(name: str, text: str, *, stores: bool = False) -> Callable[[_Function
 
 
 def _numbered(t: NodeTester, identity: list[int], node_id: int) -> None:
-    """Sets the node id after the next reset of the communication."""
+    """Sets the node id that becomes valid at the next reset of the communication."""
     _select(t, identity)
     _answered(t, _ask(t, 0x11, node_id), 0x11, 0)
 
 
 def _back(t: NodeTester, identity: list[int], now: int) -> None:
-    """Restores the node's own node id, by frames alone, which the end of the run does not suppress."""
+    """Restores the node's own node id; sends all requests before it waits, so that the user's stop cannot
+    prevent them.
+    """
     requests = [struct.pack("<BI3x", 0x40 + part, number) for part, number in enumerate(identity)]
     since = len(t.log)
     for request in (_WAITING, *requests, bytes((0x11, t.node_id)).ljust(8, b"\0"), _WAITING):

@@ -50,7 +50,7 @@ def _position(t: NodeTester) -> int:
 
 
 def _stands(t: NodeTester, duration_s: float = 0.1, within: float = 0.1) -> None:
-    """Fails if the axis moves by more than a share of the test distance."""
+    """Fails if the axis moves by more than the fraction ``within`` of the test distance."""
     start, end_s = _position(t), t.now + duration_s
     while t.now < end_s:
         t.wait(0.01)
@@ -59,7 +59,7 @@ def _stands(t: NodeTester, duration_s: float = 0.1, within: float = 0.1) -> None
 
 
 def _moved_at_most(t: NodeTester, before: int, most: float, now: int | None = None) -> None:
-    """Fails if the axis is further from ``before`` than ``most``; ``now``: position, by default read."""
+    """Fails if the axis is further than ``most`` from ``before``; ``now`` is its position, if known."""
     moved = abs((_position(t) if now is None else now) - before)
     t.true(moved <= most, f"the axis moved by {moved}", "standstill")
 
@@ -194,7 +194,7 @@ def _(t: NodeTester) -> None:
     t.control(0x00)
     t.control(0x80)
     t.reaches(SWITCH_ON_DISABLED)
-    # Bit 7 is high before the next fault comes, through the last controlword that enables: there is no edge.
+    # The last controlword before the second fault already sets bit 7, so no rising edge follows the fault.
     t.control(0x06)
     t.reaches(READY_TO_SWITCH_ON)
     t.control(0x0F)
@@ -353,7 +353,7 @@ for _code in (0, 1, 2):
 
 
 def _select_slowly(t: NodeTester) -> None:
-    """Selects profile position at one test distance in 0.2 s."""
+    """Selects profile position mode, at a velocity of at most one test distance in 0.2 s."""
     t.disable()
     _select(t, 1)
     t.require(0x6081)
@@ -366,7 +366,7 @@ def _enable_slowly(t: NodeTester) -> None:
 
 
 def _direction(t: NodeTester, distances: int) -> int:
-    """Returns 1 or -1, the direction in which the software limits leave space."""
+    """Returns 1 or -1, the direction in which the software limits leave room for this many distances."""
     if not t.has(0x607D, 1):
         return 1
     low, high = (t.read(0x607D, sub, signed=True) for sub in (1, 2))
@@ -398,7 +398,7 @@ def _window(t: NodeTester) -> float:
 
 
 def _arrives(t: NodeTester, target: int, timeout_s: float = 10.0) -> None:
-    """Waits for target reached, when the axis must be at the target."""
+    """Waits until the drive reports target reached and the axis is at the target; fails on time-out."""
     end_s = t.now + timeout_s
     while not t.read(0x6041) & _REACHED or abs(_position(t) - target) > _window(t):
         if t.now > end_s:

@@ -339,7 +339,7 @@ def _(t: NodeTester) -> None:
 
 
 def lose_heartbeat(t: NodeTester) -> None:
-    """Makes the node lose the tester's heartbeat."""
+    """Makes the node lose the tester's heartbeat; fails unless it sends EMCY 8130h."""
     _watch(t)
     _beat(t)
     since = t.mark()

@@ -235,7 +235,7 @@ def _wrong_length(t: NodeTester) -> bytes:
 
 
 def _refuses_entry(t: NodeTester, mapping: int, word: bytes, codes: tuple[int, ...]) -> None:
-    """Fails unless the node refuses a mapping entry, itself or when sub-index 0 activates it."""
+    """Fails unless the node refuses a mapping entry, either at once or when sub-index 0 activates it."""
     answer = t.answer(expedited(mapping, 1, word))
     if answer[0] == 0x80:
         code = int.from_bytes(answer[4:], "little")
@@ -427,7 +427,10 @@ def _(t: NodeTester) -> None:
 
 
 class _Reception:
-    """Scratch object mapped to RPDO 1 behind ``ahead``; ``value`` differs from the value ``before``."""
+    """Scratch object mapped to RPDO 1 after the objects ``ahead``.
+
+    ``before`` is its original value, ``value`` a different one to be sent.
+    """
 
     def __init__(
         self,
@@ -458,14 +461,14 @@ class _Reception:
         self._t.send(self.can_id, self.data() if data is None else data)
 
     def holds(self, value: int, when: str, found: int | None = None) -> None:
-        """Checks the object's value after the time to process a frame, or the value ``found``."""
+        """Checks ``found``, or by default the object's value after the node had time to process a frame."""
         if found is None:
             self._t.wait(0.02)
             found = self.read()
         self._t.equal(found, value, f"{self.index:04X}h:{self.sub:02X} {when}")
 
     def after(self, data: bytes) -> int:
-        """Returns the object's value after an RPDO of a wrong length; a correct one then ends the error."""
+        """Returns the object's value after an RPDO of wrong length, then ends the error by a correct RPDO."""
         self.send(data)
         self._t.wait(0.02)
         found = self.read()

@@ -196,7 +196,7 @@ def _(t: NodeTester) -> None:
 
 
 def _is_served(t: NodeTester) -> None:
-    """Fails unless a request is answered, at the second attempt if the first ends the transfer before it."""
+    """Fails unless a request is answered; repeats it if the first one only ends the old transfer."""
     answer = t.ask(upload_request(0x1000))
     if answer is None or answer[0] == 0x80:
         answer = t.answer(upload_request(0x1000))
@@ -305,7 +305,7 @@ def _(t: NodeTester) -> None:
 
 
 def _downloads(t: NodeTester, request: Callable[[int, int, bytes], list[bytes]]) -> None:
-    """Writes another value by these requests and compares it; restores the old value."""
+    """Writes a different value with these requests and reads it back; restores the old value."""
     index, sub, size = _number(t)
     before = t.upload(index, sub)
     value = ((int.from_bytes(before, "little") + 100) & 0x7FFF).to_bytes(size, "little")
@@ -417,7 +417,7 @@ def _block_upload(t: NodeTester, size: int = 127) -> tuple[bytes, bytes]:
 
 
 def _segments(t: NodeTester, request: bytes) -> list[bytes]:
-    """Returns the segments of a block that the request starts."""
+    """Sends the request that starts a block; returns the segments of the block."""
     since = t.mark()
     t.send(0x600 + t.node_id, request)
     t.wait(0.05)

@@ -1,4 +1,4 @@
-"""Suite: all checks in order, and the run."""
+"""Collects all checks in order, and runs them."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress

@@ -216,13 +216,13 @@ class NodeTester:
         return len(self.log)
 
     def wait(self, duration_s: float) -> None:
-        """Receives frames for this time."""
+        """Receives frames for this duration."""
         end_s = self.now + duration_s
         while self._received(end_s):
             pass
 
     def _received(self, end_s: float) -> bool:
-        """Receives a frame, or waits a little; returns False at the end of the time."""
+        """Receives a frame, or waits a little; returns False once ``end_s`` has passed without a frame."""
         if self._stopped():
             raise StoppedError("the run was ended before its last check")
         frame = self.link.recv(min(end_s, self.now + 0.25))
@@ -449,11 +449,11 @@ class NodeTester:
         return int.from_bytes(self.upload(index, sub), "little", signed=signed)
 
     def put(self, index: int, sub: int, value: int, size: int) -> None:
-        """Downloads an integer of ``size`` bytes permanently."""
+        """Downloads an integer of ``size`` bytes, which is not undone at the end of the check."""
         self.download(index, sub, pack(value, size))
 
     def write(self, index: int, sub: int, value: int, size: int) -> None:
-        """Downloads an integer; the value before is restored at the end of the check."""
+        """Downloads an integer; the previous value is restored at the end of the check."""
         before = self.upload(index, sub)
         self.put(index, sub, value, size)
         self._undo.append((index, sub, before))
@@ -515,7 +515,7 @@ class NodeTester:
         raise NotApplicableError("no object is known that can be written, read and mapped without effect")
 
     def other_value(self, index: int, sub: int, bits: int) -> int:
-        """Returns a value next to the present one."""
+        """Returns a value that differs from the present one by 1."""
         now = int.from_bytes(self.upload(index, sub), "little")
         return now - 1 if now > 1 else now + 1
 
@@ -526,7 +526,7 @@ class NodeTester:
         self.need(self.read(0x1000) & 0xFFFF == 402, "the device profile (1000h) is not CiA 402")
 
     def control(self, word: int) -> None:
-        """Writes the controlword by SDO. Without permission to move, bit 0 stays off or alone is harmless."""
+        """Writes the controlword by SDO; refuses to switch power on without permission to move."""
         if word & 0x07 == 0x07 and not word & 0x80:
             if not self.may_power:
                 raise AssertionError("a check without permission to move must not switch power on")
@@ -563,7 +563,7 @@ class NodeTester:
             self.wait(0.01)
 
     def disable(self) -> None:
-        """Leads to SWITCH ON DISABLED, resetting a fault if necessary."""
+        """Brings the drive to SWITCH ON DISABLED, resetting a fault if necessary."""
         self.control(0x00)
         deadline_s = self.now + self.timing.power_s
         while (state := self.power_state()) != SWITCH_ON_DISABLED:
@@ -621,7 +621,7 @@ class NodeTester:
         )
 
     def abandon(self) -> None:
-        """Ends an interrupted check: quick stop, power off, and undoing of its changes."""
+        """Ends an interrupted check: quick stop, power off, and reversal of the check's changes."""
         self._stopped = lambda: False
         if self.powered:
             self.send(0x600 + self.node_id, abort())

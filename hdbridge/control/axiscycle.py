@@ -5,7 +5,7 @@ next RPDOs; it neither waits nor sends. An axis is
 
 * *silent*: it receives no RPDO. TPDOs are accepted when they arrive, and nothing is judged as a fault. This
   is the state before `AxisCycle.begin`, after `AxisCycle.silence`, and after a reaction of `Reaction.LATCH`.
-* *speaking*: it receives an RPDO in every period, its TPDOs are awaited, and everything is judged.
+* *speaking*: it receives an RPDO in every period, its TPDOs are awaited, and every fault is judged.
 * *stopped*: speaking, with a latched quick stop. The quick stop is sent until the motor stands still, while
   the other axes continue. After that, or after its time-out, its TPDOs are no longer awaited.
 """
@@ -32,7 +32,7 @@ Target = int | None
 Command = Target | Callable[[Feedback], Target]
 
 STILL_CYCLES: Final = 3
-"""Cycles without motion after which the motor counts as standing still after a quick stop."""
+"""Number of cycles without motion after which a quick stop counts as completed."""
 _ENABLED: Final = State.OPERATION_ENABLED
 _POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 _STILL_DRIVEN: Final = (State.OPERATION_ENABLED, State.FAULT_REACTION_ACTIVE, State.UNKNOWN)
@@ -42,9 +42,9 @@ class AxisCycle:
     """One axis on a `BusCycle`; silent until `begin`.
 
     ``image`` provides the controlword (``image.power.go``) and the scaling; ``supervision`` holds the latch
-    and the list of faults; ``monitor`` may be shared with the boot-up. Errors of a command that are in
-    ``refused`` stop this axis, like a bad target; all others propagate through the whole cycle and affect the
-    other axes.
+    and the list of faults; ``monitor`` may be shared with the boot-up. An exception of a command whose type
+    is in ``refused`` stops only this axis, like a bad target; any other exception propagates out of the cycle
+    and affects all axes.
     """
 
     __slots__ = (
@@ -79,23 +79,23 @@ class AxisCycle:
             -1, 0.0, image.statusword or 0, image.motor_counts, image.load_counts, image.demand_counts,
             image.torque_permille, False, image.readings,
         )  # fmt: skip
-        """Feedback of the last turn; stale if the turn had none."""
+        """Feedback of the last cycle; stale if the cycle had none."""
         self.patience_s = drives_patience_s(axis)
         """Time without a frame of the master after which the drive stops on its own."""
         self.spoke_s = 0.0
-        """Clock time at the start of the last turn that sent an RPDO to this axis."""
+        """Clock time at the start of the last cycle that sent an RPDO to this axis."""
 
-        # Between the bus and its axes:
+        # Shared with `BusCycle`:
         self.pending: list[tuple[Fault, str]] = []
-        """Faults of this turn that have not been judged yet."""
+        """Faults of this cycle that have not been judged yet."""
         self.needed = 0
         """Bits of the TPDOs required for fresh feedback."""
         self.awaited = False
-        """True if the turn waits for its TPDOs."""
+        """True if the cycle waits for this axis's TPDOs."""
         self.rested = True
-        """True until the first turn; frames queued before it do not count."""
+        """True from `begin` until the next cycle has read the queued frames, which are not judged."""
         self.changed: Callable[[], None] = _nobody
-        """Called when the axis changes its identifiers or state; the change takes effect with the next turn.
+        """Called when the identifiers or the state of the axis change, which takes effect in the next cycle.
         """
 
         self._traffic = Traffic(image, self.monitor, 0.0)
@@ -112,7 +112,7 @@ class AxisCycle:
         self._stop_cycles = max(int(stop_timeout_s / axis.drive.cycle_s), STILL_CYCLES + 1)
 
     def begin(self) -> None:
-        """Sends RPDOs from the next turn on; earlier frames and encoder motion are not supervised.
+        """Sends RPDOs from the next cycle on; earlier frames and encoder motion are not supervised.
 
         After a `Reaction.LATCH`, the axis stays silent unless the latch has been released.
         """
@@ -125,7 +125,7 @@ class AxisCycle:
         self.changed()
 
     def silence(self) -> None:
-        """Stops sending to and judging the axis, from the next turn on."""
+        """Stops sending RPDOs and judging faults, from the next cycle on."""
         self.silent = True
         self.pending.clear()
         self._commanded = False
@@ -170,16 +170,16 @@ class AxisCycle:
         return self._traffic.identifiers | self._channel_ids
 
     def route(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Returns the identifiers of the TPDOs that each turn needs, and of the channel TPDOs.
+        """Returns the identifiers of the TPDOs that each cycle needs, and of the channel TPDOs.
 
-        Also decides whether the following turns wait for them.
+        Also decides whether the following cycles wait for them.
         """
         self.awaited = not self.silent and (self.supervision.stop is None or self.riding)
         self._awaited_channels = self.image.awaited_channels()
         return self.image.tpdo_ids, tuple(self._awaited_channels)
 
     def start(self, now: float, count: int) -> None:
-        """Starts the first turn after `begin`; ``now`` is the clock time, ``count`` the cycle number."""
+        """Starts the first cycle after `begin`; ``now`` is the clock time, ``count`` the cycle number."""
         self._traffic.heard_s = self.spoke_s = now
         self._good_cycle = count
 
@@ -211,7 +211,7 @@ class AxisCycle:
                 self._commanded = False
 
     def hear(self, frame: Frame) -> None:
-        """Interprets an unawaited frame of the axis, and notes its faults."""
+        """Interprets a frame of the axis that the cycle does not wait for, and records its faults."""
         can_id, data, _ = frame
         if can_id not in self._channel_ids:
             faults = list(self._traffic.faults(frame, commanded=self._commanded))
@@ -225,7 +225,10 @@ class AxisCycle:
             self.pending += faults
 
     def turn(self, now: float, count: int, time_s: float, complete: bool) -> Frames | None:
-        """Judges one period, ``complete`` if all TPDOs arrived; returns the RPDOs to send, or None."""
+        """Judges one period and returns the RPDOs to send, or None.
+
+        ``complete`` states that all required TPDOs have arrived.
+        """
         image, supervision = self.image, self.supervision
         self.spoke_s = now
         stop = supervision.stop
@@ -285,12 +288,12 @@ class AxisCycle:
             self.stale(count, time_s)
 
     def also(self, count: int, fault: Fault, detail: str) -> None:
-        """Judges a fault that occurred during or after the reply of the turn."""
+        """Judges a fault that occurred while or after this cycle's RPDOs were sent."""
         if self.supervision.also(count, fault, detail) is Reaction.LATCH:
             self._latch()
 
     def bus_down(self, count: int, time_s: float, detail: str) -> None:
-        """Judges a failure of the interface during the turn."""
+        """Judges a failure of the interface during the cycle."""
         if self.pending:
             self._judge(count)
         self.also(count, Fault.BUS_DOWN, detail)
@@ -309,10 +312,10 @@ class AxisCycle:
             )  # fmt: skip
         return self.feedback
 
-    # ---------------------------------------------------------------- the parts of a turn
+    # ---------------------------------------------------------------- parts of a cycle
 
     def _react(self, count: int, data: Frames | None, before: Feedback) -> Frames | None:
-        """Completes a turn with a fault in this turn or the last."""
+        """Completes a cycle if there is a new fault, a fault in the last cycle, or a latched stop."""
         power, stop = self.image.power, self.supervision.stop
         reaction = self._judge(count)
         if reaction is Reaction.QUICK_STOP:
@@ -348,7 +351,7 @@ class AxisCycle:
                 self.changed()
 
     def _believable(self, last: Feedback, count: int) -> bool:
-        """Returns False if the positions contradict the last good positions; also notes a following error."""
+        """Returns False if the positions contradict the last good ones; also records a following error."""
         image, plausibility = self.image, self._plausibility
         motor = image.motor_counts
         cycles = count - self._good_cycle
@@ -373,10 +376,11 @@ class AxisCycle:
         try:
             return self.image.pack_rpdo_idle()
         except InputError:
-            # It does not fit the target object. The drive ignores it: it is not enabled, or is being stopped.
+            # The position does not fit the target object. The drive ignores the target in any case, because
+            # it is not enabled or is being stopped.
             return self.image.pack_rpdo_held()
 
-    # ---------------------------------------------------------------- a quick stop, turn by turn
+    # ---------------------------------------------------------------- quick stop, cycle by cycle
 
     def _over(self) -> bool:
         """Returns True if the latched quick stop is confirmed or timed out."""
@@ -391,7 +395,7 @@ class AxisCycle:
         self.changed()
 
     def _ride(self, before: Feedback) -> None:
-        """Counts one turn of the quick stop."""
+        """Counts one cycle of the quick stop."""
         if self._over():
             return
         feedback = self.feedback

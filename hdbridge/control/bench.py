@@ -128,10 +128,10 @@ def axis_view(axis: AxisConfig) -> AxisView:
 
 
 def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation:
-    """Returns the model's inverse with the caps of the axis file, at the axis's cycle.
+    """Returns the compensation for a model, with the limits and the cycle time of the axis file.
 
-    InputError if the model is bound to another gear, axis or drive, or if an effect needs a channel that the
-    control loop lacks.
+    Raises InputError if the model is bound to another gear, axis or drive, or if an effect needs a channel
+    that the control loop lacks.
     """
     model.check_bound_to(axis)
     for name, channels in unmet(compensable(model.effects), known_on_line(axis)).items():
@@ -202,14 +202,15 @@ class Bench:
         *,
         keep_s: float = math.inf,
     ) -> Run[Outcome]:
-        """Runs one procedure to its end; ``progress`` receives the completed share after each leg.
+        """Runs one procedure to its end; ``progress`` receives the completed fraction after each leg.
 
         ``keep_s`` limits the samples of a leg that holds the axis for hours. At least the last ``keep_s``
         seconds are kept, at most twice as many.
 
         Raises InputError before any motion if the procedure would leave the axis's limits or if the
-        compensation's model is bound to another gear, axis or drive. SafetyStop if the supervision stops the
-        axis, KeyboardInterrupt if interrupted; `record` then returns the samples up to the stop.
+        compensation's model is bound to another gear, axis or drive. Raises SafetyStop if the supervision
+        stops the axis, and KeyboardInterrupt if interrupted; `record` then returns the samples up to the
+        stop.
         """
         # Every motion with a model begins here: check it against the connected drive, not only the axis file.
         self._compensation.model.check_bound_to(self._drive.axis, self._drive.identity)
@@ -308,7 +309,7 @@ class Bench:
         self._compensation.engage()
 
     def _await_channels(self, feedback: Feedback) -> Feedback:
-        """Waits at standstill until every channel of the axis file has a reading; else DriveError."""
+        """Waits at standstill until every channel of the axis file has a reading; DriveError on time-out."""
         image, period_s = self._image, self.cycle.period_s
         rarest = max((each.every_cycles for each in image.axis.channels.values()), default=0)
         for _ in range(math.ceil(ENABLE_TIMEOUT_S / period_s) + 2 * rarest):

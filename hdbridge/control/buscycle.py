@@ -42,11 +42,11 @@ from hdbridge.drive.traffic import bus_faults
 from hdbridge.errors import BusError, InputError
 
 WINDOW: Final = 0.8
-"""Share of the period after SYNC within which the TPDOs must arrive; the rest is for sending the RPDOs."""
+"""Fraction of the period after SYNC within which the TPDOs must arrive; the rest is for sending the RPDOs."""
 LATE: Final = 0.5
-"""Maximum lateness of a cycle that is not skipped, as a share of the period."""
+"""Maximum lateness of a cycle that is not skipped, as a fraction of the period."""
 SPARE: Final = 0.1
-"""Share of the period before the next SYNC in which no frames of ``outgoing`` are sent."""
+"""Fraction of the period before the next SYNC in which no frames of ``outgoing`` are sent."""
 DRAIN_MAXIMUM: Final = 256
 """Maximum number of frames read before SYNC; a full bus at 1 Mbit/s delivers at most 220 in 10 ms."""
 FLUSH_MAXIMUM: Final = 10_000
@@ -60,7 +60,7 @@ class BusCycle:
     """Runs the axes of one bus over a link, one `exchange` per period.
 
     ``on_frame`` receives every frame that is not a PDO of the cycle: SDO answers, heartbeats, emergencies.
-    ``outgoing`` is called once per turn, after all frames of the cycle are sent, and returns an additional
+    ``outgoing`` is called once per cycle, after all frames of the cycle are sent, and returns an additional
     frame to send, or None. Both may be set at any time. They run within the cycle, so they must be fast and
     must not raise.
     """
@@ -87,9 +87,9 @@ class BusCycle:
         self.on_frame: Callable[[Frame], None] | None = None
         self.outgoing: Callable[[], tuple[int, bytes] | None] | None = None
         self.axes: tuple[AxisCycle, ...] = ()
-        """Axes in the order of their replies."""
+        """Axes, in the order in which they are judged and their RPDOs are sent."""
         self.histogram = Histogram()
-        """Lateness of the start of each period."""
+        """Histogram of the lateness with which the periods started."""
         self.overruns = 0
         """Number of cycles skipped because they began too late."""
         self.skipped = 0
@@ -100,17 +100,17 @@ class BusCycle:
         self.count = -1
         """Number of the last period, including skipped periods."""
         self.woke_s = clock.now()
-        """Clock time at which the last turn began."""
+        """Clock time at which the last cycle began."""
         self.due_s = self.woke_s
-        """Clock time at which the last turn was due."""
+        """Clock time at which the last cycle was due."""
         self.late_s = 0.0
-        """Lateness of the last turn."""
+        """Lateness of the start of the last cycle."""
         self.busy_s = 0.0
-        """Duration of the last turn."""
+        """Duration of the last cycle, without the wait for its start."""
         self.faults: list[tuple[Fault, str]] = []
-        """Faults of the bus itself in the last turn, which each speaking axis has judged as well."""
+        """Faults of the bus itself in the last cycle, which each speaking axis has judged as well."""
         self.down: str | None = None
-        """Failure of the interface in the last turn, in words; None without a failure."""
+        """Failure of the interface in the last cycle, in words; None without a failure."""
 
         self._window_s = WINDOW * period_s
         self._late_s = LATE * period_s
@@ -132,16 +132,16 @@ class BusCycle:
 
     @property
     def bus_load(self) -> float:
-        """Worst-case share of the period occupied by the last turn's frames; NaN if the bit rate is unknown.
+        """Worst-case fraction of the period occupied by frames in the last cycle.
 
-        An awaited frame counts even if it did not arrive.
+        NaN if the bit rate is unknown. An awaited frame counts even if it did not arrive.
         """
         return self._bits_of_turn * self._per_bit
 
     def join(self, axis: AxisCycle) -> None:
-        """Adds an axis, which stays silent until its ``begin``. Must not be called within a turn.
+        """Adds an axis, which stays silent until its ``begin``. Must not be called within a cycle.
 
-        InputError if another axis uses one of its identifiers, or if it requires another cycle time or
+        Raises InputError if another axis uses one of its identifiers, or if it requires another cycle time or
         master.
         """
         config = axis.image.axis
@@ -155,7 +155,7 @@ class BusCycle:
         self._take_axes((*self.axes, axis))
 
     def leave(self, axis: AxisCycle) -> None:
-        """Removes an axis; its frames are then treated as foreign. Must not be called within a turn."""
+        """Removes an axis; its frames are then treated as foreign. Must not be called within a cycle."""
         self._take_axes(tuple(each for each in self.axes if each is not axis))
 
     def restart(self) -> None:
@@ -222,7 +222,7 @@ class BusCycle:
             self._failed(str(error))
         self.busy_s = self.clock.now() - now
 
-    # ---------------------------------------------------------------- the parts of a turn
+    # ---------------------------------------------------------------- parts of a cycle
 
     def _wait(self) -> float:
         """Sleeps until the next deadline, skipping missed periods; returns the clock time."""
@@ -276,7 +276,7 @@ class BusCycle:
                         send(*frame)
 
     def _note_hang(self, axis: AxisCycle, silence_s: float) -> None:
-        """Notes that this process was silent beyond the time-out of a powered drive."""
+        """Records that this process was silent beyond the time-out of a powered drive."""
         hang = (Fault.HANG, f"{1e3 * silence_s:.0f} ms; the drive waits {1e3 * axis.patience_s:.0f} ms")
         axis.pending.insert(0, hang)
         if all(fault is not Fault.HANG for fault, _ in self.faults):
@@ -364,7 +364,7 @@ class BusCycle:
         return got
 
     def _note_missing(self, got: int, spoilt: dict[int, int]) -> None:
-        """Notes missing TPDOs and TPDOs of wrong length as faults of the axis that awaits them."""
+        """Records missing TPDOs and TPDOs of wrong length as faults of the axis that awaits them."""
         for can_id, length in spoilt.items():
             bit, _, axis = self._slots[can_id]
             if axis.awaited:
@@ -384,7 +384,7 @@ class BusCycle:
                     axis.pending.append((Fault.LOST_TPDO, ", ".join(lost)))
 
     def _other(self, frame: Frame) -> None:
-        """Passes an unawaited frame to its axis and to ``on_frame``, and notes bus faults."""
+        """Passes a frame that is not awaited to its axis and to ``on_frame``, and records bus faults."""
         self._bits_of_turn += FRAME_BITS[len(frame.data)]
         axis = self._listeners.get(frame.can_id)
         if axis is not None:
@@ -423,14 +423,14 @@ class BusCycle:
     # ---------------------------------------------------------------- faults of the bus
 
     def _everybody(self, fault: Fault, detail: str) -> None:
-        """Notes a bus fault for every axis, before the axes react."""
+        """Records a bus fault for every axis, before the axes react."""
         self.faults.append((fault, detail))
         for axis in self._speaking:
             if not axis.rested:
                 axis.pending.append((fault, detail))
 
     def _no_room(self, detail: str) -> None:
-        """Notes an unsent frame of the cycle; axes that already have their reply stop with the next turn."""
+        """Records an unsent frame of the cycle; axes already served in this cycle stop in the next."""
         self.faults.append((Fault.TRANSMIT_FULL, detail))
         for axis in self._speaking:
             if axis.feedback.cycle == self.count:
@@ -447,7 +447,7 @@ class BusCycle:
         for axis in self._listening:
             axis.stale(self.count, time_s)
 
-    # ---------------------------------------------------------------- who is on the bus
+    # ---------------------------------------------------------------- axes on the bus
 
     def _take_axes(self, axes: tuple[AxisCycle, ...]) -> None:
         for axis in self.axes:
@@ -461,11 +461,11 @@ class BusCycle:
         self._changed = True
 
     def _change(self) -> None:
-        """Requests `_rebuild` at the next turn."""
+        """Requests `_rebuild` in the next cycle."""
         self._changed = True
 
     def _rebuild(self, now: float) -> None:
-        """Sorts the axes and their identifiers again, and starts those that begin."""
+        """Recomputes the routes, and starts the axes that begin."""
         self._changed = False
         self._speaking, self._listening, self._slots, self._listeners, self._awaited, self._bits = routes(
             self.axes

@@ -46,10 +46,10 @@ READERS: Final[dict[str, Any]] = {
 """Readers by file name suffix, which .gz may follow."""
 _BINARY: Final = {".blf", ".mf4"}
 FOLLOWED_SHARE: Final = 0.5
-"""Minimum share of moving samples with a changing target, for the target to count as the command of each
-cycle."""
+"""Minimum fraction of the samples in motion with a changing target, for the target to count as the command
+of each cycle."""
 _SINCE_1970_S: Final = 1e9
-"""Smallest time stamp that is absolute; smaller ones are relative."""
+"""Smallest time stamp that counts as absolute (seconds since 1970); smaller ones are relative."""
 _RESETS: Final = (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION)
 
 
@@ -62,7 +62,7 @@ def import_log(
     Samples with the drive not enabled are left out unless ``all_states``. A new part begins at a gap and when
     the drive boots. The notes state the origin of the mapping.
 
-    InputError if the log cannot be read, has no sample of the axis, or contradicts the gear's ratio.
+    Raises InputError if the log cannot be read, has no sample of the axis, or contradicts the gear's ratio.
     """
     buses: dict[str, _Bus] = {}
     heard: Counter[int] = Counter()
@@ -116,7 +116,7 @@ def messages(path: Path, cut_off: list[str]) -> Iterator[can.Message]:
         ) from None
     except InputError:
         raise
-    except Exception as problem:  # each reader of python-can raises what its parsing meets
+    except Exception as problem:  # python-can's readers raise exceptions of many types
         why = str(problem) or type(problem).__name__
         if count:
             cut_off.append(one_line(f"damaged after {count} frames: {why}"))
@@ -141,7 +141,7 @@ def _silence(axis: AxisConfig, heard: Counter[int], channel: str | None) -> str:
 
 
 class _Bus:
-    """One axis in one channel of the log."""
+    """Collects the samples of one axis from one channel of the log."""
 
     def __init__(self, axis: AxisConfig, *, all_states: bool) -> None:
         self._axis, self._od, self._all_states = axis, dictionary_of(axis), all_states
@@ -355,7 +355,7 @@ class _Bus:
             image.follow_target(self._target)
 
     def _begin(self, *, unseated: bool = False) -> None:
-        """Begins a new part, before which the path of the axis is unknown."""
+        """Begins a new part; the path of the axis between two parts is unknown."""
         self._reseated |= unseated and self._seated
         self._target, self._targets_heard = None, 0
         self._fresh.clear()
@@ -458,7 +458,7 @@ def _from_first_target(samples: list[Sample]) -> list[Sample]:
 
 
 def _is_followed(record: Record) -> bool:
-    """Returns True if the target is the command of each cycle, not the end of a move that the drive plans."""
+    """Returns True if the target is commanded in each cycle, False if it is the end of a planned move."""
     target, motor = np.diff(record.columns["motor_target_deg"]), np.diff(record.motor_position_deg)
     fast = np.abs(motor) > 0.1 * np.max(np.abs(motor), initial=0.0)
     return bool(np.mean(target[fast] != 0.0) > FOLLOWED_SHARE) if np.any(fast) else True

@@ -1,7 +1,7 @@
 """Routing of identifiers to the axes of a bus, and the check that axes can share a bus. Pure.
 
 All axes have one cycle and one master, and no identifier is used twice. The routes are computed whenever an
-axis begins, falls silent or is stopped, so a turn only looks them up.
+axis begins, falls silent or is stopped, so a cycle only looks them up.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ if TYPE_CHECKING:
 
 
 Slot = tuple[int, Callable[[bytes], None], "AxisCycle"]
-"""One TPDO of a turn: its bit among those of the turn, the function that takes its data
-(`PdoLengthError` if the length is wrong), and its axis. A plain tuple unpacks in a third of the time
-of a named one."""
+"""One TPDO of a cycle: its bit in the mask of all TPDOs, the function that takes its data (`PdoLengthError`
+if the length is wrong), and its axis. A plain tuple unpacks in a third of the time of a named one."""
 
 
 class Routes(NamedTuple):
@@ -34,7 +33,7 @@ class Routes(NamedTuple):
     listeners: dict[int, AxisCycle]
     """Axes that receive all other frames, by identifier."""
     awaited: int
-    """Bits of the TPDOs that a turn waits for."""
+    """Bits of the TPDOs that a cycle waits for."""
     bits: int
     """Maximum number of bits that SYNC, the awaited TPDOs and the RPDOs take on the wire."""
 

@@ -1,4 +1,4 @@
-"""Check that the caps of an axis file do not cut a model's correction. Pure."""
+"""Check that the limits in an axis file do not clip a model's correction. Pure."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _POINTS = 20_000
 
 
 def cap_remark(axis: AxisConfig, model: TransmissionModel) -> str | None:
-    """Returns a remark if ``compensation.maximum_arcsec`` cuts the model's correction, else None.
+    """Returns a remark if ``compensation.maximum_arcsec`` clips the model's correction, else None.
 
-    The correction is evaluated over the travel in both directions at the limits' velocity, with the measured
-    channels at their defaults.
+    The correction is evaluated over the travel in both directions at the axis's maximum velocity, with the
+    measured channels at their defaults.
     """
     limits, cap_arcsec = axis.limits, axis.compensation.maximum_arcsec
     travel_deg = axis.gear.ratio * (limits.position_max_deg - limits.position_min_deg)

@@ -3,16 +3,16 @@
 The compensated motor angle solves ``theta_M / N + w TE(theta_M) = theta_L``, where TE is the model's error
 from its present state and w the ramp's weight. Three choices matter:
 
-* It is driven by the command, never by a measured angle. Near a reversal the slope of the elastic law is
-  infinite, and one count of encoder chatter would become several arcseconds.
-* The root is bracketed. The left side rises with theta_M if the repeating part cannot fall faster than the
-  gear rises (otherwise the model is refused; play is crossed more gently), so the root is unique. A
-  plain fixed-point iteration does not converge near a reversal.
+* The model's input is the commanded angle, never a measured one. Near a reversal the slope of the elastic law
+  is infinite, and one count of encoder noise would become several arcseconds.
+* The root is bracketed. The left side rises with theta_M as long as the error cannot fall more steeply than
+  the gear rises, so the root is unique. Any other model is refused, except that the slope of backlash is
+  reduced. A plain fixed-point iteration does not converge near a reversal.
 * The model's state changes only when a command is issued (`Compensation.command`), with the angle issued,
   after caps and ramps.
 
-An effect may need a channel that can be lost (`LOSABLE`). `Compensation.know` sets the available ones; the
-part of the correction that needs a lost channel is faded out, as by `disengage`, and later back in.
+An effect may need a channel that can be lost (`LOSABLE`). `Compensation.know` sets the available channels.
+The part of the correction that needs a lost channel is faded out, as by `disengage`, and later back in.
 
 In motion the servo filters the correction. If the model has the measured response of the axis, the correction
 passes through its filter (`prefilter`). The model's state follows the unfiltered path, which is the intended
@@ -38,12 +38,12 @@ from hdbridge.units import ARCSEC_PER_DEG
 _TOLERANCE_ARCSEC = 5e-7
 _STEEPEST_FALL = 0.9
 _SAFE = 0.9
-"""Share of the steepest allowed fall up to which gentle play is used, as a margin."""
+"""Fraction of the steepest allowed fall to which the slope of backlash is reduced; the rest is a margin."""
 _NOWHERE = Moment()
 _TURNS = 32
-"""Number of reversals of the issued path that are kept for a model that takes over."""
+"""Number of reversals of the issued path that are kept, to initialise a model that takes over."""
 LOSABLE = frozenset(each for each in MEASURED if each.axis_key)
-"""Channels with sensors of their own."""
+"""Channels with their own sensors, which can be lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class CompensationLimits:
 
 
 class _Faded(Tracker):
-    """Tracker of an effect with a weight on its error; it follows the motion at any weight."""
+    """Tracker that multiplies an effect's error by a weight; it follows the motion at any weight."""
 
     __slots__ = ("_tracker", "needs", "weight")
 
@@ -87,7 +87,7 @@ class Inverse:
     def __init__(self, model: TransmissionModel, start: Start = Start.VIRGIN) -> None:
         """Omits effects that cannot or must not be compensated, such as the load encoder's errors.
 
-        InputError if the repeating part of the model is too steep for a unique inverse.
+        Raises InputError if the model's error falls too steeply for a unique inverse.
         """
         model = replace(model, effects=compensable(model.effects))
         self._slope = ARCSEC_PER_DEG / model.ratio
@@ -99,7 +99,7 @@ class Inverse:
             if sensed := each.needs() & LOSABLE:
                 trackers[place] = faded = _Faded(trackers[place], sensed)
                 self.faded.append(faded)
-        # The same at every motor angle, as wind-up is: evaluated once per cycle instead of in each solution.
+        # Effects that are the same at every motor angle, such as wind-up, are evaluated once per cycle.
         level = [isinstance(each, Level) for each in trackers]
         self._offsets = [each for each, is_level in zip(trackers, level, strict=True) if is_level]
         self._enter(_NOWHERE)
@@ -127,15 +127,15 @@ class Inverse:
         self.memory_deg = self._tracker.memory_deg
         """Motor travel in one direction after which the state no longer depends on the start."""
         self._forward: bool | None = None
-        """Direction of the last motion."""
+        """True if the last motion was forward; None before the first motion."""
         self._known = not self.memory_deg
-        """True if an earlier path in one direction was longer than the memory."""
+        """True if an earlier run in one direction was longer than the memory."""
         self._turns = deque([0.0], _TURNS)
         """Motor angles of the start and the reversals of the issued path."""
 
     @property
     def error_arcsec(self) -> float:
-        """Model's error at the last motor target."""
+        """Model's error at the last motor target, arcsec at the load."""
         return self._error + self._offset
 
     @property
@@ -145,7 +145,7 @@ class Inverse:
 
     @property
     def memory_known(self) -> bool:
-        """True if that path has run further in one direction than the model remembers."""
+        """True if the issued path has run further in one direction than the model's memory."""
         return self._known or abs(self._motor_deg - self._turns[-1]) >= self.memory_deg
 
     def error_at(self, motor_deg: float, moment: Moment = _NOWHERE) -> float:
@@ -162,12 +162,12 @@ class Inverse:
         return total
 
     def _enter(self, moment: Moment) -> None:
-        """Evaluates that part for a new cycle."""
+        """Evaluates the part that does not depend on the motor angle, for a new cycle."""
         self._moment = moment
         self._offset = self._level(moment)
 
     def begin(self, motor_deg: float, moment: Moment = _NOWHERE) -> None:
-        """Starts at this motor angle, with an unknown past."""
+        """Starts at this motor angle, with an unknown history."""
         self.advance(motor_deg, moment)
         self._forward = None
         self._known = not self.memory_deg
@@ -202,7 +202,7 @@ class Inverse:
         return error + self._offset
 
     def _turn(self, forward: bool) -> None:
-        """Notes a reversal at the present angle."""
+        """Records a reversal at the present angle."""
         if self._forward is not None:
             self._known = self.memory_known
             self._turns.append(self._motor_deg)
@@ -213,7 +213,7 @@ class Inverse:
         change.
 
         ``weight`` scales the error (0: uncompensated). Accurate to 1e-6 arcsec at the load, or to the last
-        bit of the motor angle where a steep law makes this coarser.
+        bit of the motor angle if a steep law makes that coarser.
         """
         peek, slope, last = self._tracker.peek, self._slope, self._motor_deg
         self._peeked = None
@@ -224,7 +224,7 @@ class Inverse:
         gap = goal - slope * last - weight * here
         if abs(gap) <= _TOLERANCE_ARCSEC:
             return last
-        # In plain travel the last step gives the first slope, and three points the next ones.
+        # Away from reversals, the last step gives the first slope, and three points give the next ones.
         before, x0, f0, s0 = self._before_deg, last, -gap, slope + weight * self._rise
         x1 = last + gap / (s0 if 0.5 * slope < s0 < 2.0 * slope else slope)
         for _ in range(4):
@@ -240,7 +240,7 @@ class Inverse:
             # Points before a reversal do not predict the slope after it, so only the chord is used.
             s = s1 + bend if -0.5 < bend / s1 < 1.0 else s1
             before, x0, x1, f0, s0 = x0, x1, x1 - f1 / s, f1, s1
-        # The predicted error falls at most by `fall` per degree. This limits the slope, and so the root.
+        # Left side minus right side rises by at least `slope - weight * fall` per degree: bounds the root.
         far = last + gap / (slope - weight * self._fall) * (1.0 + 1e-9)
         return self._bracketed(goal, moment, weight, last, -gap, far)
 
@@ -276,9 +276,9 @@ def _gentle(effects: tuple[Effect, ...], start: Start, steepest: float) -> tuple
     """Returns trackers of the effects, and a bound on the steepest fall of their sum, arcsec per motor
     degree.
 
-    The load rests while the motor crosses play, so play falls as steeply as the gear rises, or more steeply
-    if noise made the fitted play too narrow. If the sum would fall more steeply than ``steepest``, play is
-    crossed only as steeply as the other effects allow.
+    The load rests while the motor crosses backlash. The error then falls as steeply as the gear rises, or
+    more steeply if noise made the fitted backlash too narrow. If the sum would fall more steeply than
+    ``steepest``, the slope of backlash is reduced to what the other effects leave.
     """
     trackers = [each.tracker(start) for each in effects]
     fall = fall_bound(effects)
@@ -310,18 +310,18 @@ class Compensation:
     def __init__(self, model: TransmissionModel, limits: CompensationLimits, period_s: float) -> None:
         """``period_s`` is the control cycle.
 
-        InputError if the model's response was measured at another cycle.
+        Raises InputError if the model's response was measured with another cycle time.
         """
         self.model = model
         """Model that is inverted; `Bench` rejects a model of another axis, gear or drive."""
         self._inverse = Inverse(model)
         self._ratio = model.ratio
         self.maximum_arcsec = limits.maximum_arcsec
-        """Cap on the correction."""
+        """Cap on the correction, arcsec at the load."""
         self.step_arcsec = limits.slew_arcsec_s * period_s
-        """Maximum change of the correction in one cycle."""
+        """Maximum change of the correction in one cycle, arcsec at the load."""
         self.ramp_step = period_s / limits.ramp_s if limits.ramp_s > 0.0 else 1.0
-        """Change of a weight in one cycle."""
+        """Maximum change of a weight in one cycle."""
         self.weight = 0.0
         """Weight of the ramp: 0 off, 1 fully on."""
         self._target = 0.0
@@ -339,7 +339,7 @@ class Compensation:
         self._known = LOSABLE
         self._fading = False
         self.needs = self._inverse.needs
-        """Channels required in a `Moment`, which may be omitted if this is empty."""
+        """Channels required in a `Moment`; if empty, the moment may be omitted."""
         self.limited = 0
         """Number of cycles in which a cap or the slew limit acted."""
 
@@ -350,8 +350,8 @@ class Compensation:
 
     @property
     def memory_known(self) -> bool:
-        """True if the state depends only on the issued path, which since `reset` has run further in one
-        direction than the model remembers. Always True for a model without memory.
+        """True if the model's state depends only on the path issued since `reset`, because this path has run
+        further in one direction than the model's memory. Always True for a model without memory.
         """
         return self._inverse.memory_known
 
@@ -393,7 +393,7 @@ class Compensation:
         return motor if correction == static else self._ratio * (load_deg - correction / ARCSEC_PER_DEG)
 
     def _limit(self, wanted: float, last: float) -> float:
-        """Limits the correction to the slew limit and the cap; counts in `limited`."""
+        """Applies the slew limit and the cap to the correction; increments `limited` if one of them acts."""
         slew, most = self.step_arcsec, self.maximum_arcsec
         if last - slew <= wanted <= last + slew and -most <= wanted <= most:
             return wanted
@@ -439,7 +439,7 @@ class Compensation:
         self._inverse.advance(motor_deg, moment)
 
     def take_over(self, other: Compensation, moment: Moment = _NOWHERE) -> None:
-        """Continues a new object from another compensation, on the path that the other has issued.
+        """Continues from another compensation, along the path that the other has issued; for a new object.
 
         Effects with memory receive the state that results from this path, as far back as the path is kept.
         """
@@ -454,7 +454,7 @@ class Compensation:
             self._prefilter.take_over(other._prefilter, self._static)
 
     def _fade(self) -> None:
-        """Moves the weights of the fading effects by one cycle."""
+        """Advances the weights of the fading effects by one cycle."""
         settled = True
         for each in self._inverse.faded:
             target = float(each.needs <= self._known)

@@ -21,7 +21,7 @@ _BINS: Final = _EXACT + (_TOP_BITS - _EXACT_BITS) * _STEPS
 
 
 def _bin_of(us: int) -> int:
-    """Returns the bin of a lateness: exact below 64 us, then 32 bins to the octave."""
+    """Returns the bin of a lateness: exact below 64 us, then 32 bins per octave."""
     if us < _EXACT:
         return us
     shift = us.bit_length() - _EXACT_BITS
@@ -29,7 +29,7 @@ def _bin_of(us: int) -> int:
 
 
 def _bin_top_us(index: int) -> int:
-    """Returns the greatest whole lateness of a bin, us."""
+    """Returns the greatest lateness in a bin, whole us."""
     if index < _EXACT:
         return index
     octave, step = divmod(index - _EXACT, _STEPS)
@@ -49,7 +49,7 @@ class Histogram:
         self.total = 0
         """Number of recorded values."""
         self.maximum_us = 0
-        """Exact maximum."""
+        """Exact maximum of the lateness, us."""
 
     def record(self, late_s: float) -> None:
         """Counts one lateness in seconds; an early wake-up counts as zero."""
@@ -88,7 +88,7 @@ class Histogram:
         self.maximum_us = max(self.maximum_us, other.maximum_us)
 
     def octaves(self) -> list[tuple[int, int]]:
-        """Returns (upper end in us, count) by powers of two, from the first to the last that is not empty."""
+        """Returns (upper end in us, count) for each power of two from the first to the last non-empty one."""
         sums: dict[int, int] = {}
         for index, count in enumerate(self._counts):
             if count:
@@ -137,7 +137,7 @@ def carries(histogram: Histogram, period_s: float) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """Wake-ups at one period."""
+    """Lateness of the wake-ups at one period."""
 
     period_s: float
     histogram: Histogram = field(repr=False)
@@ -160,7 +160,7 @@ class LatencyReport:
 
     @property
     def carried_s(self) -> float | None:
-        """Shortest period above which the computer sustains all measured periods; None without one."""
+        """Shortest measured period that the computer sustains with all longer ones; None if there is none."""
         best = None
         for each in reversed(self.measurements):
             if not each.carried:
@@ -170,7 +170,7 @@ class LatencyReport:
 
     @property
     def verdict(self) -> str:
-        """Result in one line."""
+        """Shortest cycle that the computer sustains, as a sentence with the rule."""
         if self.carried_s is None:
             return (
                 f"this computer sustains none of these cycle times ({RULE}); "

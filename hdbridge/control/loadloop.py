@@ -1,6 +1,6 @@
 """Slow loop over the load encoder: removes the mean error at rest that the model leaves.
 
-The compensation is feed-forward, so an aged model leaves an unseen error. This loop integrates the error
+The compensation is feed-forward, so an aged model leaves an undetected error. This loop integrates the error
 (load target minus load encoder) at rest and adds the result to the load target. In motion the error is mostly
 delay, and the value is held. The value is bounded and its slew is limited. It fades out in three cases, with
 the reason in `LoadLoop.doubt`:
@@ -9,11 +9,11 @@ the reason in `LoadLoop.doubt`:
     the load encoder moved at rest     without the motor; ends when it has moved back
     the load encoder does not follow   the motor, which the loop moves at rest; ends when it follows
 
-The last two compare the load encoder with the load angle by motor encoder and model. The explained difference
-follows from the axis: one count of each encoder at the load, the noise of the difference, and for the last
-case the slack, which is the possible error of the model's hysteresis. The noise is measured at rest, and a
-slow drift of the load against the motor is tracked. A doubt about the encoder that does not end at the same
-place ends when the two agree again at rests after motion in both directions.
+The last two compare the load encoder with the load angle from motor encoder and model. A difference is
+explained up to one count of each encoder at the load plus the noise of the difference. In the last case the
+slack is added, which is the possible error of the model's hysteresis. The noise is measured at rest, and a
+slow drift of the load against the motor is tracked. If a doubt about the encoder does not end where it arose,
+it ends when the two have agreed at rest after motion in both directions.
 
 Pure: no clock, no bus.
 """
@@ -36,22 +36,22 @@ _NOISE_S: Final = 1.0
 _DRIFT_S: Final = 600.0
 """Time constant for tracking a drift of the load against the motor at rest."""
 _AGREED_S: Final = 1.0
-"""Time at rest for which an encoder that has moved back is observed, doubled by each further doubt."""
+"""Time at rest for which an encoder that has moved back must stay there; doubled at each further doubt."""
 _AGREED_MAX_S: Final = 600.0
 _SIGMAS: Final = 8.0
 """Maximum deviation that counts as noise, in standard deviations."""
 _SIGMA_OF_MEAN_DEVIATION: Final = math.sqrt(math.pi / 2.0)
 """Ratio of the standard deviation to the mean absolute deviation of normal readings."""
 _LEAST_SHARE: Final = 0.5
-"""Minimum ratio of the bound to the error."""
+"""Minimum ratio of the loop's bound to the mean error; below it, the loop does not act."""
 _OUTLIERS: Final = 2
 """Number of consecutive unexplained readings that count as a move of the load encoder."""
 _AGREEMENT: Final = 1.0 / 3.0
-"""Share of the greatest disagreement below which the encoders count as agreeing again."""
+"""Fraction of the greatest disagreement below which the encoders count as agreeing again."""
 _MODEL_ERROR: Final = 0.25
 """Possible relative error of a model's hysteresis."""
 _PLACES: Final = 24
-"""Positions at which the width of a hysteresis loop is evaluated."""
+"""Number of intervals between the positions at which the width of a hysteresis loop is evaluated."""
 _BOTH: Final = frozenset({-1, 1})
 
 
@@ -88,10 +88,10 @@ class LoadLoop:
         *,
         counts_arcsec: float,
     ) -> None:
-        """``gain_1_s`` is the share of the error removed per second; ``maximum_arcsec`` bounds the value.
+        """``gain_1_s`` is the fraction of the error removed per second; ``maximum_arcsec`` bounds the value.
 
         ``counts_arcsec`` is one count of the motor encoder plus one of the load encoder, both at the load.
-        InputError for numbers that are not finite and positive, and for a gain at which the loop would
+        Raises InputError for numbers that are not finite and positive, and for a gain at which the loop would
         oscillate.
         """
         for name, number in (
@@ -126,8 +126,8 @@ class LoadLoop:
         self._standing = self._outliers = 0
         """Number of periods at rest, and of consecutive readings outside the explained range."""
         self._difference = self._motor = self._error = 0.0
-        """Averages at rest: load encoder minus load angle by motor encoder, that load angle, and the
-        error."""
+        """Averages at rest: load encoder minus load angle from motor encoder and model, that load angle, and
+        the error without this loop."""
         self._noise = 0.0
         """Mean absolute deviation of the difference from its average at rest, minus that of the motor."""
         self._noise_readings = 0
@@ -158,8 +158,8 @@ class LoadLoop:
         """Sets the models: ``whole`` has the full hysteresis, ``predicting`` predicts the ``motor`` argument
         of `step`.
 
-        The load may lag the motor by the unpredicted part of the hysteresis, and by a share of the predicted
-        part. Without a known hysteresis, only the loop's own bound limits the lag.
+        The load may lag the motor by the unpredicted part of the hysteresis, and by a fraction of the
+        predicted part. If the hysteresis is unknown, only the loop's own bound limits the lag.
         """
         width = loop_width_arcsec(whole)
         known = (1.0 - _MODEL_ERROR) * loop_width_arcsec(predicting)
@@ -204,7 +204,7 @@ class LoadLoop:
     # ---------------------------------------------------------------- at rest
 
     def _settle(self, error: float, difference: float, motor: float) -> None:
-        """Adds a reading while the load settles to an average that forgets the first readings."""
+        """Adds a reading during settling to the averages, which forget the first readings."""
         self._outliers = 0
         self._average(error, difference, motor, max(self._share, 1.0 / self._standing))
         if self._standing < self._settled:
@@ -263,13 +263,13 @@ class LoadLoop:
             self._noise += noise_share * (max(abs(deviation) - abs(moved), 0.0) - self._noise)
 
     def _explained(self) -> float:
-        """Returns the difference of the encoders at rest that is explicable without motion of the load."""
+        """Returns the largest encoder difference at rest that counts and noise can explain."""
         return self._counts + _SIGMAS * _SIGMA_OF_MEAN_DEVIATION * self._noise
 
     # ---------------------------------------------------------------- doubt about the encoder
 
     def _jump(self, size: float, explained: float) -> None:
-        """Notes that the load encoder moved at rest, and shifts the averages by it."""
+        """Records that the load encoder moved by ``size`` at rest, and shifts the averages accordingly."""
         self._outliers = 0
         self._difference += size
         self._error -= size
@@ -297,7 +297,7 @@ class LoadLoop:
         if off > tolerance:
             self._agreed = frozenset()
         moved = self._motor - self._rest_motor
-        # An encoder that stands still agrees at most once in two rests that are farther apart.
+        # A load encoder that is stuck cannot agree at both of two rest positions that are farther apart.
         if abs(moved) > max(self._explained() + self._slack, 3.0 * tolerance):
             self._rest_motor = self._motor
             if off <= tolerance:

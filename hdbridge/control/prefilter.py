@@ -1,6 +1,6 @@
-"""Prefilter of the correction in motion: the filter of `Response` along the predicted path.
+"""Prefilter of the correction in motion: applies the filter of `Response` along the predicted path.
 
-The correction is predicted for load targets a few cycles ahead, which extend the last three targets at
+The correction is predicted for load targets a few cycles ahead, extrapolated from the last three targets at
 constant acceleration. At rest the prediction equals the correction, and the filter returns it unchanged.
 
 Pure: no clock, no bus.
@@ -28,7 +28,7 @@ class Prefilter:
     )  # fmt: skip
 
     def __init__(self, lead: LeadFilter, period_s: float, needs: frozenset[Channel]) -> None:
-        """``needs`` are the channels of the corrected effects; the predictions share their acceleration."""
+        """``needs`` are the channels of the compensated effects; speed and load angle are extrapolated."""
         self._weights = lead.weights
         self._varies = not _VARYING.isdisjoint(needs)
         self._feedback = (*lead.feedback, 0.0, 0.0)[:2]
@@ -39,7 +39,7 @@ class Prefilter:
         first, per_cycle = lead.lead_cycles, lead.per_cycle
         ahead = [first - j / per_cycle for j in range(per_cycle - 1, -1, -1)]
         self._reaches = tuple((s, 0.5 * s * (s + 1.0)) for s in ahead)
-        """Factors of the last step and of its change for the distance of each new prediction."""
+        """Distance of each new prediction: factors of the last step of the target and of its change."""
         self._full_step = lead.full_speed_deg_s * period_s
         self._last: float | None = None
         self._step = 0.0

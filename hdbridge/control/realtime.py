@@ -67,7 +67,7 @@ def _lock_memory(flags: int) -> str | None:
 
 @contextmanager
 def prepare_realtime(priority: int = PRIORITY, cpus: Collection[int] = ()) -> Iterator[Realtime]:
-    """Makes the calling thread and its process punctual within the block.
+    """Applies the settings to the calling thread and its process within the block.
 
     ``priority`` is the SCHED_FIFO priority, 1 to 99, or 0 to leave the scheduling unchanged; ``cpus`` are the
     numbers of the permitted processors, empty for any.

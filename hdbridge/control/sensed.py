@@ -19,7 +19,7 @@ class Sensed:
 
     def __init__(self, axis: AxisConfig) -> None:
         self.torque_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
-        """Motor torque per mille of 6077h, positive forward; Nm."""
+        """Motor torque for one unit (per mille) of 6077h, positive forward; Nm."""
         self._channels = tuple(BY_KEY[key] for key in axis.channels)
         self._slots = tuple(SLOT[each] for each in self._channels)
         self._motor_torque = SLOT[Channel.MOTOR_TORQUE]
@@ -28,7 +28,7 @@ class Sensed:
     def reset(self) -> None:
         """Forgets all readings."""
         self.known: frozenset[Channel] = frozenset()
-        """Channels with sensors of their own that have a current reading."""
+        """Channels with their own sensors that have a current reading."""
         self._present: tuple[bool, ...] = (False,) * len(self._channels)
         self._values = list(AT_REST)
 

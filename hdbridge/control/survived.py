@@ -29,7 +29,7 @@ class Survived(BaseModel):
 
 
 class Watch:
-    """Counts faults and skipped periods from its creation."""
+    """Counts faults and skipped periods since its creation."""
 
     __slots__ = ("_before", "_skipped", "_supervision")
 

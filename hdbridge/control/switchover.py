@@ -1,8 +1,8 @@
-"""Change of the model in motion without a step: replaces a single `Compensation` in the control cycle.
+"""Change of the model in motion without a jump of the target; takes the place of a single `Compensation`.
 
-During a change both models follow the issued angle, and the correction passes from that of the old model to
-that of the new model, by a weight that rises over the ramp time, within the slew limit and the caps. The new
-model begins on the last issued path, which also determines the state of its hysteresis.
+During a change both models follow the issued angle. The correction is blended from the old model to the new
+one with a weight that rises over the ramp time, within the slew limit and the caps. The new model begins on
+the last issued path, which also determines the state of its hysteresis.
 
 A scheme (none, synchronous, hysteresis, both) is a model with other effects, so schemes are switched in the
 same way.
@@ -34,7 +34,7 @@ class Correction:
     command: Callable[[float, Moment], float]
     """Returns the motor target in degrees for this cycle's load target (`Compensation.command`)."""
     hold: Callable[[float, Moment], float]
-    """Returns the same with the correction frozen (`Compensation.hold`); a change pauses."""
+    """Returns the motor target with the correction frozen (`Compensation.hold`); a change pauses."""
 
     def __init__(self, first: Compensation) -> None:
         self._now = first
@@ -85,9 +85,9 @@ class Correction:
         return self._limited + self._now.limited
 
     def change(self, new: Compensation) -> None:
-        """Changes to a new compensation from the next command on; `changing` is True until it is complete.
+        """Changes to a new compensation from the next command on; `changing` is True until that is complete.
 
-        InputError, without any change, for another gear ratio and while a change is under way.
+        Raises InputError, without any effect, for another gear ratio and while a change is under way.
         """
         if self._new is not None:
             raise InputError("a change of the model is under way: wait until it is done")

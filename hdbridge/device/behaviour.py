@@ -11,18 +11,18 @@ class Controlword(Enum):
     """Reaction of the drive to a repeated controlword."""
 
     EDGE = "edge"
-    """Ignored."""
+    """A repeated controlword is ignored."""
     LEVEL = "level"
-    """Evaluated again, so a repeated 000Fh in *quick stop active* is transition 16."""
+    """A repeated controlword is evaluated again: 000Fh in *quick stop active* is transition 16."""
 
 
 class HeartbeatConsumer(Enum):
     """Supervision of the master's heartbeat (1016h) after a loss."""
 
     RESTARTS = "restarts"
-    """Starts again with the next heartbeat."""
+    """Supervision starts again with the next heartbeat."""
     STOPS = "stops"
-    """Stays off until 1016h is written or the node is reset."""
+    """Supervision stays off until 1016h is written or the node is reset."""
 
 
 class Behaviour(Strict):

@@ -75,7 +75,7 @@ class SdoAbortError(Exception):
 
 
 def only(*allowed: int) -> Callable[[int], None]:
-    """Returns a guard that refuses all other values."""
+    """Returns a guard that refuses all values except these."""
 
     def check(value: int) -> None:
         if value not in allowed:
@@ -85,7 +85,7 @@ def only(*allowed: int) -> Callable[[int], None]:
 
 
 class Entry:
-    """One (index, sub-index).
+    """Object at one index and sub-index.
 
     ``value`` is the stored value. After ``bind``, reads call a function instead. ``guard`` checks a new value
     before it is stored, and refuses by raising ``SdoAbortError``; ``follower`` is called after it was stored.
@@ -161,7 +161,7 @@ class Entry:
         return self.codec.pack(self.number())
 
     def check_length(self, size: int) -> None:
-        """Refuses writes to a read-only entry and of a wrong length for the data type."""
+        """Refuses a write if the entry is read-only or the length does not fit the data type."""
         if not self.writable:
             raise SdoAbortError(Abort.READ_ONLY)
         longest = self.codec.size if self.codec else MAX_STRING
@@ -191,7 +191,7 @@ class Entry:
             self.follower(value)
 
     def accepts(self, value: object) -> bool:
-        """Returns True for a number of its type within its limits, without asking the guard."""
+        """Returns True for a number of the entry's type within its limits, without calling the guard."""
         if self.codec is None or not isinstance(value, int | float):
             return False
         try:
@@ -253,11 +253,11 @@ class Dictionary:
         self._indices = {entry.index for entry in self}
 
     def __getitem__(self, key: tuple[int, int]) -> Entry:
-        """Returns an entry to the firmware, hidden or not."""
+        """Returns an entry for the firmware, even if it is hidden."""
         return self._entries[key]
 
     def open(self, index: int, sub: int) -> Entry:
-        """Returns an entry to the bus; refuses missing and hidden entries."""
+        """Returns an entry for the bus; refuses missing and hidden entries."""
         entry = self._entries.get((index, sub))
         if entry is None or entry.hidden:
             code = Abort.NO_SUBINDEX if index in self._indices else Abort.NO_OBJECT
@@ -281,13 +281,13 @@ class Dictionary:
         return self._entries[index, sub].number()
 
     def renumber(self, before: int, after: int) -> None:
-        """Adapts the defaults that contain the node id."""
+        """Adapts the defaults that contain the node id to a new node id."""
         for entry in self._entries.values():
             if entry.is_relative:
                 entry.default += after - before
 
     def restore(self, first: int = 0x0000, last: int = 0xFFFF) -> None:
-        """Restores the default of every entry in this range of indices, without asking the guards."""
+        """Restores the default of every entry in this range of indices, without calling the guards."""
         for entry in self._entries.values():
             if first <= entry.index <= last:
                 entry.value = entry.default

@@ -19,7 +19,7 @@ Outgoing = tuple[int, bytes]
 
 @dataclass
 class Faults:
-    """Faults to inject, all off at first."""
+    """Faults to inject, all off initially."""
 
     drop_tpdos: int = 0
     """The next n TPDOs are lost."""
@@ -40,9 +40,9 @@ class Faults:
     muted_ids: frozenset[int] = frozenset()
     """Identifiers of frames that are not sent, for example those of one TPDO or of the SDO answers."""
     load_jump_counts: int = 0
-    """Added to the load encoder from the next sample on."""
+    """Counts added to the load encoder from the next sample on."""
     motor_jump_counts: int = 0
-    """Added to the motor encoder from the next sample on; the servo loops act on it."""
+    """Counts added to the motor encoder from the next sample on; the servo loops act on them."""
     load_reading: Callable[[int], int] | None = None
     """Maps the counts of the load encoder to its reading from the next sample on: drift, freeze, noise."""
     ignore_lost_heartbeat: bool = False
@@ -56,37 +56,37 @@ class Faults:
     deceleration_counts_s2: float | None = None
     """Deceleration of every ramp, overriding the objects; counts/s2."""
     pending: list[Callable[[DriveNode], None]] = field(default_factory=list)
-    """For the node: events due at the next poll."""
+    """Events that the node runs at the next poll."""
     _held: list[Outgoing] = field(default_factory=list)
 
     def raise_error(self, code: int, additional: bytes = b"") -> None:
-        """At the next poll: malfunction ``code`` (EMCY, fault reaction), with up to five bytes of detail."""
+        """Raises error ``code`` at the next poll (EMCY, fault reaction), with up to five bytes of detail."""
         self.pending.append(lambda node: node.firmware.fault(code, additional))
 
     def lose_master(self, code: int) -> None:
-        """At the next poll: loss of the master without an EMCY, with the reaction of 6007h."""
+        """Makes the drive lose its master at the next poll, without an EMCY, with the reaction of 6007h."""
         self.pending.append(lambda node: node.firmware.connection_lost(code))
 
     def miss_master(self, code: int) -> None:
-        """At the next poll: like ``lose_master``, with the EMCY ``code`` (8130h or 8250h)."""
+        """Makes the drive lose its master at the next poll, with the EMCY ``code`` (8130h or 8250h)."""
         self.pending.append(lambda node: node.emergency.occur(code))
         self.lose_master(code)
 
     def boot_up(self) -> None:
-        """At the next poll: reset with a boot-up message, as after a brown-out, in any state of the axis."""
+        """Resets the node at the next poll, with a boot-up message, as after a brown-out in any state."""
         self.pending.append(lambda node: node.reset())
 
     def leave_operational(self) -> None:
-        """At the next poll: change to PRE-OPERATIONAL with a heartbeat, in any state of the axis."""
+        """Takes the node to PRE-OPERATIONAL at the next poll, with a heartbeat, in any state of the axis."""
         self.pending.append(lambda node: node.drop_out())
 
     def open_enable_input(self) -> None:
-        """At the next poll: power stage off without an EMCY, as by a hardware enable input."""
+        """Switches the power stage off at the next poll, without an EMCY, as a hardware enable input does."""
         self.pending.append(lambda node: node.firmware.power_cut())
 
     @property
     def concerns_tpdos(self) -> bool:
-        """For the node: True if TPDOs must pass through ``spoil``."""
+        """True if the node must pass its TPDOs through ``spoil``."""
         counted = self.drop_tpdos + self.shorten_tpdos + self.duplicate_tpdos + self.hold_tpdos
         return bool(counted or self.reverse_tpdos or self._held)
 

@@ -28,7 +28,7 @@ STAY_STOPPED: Final = 5
 """Lowest option code of 605Ah that stays in QUICK STOP ACTIVE."""
 WINDOW_OFF: Final = 0xFFFFFFFF
 
-# For the cyclic path: to look a member up in its class takes five times as long as a name of the module.
+# The cyclic path uses module names because looking up an enum member in its class takes five times as long.
 _ENABLED: Final = State.OPERATION_ENABLED
 _QUICK_STOP_ACTIVE: Final = State.QUICK_STOP_ACTIVE
 _HALT: Final = int(Control.HALT)
@@ -97,8 +97,8 @@ class Firmware:
         self._awaits_power = False
         self._resetting = False
         self._stopped_itself = False
-        """True in QUICK STOP ACTIVE without a command. A repeated controlword then ends it only if levels
-        are read."""
+        """True in QUICK STOP ACTIVE without a command. A repeated controlword then ends this state only if
+        the drive evaluates levels."""
         self._beyond_window_s = 0.0
         self._following_error = False
         self._error_code = 0
@@ -167,7 +167,7 @@ class Firmware:
         if self.state is _ENABLED and not self._halted:
             return word | self._mode.status()
         if self._halted or self.state is State.QUICK_STOP_ACTIVE:
-            word |= _REACHED  # stopped, as demanded
+            word |= _REACHED  # stopped, as commanded
         return word
 
     def _delay_status(self) -> None:
@@ -210,7 +210,7 @@ class Firmware:
         self._state_bits = state.value | _ALWAYS
 
     def control(self, word: int) -> None:
-        """Evaluates a controlword; a repeated controlword is ignored unless the drive reads levels."""
+        """Evaluates a controlword; a repeated controlword is ignored unless the drive evaluates levels."""
         if word == self._word and not self._waits_for_rest and not self._by_level:
             return
         if word != self._word:
@@ -232,7 +232,7 @@ class Firmware:
         if wanted is not self.state:
             self._transition(wanted)
         elif self.state is State.OPERATION_ENABLED and self._braking is not None and self._braking.then:
-            self._waits_for_rest = True  # on the way out: the same word counts once more when the axis stands
+            self._waits_for_rest = True  # leaving: the same word is evaluated again at standstill
         elif self.state is State.OPERATION_ENABLED:
             self._halt_or_go(bool(word & _HALT))
             if not word & _HALT:
@@ -284,7 +284,7 @@ class Firmware:
         if self._dictionary.value(0x605A) < STAY_STOPPED:
             return
         if self._braking is not None and not self._by_level:
-            self._waits_for_rest = True  # the same word counts once more when the axis stands
+            self._waits_for_rest = True  # the same word is evaluated again at standstill
             return
         self._braking = None
         self._operate()
@@ -376,7 +376,7 @@ class Firmware:
         return enabled and isinstance(self._mode, CyclicSynchronousPosition)
 
     def _judge_stage(self) -> None:
-        """Reacts to a failure of the power stage, without a ramp, or to the end of a pending request."""
+        """Reacts without a ramp to a failure of the power stage, or completes a pending request."""
         stage = self._stage
         if stage.error_code and self.state is not State.FAULT:
             self._emergency.occur(stage.error_code, stage.error_details)

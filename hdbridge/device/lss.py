@@ -13,7 +13,7 @@ ANSWER: Final = 0x7E4
 UNCONFIGURED: Final = 255
 """Node id of an unconfigured node, which answers only to LSS."""
 BIT_RATES_BPS: Final = (1_000_000, 800_000, 500_000, 250_000, 125_000, 100_000, 50_000, 20_000, 10_000)
-"""Bit rates of table 0, by index."""
+"""Bit rates of the standard bit timing table (table 0 of CiA 305), by index."""
 _NUMBER: Final = struct.Struct("<BI3x")
 _FAST_SCAN: Final = struct.Struct("<BIBBB")
 _RESTART_SCAN: Final = 0x80
@@ -39,7 +39,8 @@ class LssSlave:
         """True in LSS configuration state, False in LSS waiting state."""
         self._identity, self._stores, self._bit_rate_bps = identity, stores, bit_rate_bps
         self._next = self._scanned = 0
-        """Number of the next identity request after those that agreed, or of the identity part under scan."""
+        """Next command in a sequence of requests that has agreed so far; number of the identity part under
+        scan."""
 
     def respond(self, request: bytes) -> bytes | None:
         """Returns the answer to a request; None for a request that is not answered."""
@@ -76,7 +77,7 @@ class LssSlave:
         return number <= own if command % 2 == 0 else own <= number
 
     def _agrees(self, command: int, span: tuple[int, int], part_agrees: bool) -> bool:
-        """Takes one of the requests that select an identity; returns True once all matched in order."""
+        """Evaluates one request of an identity sequence; returns True once all have matched in order."""
         agrees = part_agrees and command in (span[0], self._next)
         self._next = command + 1 if agrees else 0
         return agrees and command == span[1]
@@ -104,7 +105,7 @@ class LssSlave:
         return None  # 15h: the bit timing in use stays
 
     def _fast_scan(self, number: int, bit: int, part: int, following: int) -> bytes | None:
-        """Answers if the upper bits of the part of the identity under scan agree, from ``bit`` on."""
+        """Answers if ``number`` agrees with the identity part under scan in the bits from ``bit`` upwards."""
         if bit == _RESTART_SCAN:
             self._scanned = 0
         elif bit < 32 and part == self._scanned and part < 4 and following < 4:

@@ -1,7 +1,7 @@
 """The operating modes of the simulated drive: PP, homing, interpolated and cyclic synchronous position.
 
-A mode turns set-points into the demand of the next period. Power states, stopping and supervision are the
-firmware's.
+A mode turns set-points into the demand of the next period. The firmware handles power states, stopping and
+supervision.
 """
 
 import math
@@ -66,7 +66,7 @@ class CyclicSynchronousPosition(Mode):
         self._offset = motion.dictionary[0x60B0, 0]
 
     def _aim(self) -> int:
-        """Returns the user's position to reach at the end of the next period."""
+        """Returns the user position to be reached at the end of the next period."""
         target: int = self._target.value + self._offset.value
         return target
 
@@ -172,7 +172,7 @@ class ProfilePosition(_Planned):
     def _set_point(self, *, relative: bool) -> float:
         motion = self.motion
         target = motion.dictionary.value(0x607A)
-        if relative:  # CiA 402: to the preceding set-point, not to the actual position
+        if relative:  # CiA 402: relative to the preceding set-point, not to the actual position
             before = self._goal if self._waiting is None else self._waiting
             target += wrap_int32(motion.user(before))
         motion.limited = False
@@ -240,7 +240,7 @@ class Homing(_Planned):
 
     def control(self, word: int, rising: int) -> None:
         if not word & _NEW:
-            self._profile = None  # withdrawing the start bit breaks homing off
+            self._profile = None  # clearing the start bit aborts homing
         if not rising & _NEW:
             return
         motion, value = self.motion, self.motion.dictionary.value
@@ -266,7 +266,7 @@ class Homing(_Planned):
         self._attain(round(demand_counts))
 
     def _attain(self, counts: int) -> None:
-        """Sets a position of the motor encoder to 607Ch."""
+        """Assigns the value of 607Ch to a position of the motor encoder."""
         motion = self.motion
         motion.home_counts = motion.dictionary.value(0x607C) - motion.sign * counts
         motion.preload_target()

@@ -1,7 +1,7 @@
-"""Actual and demanded position of the simulated axis, in the plant's counts and in the user's.
+"""Actual and demanded position of the simulated axis, in plant counts and as user positions.
 
-The plant counts without bound and without a home. The user has int32 positions with polarity and home offset.
-All motion is computed in the plant's counts; int32 occurs only in objects that are read or written.
+Plant counts are unbounded and have no home. User positions are int32 with polarity and home offset. All
+motion is computed in plant counts; int32 occurs only in objects that are read or written.
 """
 
 from collections.abc import Callable
@@ -33,11 +33,11 @@ class Machine(Protocol):
     @property
     def load_torque_nm(self) -> float: ...
     def follow(self, start_counts: float, end_counts: float, substeps: int) -> None:
-        """Servo on: the demand moves linearly from start to end during ``substeps``."""
+        """Runs ``substeps`` with the servo on; the demand moves linearly from start to end."""
         ...
 
     def coast(self, substeps: int, braked: bool) -> None:
-        """Power stage off, with the holding brake open or closed."""
+        """Runs ``substeps`` with the power stage off and the holding brake open or closed."""
         ...
 
 
@@ -80,7 +80,7 @@ class Motion:
         self._low, self._high = low, high
 
     def user(self, counts: float) -> int:
-        """Converts a plant position to the user's (unbounded) position."""
+        """Converts a plant position to an (unbounded) user position."""
         return self.sign * round(counts) + self.home_counts
 
     def goal(self, target: int) -> float:
@@ -134,7 +134,7 @@ class Motion:
         """Moves the demand, and the plant with it, for one period."""
         substeps = self._substeps(period_s)
         if substeps:
-            jump = self.motor_jump_counts  # the loops close on the encoder as it reads
+            jump = self.motor_jump_counts  # the servo loops act on the encoder's reading
             self.machine.follow(self.demand_counts - jump, demand_counts - jump, substeps)
         self.demand_counts = demand_counts
         self.velocity_counts_s = velocity_counts_s

@@ -3,8 +3,8 @@
 Upon SYNC, the node first sends its synchronous TPDOs with the present values, then applies the synchronous
 RPDOs received since the last SYNC, then runs its axis for exactly one period of object 60C2h. (Some drives
 apply RPDOs first; `Behaviour` has this and other choices.) Before the first SYNC, and when SYNC is missing
-for one and a half periods, the clock drives the axis instead, so a drive without a master can still stop.
-Single-threaded: everything happens inside ``poll``.
+for one and a half periods, the axis runs on the node's clock instead, so a drive without a master can still
+stop. Single-threaded: everything happens inside ``poll``.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ from hdbridge.device.syncclock import SyncClock
 
 PDO_COUNT: Final = 512
 LONGEST_CATCH_UP_S: Final = 1.0
-"""Maximum delay that a late poll makes up for."""
+"""Maximum delay for which a late poll catches up; s."""
 
 FRAMES_PER_POLL: Final = 64
 
@@ -42,7 +42,7 @@ _HEARTBEAT: Final = 0x700
 
 
 _INITIALISING = NmtState.INITIALISING
-# For the cyclic path: to look a member up in its class takes five times as long as a name of the module.
+# The cyclic path uses this name because looking up an enum member in its class takes five times as long.
 
 _AFTER_ERROR: Final = {0: NmtState.PRE_OPERATIONAL, 2: NmtState.STOPPED}
 """NMT state after a communication error, by the value of 1029h:01; 1 changes nothing."""
@@ -51,11 +51,11 @@ _AFTER_ERROR: Final = {0: NmtState.PRE_OPERATIONAL, 2: NmtState.STOPPED}
 class DriveNode:
     """A CiA-402 drive on ``bus``, moving ``machine``.
 
-    ``bus`` is any python-can bus, and is read only here; ``eds_path`` declares the objects; ``clock`` gives
-    the time of start; ``nameplate`` distinguishes drives, ``behaviour`` their firmware. ``stage`` is a power
-    stage with delays or failures, ``store`` the file of the stored parameters, and ``bit_rate_bps`` the bit
-    rate of the interface, the only one that LSS can configure. ``poll`` must be called when frames may have
-    arrived and at ``next_event_s``.
+    ``bus`` is any python-can bus, and only this node may read it; ``eds_path`` declares the objects;
+    ``clock`` is the node's clock; ``nameplate`` distinguishes drives, ``behaviour`` their firmware. ``stage``
+    is a power stage with delays or failures, ``store`` the file of the stored parameters, and
+    ``bit_rate_bps`` the bit rate of the interface, the only one that LSS can configure. ``poll`` must be
+    called when frames may have arrived and at ``next_event_s``.
     """
 
     def __init__(
@@ -172,7 +172,7 @@ class DriveNode:
 
     @property
     def has_sync(self) -> bool:
-        """True while SYNC drives the node."""
+        """True while the node supervises SYNC and it is not lost."""
         return self._sync_due_s < _NEVER
 
     def sync_is_late(self, now_s: float) -> bool:
@@ -187,7 +187,7 @@ class DriveNode:
 
     @property
     def jitter_s(self) -> float:
-        """Mean deviation of SYNC from its regular time; 0 unless the drive measures the period."""
+        """Mean absolute deviation of SYNC from its filtered time, s; 0 if the drive uses 60C2h."""
         return self._sync.jitter_s
 
     def _watch_heartbeat(self) -> None:
@@ -257,8 +257,8 @@ class DriveNode:
         if self.nmt is _INITIALISING:
             self._boot()
         receive, now = self.bus.recv, self._clock.now
-        # Bounded, and each frame at its own time: a master that answers immediately (as in an SDO transfer)
-        # can keep this loop busy for long, and the watchdogs must not fall behind.
+        # The loop is bounded and reads the time for each frame: a master that answers immediately (as in an
+        # SDO transfer) can keep it busy for long, and the watchdogs must not fall behind.
         left = FRAMES_PER_POLL
         while left and (message := receive(0)) is not None:
             left -= 1
@@ -305,7 +305,7 @@ class DriveNode:
         try:
             self.bus.send(DataFrame(can_id, data))
         except can.CanOperationError:
-            self.lost_frames += 1  # as on a bus that is down: a drive drops the frame and carries on
+            self.lost_frames += 1  # as on a bus that is down: a drive drops the frame and continues
 
     def _send_unless_stopped(self, can_id: int, data: bytes) -> None:
         if self.nmt in (NmtState.OPERATIONAL, NmtState.PRE_OPERATIONAL):
@@ -524,7 +524,7 @@ class DriveNode:
             self.firmware.connection_lost(ErrorCode.SYNC_LOST)
 
     def bus_failed(self) -> None:
-        """Reacts to an interface that is down or bus-off like to a lost master (6007h), in any mode."""
+        """Treats an interface that is down or bus-off as a lost master (6007h), in any mode."""
         for rpdo in self._rpdos:
             rpdo.pending = None
         self.firmware.connection_lost(ErrorCode.COMMUNICATION)

@@ -70,7 +70,7 @@ class StoredParameters:
         self._stored = values
 
     def _read(self) -> dict[tuple[int, int], int]:
-        """Returns the values in the file that belong to existing parameters and are valid."""
+        """Returns the values in the file that are valid and belong to existing parameters."""
         if self._file is None:
             return {}
         found: dict[tuple[int, int], int] = {}

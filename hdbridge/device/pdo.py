@@ -72,7 +72,7 @@ class Pdo:
         self._changed()
 
     def compile(self) -> None:
-        """Takes over the present parameters from the dictionary."""
+        """Reads the present parameters from the dictionary and compiles the mapping."""
         can_id = self._parameter(1)
         self.valid = not can_id & INVALID
         self.can_id = can_id & 0x7FF
@@ -83,7 +83,7 @@ class Pdo:
         count = self._dictionary.value(self._mapping, 0)
         try:
             entries = self._entries(count)
-        except SdoAbortError:  # a default of the EDS that this drive cannot map: it has no such PDO
+        except SdoAbortError:  # this drive cannot map a default of the EDS: the PDO does not exist
             self._dictionary[self._mapping, 0].value = 0
             self._dictionary[self._communication, 1].value |= INVALID
             self.valid, entries = False, []
@@ -131,7 +131,7 @@ class Pdo:
         return self._dictionary.value(self._communication, 1) & ~INVALID
 
     def _check_fixed(self, sub: int, value: int) -> None:
-        """Refuses a different value while the PDO exists, because some masters write the present value."""
+        """Refuses a different value while the PDO exists; some masters write the present value again."""
         if self.valid and value != self._parameter(sub):
             raise SdoAbortError(Abort.STATE)
 
@@ -150,7 +150,7 @@ class Pdo:
 
 
 class TransmitPdo(Pdo):
-    """Transmit PDO."""
+    """Transmit PDO: packs the mapped values and decides when they are sent."""
 
     def __init__(self, dictionary: Dictionary, number: int, changed: Callable[[], None]) -> None:
         self.pack: Callable[[], bytes] = bytes
@@ -174,14 +174,14 @@ class TransmitPdo(Pdo):
         self.restart()
 
     def restart(self) -> None:
-        """Forgets the data sent, as on entering NMT state OPERATIONAL."""
+        """Discards the data last sent, as on entering NMT state OPERATIONAL."""
         self.sent = None
         self.sent_s = -float("inf")
         self.syncs_to_go = max(1, self.transmission_type)
         self.sync_start = self._parameter(6)
 
     def has_started(self, sync: bytearray) -> bool:
-        """Returns True from the SYNC with the start value on, or without a counter (CiA 301)."""
+        """Returns True once a SYNC has the start value as counter, or if it has no counter (CiA 301)."""
         if sync and sync[0] != self.sync_start:
             return False
         self.sync_start, self.syncs_to_go = 0, 1

@@ -19,7 +19,7 @@ class State(Enum):
     FAULT_REACTION_ACTIVE = 0x0F
     FAULT = 0x08
 
-    # By identity: the hash that Enum has is computed in Python, which shows in every cycle.
+    # Hash by identity: Enum's own hash is computed in Python, which is measurable in every cycle.
     __hash__ = object.__hash__
 
 
@@ -53,7 +53,7 @@ class Status(IntEnum):
     INTERNAL_LIMIT = 1 << 11
     MODE_12 = 1 << 12  # PP: set-point acknowledged; CSP: follows; IP: interpolates; HM: attained
     MODE_13 = 1 << 13  # PP, CSP: following error; HM: homing error
-    REFERENCED = 1 << 14  # own bit: homing has been done
+    REFERENCED = 1 << 14  # manufacturer-specific: homing has been done
 
 
 class PowerStage:

@@ -13,11 +13,11 @@ LONGEST_WAIT_S: Final = 0.1
 """Default maximum interval between calls of ``should_stop``."""
 
 PATIENCE_S: Final = 5.0
-"""Maximum duration of read failures, because an interface that is down may come up again."""
+"""Time for which read failures are tolerated, because an interface that is down may come up again; s."""
 
 
 class Served(Protocol):
-    """A `DriveNode`, or several behind one bus."""
+    """A `DriveNode`, or several of them on one bus."""
 
     def handle(self, message: can.Message, now_s: float) -> None: ...
     def poll(self, now_s: float) -> None: ...
@@ -81,7 +81,7 @@ def run(
 
 
 def _age_s(message: can.Message) -> float:
-    """Returns the time for which a frame waited for this process, by its SocketCAN time stamp; else 0.
+    """Returns the time that a frame waited for this process, s, from its SocketCAN time stamp; else 0.
 
     The stamp is wall-clock time. A negative difference, or one longer than ``LONGEST_WAIT_S``, comes from a
     step of that clock and is ignored.

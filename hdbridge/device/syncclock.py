@@ -10,7 +10,7 @@ _ASTRAY: Final = 0.5
 """Deviation above which tracking restarts at the present SYNC; periods."""
 _ANOTHER: Final = 0.1
 _AGREEING: Final = 3
-"""Number of successive intervals, equal within `_ANOTHER`, that replace a different period."""
+"""Number of successive intervals, equal within `_ANOTHER`, after which they replace a different period."""
 
 
 class SyncClock:
@@ -23,11 +23,11 @@ class SyncClock:
         self.period_s = period_s
         self.time_s = self._received_s = -float("inf")
         self._interval_s = self.jitter_s = 0.0
-        """Mean deviation of a SYNC from its time without jitter, over the last 20 or so."""
+        """Mean absolute deviation of SYNC from its filtered time, over about the last 20 SYNCs."""
         self._count = self._agreeing = 0
 
     def take(self, now_s: float) -> None:
-        """Takes a received SYNC; ``time_s`` is then its time without jitter."""
+        """Takes a received SYNC; ``time_s`` is then its filtered time, without jitter."""
         before_s, self._interval_s = self._interval_s, now_s - self._received_s
         self._received_s = now_s
         interval_s = self._interval_s

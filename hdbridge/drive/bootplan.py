@@ -1,4 +1,4 @@
-"""Adapts the boot-up's writes to a drive: leaves objects that its EDS lacks or fixes to the drive. Pure."""
+"""Adapts the boot-up's writes to a drive: omits those that the drive's EDS does not allow. Pure."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from hdbridge.errors import InputError
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """Object that is left to the drive, with the reason and the consequence."""
+    """Object that the boot-up does not write, so that the drive keeps its own value."""
 
     index: int
     sub: int
@@ -44,8 +44,8 @@ def plan(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[PlannedWr
 
 
 def left_to_drive(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[Left]:
-    """Returns the objects that `plan` leaves to the drive, and missing objects that the control cycle does
-    not need.
+    """Returns the objects that `plan` leaves to the drive, and the missing objects that the control cycle
+    can do without.
     """
     od = dictionary_of(axis) if od is None else od
     if od is None:
@@ -125,7 +125,7 @@ def _of(row: PlannedWrite) -> str:
 
 
 def _check_mode(axis: AxisConfig, od: ObjectDictionary) -> None:
-    """Raises `InputError` if the EDS excludes the mode, by 6502h or else by the limits of 6060h."""
+    """Raises `InputError` if 6502h in the EDS, or without it the limits of 6060h, exclude the mode."""
     modes, said = _value_of_6502h(od), "6502h is {:08X}h"
     mode = find(od, objects.MODE.index, objects.MODE.sub)
     if not modes and mode is not None:

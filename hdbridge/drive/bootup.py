@@ -37,7 +37,7 @@ from hdbridge.errors import DriveError, IdentityError, SdoError
 
 _log = logging.getLogger(__name__)
 BOOT_UP_TIMEOUT_S: Final = 2.0
-"""Time from a reset to the boot-up message, after which the node is queried directly; s."""
+"""Maximum wait for the boot-up message after a reset, s; then the node is queried directly."""
 SDO_AFTER_BOOT_UP_S: Final = 3.5
 """Maximum time from the boot-up message to the first SDO answer of a node; s."""
 STATE_TIMEOUT_S: Final = 1.0
@@ -64,16 +64,16 @@ class BootReport:
     written: tuple[PlannedWrite, ...] = ()
     """The subset of ``held`` that had to be written."""
     left: frozenset[tuple[int, int]] = frozenset()
-    """Index and sub-index of the objects whose value the drive refused and could keep."""
+    """Index and sub-index of each object that the drive refused to change and was allowed to keep."""
     notes: tuple[str, ...] = field(default=())
     """Remarks for the user that do not justify refusing the drive."""
 
 
 class BootUp:
-    """One boot-up.
+    """Boots one drive.
 
     ``clients`` maps node ids to SDO clients: the drive's, and that of a separate load encoder.
-    ``others_heard`` are other nodes heard before.
+    ``others_heard`` are the other nodes already heard on the bus.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class BootUp:
             raise IdentityError(first)
 
     def _readings(self, addresses: Iterable[Address]) -> dict[Address, int]:
-        """Reads those of the objects that the EDS lists."""
+        """Reads the objects, except those that the EDS lacks."""
         return {each: self._sdo.fetch(each) for each in addresses if self._sdo.has(each.index, each.sub)}
 
     def _check_device_type(self) -> None:
@@ -368,8 +368,8 @@ def await_sdo(
     """Waits for the first SDO answer of a node and returns its device type (1000h).
 
     A node may answer only seconds after its boot-up message. Raises `DriveError` if it does not answer; the
-    message reports the messages of the node since its status had the counts ``since``. ``where`` is the key
-    of the axis file that defines the node. An abort counts as an answer (`SdoAbortError`).
+    error text lists the messages received from the node since its status had the counts ``since``. ``where``
+    is the key of the axis file that defines the node. An abort counts as an answer (`SdoAbortError`).
     """
     status = monitor.watch(client.node_id)
     while True:

@@ -19,7 +19,7 @@ from hdbridge.drive.layout import layouts
 from hdbridge.errors import InputError
 
 MAXIMUM_LOAD: Final = 0.8
-"""Maximum share of the cycle occupied by its frames. The rest is for retransmissions and other nodes."""
+"""Maximum fraction of the cycle time occupied by frames. The rest is for retransmissions and other nodes."""
 _STUFFED: Final = 34
 _UNSTUFFED: Final = 13
 _LARGEST: Final = 8
@@ -62,7 +62,7 @@ def cycle_bits(axes: Sequence[AxisConfig]) -> float:
 
 
 def bus_load(axes: Sequence[AxisConfig], bitrate_bps: int | None = None) -> float | None:
-    """Returns the worst-case share of each cycle occupied by its frames; None without a known bit rate.
+    """Returns the worst-case fraction of the cycle time occupied by frames; None if the bit rate is unknown.
 
     ``bitrate_bps`` is by default that of the axis files. Raises `InputError` if they disagree on the bit rate
     or the cycle time.
@@ -97,7 +97,7 @@ def check_bus_load(axes: Sequence[AxisConfig], bitrate_bps: int | None = None) -
 
 
 def _load_at(axes: Sequence[AxisConfig], rate: int, cycle_s: float) -> float:
-    """Returns the load at another cycle time."""
+    """Returns the bus load of the axes at another cycle time."""
     return cycle_bits([_with_cycle(axis, 1e3 * cycle_s) for axis in axes]) / (rate * cycle_s)
 
 

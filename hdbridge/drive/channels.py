@@ -12,7 +12,10 @@ from hdbridge.drive.supervision import Fault
 
 
 class ChannelFollower:
-    """One channel. `accept` takes its readings, `step` ends each cycle, ``value`` is the reading in force."""
+    """Validates and holds the readings of one channel.
+
+    `accept` takes a reading, `step` ends each cycle, and ``value`` is the reading to use.
+    """
 
     def __init__(self, key: str, channel: MeasuredChannel, cycle_ms: float) -> None:
         """``key`` is the channel's key in the axis file."""
@@ -36,8 +39,8 @@ class ChannelFollower:
         is lost.
         """
         self.lost = False
-        """True if no good reading has come for longer than the hold time, so that readings are no longer
-        awaited."""
+        """True if no good reading has come for longer than the hold time; the cycle then no longer waits for
+        readings."""
         self.why = "none came"
         """Reason for the lack of a new value, for messages."""
         self._age = 0

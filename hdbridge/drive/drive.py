@@ -1,4 +1,4 @@
-"""Commissioning interface of a CiA-402 drive: boot it, enable it, move it, and never leave it enabled.
+"""Commissioning interface of a CiA-402 drive: boots, enables and moves it, and never leaves it enabled.
 
     with open_bus(axis.bus) as bus, Drive(bus, axis) as drive:
         drive.boot()
@@ -383,8 +383,8 @@ class Drive:
                 quick.store(objects.HEARTBEAT_CONSUMER, 0)
 
     def _power_off_blindly(self) -> None:
-        """Powers off without waiting for answers, with frames that even a drive that can only receive
-        obeys.
+        """Powers off without waiting for answers, so that even a drive that can no longer send is powered
+        off.
         """
         request = objects.COB_SDO_REQUEST + self.axis.drive.node_id
         with suppress(HdbridgeError):

@@ -1,6 +1,6 @@
 """Names of the error codes in EMCY messages and object 603Fh (CiA 301 table 26, CiA 402-2 annex).
 
-The name of a code is that of the profiles, else the class given by its leading digits.
+A code that the profiles do not define is named after the class given by its leading digits.
 """
 
 from typing import Final
@@ -111,7 +111,7 @@ _GATEWAY: Final[dict[int, str]] = {
     0xFF02: "power was refused, did not come, or was lost",
     0xFF03: "quick stop by a client",
 }
-"""Causes for these codes from the gateway."""
+"""Causes of the error codes that the gateway sends."""
 
 
 def gateway_error(code: int) -> str:

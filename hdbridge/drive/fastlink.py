@@ -1,7 +1,7 @@
 """Fast link for the control cycle: the same frames and errors as `Link`, with less CPU time.
 
-python-can's copying and building of messages would be half the cost of a cycle. Two shortcuts avoid it
-without other changes. On SocketCAN, frames are read and written on the bus's own socket. On other interfaces,
+Building and copying messages in python-can would take half the time of a cycle. Two shortcuts avoid this and
+change nothing else. On SocketCAN, frames are read and written on the bus's own socket. On other interfaces,
 sent messages are copied by their constructor rather than by the deep copy that python-can's virtual bus makes
 for each receiver.
 """
@@ -42,7 +42,7 @@ def fast_link(link: Link) -> Link:
 
 
 class _MessageLink(Link):
-    """Link that sends messages whose copying is cheap."""
+    """Link that sends messages that are cheap to copy."""
 
     def send(self, can_id: int, data: bytes) -> None:
         if self._down is not None:
@@ -109,7 +109,7 @@ class _SocketLink(Link):
 
 
 def _refused(can_id: int) -> Any:
-    """Returns a frame that CANopen does not use as a message, so that the base class can count it."""
+    """Converts a frame that CANopen does not use to a python-can message, so that `Link` can count it."""
     return can.Message(
         arbitration_id=can_id & _IDENTIFIER,
         is_extended_id=bool(can_id & _EXTENDED),

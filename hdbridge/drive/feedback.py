@@ -1,4 +1,4 @@
-"""Measurements of one control cycle, and waiting for power in it."""
+"""Measurements of one control cycle, and the wait for 'operation enabled' in the cycle."""
 
 import math
 from collections.abc import Callable
@@ -20,7 +20,7 @@ class Feedback(NamedTuple):
     load_counts: int
     demand_counts: int
     torque_permille: float
-    """NaN if the drive does not send it (6077h)."""
+    """Torque in per mille of the rated torque (6077h); NaN if the drive does not send it."""
     fresh: bool
     """False if a TPDO was missing or implausible; the values are then the last good values."""
     readings: tuple[float | None, ...]

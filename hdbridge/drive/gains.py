@@ -14,7 +14,7 @@ GAIN_OBJECTS: Final = (0x60F6, 0x60F9, 0x60FB)
 
 
 def read_gains(sdo: SdoClient) -> dict[str, int]:
-    """Reads the integers of `GAIN_OBJECTS` that are in the EDS and readable, by ``60FBh:01``."""
+    """Reads the readable integer objects of `GAIN_OBJECTS` in the EDS; the keys are like ``60FBh:01``."""
     found = {}
     for index in GAIN_OBJECTS:
         entry = sdo.od.get(index)
@@ -32,7 +32,7 @@ def read_gains(sdo: SdoClient) -> dict[str, int]:
 
 
 def changed_gains(then: Mapping[str, int], now: Mapping[str, int]) -> list[str]:
-    """Returns a line for each gain object whose value differs from an earlier one."""
+    """Returns one line of text for each gain object whose value has changed."""
     return [
         f"{name} is {now[name]}, was {value} when the response was measured"
         for name, value in then.items()

@@ -31,8 +31,8 @@ _ENABLED: Final = State.OPERATION_ENABLED
 _ENABLE_OPERATION: Final = Command.ENABLE_OPERATION.word
 HALT_BIT: Final = 0x0100
 HEARTBEATS_PER_TIMEOUT: Final = 2
-"""Heartbeats of the master within the drive's time-out, and periods of the drive's heartbeat for which the
-master waits."""
+"""Number of heartbeats that the master sends within the drive's time-out; also the master's time-out for the
+drive, in periods of the drive's heartbeat."""
 
 
 def drive_heartbeat_ms(axis: AxisConfig, od: ObjectDictionary | None = None) -> int:
@@ -44,7 +44,7 @@ def drive_heartbeat_ms(axis: AxisConfig, od: ObjectDictionary | None = None) -> 
 
 
 def position_limits_counts(axis: AxisConfig) -> tuple[int, int]:
-    """Returns the least and the greatest target of the drive in motor counts, ordered for either direction.
+    """Returns the minimum and maximum target in motor counts, in ascending order whatever the direction.
 
     The limits of the axis file apply to the commanded position. The compensation may add up to its own
     maximum, so the drive's limits are wider by that amount. `AxisConfig` ensures that both fit the 32 bits of
@@ -120,7 +120,7 @@ class ProcessImage:
         self.torque_permille: float = math.nan if objects.TORQUE_ACTUAL in absent else 0
         """Torque in per mille of the rated torque; NaN if the drive does not send it."""
         self.target_counts = 0
-        """Last target that was packed."""
+        """Last packed target, motor counts."""
         self._under_way = 0
 
     # -- received frames ----------------------------------------------------------------------------------
@@ -240,10 +240,10 @@ class ProcessImage:
 
     def _packer(self, layout: Layout, od: ObjectDictionary | None) -> Callable[[int, int], tuple[int, bytes]]:
         """Returns a function that builds an RPDO frame from controlword and target, either of which may be
-        elsewhere.
+        in another RPDO.
 
         A read-only mapping may contain other objects. The mode of operation is then that of the cycle; all
-        other objects are set to their value in the EDS, else to 0.
+        others have their value from the EDS, or 0 if it gives none.
         """
         entries, can_id, pack = layout.codec.entries, layout.can_id, layout.codec.pack
         values = [0 if entry.is_gap or od is None else _held(od, entry) for entry in entries]

@@ -19,13 +19,13 @@ except ImportError:  # a system without flock has no lock and no holder to repor
 
 _SHARED_BY_ALL_USERS: Final = Path("/run/lock")
 _IN_ONE_PROCESS: Final = frozenset({"virtual"})
-"""python-can interfaces within one process."""
+"""python-can interfaces that are confined to one process and therefore need no lock."""
 
 
 class InterfaceLock:
-    """Lock of a CAN interface on this computer, held by one holder until released.
+    """Lock on a CAN interface of this computer. Only one holder can have it at a time.
 
-    The lock file is never removed, because the next two processes could then each obtain a lock. ``folder``
+    The lock file is never removed; otherwise, the next two processes could each obtain a lock. ``folder``
     is its location, by default one shared by all users of the computer.
     """
 
@@ -126,12 +126,12 @@ def _folder() -> Path:
 
 
 def _open(path: Path) -> int:
-    """Opens for reading, which suffices for locking, because the file may belong to another user."""
+    """Opens the lock file for reading, which suffices for locking: it may belong to another user."""
     flags = os.O_RDONLY | os.O_NOFOLLOW
     try:
         try:
             handle = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o644)
-            os.fchmod(handle, 0o644)  # regardless of the umask, because the next user may be another
+            os.fchmod(handle, 0o644)  # regardless of the umask: another user may be next
         except FileExistsError:
             return os.open(path, flags)
         return handle

@@ -1,6 +1,6 @@
-"""Contents of each PDO, from the needs of the axis and the offers of its drive. Pure.
+"""Contents of each PDO, derived from what the axis needs and what its drive offers. Pure.
 
-A drive with free mappings gets
+A drive with configurable mappings uses
 
     TPDO1 180h+id  statusword, position, torque        8 bytes
     TPDO2 280h+id  load encoder, position demand       8 bytes (4 if the load encoder has its own node id)
@@ -73,7 +73,7 @@ class _Offer(NamedTuple):
 
     number: int
     capacity: int
-    """Number of objects that it can map."""
+    """Number of objects that the PDO can map."""
     fixed: tuple[PdoEntry, ...] | None
     """Entries of a read-only mapping; None if the mapping can be written."""
     can_id: int | None
@@ -290,9 +290,9 @@ def _fits(need: PdoEntry, offer: _Offer, entries: Sequence[PdoEntry]) -> bool:
 
 
 def _laid_out(node_id: int, first: int, chosen: _Choice, taken: set[int], every: int) -> Iterator[Layout]:
-    """Yields layouts, each with an identifier.
+    """Yields the layouts of the chosen PDOs, each with its CAN identifier.
 
-    ``first`` is the function code of the kind's first PDO. Identifiers in use are added to ``taken``.
+    ``first`` is the function code of the first PDO of this kind. The identifiers used are added to ``taken``.
     """
     predefined = [first + _STEP * place + node_id for place in range(_PREDEFINED)]
     reserved = {predefined[offer.number - 1] for offer, _ in chosen if offer.number <= _PREDEFINED}

@@ -1,7 +1,7 @@
 """Raw CAN frames in and out: the only module of the master that uses python-can.
 
-It runs in the control cycle, so it adds little to the back end's own call. Every failure of the interface
-becomes a `BusError` with its name. Frames that CANopen does not use are dropped and counted. Every deadline
+It runs in the control cycle, so it adds little to the back end's own call. Every interface failure becomes a
+`BusError` that names the interface. Frames that CANopen does not use are dropped and counted. Every deadline
 refers to the monotonic clock that was passed in.
 """
 
@@ -36,7 +36,7 @@ _PACKAGES: Final = {
     "udp_multicast": ("msgpack", "msgpack"),
     **dict.fromkeys(("slcan", "serial", "robotell", "seeedstudio"), ("serial", "pyserial")),
 }
-"""Interfaces with an optional dependency of python-can: its module and its package."""
+"""Optional dependency (module, package) of each python-can interface that requires one."""
 _NETWORK: Final = Path("/sys/class/net")
 _ARPHRD_CAN: Final = 280
 """ARPHRD_CAN of linux/if_arp.h, the type of a CAN interface."""
@@ -97,9 +97,9 @@ class Link:
         self.mark = _mark(bus)
         """Channel name of own frames on a back end that echoes them, else None."""
         self._send = bus.send
-        # BusABC.recv measures its remaining time on the *wall* clock: if that is set back during a wait, recv
-        # blocks for as long. The hook below has no such loop, so it is used for back ends that rely on
-        # BusABC.recv.
+        # BusABC.recv measures its remaining time on the *wall* clock: if that clock is set back during a
+        # wait, recv blocks longer by the same amount. The hook below has no such loop, so it is used for
+        # back ends that rely on BusABC.recv.
         own_recv = getattr(type(bus), "recv", None) is not can.BusABC.recv
         self._raw_recv = None if own_recv else bus._recv_internal
         self._recv = bus.recv
@@ -159,7 +159,7 @@ class Link:
             return new_tuple(Frame, (message.arbitration_id, bytes(message.data), now()))
 
     def drain(self) -> list[Frame]:
-        """Returns all frames that have arrived, without waiting; at most 4096, so that it ends on any bus."""
+        """Returns the frames that have arrived, without waiting; at most 4096, so that it always ends."""
         frames: list[Frame] = []
         now_s = self.now()
         while len(frames) < _DRAIN_AT_MOST and (frame := self.recv(now_s)) is not None:

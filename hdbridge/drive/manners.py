@@ -2,8 +2,7 @@
 
 A reset, and on some drives even an SDO request, stops an axis that another master is moving. A master
 therefore listens first, for as long as the slowest other master may be silent. The relevant frames are those
-that would stop the axis while this master runs: SYNC, NMT commands, the heartbeat of a master, and set-
-points.
+that would stop the axis while this master runs: SYNC, NMT commands, a master's heartbeat and set-points.
 """
 
 from collections import Counter
@@ -17,8 +16,8 @@ from hdbridge.errors import BusInUseError
 LONGEST_CYCLE_S: Final = 0.255
 """Longest SYNC period that a drive accepts: 255 ms in 60C2h; s."""
 PERIODS: Final = 2
-"""Listening time in periods of the slowest cycle and of the heartbeat: two, because a frame may just have
-been sent."""
+"""Listening time in periods of the slowest cycle or of the heartbeat, whichever is longer. Two, because a
+frame may have been sent just before."""
 USUAL_MASTER: Final = 127
 """Default node id of a master's heartbeat (77Fh), unless its axis file sets another."""
 _RPDOS: Final = (objects.COB_RPDO1, 0x300, 0x400, 0x500)
@@ -41,7 +40,7 @@ class Ear:
     """Counts the frames that only another master sends.
 
     ``drives`` are the nodes whose set-points count, ``masters`` the node ids whose heartbeat is a master's,
-    ``asked`` the nodes whose SDO channel is reserved.
+    ``asked`` the nodes whose SDO requests count.
     """
 
     def __init__(

@@ -26,15 +26,15 @@ CHANGE_AT_ONCE: Final = 0x0020
 START_HOMING: Final = 0x0010
 TARGET_REACHED: Final = 0x0400
 ACKNOWLEDGED: Final = 0x1000
-"""PP: set-point acknowledged; HM: homing attained."""
+"""Bit 12 of the statusword. PP: set-point acknowledged; HM: homing attained."""
 FAILED: Final = 0x2000
-"""PP: following error; HM: homing error."""
+"""Bit 13 of the statusword. PP: following error; HM: homing error."""
 HOMED: Final = ACKNOWLEDGED | TARGET_REACHED
 STALE_READINGS: Final = 50
-"""Number of statusword readings, at least `POLL_S` apart, after which bits from before a command have been
-cleared."""
+"""Number of statusword readings, at least `POLL_S` apart, after which a drive has cleared the bits of an
+earlier action."""
 TOWARDS_SWITCH: Final = 0.1
-"""Default speed of a homing run towards the switch, as a share of the axis's velocity limit."""
+"""Default speed of a homing run towards the switch, as a fraction of the axis's velocity limit."""
 TOWARDS_ZERO: Final = 0.02
 _OFFSET_COUNTS: Final = 2**31
 _TIME_MARGIN: Final = 1.5
@@ -240,7 +240,7 @@ def _end(commander: Commander, doing: str, what: str, before: int, bits: int, ti
 
     ``before`` is the statusword before the action was started. If it shows the end of an earlier action, the
     drive must clear those bits first. Some drives take 50 ms for this, and an action that ends at once never
-    shows cleared bits. After `STALE_READINGS` readings, the bits therefore count as the answer.
+    shows cleared bits. After `STALE_READINGS` readings, bits that are still set therefore end the wait.
     """
 
     def over(word: int) -> bool:

@@ -17,7 +17,7 @@ EMERGENCIES_KEPT: Final = 64
 
 
 class Emergency(NamedTuple):
-    """One EMCY message; a short message is kept with its actual bytes."""
+    """One EMCY message; ``vendor`` has fewer than five bytes if the message is too short."""
 
     time_s: float
     code: int
@@ -54,7 +54,7 @@ class NodeStatus:
         return self.boot_ups, self.heartbeats, self.emergency_count
 
     def heard_since(self, counts: tuple[int, int, int]) -> str:
-        """Describes the messages of the node since these counts; empty without any."""
+        """Describes the messages of the node since these counts; empty if there are none."""
         boot_ups, heartbeats, emergencies = counts
         said = []
         if self.boot_ups > boot_ups:

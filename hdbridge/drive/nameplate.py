@@ -14,7 +14,7 @@ from hdbridge.drive.layout import cyclic_mode
 from hdbridge.drive.objects import Address
 
 Readings = Mapping[Address, int]
-"""Values read from the drive, without the objects that it lacks."""
+"""Values read from the drive, by address; objects that the drive lacks are missing."""
 
 IDENTITY: Final[tuple[tuple[Address, str], ...]] = (
     (objects.VENDOR_ID, "vendor_id"),
@@ -151,7 +151,10 @@ def _polarity(axis: AxisConfig, readings: Readings) -> Iterator[str]:
 
 
 def _load_counts(axis: AxisConfig, readings: Readings) -> Iterator[str]:
-    """Compares 60E6h and 60EBh, for an encoder at 60E4h, with the axis file, per turn of load or motor."""
+    """Compares the resolution of a load encoder at 60E4h (60E6h over 60EBh) with the axis file.
+
+    The drive may give it per turn of the load or of the motor.
+    """
     source, counts = axis.load_encoder.source, axis.load_encoder.counts_per_turn
     if source.node is not None or source.index != objects.ADDITIONAL_POSITIONS:
         return

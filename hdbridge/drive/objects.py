@@ -32,17 +32,17 @@ class IntegerType(Enum):
 
     @property
     def signed(self) -> bool:
-        """True if the type has a sign."""
+        """True for a signed type."""
         return not self.value.startswith("u")
 
     @property
     def minimum(self) -> int:
-        """Smallest value."""
+        """Smallest value of the type."""
         return -(1 << (self.bits - 1)) if self.signed else 0
 
     @property
     def maximum(self) -> int:
-        """Largest value."""
+        """Largest value of the type."""
         return (1 << (self.bits - self.signed)) - 1
 
     def encode(self, value: int) -> bytes:
@@ -95,7 +95,7 @@ class Mode(IntEnum):
         return 1 << (self.value - 1)
 
 
-# Function codes of the predefined connection set (CiA 301); the node id is added where there is one.
+# Function codes of the predefined connection set (CiA 301), to which the node id is added for most services.
 COB_NMT: Final = 0x000
 COB_SYNC: Final = 0x080
 COB_EMCY: Final = 0x080
@@ -171,7 +171,7 @@ CYCLE_EXPONENT: Final = Address(0x60C2, 2, _I8, "interpolation time index")
 SUPPORTED_MODES: Final = Address(0x6502, 0, _U32, "supported drive modes")
 
 ADDITIONAL_POSITIONS: Final = 0x60E4
-"""Array of additional encoders; the sub-index is the encoder's number."""
+"""Index of the array of additional encoder positions; the sub-index is the encoder's number."""
 
 
 def additional_resolution(sub: int) -> tuple[Address, Address]:
@@ -192,7 +192,7 @@ class CyclicMode(NamedTuple):
     mode: Mode
     target: Address
     enabling: int
-    """Controlword bits set only in 'operation enabled', without which the drive holds its position."""
+    """Controlword bits set only in 'operation enabled'; without them the drive holds its position."""
 
 
 CYCLIC: Final = {

@@ -20,7 +20,7 @@ _FIRST_OBJECT = 0x1000
 
 
 class PdoLengthError(DriveError):
-    """A PDO does not have the length of its mapping and counts as lost."""
+    """A PDO's length differs from that of its mapping; the PDO counts as lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class PdoEntry:
 
     @property
     def is_gap(self) -> bool:
-        """True for a data type in place of an object, which a drive's own mapping may contain as padding."""
+        """True for padding: a data type in place of an object, which a drive's own mapping may contain."""
         return self.index < _FIRST_OBJECT
 
     @property
@@ -67,7 +67,7 @@ class PdoCodec:
         self.positions: dict[tuple[int, int], int] = {
             (entry.index, entry.sub): place for place, entry in enumerate(self.entries)
         }
-        """Place of an object's value in the tuple, by (index, sub-index)."""
+        """Position of each object's value in the unpacked tuple, by (index, sub-index)."""
         # struct has no 24-bit integer: such entries are packed as three bytes and converted separately.
         self._odd = tuple(place for place, entry in enumerate(self.entries) if entry.type.bits == 24)
         names = ", ".join(map(str, self.entries))

@@ -6,7 +6,7 @@ thread receives until the answer arrives or a deadline on the given clock passes
 to the network monitor. The client also retries whole transfers, limits the size of an answer, checks every
 answer's length, and raises errors with advice.
 
-Never used inside the control cycle.
+It must not be used in the control cycle.
 """
 
 import logging
@@ -235,7 +235,7 @@ class SdoClient:
         )
 
     def read_bytes(self, index: int, sub: int) -> bytes:
-        """Reads an object's raw bytes, at most `SIZE_CAP`; an expedited answer without a size has four."""
+        """Reads an object's raw bytes, at most `SIZE_CAP`; four for an expedited answer without a size."""
         return self._transfer("read", index, sub, None)
 
     def write_bytes(self, index: int, sub: int, data: bytes) -> None:

@@ -139,7 +139,7 @@ def decode(statusword: int | None) -> State:
 
 
 def row_for(state: State, command: Command) -> Transition:
-    """Returns the row of ``command`` in ``state``; raises `TransitionError` without one."""
+    """Returns the row of ``command`` in ``state``; raises `TransitionError` if there is none."""
     for row in TRANSITIONS:
         if row.source is state and row.command is command:
             return row
@@ -288,7 +288,7 @@ class PowerWalk:
         if self._reset == _RESET_HIGH:
             return Command.FAULT_RESET.word
         if self._aim is _QUICK_STOP and self._state is not _QUICK_STOP:
-            # Also if nothing is known about the drive: a quick stop does no harm in any state.
+            # Sent even if the drive's state is unknown: a quick stop does no harm in any state.
             return Command.QUICK_STOP.word
         return _WORDS[self._state][self._aim]
 

@@ -114,7 +114,7 @@ EXPLAINED_HINT: Final = f"remove that cause, then reset the fault: {RESET}"
 
 
 class Event(NamedTuple):
-    """Occurrence of a fault."""
+    """Occurrence of a fault, with the reaction to it."""
 
     cycle: int
     fault: Fault
@@ -139,7 +139,7 @@ class Supervision:
         self._runs: dict[Fault, int] = {}
         self._frozen = False
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
-        """Newest events, oldest first."""
+        """Newest `EVENTS_KEPT` events, oldest first."""
         self.noted = 0
         """Number of all events, including those dropped."""
         self.counts: dict[Fault, int] = dict.fromkeys(Fault, 0)
@@ -197,7 +197,7 @@ class Supervision:
         return reaction
 
     def since(self, noted: int) -> list[Event]:
-        """Returns the events after the first ``noted`` events, oldest first, as far as kept."""
+        """Returns those of the kept events that followed the first ``noted`` events, oldest first."""
         new = min(self.noted - noted, len(self.events))
         return list(islice(self.events, len(self.events) - new, None)) if new > 0 else []
 

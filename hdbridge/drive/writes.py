@@ -35,7 +35,7 @@ _LARGEST_MANTISSA: Final = 255
 
 @dataclass(frozen=True, slots=True)
 class PlannedWrite:
-    """Required value of one object."""
+    """One write of the boot-up: the required value of one object."""
 
     node_id: int
     index: int
@@ -114,7 +114,7 @@ def set_point_timeout_ms(axis: AxisConfig) -> int:
 
 
 def drives_patience_s(axis: AxisConfig) -> float:
-    """Returns the time after which a drive with all its watchdogs stops without its master; s."""
+    """Returns the time without a master after which a drive with all its watchdogs stops; s."""
     return min(axis.drive.heartbeat_ms, set_point_timeout_ms(axis)) / 1000.0
 
 
@@ -257,8 +257,8 @@ def _cycle(axis: AxisConfig, od: ObjectDictionary | None) -> Iterator[PlannedWri
 
 
 def _period(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[int, int]:
-    """Returns mantissa and exponent of the cycle in a form that the drive accepts; some fix exponent or
-    period.
+    """Returns the cycle time as a mantissa and an exponent that the drive accepts; some drives fix the
+    exponent or the period.
     """
     seconds = Decimal(repr(axis.drive.cycle_ms)) / 1000
     pairs = [(seconds.scaleb(-exponent), exponent) for exponent in _EXPONENTS]

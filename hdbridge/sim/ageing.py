@@ -1,7 +1,7 @@
 """Ageing: gradual changes in the gear over hours of work, linear from switch-on; see `hdbridge.sim.gear`.
 
-Stiffening grease and settling preload change the loop; wear of the teeth changes the tooth error. Each piece
-is evaluated once per substep, in order of time.
+Stiffening grease and settling preload change the hysteresis loop; wear of the teeth changes the tooth error.
+Each piece is evaluated once per substep, in order of time.
 """
 
 import math
@@ -14,7 +14,7 @@ from hdbridge.sim.truth.gear import TrueAgeing
 
 @state
 class Age:
-    """Completed share of the ageing, which rises from 0 at switch-on to 1 and stays there."""
+    """Completed fraction of the ageing, which rises from 0 at switch-on to 1 and stays there."""
 
     _share: float
     _step: float
@@ -24,14 +24,14 @@ class Age:
         self._share = 0.0
 
     def grown(self) -> float:
-        """Returns the share after one more substep."""
+        """Advances by one substep and returns the completed fraction."""
         self._share = min(1.0, self._share + self._step)
         return self._share
 
 
 @state
 class AgeFactor:
-    """Growth of the elastic hysteresis."""
+    """Factor by which the elastic hysteresis has grown with age."""
 
     _age: Age
     _growth: float
@@ -46,7 +46,7 @@ class AgeFactor:
 
 @state
 class WornTeeth:
-    """Tooth error by motor angle, caused by wear."""
+    """Tooth error over the motor angle that wear adds with age."""
 
     by_motor_only: ClassVar[bool] = False
     _age: Age

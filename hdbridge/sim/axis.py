@@ -1,4 +1,4 @@
-"""Simulated axis, cycle by cycle: the loops, the heat, and the encoder readings at the end of a cycle.
+"""Simulated axis, cycle by cycle: servo loops, temperature, and the encoder readings at the end of a cycle.
 
 It contains all computations of `hdbridge.sim.machine` in a cycle except noise, so it can be compiled as a
 whole and advanced by one call per cycle.
@@ -19,9 +19,9 @@ class Measured(NamedTuple):
     """Measurements at the end of a cycle."""
 
     motor_reading: float
-    """Motor encoder in counts, before rounding."""
+    """Reading of the motor encoder in counts, before rounding."""
     load_reading: float
-    """Load encoder in counts, before rounding; includes noise."""
+    """Reading of the load encoder in counts, before rounding; includes noise."""
     torque_nm: float
     """Motor torque, not rounded, in the direction of the motor encoder."""
     torque_permille: int
@@ -33,9 +33,12 @@ class Measured(NamedTuple):
     that the truth file states. Friction of the gear's bearings and the load's inertia are not included.
     """
     motor_counts: int
-    """Motor encoder in whole counts, multi-turn, never wrapped, each at the middle of its count."""
+    """Reading of the motor encoder in whole counts, multi-turn, never wrapped.
+
+    A count represents the angle at its middle.
+    """
     load_counts: int
-    """Load encoder in whole counts, multi-turn, never wrapped."""
+    """Reading of the load encoder in whole counts, multi-turn, never wrapped."""
     velocity_counts_s: float
     """Motor speed as measured by the drive."""
     elapsed_s: float
@@ -58,7 +61,7 @@ class Axis:
     _hold_counts: float
     _hold_deg: float
     _holds: bool
-    """True while the demand is still that of switch-on."""
+    """True while the demand has not changed since switch-on."""
     _load_counts_per_deg: float
     _load_errors: FixedErrors
     _load_losses: Losses
@@ -91,7 +94,7 @@ class Axis:
         self._torque_sense = float(truth.load_.torque_sense)
 
     def at_first(self) -> Measured:
-        """Returns the initial state."""
+        """Returns the measurements in the initial state."""
         return self._readings(0.0, 0.0, 0.0)
 
     def drive(
@@ -164,7 +167,7 @@ class Axis:
             round(self._sense_permille * loops.torque_nm / self._rated_nm),
             heat.body_c,
             self._torque_sense * (plant.weight_nm(plant.now.load_deg) + outer_nm),
-            # Multi-turn, never wrapped. The middle of a count is its angle.
+            # Multi-turn, never wrapped. A count represents the angle at its middle.
             math.floor(motor_reading + 0.5),
             math.floor(load_reading + 0.5),
             loops.servo.measured_deg_s * self.motor_counts_per_deg,
@@ -175,10 +178,10 @@ class Axis:
         )
 
     def _motor_reading(self, motor_deg: float) -> float:
-        """Returns the motor encoder at an angle, in counts before rounding."""
+        """Returns the reading of the motor encoder at an angle, in counts before rounding."""
         read_deg = motor_deg + self._motor_errors.at_deg(motor_deg) + self._lost_deg()
         return read_deg * self.motor_counts_per_deg + self._motor_zero
 
     def _lost_deg(self) -> float:
-        """Returns the angle lost by the motor encoder."""
+        """Returns the angle error due to lost counts of the motor encoder, degrees."""
         return self._motor_losses.counts(self.heat.since_s) / self.motor_counts_per_deg

@@ -45,9 +45,9 @@ class Kinds(NamedTuple):
 
     classes: tuple[type, ...]
     room: int
-    """Capacity of the tuple of elements."""
+    """Number of places in a tuple of such attributes."""
     neutral: float
-    """Value of an unused place in such a tuple."""
+    """Value that an unused place returns."""
 
 
 KINDS: Final[dict[Any, Kinds]] = {
@@ -117,7 +117,7 @@ class CompiledAxis:
         held_nm: FloatArray,
         readings: FloatArray,
     ) -> Measured:
-        """Runs `Axis.drive` over many cycles, each from the demand before it, first held by ``held_nm``.
+        """Runs `Axis.drive` over many cycles, each from the previous demand, after `hold` with ``held_nm``.
 
         ``readings`` receives the first six values of each cycle (`machine.Cycles`).
         """
@@ -315,9 +315,9 @@ def _fill_union(record: Any, protocol: Any, value: Any) -> None:
 
 
 _CLASSES: Final[dict[Any, type]] = {}
-"""Class of each record type of numba."""
+"""State class of each numba record type."""
 _UNIONS: Final[dict[Any, Any]] = {}
-"""Protocol of each record type of numba that may be one of several classes."""
+"""Protocol of each numba record type that can hold an object of one of several classes."""
 
 
 @cache
@@ -357,8 +357,8 @@ _METHOD: Final[dict[str, Any]] = {
     "strict": False,
     "jit_options": {"no_cpython_wrapper": True, "no_cfunc_wrapper": True},
 }
-"""Numba's options for methods called only by compiled code: without entries for Python and C they compile in
-an eighth of the time."""
+"""Numba's options for methods called only by compiled code. They compile in an eighth of the time without
+entry points for Python and C."""
 _KNOWN: Final[dict[str, int]] = {}
 """Registered methods, with the number of their parameters."""
 

@@ -1,4 +1,4 @@
-"""Encoder errors: geometry of the disc, signals, cable, ageing, lost counts.
+"""Encoder errors: geometry of the disc, signals, cable, warming, lost counts.
 
 Each error is a reading error in degrees of the encoder's shaft; the shaft itself does not move.
 """
@@ -60,7 +60,7 @@ class Disc:
 
 @state
 class Signals:
-    """Angle within a line, from imperfect sine and cosine signals.
+    """Interpolation within a line from imperfect sine and cosine signals.
 
     Offsets cause an error once per line, unequal amplitudes or phases twice, third harmonics four times.
     """
@@ -118,7 +118,7 @@ class Cable:
 
 @state
 class SensorWarming:
-    """Shift proportional to the square of the speed, with a lag, as the encoder warms and cools."""
+    """Reading shift proportional to the square of the speed, with a lag, as the encoder warms and cools."""
 
     _exponent: float
     _goal: float
@@ -166,7 +166,7 @@ class Losses:
         self._past, self._lost = 0, 0.0
 
     def counts(self, now_s: float) -> float:
-        """Returns the reading error at a time; successive times must not decrease."""
+        """Returns the reading error in counts at a time; successive times must not decrease."""
         while self._past < self._count and self._times_s[self._past] <= now_s:
             self._lost += self._counts[self._past]
             self._past += 1
@@ -180,7 +180,7 @@ class Late:
     deg: float
     """Delayed angle."""
     _angles: list[float]
-    """Angles since then, in a ring that starts at ``_oldest``."""
+    """Angles since the delayed one, in a ring buffer that starts at ``_oldest``."""
     _kept: int
     _oldest: int
     _part: float

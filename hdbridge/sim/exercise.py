@@ -1,7 +1,7 @@
 """Moves the simulated axis without a bus and records its encoders.
 
-This generates records in bulk with the same loops, mechanics and encoders as behind the firmware, at least
-250 times faster than real time. All moves begin and end at rest, with continuous speed.
+This generates records in bulk, at least 250 times faster than real time, with the same loops, mechanics and
+encoders as the drive with firmware. All moves begin and end at rest, with continuous speed.
 """
 
 import math
@@ -30,7 +30,7 @@ class Readings(NamedTuple):
 
 
 class Exercise:
-    """Moves of one machine, in motor degrees from its present position; one demand per cycle."""
+    """Moves one machine, with one demand per cycle; distances are motor degrees from its present position."""
 
     def __init__(self, machine: Machine, cycle_s: float = 0.004, cycles_per_sample: int = 1) -> None:
         self.machine = machine
@@ -86,7 +86,7 @@ class Exercise:
             self.lead(way, 2.0 * ramp_s + even_s, distance_deg)
 
     def sine(self, amplitude_deg: float, frequency_hz: float, periods: float) -> None:
-        """Oscillates as 1 - cos, between here and twice the amplitude away."""
+        """Oscillates as 1 - cos, between the present position and twice the amplitude from it."""
         turn = math.tau * frequency_hz
         self.lead(lambda seconds: amplitude_deg * (1.0 - np.cos(turn * seconds)), periods / frequency_hz)
 
@@ -98,7 +98,10 @@ class Exercise:
     def lead(
         self, way: Callable[[Floats], Floats], duration_s: float, distance_deg: float | None = None
     ) -> None:
-        """Follows ``way``, distance over time, for a duration; ends exactly at ``distance_deg`` if given."""
+        """Follows ``way`` (distance as a function of time) for a duration.
+
+        The motion ends exactly at ``distance_deg`` if given.
+        """
         cycles = max(1, math.ceil(duration_s / self.cycle_s - 1e-9))
         ways = way(np.arange(1, cycles + 1, dtype=np.float64) * self.cycle_s)
         if distance_deg is not None:

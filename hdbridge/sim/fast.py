@@ -1,8 +1,8 @@
-"""Decision whether and when to compile the simulated axis: with numba, and once compiling pays off.
+"""Decides whether and when the simulated axis is compiled: if numba is installed, once compiling pays off.
 
-numba comes with the extra ``hdbridge[fast]``. Loading it takes a second, and compiling another twelve the
-first time on a computer; compiled code is kept on disk. A process therefore begins in Python and switches to
-the compiled axis after the number of steps that would have paid for it. The numbers are the same.
+numba comes with the extra ``hdbridge[fast]``. Loading it takes a second, and compiling takes another twelve
+the first time on a computer; compiled code is kept on disk. A process therefore begins in Python and switches
+to the compiled axis after as many substeps as pay for compiling. The results are the same.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def compiled_axis(axis: Axis) -> AnyAxis:
     """Returns the axis compiled in its present state, or the axis itself if that is not possible."""
     if os.environ.get(SWITCH) == "0" or importlib.util.find_spec("numba") is None:
         return axis
-    from hdbridge.sim import compiled  # noqa: PLC0415 - takes half a second, and the extra
+    from hdbridge.sim import compiled  # noqa: PLC0415 - takes half a second and needs numba
 
     try:
         made = compiled.CompiledAxis(axis)

@@ -29,7 +29,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 
 class Factor(Protocol):
-    """Factor on the size of a cause."""
+    """Factor by which the size of a cause is multiplied."""
 
     def factor(self, now: Conditions) -> float:
         """Returns the factor under these conditions, one substep after the last call."""
@@ -45,7 +45,7 @@ class Piece(Protocol):
         ...
 
     def arcsec(self, now: Conditions) -> float:
-        """Returns the piece's part of the output error under the new conditions, arcsec."""
+        """Returns the piece's contribution to the output error under the new conditions, arcsec."""
         ...
 
 
@@ -91,7 +91,7 @@ class MotorOrders:
             size *= factor.factor(now)
         error, slope = self._orders.at(angle_deg * self._rad_per_deg)
         grown = self._growth_per_nm * abs(now.torque_nm)
-        # The energy stored by torque T in an error that grows with it is half of that product; see `plant`.
+        # Torque T does only half of the work T * error on an error that grows with T; see `plant`.
         now.slope_arcsec += slope * self._turns * (1.0 + 0.5 * grown) * size
         return error * (1.0 + grown) * size
 
@@ -146,7 +146,7 @@ class ElasticHysteresis:
 
 @state
 class ZeroDrift:
-    """Shift proportional to the temperature."""
+    """Shift of the output proportional to the temperature above ambient."""
 
     by_motor_only: ClassVar[bool] = False
     _ambient_c: float
@@ -162,7 +162,7 @@ class ZeroDrift:
 
 @state
 class SlowZeroDrift:
-    """Shift by the temperature of a housing that lags the measured temperature."""
+    """Shift of the output with the temperature of a housing, which lags the measured temperature."""
 
     by_motor_only: ClassVar[bool] = False
     _ambient_c: float
@@ -211,7 +211,7 @@ def pieces_of(truth: Truth) -> list[Piece]:
 
 
 def warmth_factor(truth: Truth, per_k: float) -> WarmthFactor | None:
-    """Returns the growth with temperature, or None."""
+    """Returns the factor for growth with temperature; None without growth."""
     return WarmthFactor(per_k, truth.temperature.unchanged_c) if per_k else None
 
 

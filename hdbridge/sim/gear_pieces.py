@@ -49,7 +49,7 @@ class Flank:
 
 @state
 class SpeedFactor:
-    """Growth of the rolling friction with the logarithm of speed, with a lag."""
+    """Factor for rolling friction that grows with the logarithm of the motor speed, with a lag."""
 
     _dt: float
     _from_deg_s: float
@@ -76,7 +76,7 @@ class SpeedFactor:
 
 @state
 class WarmthFactor:
-    """Growth with temperature; the factor is at least 0.05."""
+    """Factor that grows linearly with the temperature; at least 0.05."""
 
     _per_k: float
     _reference_c: float
@@ -162,7 +162,7 @@ class Creep:
 
 @state
 class Jumps:
-    """Jumped teeth, each over its duration."""
+    """Tooth jumps, each spread over its duration."""
 
     by_motor_only: ClassVar[bool] = False
     _dt: float

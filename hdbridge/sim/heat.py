@@ -9,7 +9,7 @@ from hdbridge.sim.truth import Truth
 
 @state
 class Heat:
-    """Heat store between its losses and its surroundings, advanced once per control cycle."""
+    """Thermal mass warmed by losses and cooled by its surroundings, advanced once per control cycle."""
 
     body_c: float
     """Temperature of motor and gear."""
@@ -49,7 +49,7 @@ class Heat:
         self.rub = self._growth.at(self.body_c) if self._friction_grows else 1.0
 
     def warm(self, torque_squares: float, friction_j: float, elapsed_s: float) -> None:
-        """Advances by some substeps, from the sum of the torque's squares (Nm^2) and the friction work."""
+        """Advances by several substeps, given the sum of the squared torques (Nm^2) and the friction work."""
         self.since_s += elapsed_s
         copper_j = torque_squares * self._copper_loss_w * self._dt_s
         goal_c = self._ambient_c + self._resistance_k_per_w * ((copper_j + friction_j) / elapsed_s)

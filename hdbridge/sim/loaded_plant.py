@@ -1,8 +1,8 @@
 """Mechanics with a multi-stage spring, a dead zone behind it, and torques on the load.
 
-Gravity, drag and shaking act on the load as a torque that is constant within a substep, and so does the
-deviation of the spring from its linear first stage. The linear step therefore stays exact, and at rest the
-load stands exactly where the torques balance.
+Gravity, drag and vibration act on the load as a torque that is constant within a substep, and so does the
+deviation of the spring from its linear first stage. The linear step therefore stays exact, and the load comes
+to rest exactly where the torques balance.
 """
 
 import math
@@ -18,7 +18,7 @@ GRAVITY_M_S2 = 9.80665
 
 @state
 class Spring:
-    """Spring: torque by wind-up, zero within the dead zone, then three stages."""
+    """Spring torque as a function of wind-up: zero within the dead zone, then three linear stages."""
 
     _first_deg: float
     _first_nm: float
@@ -124,7 +124,7 @@ class LoadedPlant(Plant):
 
     @staticmethod
     def needed(truth: Truth) -> bool:
-        """Returns True if a truth file needs anything beyond `Plant`."""
+        """Returns True if a truth file contains a property that `Plant` does not simulate."""
         gear, load = truth.gear, truth.load_
         coupling = load.encoder.coupling
         return bool(
@@ -147,7 +147,7 @@ class LoadedPlant(Plant):
         load_speed = self.load_deg_s
         lag = output - load
 
-        # Torque of the spring beyond its linear first stage, halfway through the substep.
+        # Deviation of the spring torque from its linear first stage, halfway through the substep.
         closing = self.motor_deg_s / self._ratio - load_speed
         halfway = lag + 0.5 * dt * closing
         beyond = self._spring.pull_nm(halfway) - self._stiffness * halfway
@@ -186,7 +186,7 @@ class LoadedPlant(Plant):
         self._turn_encoder(load, new_load)
 
     def _outer_nm(self, load_deg: float, load_speed: float) -> float:
-        """Returns the external torque on the load, gravity, viscous drag, sliders and shaking."""
+        """Returns the torque on the load without the spring: external, gravity, drag, sliders, vibration."""
         outer = self.outer_nm
         if self._arm_nm:
             outer += self.weight_nm(load_deg)

@@ -1,9 +1,9 @@
 """Simulated bench without real time: master and simulated drives in one thread, on one virtual clock.
 
-The master uses ``LockstepBus`` and sleeps on ``VirtualClock``. Its sending and waiting run the drives: a
-frame is answered before ``send`` returns, and time passes only while the master waits, from one event of a
-drive to the next. Nothing sleeps, there are no races, and the same run always has the same frames. The frames
-are real python-can messages over python-can ``virtual`` buses.
+The master uses ``LockstepBus`` and sleeps on ``VirtualClock``. The drives run whenever the master sends or
+waits: a frame is answered before ``send`` returns, and time passes only while the master waits, from one
+drive event to the next. Nothing really sleeps, there are no races, and the same run always has the same
+frames. The frames are real python-can messages over python-can ``virtual`` buses.
 """
 
 import gc
@@ -42,12 +42,12 @@ class Node(Protocol):
         ...
 
     def next_event_s(self) -> float:
-        """Returns the latest time of the next poll."""
+        """Returns the time by which the next poll must take place."""
         ...
 
 
 class VirtualClock:
-    """``hdbridge.clock.Clock`` that advances when waited on, and meanwhile runs the nodes."""
+    """``hdbridge.clock.Clock`` that advances only during a wait, and runs the nodes meanwhile."""
 
     def __init__(self, start_s: float = 0.0) -> None:
         self.now_s = start_s
@@ -59,7 +59,7 @@ class VirtualClock:
         return self.now_s
 
     def sleep_until(self, deadline_s: float) -> None:
-        """Advances to ``deadline_s``, through every event of a node before it."""
+        """Advances to ``deadline_s``, processing every earlier event of a node."""
         while self.step(deadline_s):
             pass
 
@@ -164,7 +164,7 @@ class LockstepBus(can.BusABC):
             node.poll(now_s)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Returns the next frame; while there is none, time passes up to ``timeout`` virtual seconds.
+        """Returns the next frame; if there is none, advances the time by up to ``timeout`` virtual seconds.
 
         Raises CanOperationError after ``LONGEST_WAIT_S`` without a frame if no time-out is given.
         """
@@ -287,7 +287,7 @@ def simulated_benches(
     """Provides several simulated axes on one bus and one clock, with the master's bus; see `lockstep_bench`.
 
     Each axis has its own noise, so the same axis yields the same frames, whatever the other axes do.
-    ``clock`` starts at zero by default. InputError if two axes have the same node id.
+    ``clock`` starts at zero by default. Raises InputError if two axes have the same node id.
     """
     node_ids = [axis.node_id for axis in axes]
     twice = next((node_id for node_id in node_ids if node_ids.count(node_id) > 1), None)

@@ -15,7 +15,7 @@ from hdbridge.sim.truth.encoder import TrueDisc
 
 @state
 class Loops:
-    """Servo axis, substep by substep."""
+    """Servo loops and mechanics of the axis, run substep by substep."""
 
     servo: Servo
     plant: Plant
@@ -24,7 +24,7 @@ class Loops:
     torque_nm: float
     """Torque of the motor at the end of the last cycle."""
     torque_squares: float
-    """Sum of its squares over the substeps of that cycle, Nm^2."""
+    """Sum of the squared motor torque over the substeps of the last cycle, Nm^2."""
     body: Body
     _disc: Disc
     _late_demand: Late
@@ -78,7 +78,7 @@ class Loops:
         self.plant.outer_nm = outer_nm
 
     def switch_on(self) -> float:
-        """Starts the loops at the motor's angle as they see it, and returns that angle."""
+        """Starts the loops at the motor angle that they measure, and returns that angle."""
         return self.servo.engage(self._seen_deg(self.plant.now.motor_deg), self.plant.motor_deg_s)
 
     def sampled_motor_deg(self) -> float:
@@ -90,7 +90,7 @@ class Loops:
         return self._late_load.deg if self._with_late_load else self.plant.encoder_deg
 
     def begin_demand(self, demand_deg: float) -> None:
-        """Resets to a demand that has always been constant."""
+        """Resets the delay to a demand that has always been constant."""
         self._late_demand.begin(demand_deg)
 
     def hold(self, torque_nm: float) -> None:
@@ -136,7 +136,7 @@ class Loops:
         self.switch_on()
 
     def _seen_deg(self, motor_deg: float) -> float:
-        """Returns the motor's angle as seen by its encoder, before rounding."""
+        """Returns the motor angle as measured by its encoder, before rounding."""
         if self._with_disc:
             motor_deg += self._disc.error_deg(motor_deg)
         return motor_deg + self._off_deg

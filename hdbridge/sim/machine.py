@@ -84,7 +84,7 @@ class Machine:
         outer_nm: FloatArray | None = None,
         held_nm: FloatArray | None = None,
     ) -> Cycles:
-        """Runs many closed-loop cycles, each from the demand before it, with the same numbers as `follow`.
+        """Runs many closed-loop cycles, each from the previous demand, with the same results as `follow`.
 
         ``counts`` contains the demand at the start of the first and at the end of each cycle, shape (n + 1,);
         ``substeps`` the substeps of each cycle; ``outer_nm`` the external torque on the load in each, in

@@ -24,7 +24,7 @@ class Orders:
         self._count = len(self._coefficients)
 
     def at(self, angle_rad: float) -> tuple[float, float]:
-        """Returns the sum in arcsec, and its derivative by the angle in arcsec per radian."""
+        """Returns the sum in arcsec, and its derivative with respect to the angle in arcsec per radian."""
         turn = complex(math.cos(angle_rad), math.sin(angle_rad))
         total = slope = 0j  # of the polynomial in exp(i angle)
         for place in range(self._count):

@@ -1,7 +1,7 @@
 """Virtual clock that never runs ahead of real time, for simulated drives under observation.
 
-If the computer is late, virtual time is equally late. Nothing is skipped, and lost time is not made up for. A
-stall of the computer is therefore not a fault of a simulated bus.
+If the computer is late, virtual time is equally late. Nothing is skipped, and a long delay is not made up
+for. A stall of the computer is therefore not a fault on a simulated bus.
 """
 
 import math

@@ -11,12 +11,13 @@ angle, e the tooth error and h the hysteresis,
                                                 torque on the motor -dV/dq = -T (1/N + de/dq)
 
 (Lagrange's equations; Goldstein, Classical Mechanics, chapter 1). So the tooth error changes the momentary
-ratio in the reaction as in the angles, by up to some per cent. The hysteresis is no function of the motor's
+ratio in the reaction as in the angles, by up to some per cent. The hysteresis is not a function of the motor
 angle. If K h is the friction torque by which the teeth drag the output along, it acts on both by the nominal
-ratio. If sticking contacts displace the output instead, they do no work, and the reaction has dh/dq too: the
-share ``gear.hysteresis_reaction`` does this. If the error grows with the torque, e (1 + g |T|), the spring
-has the stiffness K / (1 - K g e) in the direction of the torque, and dV/dq = T (1/N + (1 + g |T| / 2) de/dq).
-An error by load angle would change the torque on the load, by less than a thousandth; this is neglected.
+ratio. If sticking contacts displace the output instead, they do no work, and dh/dq contributes to the
+reaction too: ``gear.hysteresis_reaction`` is the fraction that does so. If the error grows with the torque,
+e (1 + g |T|), the spring has the stiffness K / (1 - K g e) in the direction of the torque, and
+dV/dq = T (1/N + (1 + g |T| / 2) de/dq). An error over the load angle would change the torque on the load by
+less than a thousandth; this is neglected.
 
 `Plant` has a linear spring and a load without external torques; `hdbridge.sim.loaded_plant` has the rest.
 """
@@ -74,7 +75,7 @@ class Plant:
         self._ratio = gear.ratio
         self._stiffness = gear.stiffness_nm_per_rad * RAD_PER_DEG
         self._damping = gear.damping_nm_s_per_rad * RAD_PER_DEG
-        # Spring torque, averaged over a step, by the sum of the motor's speeds at its ends.
+        # Spring torque, averaged over a step, per sum of the motor speeds at the two ends of the step.
         self._arm = (self._stiffness * dt / 4.0 + self._damping / 2.0) / gear.ratio
         self._inertia = motor.inertia_kg_m2 * RAD_PER_DEG / dt
         self._drag = self._cold_drag = motor.viscous_nm_s_per_rad * RAD_PER_DEG
@@ -113,7 +114,7 @@ class Plant:
         spring = self._stiffness * (lag - 0.5 * dt * load_speed) - self._damping * load_speed
         moved = self._turn_motor(torque_nm, brake_nm, spring)
 
-        # Load, seen from the gear's output.
+        # Load, relative to the gear's output.
         if moved or not self._gear.by_motor_only:
             self.output_deg = new_output = self._gear.turned_deg(now)
             rate = (new_output - output) / dt
@@ -148,15 +149,15 @@ class Plant:
     def _turn_motor(self, torque_nm: float, brake_nm: float, spring: float) -> bool:
         """Runs the motor's part of a substep; returns True if the motor moved.
 
-        ``spring`` is the spring's torque without the share that the motor's own motion adds: arm * lever *
-        (old speed + new speed).
+        ``spring`` is the spring torque without the contribution of the motor's own motion in this substep,
+        which is arm * lever * (old speed + new speed).
         """
         now, dt, speed = self.now, self._dt, self.motor_deg_s
         held = self._coulomb + brake_nm
         if self._sticking:
             speeds = speed / self._stribeck
             held += self._sticking * math.exp(-speeds * speeds)
-        # Nominal over momentary ratio.
+        # Nominal ratio divided by momentary ratio.
         lever = 1.0 + self._ratio * now.slope_arcsec * RAD_PER_DEG / ARCSEC_PER_DEG
         arm = self._arm * lever * lever / self._ratio
         push = (self._inertia - arm) * speed + torque_nm - spring * lever / self._ratio

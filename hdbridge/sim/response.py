@@ -28,7 +28,7 @@ class Response:
         self.rest()
 
     def rest(self) -> None:
-        """Clears the latest cycles."""
+        """Clears the stored cycles, as after a long rest."""
         self._speed, self._direction = (np.zeros(len(each)) for each in self._taps[1:])
         self.demand_counts = self.torque_nm = 0.0
 
@@ -46,7 +46,7 @@ class Response:
         self.torque_nm = float(torque @ self._speed + friction @ self._direction)
 
     def _at(self, cycle_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Returns the taps for this cycle; both responses to speed have the same length."""
+        """Returns the filter taps for this cycle time; both responses to speed have the same length."""
         length = max(len(self._truth.demand_ms), len(self._truth.torque_nm_s_per_rad), 1)
         demand, torque, friction = (
             self._regridded(taps, size, cycle_s)

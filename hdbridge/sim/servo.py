@@ -4,7 +4,7 @@ The blocks in order: moving average and two lags of the demand, position P, velo
 (whose integral may sum the position error instead: PIV), feed-forwards, disturbance observer, notch, torque
 filter, limit.
 
-Like real drives of this class, it closes its loops on an interpolated encoder, so a settled motor is in the
+Like real drives of this class, it closes its loops on an interpolated encoder, so the motor settles in the
 middle of the commanded count and not anywhere within it.
 """
 
@@ -18,7 +18,7 @@ from hdbridge.sim.truth.motor import TrueNotch
 
 RAD_PER_DEG = math.pi / 180.0
 HIGHEST_NOTCH = 0.45
-"""Maximum notch frequency over the substep rate; the bilinear transform ends at half the rate."""
+"""Maximum notch frequency as a fraction of the substep rate; the bilinear transform ends at half the rate."""
 AT_REST_DEG_S = 0.05
 """Speed below which the demand counts as at rest: friction feed-forward keeps its direction, and the
 integral may rest."""
@@ -39,16 +39,16 @@ class MovingAverage:
         self.start_at(0.0)
 
     def start_at(self, demand_deg: float) -> None:
-        """Resets to a demand that has always been constant."""
+        """Resets the average to a demand that has always been constant."""
         self._start_deg, self._integral = demand_deg, 0.0
         self._late_integral.begin(0.0)
 
     def mean_deg(self) -> float:
-        """Returns the present mean."""
+        """Returns the present mean of the demand."""
         return self._start_deg + (self._integral - self._late_integral.deg) / self._duration_s
 
     def add_up(self, demand_deg: float, duration_s: float) -> None:
-        """Advances by a time with this mean demand."""
+        """Advances by ``duration_s`` with this mean demand."""
         self._integral += (demand_deg - self._start_deg) * duration_s
         self._late_integral.feed(self._integral)
 
@@ -80,7 +80,7 @@ class Notch:
         self._second = (self._b2 - self._a2) * torque_nm
 
     def notched_nm(self, torque_nm: float) -> float:
-        """Filters one sample."""
+        """Filters one sample of the torque."""
         notched = self._b0 * torque_nm + self._first
         self._first = self._a1 * (torque_nm - notched) + self._second
         self._second = self._b2 * torque_nm - self._a2 * notched
@@ -276,9 +276,9 @@ class Servo:
         return self._load_gain * (new_speed - speed)
 
     def _turn(self, direction: float) -> float:
-        """Reverses the friction feed-forward; returns the integral without the part that this provides.
+        """Reverses the friction feed-forward; returns the integral without the torque that it now provides.
 
-        Loops without it know nothing of friction, so their integral stays.
+        Without friction feed-forward, the integral does not change.
         """
         standing = self._integral + self._friction * self._direction
         self._direction = direction

@@ -31,14 +31,14 @@ class Reach:
 
     drive: WatchedDrive
     another: Callable[[], AbstractContextManager[can.BusABC]]
-    """Opens another node's end of the bus."""
+    """Opens the bus for another node."""
     port: Port | None
     """Program's interface, if it is in this process."""
     bus: str
     """Name of the bus, for messages."""
 
     def send(self, can_id: int, data: bytes = b"", times: int = 1, **kind: bool) -> End:
-        """Sends frames of another node."""
+        """Sends frames as another node."""
         kind = {"is_extended_id": False, **kind}
         with self.another() as bus:
             for _ in range(times):
@@ -70,7 +70,7 @@ class Reach:
 
 
 def _nothing() -> None:
-    """End of a fault that is instantaneous."""
+    """Ends an instantaneous fault by doing nothing."""
 
 
 Make = Callable[..., End]
@@ -86,22 +86,22 @@ class Needs(Enum):
 
 @dataclass(frozen=True)
 class Row:
-    """One fault."""
+    """One fault that a test can cause by name."""
 
     name: str
     what: str
-    """One sentence, with the arguments by name."""
+    """Description in one sentence, which names the arguments."""
     make: Make
     arguments: Mapping[str, Value] = field(default_factory=dict)
     answers: str = ""
-    """First words of the corresponding row of the fault table."""
+    """Text of the corresponding fault in the fault table."""
     needs: Needs = Needs.NOTHING
     touches: Callable[[Mapping[str, Any]], tuple[int, int]] | None = None
     """Returns the object that the drive must have, given the arguments."""
 
     def check(self, reach: Reach, arguments: Mapping[str, Any]) -> None:
-        """Raises `InputError` if the fault cannot be made on this bus or drive."""
-        __tracebackhide__ = True  # pytest shows the test's line
+        """Raises `InputError` if the fault cannot be caused on this bus or drive."""
+        __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
         if self.needs is Needs.INTERFACE and reach.port is None:
             raise InputError(
                 f"fault '{self.name}': the interface of {reach.bus} is not the drive's to take away; choose "
@@ -124,8 +124,8 @@ class Row:
             raise BusError(f"fault '{self.name}' cannot be made on {reach.bus}: {error}") from error
 
     def checked(self, given: Mapping[str, Any]) -> dict[str, Value]:
-        """Returns the complete arguments; raises `InputError` with the existing arguments."""
-        __tracebackhide__ = True  # pytest shows the test's line
+        """Returns the arguments completed with defaults; raises `InputError` with the valid arguments."""
+        __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
         signature = ", ".join(f"{name}={value!r}" for name, value in self.arguments.items()) or "none"
         for name, value in given.items():
             if name not in self.arguments:
@@ -365,12 +365,12 @@ OF_THE_PROGRAM: Final = (
     "the target is not a number within the limits",
     "a load torque or temperature stays away",
 )
-"""Rows of the fault table without a fault here: those of the program, and consequences of other rows."""
+"""Rows of the fault table that no fault here causes: faults of the program, and consequences of others."""
 
 
 def find(name: str) -> Row:
     """Returns the fault with a name; raises `InputError` with the nearest name."""
-    __tracebackhide__ = True  # pytest shows the test's line
+    __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
     row = FAULTS.get(name)
     if row is None:
         close = nearest(name, list(FAULTS))

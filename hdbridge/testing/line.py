@@ -124,7 +124,7 @@ LONGEST_TURN_S: Final = 600.0
 """Maximum wait for a bus of the computer that other tests are using; s."""
 
 _IN_USE: Final[dict[str, int]] = {}
-"""Computer buses with a drive of this process, and the thread that created it."""
+"""Buses of the computer on which this process has a drive; the value is the thread that created it."""
 
 
 @dataclass
@@ -137,7 +137,7 @@ class Line:
     channel: str
     clock: Clock
     opened: Callable[[], AbstractContextManager[can.BusABC]]
-    """Opens a node's end of the bus."""
+    """Opens the bus for a node."""
     port: Port | None = None
     """Program's interface, if it is in this process."""
     nodes: list[WatchedDrive] = field(default_factory=list)
@@ -231,7 +231,7 @@ def open_line(choice: BusChoice) -> Iterator[Line]:
 
 @contextmanager
 def _turn(choice: BusChoice) -> Iterator[None]:
-    """Waits until no other test of this computer, such as one of pytest-xdist, has a drive on the bus."""
+    """Reserves the bus; waits until no other test on this computer (pytest-xdist) has a drive on it."""
     name = str(choice)
     if _IN_USE.get(name) == threading.get_ident():
         raise InputError(

@@ -28,7 +28,7 @@ _PORTS: Final[dict[str, Port]] = {}
 
 
 class Condition(Enum):
-    """Condition of an interface."""
+    """State of a CAN interface."""
 
     UP = "up"
     DOWN = "down"
@@ -70,7 +70,7 @@ class Port:
         """Number of losses of the interface."""
         self.deletions = 0
         self.refused_sends = 0
-        """Number of further frames that find the transmit queue full."""
+        """Number of further frames to be refused because the transmit queue is full."""
         self.open_buses: list[ProgramBus] = []
 
     def __enter__(self) -> Port:
@@ -83,7 +83,7 @@ class Port:
             each.shutdown()
 
     def fail(self, condition: Condition) -> Callable[[], None]:
-        """Takes the interface away; returns a function that restores it."""
+        """Takes the interface down or deletes it; returns a function that restores it."""
 
         def comes_back() -> None:
             self.condition = Condition.UP
@@ -95,7 +95,7 @@ class Port:
 
 
 class ProgramBus(can.BusABC):
-    """End of the bus opened by the program. An end left open is closed with the drive."""
+    """Bus opened by the program. If the program leaves it open, it is closed with the drive."""
 
     def __init__(self, channel: str, can_filters: Any = None, **_: Any) -> None:
         """Further options, such as a bit rate, concern hardware and are ignored."""
@@ -148,7 +148,7 @@ class ProgramBus(can.BusABC):
         super().shutdown()
 
     def _check_receive(self) -> bool:
-        """Returns True if frames can arrive; raises if that has ended since the last call."""
+        """Returns True if frames can arrive; raises if the interface was lost since the last call."""
         port = self._port
         if port.losses != self._losses:
             self._losses = port.losses

@@ -1,4 +1,4 @@
-"""Simulated drive as used in a test."""
+"""Simulated drive for use in tests."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +19,7 @@ POLL_S: Final = 0.005
 
 
 class DriveTime:
-    """Drive time with the interface of the module ``time``; missing names are that module's.
+    """Drive time with the interface of the module ``time``; all other names come from that module.
 
     In real time, it is the module's own time. In lockstep ``sleep`` runs the drive for that time and returns
     at once. ``monkeypatch.setattr(program, "time", drive.time)`` makes a program use it.
@@ -46,7 +46,7 @@ class DriveTime:
     perf_counter_ns = monotonic_ns
 
     def sleep(self, seconds: float) -> None:
-        """Waits."""
+        """Waits for this duration of drive time."""
         self._clock.sleep_until(self._clock.now() + seconds)
 
     def __getattr__(self, name: str) -> Any:
@@ -96,7 +96,7 @@ class SimulatedDrive:
 
     @property
     def truth(self) -> TrueState:
-        """Present true angles."""
+        """Present true angles of motor and load."""
         with self._node.lock:
             return self._node.true_state()
 
@@ -167,7 +167,7 @@ class SimulatedDrive:
         `InputError` for an unknown name or argument, with the nearest one, and if the fault is impossible on
         this bus.
         """
-        __tracebackhide__ = True  # pytest shows the test's line
+        __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
         row = find(name)
         checked = row.checked(arguments)
         for what, value in (("after_s", after_s), ("for_s", for_s), ("beyond_deg", beyond_deg)):
@@ -200,7 +200,7 @@ class SimulatedDrive:
 
     def wait_until(self, condition: Callable[[], object], timeout_s: float = 5.0, what: str = "it") -> None:
         """Runs the drive until a condition is true; raises `TimeoutError` with the log."""
-        __tracebackhide__ = True  # pytest shows the test's line
+        __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
         end_s = self._clock.now() + timeout_s
         while not condition():
             if self._clock.now() >= end_s:
@@ -213,7 +213,7 @@ class SimulatedDrive:
 
     def _check(self) -> None:
         """Raises the error that ended the drive."""
-        __tracebackhide__ = True  # pytest shows the test's line
+        __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
         if self._failures:
             raise self._failures[0]
 

@@ -24,7 +24,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 EVENTS: Final = 10_000
 FRAMES: Final = 1_000
 PERIODS: Final = 250_000
-"""Maximum number of kept entries, newest first; periods for a thousand seconds at 4 ms."""
+"""Maximum number of entries kept; older ones are dropped. The periods cover 1000 s at 4 ms."""
 
 SHOWN_EVENTS: Final = 40
 SHOWN_FRAMES: Final = 12
@@ -200,7 +200,7 @@ class WatchedDrive(DriveNode):
         self.nameplate = nameplate_of(truth, load_object=load_object)
         self.ratio = self.nameplate.gear_motor_turns / self.nameplate.gear_load_turns
         self.last_tpdos: dict[int, bytes] = {}
-        """Data last sent, by identifier."""
+        """Data of the last TPDO sent with each identifier."""
         self._plans: list[_Plan] = []
         self._begin_s = clock.now()
         super().__init__(bus, self.machine, eds_path, node_id, clock, self.nameplate, truth.firmware)
@@ -268,7 +268,7 @@ class WatchedDrive(DriveNode):
     # ---------------------------------------------------------------- the drive, watched
 
     def next_event_s(self) -> float:
-        """See `hdbridge.device.node.DriveNode`; the triggers of faults are events as well."""
+        """Returns the time by which ``poll`` must be called; triggers of faults count as events."""
         event_s = super().next_event_s()
         return min((event_s, *(plan.at_s for plan in self._plans))) if self._plans else event_s
 

@@ -41,7 +41,7 @@ class TrueFlank(Strict):
 
 
 class TrueRate(Strict):
-    """Growth of the elastic hysteresis with speed: the grease's share in the rolling friction."""
+    """Growth of the elastic hysteresis with speed: the contribution of the grease to the rolling friction."""
 
     growth_per_decade: float = Field(ge=-1, le=5, description="growth of the loop per decade of motor speed")
     from_deg_s: float = Field(gt=0, le=1e5, description="motor speed at which the growth sets in")
@@ -112,7 +112,7 @@ class TrueSeat(Strict):
 
 
 class TrueGear(Strict):
-    """Harmonic gear: its output, beyond motor angle / ratio."""
+    """Harmonic gear: ratio, elasticity, and the causes of transmission error."""
 
     ratio: float = Field(ge=1, le=1_000, description="motor turns per load turn")
     stiffness_nm_per_rad: float = Field(gt=0, le=1e9, description="flexspline's spring to the load")

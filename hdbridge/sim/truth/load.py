@@ -9,7 +9,7 @@ from hdbridge.strictness import Strict
 
 
 class TrueGravity(Strict):
-    """Mass on the axis."""
+    """Mass on the axis, subject to gravity."""
 
     mass_kg: float = Field(gt=0, le=1e5, description="mass")
     arm_m: float = Field(gt=0, le=100, description="its distance from the axis")
@@ -27,7 +27,7 @@ class TrueStribeck(Strict):
 
 
 class TrueThinning(Strict):
-    """Grease that thins when sheared: viscous friction / (1 + speed / its speed)^exponent."""
+    """Grease that thins when sheared: viscous friction / (1 + speed / ``speed_rad_s``)^exponent."""
 
     speed_rad_s: float = Field(gt=0, le=1_000, description="load speed at which it sets in")
     exponent: float = Field(0.5, gt=0, le=1, description="how much; 1 ends at a constant torque")
@@ -75,7 +75,7 @@ class TrueLoad(Strict):
 
     @property
     def whole_inertia_kg_m2(self) -> float:
-        """Inertia of the load with the mass on it."""
+        """Inertia of the load including the mass on it."""
         if self.gravity is None:
             return self.inertia_kg_m2
         return self.inertia_kg_m2 + self.gravity.mass_kg * self.gravity.arm_m**2

@@ -23,7 +23,7 @@ from hdbridge.strictness import Strict
 
 
 class TrueTemperature(Strict):
-    """Heat store that is warmed by losses and cooled by the surroundings."""
+    """Thermal mass that is warmed by losses and cooled by the surroundings."""
 
     ambient_c: float = Field(22.0, ge=-60, le=100, description="temperature of the surroundings")
     start_c: float | None = Field(None, ge=-60, le=200, description="temperature at the start; else ambient")
@@ -53,12 +53,12 @@ class TrueTemperature(Strict):
 
     @property
     def unchanged_c(self) -> float:
-        """Temperature at which no parameter has changed."""
+        """Reference temperature, at which all parameters have the values of the truth file."""
         return self.ambient_c if self.reference_c is None else self.reference_c
 
 
 class Truth(Strict):
-    """Truth of the simulated axis."""
+    """True parameters of the simulated axis."""
 
     schema_: Literal["hdbridge.truth/1"] = Field(
         alias="schema", description="schema and version of this file"
@@ -84,7 +84,7 @@ class Truth(Strict):
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Reads a truth file, or that of a profile's folder; InputError with file:line:column."""
+        """Reads a truth file, or that of a profile's folder; InputError gives file:line:column."""
         path = Path(path)
         return read_yaml(path / "truth.yaml" if path.is_dir() else path).validate(cls)
 
@@ -94,7 +94,7 @@ class Truth(Strict):
         return document_from_text(text, path).validate(cls)
 
     def changed(self, **sections: Mapping[str, Any]) -> Self:
-        """Returns a truth with changed keys in some sections; InputError if the result is invalid."""
+        """Returns a copy with changed keys in some sections; InputError if the result is invalid."""
         data = self.model_dump(mode="json", by_alias=True, exclude_unset=True)
         for name, keys in sections.items():
             data[name] = {**data.get(name, {}), **keys}
@@ -107,7 +107,7 @@ class Truth(Strict):
 
     @property
     def load_frequency_hz(self) -> float:
-        """Natural frequency of the load on the gear's spring, the motor held."""
+        """Natural frequency of the load on the gear's spring with the motor held, Hz."""
         return math.sqrt(self.gear.stiffness_nm_per_rad / self.load_.whole_inertia_kg_m2) / math.tau
 
     @property
@@ -121,7 +121,7 @@ class Truth(Strict):
 
     @property
     def highest_stiffness_nm_per_rad(self) -> float:
-        """Stiffness of the stiffest spring whose resonance the time step resolves."""
+        """Maximum stiffness of the spring for which the time step resolves the resonance."""
         return self.resonance.stiffest_nm_per_rad(1.0 / self.substep_s)
 
     @model_validator(mode="after")
