@@ -1,5 +1,4 @@
-"""Acceptance tests of a finding: block-robust evidence in the parts of the record where the cause is
-visible.
+"""Acceptance tests of a finding, by block-robust evidence in those parts of the record that show the cause.
 
 Chi square treats neighbouring samples as independent, which correlated noise violates. A finding's score is
 therefore summed over blocks of time, and its variance is estimated from these sums, so correlation within a
@@ -17,12 +16,13 @@ from hdbridge.analysis.linear import Linearised, of_length, sandwich, side_by_si
 from hdbridge.axis.effects import BoolArray, Effect, FloatArray
 
 BLOCKS_S = (1.0, 5.0, 20.0)
-"""Block lengths; wandering noise and warming are correlated over less than one block."""
+"""Block lengths at which the evidence is tested. Noise and thermal drift must be correlated over less than
+a block."""
 LEAST_BLOCKS = 30
-"""Minimum number of blocks; in a short record they become shorter, because fewer give no reliable
-variance."""
+"""Minimum number of blocks for a reliable variance. In a short record the blocks are shortened to reach
+it."""
 LEAST_POINTS = 20
-"""Minimum number of points."""
+"""Minimum number of points for a test; with fewer, the evidence is zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +48,11 @@ def robust_chi_square(
 ) -> float:
     """Returns the block-robust chi square of an effect's coefficients against zero.
 
-    Leaves out incidental coefficients and refits all other parameters. Its own shape, which has no meaning
-    without the effect, is refitted only if ``free``: that tests if the record determines the coefficients.
-    ``nuisances`` are further weighted columns; ``rows`` restricts the points, ``only`` the coefficients to
-    one number. ``laws`` are weighted columns of one standard deviation each of the errors of other laws.
+    Omits incidental coefficients and refits all other parameters. The effect's shape has no meaning without
+    the effect. It is refitted only if ``free`` is set, which tests whether the record determines the
+    coefficients. ``nuisances`` are additional weighted columns. ``rows`` selects points, and ``only`` a
+    single coefficient. Each column of ``laws`` is a weighted error of another effect's law, one standard
+    deviation.
     """
     own = fitted.places(place)
     shape = [i for i in own if fitted.parameters[i].shape and not free]
@@ -77,14 +78,14 @@ def block_robust(
     rows: BoolArray | slice = slice(None),
     laws: FloatArray | None = None,
 ) -> float:
-    """Returns the block-robust chi square of the columns ``own`` of a fit, for these ``coefficients``."""
+    """Returns the block-robust chi square of ``coefficients``, those of the columns ``own`` of a fit."""
     time_s = estimator.time_s[rows]
     if len(time_s) < LEAST_POINTS:
         return 0.0
     inverse = fit.directions @ fit.directions[own].T
     coefficients = coefficients + fit.directions[own] @ fit.slack
     influence = (fit.columns @ inverse) * (fit.residual - fit.basis @ fit.slack)[:, np.newaxis]
-    # The noise is a floor, because a residual may be smaller than it by chance.
+    # The noise model sets a lower limit, because a residual may be smaller than the noise by chance.
     least = 0.25 * inverse[own] + inverse.T @ (np.maximum(fit.known[:, :1], 0.0) * inverse)
     longest_s = estimator.data.period_s * len(estimator.data.full) / LEAST_BLOCKS
     if laws is not None:
@@ -95,7 +96,7 @@ def block_robust(
 
 
 def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
-    """Tests one finding."""
+    """Runs the acceptance tests for the effect at ``place``."""
     effect = fitted.hypothesis.effects[place]
     shapes = sum(fitted.parameters[each].shape for each in fitted.places(place))
     needed = estimator.scales.robust + estimator.scales.robust_more * (len(evident(effect)) + shapes - 1)
@@ -130,7 +131,7 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
 
 
 def gate_of_change(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gate:
-    """Tests a change of the model's own loop; ``without`` is the fit with the given loop."""
+    """Tests a change of a part of the model; ``without`` is the fit with the part as given."""
     change = without.residual - fitted.residual
     columns = np.column_stack([without.tangent, change])
     known = np.vstack([without.linearised.known, np.zeros(2)])
@@ -143,19 +144,19 @@ def gate_of_change(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gat
 
 
 def evident(effect: Effect) -> list[int]:
-    """Returns the indices of the coefficients that count as evidence of an effect."""
+    """Returns the indices of the coefficients that are evidence of an effect, all except incidental ones."""
     named = effect.named_coefficients()
     return [column for each in named if each.name not in effect.incidental for column in each.columns]
 
 
 def law_discrepancies(estimator: Estimator, hypothesis: Hypothesis) -> FloatArray:
-    """Returns the uncertainties of the laws of all effects of a hypothesis, weighted columns (m, k)."""
+    """Returns the uncertainties of the laws of a hypothesis's effects as weighted columns, shape (m, k)."""
     forms = [estimator.law_discrepancy(each, hypothesis.start) for each in hypothesis.effects]
     return side_by_side(forms, len(estimator.index))
 
 
 def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:
-    """Returns True if each piece of a finding is significant and exceeds the law error of larger pieces."""
+    """Returns True if each piece of a finding is significant, and not just a law error of a larger piece."""
     effect = fitted.hypothesis.effects[place]
     pieces = range(len(effect.coefficients()))
     if not effect.inexact or len(pieces) != len(effect.pieces()):
@@ -165,7 +166,10 @@ def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:
 
 
 def _changes(estimator: Estimator, fitted: Fitted, place: int) -> bool:
-    """Returns True if a parameter that must be constant changes along the record (`Effect.changing`)."""
+    """Returns True if a parameter that must be constant changes significantly along the record.
+
+    See `Effect.changing`.
+    """
     effect, own = fitted.hypothesis.effects[place], fitted.places(place)
     for number, piece in enumerate(effect.pieces()):
         changing = piece.changing(estimator.motion)

@@ -1,4 +1,5 @@
-"""Averaging of samples over short blocks, which reduces a million rows to some ten thousand.
+"""Averages samples over short blocks, which reduces a million rows to some ten thousand.
+
 
 Columns are averaged like the observations, so a linear model of the samples is the same linear model of the
 blocks. Only the variation within a block is lost. Blocks are short just after a reversal, where the
@@ -28,14 +29,15 @@ FINE_DEG = 0.4
 """Scale of the block length after a reversal. A block is a twentieth of this angle plus the angle since the
 reversal."""
 REST_DEG_S = 0.05
-"""Motor speed below which an axis counts as resting."""
+"""Maximum motor speed at which an axis counts as resting."""
 AVERAGED_COUNTS_S = 200.0
-"""Count rate above which rounding averages out, because a servo passes several counts before it responds."""
+"""Count rate, counts/s, above which rounding averages out, because a servo passes several counts before it
+responds."""
 LOCKED_COUNTS = 0.15
-"""Standard deviation of a leg's mean rounding error. Sampling in step with the counts reads the encoder at
-the same few places within each count up to the next turning point."""
+"""Standard deviation of a leg's mean rounding error at low speed, counts. If sampling is in step with the
+counts, all readings of a leg lie at the same few positions within a count."""
 LEAST_LOCKED_COUNTS = 0.03
-"""Lower limit of that deviation at any speed."""
+"""Minimum standard deviation of a leg's mean rounding error at any speed, counts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,20 +45,20 @@ class Blocks:
     """Blocks of samples; arrays of shape (b,) unless stated otherwise."""
 
     index: IntArray
-    """Usable samples, shape (u,)."""
+    """Indices of the usable samples, shape (u,)."""
     first: IntArray
-    """Position in ``index`` at which each block begins."""
+    """Position in ``index`` of the first sample of each block."""
     weight: FloatArray
     """Weight of each usable sample, shape (u,): 1, or 0 for an outlier."""
     count: FloatArray
-    """Sum of the weights in a block."""
+    """Sum of the sample weights in a block."""
     time_s: FloatArray
     duration_s: FloatArray
     motor_deg: FloatArray
     travel_deg: FloatArray
-    """Travel of the motor since the first sample, both directions counted positive."""
+    """Motor travel since the first sample; both directions count as positive."""
     extent_deg: FloatArray
-    """Travel inside the block."""
+    """Motor travel within the block."""
     speed_deg_s: FloatArray
     moving: BoolArray
     heading: FloatArray
@@ -68,13 +70,13 @@ class Blocks:
     """Index of the middle sample of each block."""
     error_arcsec: FloatArray
     leg: IntArray
-    """Number of the leg, from turning point to turning point, that contains the block."""
+    """Number of the leg that contains the block. A leg extends from one turning point to the next."""
     locked_arcsec: FloatArray
-    """Standard deviation of the rounding error of the motor angle that is constant over a leg."""
+    """Standard deviation of that part of the motor angle's rounding error that is constant over a leg."""
     since_turn_deg: FloatArray
     """Motor travel since the last turning point."""
     blur: FloatArray
-    """Variance of each block due to uncertain turning points of the driving angle, arcsec squared."""
+    """Variance of each block due to the uncertainty of the motor's turning points, arcsec squared."""
 
     def __len__(self) -> int:
         return len(self.first)
@@ -92,7 +94,7 @@ class Blocks:
         return np.asarray(total / np.maximum(self.count, 1e-300)[spread])
 
     def picked(self, index: IntArray | BoolArray) -> Blocks:
-        """Selects blocks, each represented by its middle sample."""
+        """Returns the selected blocks, each represented by its middle sample."""
         own = {"index", "first", "weight"}
         kept = {each.name: getattr(self, each.name)[index] for each in fields(self) if each.name not in own}
         middle = self.middle[index]
@@ -100,7 +102,7 @@ class Blocks:
 
 
 def make_blocks(samples: Samples, weight: FloatArray | None = None) -> Blocks:
-    """Cuts the usable samples into blocks; ``weight`` (one per sample, 0 or 1) excludes outliers."""
+    """Divides the usable samples into blocks. ``weight`` is 0 for each outlier and 1 for other samples."""
     index = np.flatnonzero(samples.usable)
     motor, time = samples.motor_deg, samples.time_s
     parts = [motor[each.rows] for each in samples.chains]
@@ -158,7 +160,7 @@ def make_blocks(samples: Samples, weight: FloatArray | None = None) -> Blocks:
 
 
 def locked_counts(speed_deg_s: FloatArray, count_deg: float) -> FloatArray:
-    """Returns the rounding error that is constant over a leg, counts (standard deviation), by motor speed."""
+    """Returns the standard deviation of a leg's constant rounding error, counts, for each motor speed."""
     rate = np.abs(speed_deg_s) / max(count_deg, 1e-12)
     share = np.minimum(1.0, AVERAGED_COUNTS_S / np.maximum(rate, 1.0))
     return np.maximum(LOCKED_COUNTS * share, LEAST_LOCKED_COUNTS)
@@ -175,7 +177,7 @@ def _heading(motor_deg: FloatArray) -> FloatArray:
 
 
 def _cells(motor_deg: FloatArray, turning: Sequence[int], coarsest_deg: float) -> IntArray:
-    """Numbers the samples by cells of travel since the last turning point."""
+    """Divides the travel since the last turning point into cells, and returns each sample's cell number."""
     cells = np.zeros(len(motor_deg), dtype=np.int64)
     edge = 20.0 * coarsest_deg - FINE_DEG  # from here on all cells have the coarsest size
     base = 0
@@ -193,7 +195,7 @@ def _cells(motor_deg: FloatArray, turning: Sequence[int], coarsest_deg: float) -
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
-    """Samples, their blocks, and the elastic state in which each chain begins."""
+    """Samples, their blocks, and the elastic state at the start of each chain."""
 
     samples: Samples
     blocks: Blocks
@@ -202,29 +204,30 @@ class Design:
 
     @classmethod
     def of(cls, samples: Samples, blocks: Blocks, starts: Sequence[Start]) -> Design:
-        """Prepares the regressors for these blocks."""
+        """Creates a design with regressors averaged over these blocks."""
         motions = [samples.along(each) for each in samples.chains]
         return cls(samples, blocks, tuple(starts), Regressors(motions, blocks.mean, len(blocks)))
 
     def beginning(self, starts: Sequence[Start]) -> Design:
-        """Returns the design with other elastic states at the starts of the chains."""
+        """Returns the design with other elastic states at the start of each chain."""
         return replace(self, starts=tuple(starts))
 
     def columns(self, effect: Effect) -> FloatArray:
-        """Returns the regressors of an effect, block averages, shape (b, p)."""
+        """Returns the block averages of an effect's regressors, shape (b, p)."""
         return self.regressors.columns(effect, self.starts)
 
     def predict(self, effects: Sequence[Effect]) -> FloatArray:
-        """Returns the sum of the effects, arcsec, shape (b,)."""
+        """Returns the transmission error due to all effects, arcsec, shape (b,)."""
         return self.regressors.predict(effects, self.starts)
 
     def turn_effects(self, effects: Sequence[Effect]) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Returns the influence of each block's last turning point, three arrays of shape (b,).
+        """Returns the influence of the last turning point on each block, three arrays of shape (b,).
 
-        These are the change of the error, arcsec, if the turning point lay further out by its reach; the
-        share of the reach that is due to sampling; and the number of the turning point. The reach is the
-        uncertainty of a turning point: one count plus twice the overshoot between samples. All turning points
-        are moved outwards at once; a change on a branch is attributed to the turning point at its start.
+        The reach is the uncertainty of a turning point: one count plus twice the overshoot between samples.
+        The arrays are the change of the transmission error, arcsec, for a shift of the turning point outwards
+        by its reach; the fraction of the reach that is due to sampling; and the number of the turning point.
+        All turning points are shifted at once. A change on a branch is attributed to the turning point at its
+        start.
         """
         change, missed = np.zeros((2, len(self.blocks)))
         turn = np.zeros(len(self.blocks), dtype=np.intp)
@@ -252,7 +255,8 @@ class Design:
         return 2.0 * change, missed, turn
 
     def blurred(self, effects: Sequence[Effect]) -> Design:
-        """Returns the design with the variance that rounding of the driving angle adds to each block.
+        """Returns the design with the variance that rounding of the motor angle adds to each block.
+
 
         Just after a turning point a hysteresis may be arbitrarily steep, so measurements there get little
         weight.
@@ -261,7 +265,11 @@ class Design:
         return replace(self, blocks=replace(self.blocks, blur=change**2 / 12.0))
 
     def residual(self, effects: Sequence[Effect], rest: FloatArray) -> FloatArray:
-        """Returns the observation minus ``effects`` per sample and ``rest`` per block; NaN where unusable."""
+        """Returns the residual of each sample, arcsec; NaN for unusable samples.
+
+        The residual is the observed error less the contributions of ``effects`` and, for each block,
+        ``rest``.
+        """
         left = self.samples.error_arcsec - self.regressors.predicted(effects, self.starts)
         result = np.full(len(left), np.nan)
         index = self.blocks.index
@@ -270,9 +278,9 @@ class Design:
 
 
 def harmonics(design: Design, orders: Sequence[float]) -> FloatArray:
-    """Returns cosine and sine of each order of the motor angle, block averages, (blocks, 2 * orders).
+    """Returns block averages of the cosine and sine of each motor order, shape (blocks, 2 * orders).
 
-    Orders need not be integers: 1 / N is the load turn, k (1 + 1/N) the flexspline.
+    Orders need not be integers: 1 / N is one cycle per load turn, and k (1 + 1/N) a flexspline order.
     """
     found = waves(np.deg2rad(design.samples.motor_deg), orders)
     parts = [design.blocks.mean(each.view(np.float64).reshape(-1, 2)) for each in found]
@@ -280,7 +288,10 @@ def harmonics(design: Design, orders: Sequence[float]) -> FloatArray:
 
 
 def clusters(blocks: Blocks, number: int) -> IntArray:
-    """Numbers the blocks by about ``number`` stretches of measured time, each within one chain."""
+    """Divides the measured time into about ``number`` stretches, each within one chain.
+
+    Returns the number of each block's stretch.
+    """
     gone = np.concatenate([[0.0], np.cumsum(np.clip(np.diff(blocks.time_s), 0.0, 1.0))])
     span_s = max(float(gone[-1]) / number, 1e-9)
     cut = (np.diff(np.floor(gone / span_s)) != 0) | (np.diff(blocks.chain) != 0)
@@ -288,10 +299,10 @@ def clusters(blocks: Blocks, number: int) -> IntArray:
 
 
 def missed_deg(motor_deg: FloatArray, turns: IntArray) -> FloatArray:
-    """Returns the possible motor travel beyond the sample of each turning point, shape of ``turns``.
+    """Returns the possible motor travel beyond the sample at each turning point, degrees, shape of ``turns``.
 
-    At constant speed before and after, the two lines intersect that far beyond the sample. It is 0 for a
-    motor that rests at the turning point.
+    Straight lines through the samples before and after, at constant speed, intersect at this distance beyond
+    the sample. The result is 0 for a motor that rests at the turning point.
     """
 
     def step(way: int) -> FloatArray:

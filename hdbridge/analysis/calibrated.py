@@ -1,10 +1,10 @@
-"""Priors of a fit from the calibration of a model: each part is either as calibrated or has changed.
+"""Derives the priors of a fit from the calibration of a model. Each part is unchanged or has changed.
 
-A part is a group of parameters that change together: a loop, one order, a spring. As calibrated, its
-parameters are normally distributed about those of the model file, with the 95 % intervals given there or,
-without any, by `Scales.calibrated`. A part becomes free if the data strain it by more than the cost of a
-change. The model thus keeps its calibration if the data cannot separate a changed part from a new cause, and
-a changed loop is still found.
+A part is a group of parameters that change together: a loop, one order, a spring. The parameters of an
+unchanged part are normally distributed about the values of the model file. Their 95 % intervals are those of
+the file or, if it has none, follow from `Scales.calibrated`. A part becomes free if its deviation from the
+calibration (`CalibratedPart.strain`) exceeds the cost of a change. The model thus keeps its calibration if
+the data cannot separate a changed part from a new cause, but a changed loop is still found.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hdbridge.analysis.separable import on_scale, shape_value
 from hdbridge.axis.effects import Effect, FloatArray
 
 EXACT: Final = 1e-3
-"""Share of the calibrated standard deviation that is practically zero."""
+"""Factor that reduces the calibrated standard deviation to practically zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,23 +31,23 @@ class CalibratedPart:
     """Parameters of one effect that change together, with their calibrated values."""
 
     place: int
-    """Place of the effect in the model."""
+    """Index of the effect in the model."""
     parameters: Mapping[str, tuple[float, float]]
-    """Mean and standard deviation, by index of the coefficient or name of the shape (of its logarithm if
-    logarithmic)."""
+    """Mean and standard deviation of each parameter. The key is the index of a coefficient or the name of a
+    shape parameter. A logarithmic shape parameter is given by its logarithm."""
     scales: Scales
     fixed: bool = False
-    """True if the part cannot have changed."""
+    """True if a change of the part is ruled out."""
 
     @property
     def change_cost(self) -> float:
-        """Penalty in chi square for a change of the part."""
+        """Chi-square penalty for a change of the part."""
         if self.fixed:
             return math.inf
         return self.scales.enter + self.scales.penalty * len(self.parameters)
 
     def as_given(self) -> CalibratedPart:
-        """Returns the part fixed exactly at the values of the model file."""
+        """Returns the part fixed at the values of the model file."""
         exact = {name: (mean, EXACT * deviation) for name, (mean, deviation) in self.parameters.items()}
         return replace(self, parameters=exact, fixed=True)
 
@@ -69,7 +69,7 @@ class CalibratedPart:
         return float(off @ np.linalg.solve(np.diag(variance) + spread, off))
 
     def times(self, share: float) -> CalibratedPart:
-        """Returns the part with its visibility reduced to ``share``."""
+        """Returns the part with its mean values multiplied by ``share``, the visible fraction."""
         seen = {name: (share * mean, deviation) for name, (mean, deviation) in self.parameters.items()}
         return replace(self, parameters=seen)
 
@@ -80,9 +80,9 @@ def calibrated(
     columns: Callable[[Effect], FloatArray],
     scales: Scales,
 ) -> tuple[CalibratedPart, ...]:
-    """Returns the parts of a model with its 95 % half widths.
+    """Returns the calibrated parts of a model, given the 95 % half widths of its parameters.
 
-    ``columns`` returns the columns of an effect in the record, (m, p).
+    ``columns`` returns an effect's columns in the record, shape (m, p).
     """
     return tuple(
         CalibratedPart(place, parameters, scales)
@@ -92,13 +92,13 @@ def calibrated(
 
 
 def variances(parts: Sequence[CalibratedPart], place: int, columns: Iterable[int]) -> FloatArray:
-    """Returns the calibrated variances of some coefficients, shape (n,); 0 without a calibration."""
+    """Returns the calibrated variance of each coefficient in ``columns``, shape (n,); 0 if uncalibrated."""
     own = {name: each for part in parts if part.place == place for name, each in part.parameters.items()}
     return np.array([own.get(str(each), (0.0, 0.0))[1] ** 2 for each in columns])
 
 
 def priors(parts: Sequence[CalibratedPart]) -> dict[tuple[int, str], Prior]:
-    """Returns the priors of the parameters of some parts."""
+    """Returns the priors of all parameters of the parts, by place and name."""
     return {
         (part.place, name): Prior(mean, deviation**-2)
         for part in parts
@@ -145,7 +145,10 @@ def _width(half: object, otherwise: float) -> float:
 
 
 def _of_order(amplitude_arcsec: float, halves: Mapping[str, Any] | None, share: float) -> float:
-    """Returns the standard deviation of cosine and sine from the half widths of amplitude and phase."""
+    """Returns the standard deviation of an order's cosine and sine from its amplitude and phase intervals.
+
+    Without half widths, the deviation is the fraction ``share`` of the amplitude.
+    """
     if halves is None:
         return share * amplitude_arcsec
     turn = math.radians(float(halves.get("phase_deg", 0.0))) * amplitude_arcsec

@@ -1,4 +1,4 @@
-"""Capability of a record: causes that are detectable in it, and causes that are not, in one sentence."""
+"""Capability of a record: the causes that it can show, and those that it cannot, in one sentence."""
 
 from __future__ import annotations
 
@@ -17,31 +17,29 @@ from hdbridge.axis.effects.carried import loop_of
 from hdbridge.units import DEG_PER_TURN
 
 SAMPLES_PER_WIDTH: Final = 4
-"""Minimum number of samples of slow motion over the width of a loop: one more than the loop has
+"""Minimum number of samples over the width of a loop in slow motion: one more than the number of loop
 parameters."""
 COMPLETE: Final = ("slow motion", "reversals", "rests")
 CERTAINTY: Final = ((0.9, ""), (0.6, "probably "), (0.0, "perhaps "))
-"""Lower limits of probability, and the qualifier in front of a name above each."""
+"""Lower limits of the probability of a cause, each with the qualifier used above that limit."""
 
 
 def certainty(probability: float) -> str:
-    """Returns the qualifier in front of a name of this probability, with a trailing space; empty if
-    certain.
-    """
+    """Returns the qualifier for a cause of this probability, with a trailing space; empty above 0.9."""
     return next((word for least, word in CERTAINTY if probability > least), CERTAINTY[-1][1])
 
 
 @dataclass(frozen=True, slots=True)
 class Identifiability:
-    """Identifiability of a cause in a record."""
+    """Detectability of a cause in a record, and the causes from which it is not separable."""
 
     detectable: bool
     detection_limit_arcsec: float | None
     """Smallest peak that would be reported; None if the cause is invisible."""
     aliases: tuple[str, ...]
-    """Causes that are not separable from it in this record."""
+    """Causes that are not separable from this cause in the record."""
     share_left: float
-    """Share of its square that the baseline cannot absorb."""
+    """Fraction of the cause's sum of squares that the baseline cannot absorb."""
     reason: str = ""
 
     def as_dict(self) -> dict[str, Any]:
@@ -69,7 +67,7 @@ class Capability:
     unseen: tuple[str, ...]
     """Subjects without a detectable cause."""
     most: float
-    """Highest probability of any name in such a record."""
+    """Highest probability that a cause can reach in such a record."""
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the JSON object."""
@@ -83,7 +81,7 @@ class Capability:
         }
 
     def sentence(self) -> str:
-        """Returns the sentence that precedes a diagnosis."""
+        """Returns the summary sentence that precedes a diagnosis."""
         seldom = len(self.identified) > len(self.unseen) + len(self.confused)
         can = "all else" if seldom else listed(self.identified, "and")
         cannot = listed(self.unseen, "and")
@@ -161,7 +159,7 @@ def _lacks(data: Observed, base: Sequence[Effect], causes: Mapping[str, Identifi
 
 
 def _slow_travel_deg(samples: Samples, width_deg: float) -> float:
-    """Returns the slow motor travel that is sampled densely enough to show the shape of a loop."""
+    """Returns the motor travel, degrees, that is slow and sampled densely enough to show a loop's shape."""
     speed, acceleration = samples.speed_deg_s, samples.motion.motor_acceleration_deg_s2
     assert acceleration is not None
     steps = np.diff(samples.time_s, append=samples.time_s[-1])

@@ -1,4 +1,4 @@
-"""Changes of the model's own parts: hysteresis law and parameters, motor orders, springs.
+"""Finds changes of the model's own parts: hysteresis law and parameters, motor orders, springs.
 
 Calibrations are usually off by a few per cent. A finding must exceed this deviation.
 """
@@ -27,12 +27,13 @@ from hdbridge.axis.model import TransmissionModel
 def findings(
     search: Search, model: TransmissionModel, fitted: Fitted, precise: Fitted, spread: FloatArray
 ) -> list[Finding]:
-    """Returns the findings within the baseline.
+    """Returns the changed parts of the baseline as findings.
 
-    ``spread`` is the covariance of ``precise``, the fit that determines the parameters.
+    ``precise`` is the fit that determines the parameters, and ``spread`` is its covariance.
     """
     estimator = search.estimator
-    # Independent of the file's intervals: temperature and time put every calibration off by as much.
+    # The file's intervals are ignored, because temperature and time shift every calibration by a few per
+    # cent.
     parts = calibrated(
         model.effects, {}, lambda effect: estimator.columns(effect, Start.VIRGIN), estimator.scales
     )
@@ -70,10 +71,10 @@ class _Change(NamedTuple):
 def _finding(
     search: Search, fitted: Fitted, loose: Fitted, place: int, given: Effect, change: _Change
 ) -> Finding | None:
-    """Judges a change like any other cause, by its block-robust evidence and its gain on held-out data.
+    """Assesses a change like any other cause, by its block-robust evidence and its gain on held-out data.
 
-    Both compare the fit with one in which the part is as ``given``. The evidence is that of the ``loose``
-    fit, which unlike a model may have a free-form loop. Returns None if the evidence is insufficient.
+    Both compare the fit with one that keeps the ``given`` part. The evidence is computed from ``loose``, a
+    fit that may contain a free-form loop, unlike a model. Returns None if the evidence is insufficient.
     """
     estimator, name = search.estimator, change.effect.name
 
@@ -120,7 +121,7 @@ def _loop(
     given: Effect,
     spread: FloatArray,
 ) -> _Change | None:
-    """Returns a change if the loop's parameters have changed, or its shape matches neither law."""
+    """Returns a change if the loop's parameters have changed or its shape fits neither hysteresis law."""
     estimator, place = search.estimator, usual.place
     scales = estimator.scales
     change = _change(estimator, precise, place, given)
@@ -142,13 +143,16 @@ def _loop(
 
 
 def _apart_arcsec(estimator: Estimator, one: Fitted, other: Fitted) -> float:
-    """Returns the largest difference between two fits, arcsec, without rare extremes."""
+    """Returns the largest difference between two fits, arcsec, excluding rare extremes."""
     apart = np.abs(one.residual - other.residual) / estimator.weight
     return float(np.quantile(apart, 1.0 - estimator.rare))
 
 
 def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
-    """Returns the peak that a free-form loop adds to the law, arcsec; 0 if the law fits as well."""
+    """Returns the peak contribution of a free-form loop beyond the hysteresis law, arcsec.
+
+    The result is 0 if the law alone fits as well.
+    """
     scales, free = estimator.scales, fitted.hypothesis.nuisances
     if free is None:
         return 0.0
@@ -161,7 +165,7 @@ def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
 def _orders(
     estimator: Estimator, fitted: Fitted, usual: Sequence[CalibratedPart], given: Effect, spread: FloatArray
 ) -> _Change | None:
-    """Returns a change of the motor orders."""
+    """Returns a change that combines all changed motor orders; None if no order has changed."""
     place, scales = usual[0].place, estimator.scales
     now = fitted.hypothesis.effects[place]
     columns = fitted.places(place)
@@ -170,7 +174,7 @@ def _orders(
     known: list[FloatArray] = []
     for old, new, named in zip(given.pieces(), now.pieces(), now.named_coefficients(), strict=True):
         before, after = old.coefficients(), new.coefficients()
-        # Effects that are odd in the direction reduce an order's mean over both directions.
+        # Effects that change sign with the direction of motion reduce an order's mean over both directions.
         number = round(new.waves()[0][0]) if new.waves() else 0
         share = math.prod(each.left_in_mean(number) for each in fitted.hypothesis.effects)
         part = next(each for each in usual if str(named.columns[0]) in each.parameters).times(share)
@@ -187,8 +191,8 @@ def _orders(
     difference = is_now.fitted(is_now.coefficients() - was.coefficients())
     causes = causes_of(was, is_now)
     if not causes or difference.largest_piece_arcsec() > scales.extrapolated * seen:
-        return None  # on an arc of their turn, orders can take any amplitude
-    # The old value has the uncertainty of its calibration.
+        return None  # a record over part of a motor turn does not limit the amplitudes of orders
+    # The uncertainty of the old value is that of its calibration.
     apart = spread[np.ix_(own, own)] + np.diag(np.concatenate(known))
     return _Change(
         causes[0],
@@ -202,7 +206,7 @@ def _orders(
 def _freed(
     search: Search, fitted: Fitted, precise: Fitted, place: int, given: Effect, spread: FloatArray
 ) -> _Change | None:
-    """Returns a change of any other part that the data pull out of its calibration (`calibrated`)."""
+    """Returns a change of any other part if the fit has freed it from its calibration (`calibrated`)."""
     estimator, own = search.estimator, precise.places(place)
     if not len(own) or np.all(precise.information[own] != 0.0):
         return None
@@ -227,14 +231,17 @@ def _freed(
 
 
 def _change(estimator: Estimator, fitted: Fitted, place: int, given: Effect) -> FloatArray:
-    """Returns the change of a part's contribution from the ``given`` contribution, arcsec, shape (m,)."""
+    """Returns the fitted contribution of a part less that of the ``given`` part, arcsec, shape (m,)."""
     start, now = fitted.hypothesis.start, fitted.hypothesis.effects[place]
     after = estimator.columns(now, start) @ now.coefficients()
     return np.asarray(after - estimator.columns(given, start) @ given.coefficients())
 
 
 def strain(fitted: Fitted, part: CalibratedPart, spread: FloatArray) -> float:
-    """Returns the chi square of a part's deviation from its calibration, with the errors of both."""
+    """Returns the chi square of a part's deviation from its calibration.
+
+    Its variance includes the errors of the fit, from the covariance ``spread``, and of the calibration.
+    """
     own = {fitted.parameters[i].name: i for i in fitted.places(part.place)}
     seen = replace(part, parameters={name: each for name, each in part.parameters.items() if name in own})
     at = [own[name] for name in seen.parameters]
@@ -242,6 +249,6 @@ def strain(fitted: Fitted, part: CalibratedPart, spread: FloatArray) -> float:
 
 
 def causes_of(given: Effect, now: Effect) -> list[Effect]:
-    """Returns the causes that can explain the change, most specific first."""
+    """Returns the causes that can explain the change from ``given`` to ``now``, most specific first."""
     found = [each for kind in CATALOGUE.values() if (each := kind.of_change(given, now)) is not None]
     return sorted(found, key=lambda each: each.changes is None)

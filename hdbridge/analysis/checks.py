@@ -1,4 +1,4 @@
-"""Plausibility checks of records: rejects impossible records and suggests how to read them correctly."""
+"""Rejects implausible records, and suggests the units or options with which to read them correctly."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from hdbridge.records.wraps import Wraps, count_of, find_wraps, period_in, unwra
 from hdbridge.units import DEG_PER_TURN
 
 LEAST_WHOLE = 10.0
-"""Minimum travel in which nothing but whole numbers cannot be a coincidence."""
+"""Minimum travel for the check for whole numbers. Over this travel, they cannot be a coincidence."""
 SLOWEST_DEG_S = 6.0
-"""Minimum peak motor speed of a plausible record: one turn per minute."""
+"""Minimum peak motor speed of a plausible record, equal to one motor turn per minute."""
 MOST_COUNTS = 2**32
-"""Largest plausible counter that wraps within a record, counts."""
+"""Maximum plausible range of a wrapping counter, counts."""
 TURNS_SEEN = 4.0
-"""Minimum motor turns for a test of repetition."""
+"""Minimum number of motor turns for testing whether the error repeats."""
 PLACES = 8
-"""Number of sectors of a motor turn that count as different places."""
+"""Number of sectors into which a motor turn is divided for counting visited places."""
 REPEATS_SHARE = 0.5
-"""Minimum share of the error's variance that repeats with each motor turn, over `TURNS_SEEN` turns. Over
-more turns, chance explains less."""
+"""Minimum fraction of the error's variance that repeats with each motor turn, for `TURNS_SEEN` turns. For
+more turns the minimum is smaller, because a chance repetition explains less."""
 LEAST_REPEATS_SHARE = 0.1
-"""Lower bound of that share for records of more turns."""
+"""Lower bound of the required repeating fraction, reached in records of many turns."""
 FOLLOWS_SHARE = 0.1
-"""Maximum remaining share of the distance between command and motor after unwrapping the command."""
+"""Maximum ratio of the deviations between command and motor after and before unwrapping the command."""
 
 
 def check_records(records: Mapping[Path, Record], ratio: float) -> None:
-    """Checks that an axis of this ratio can have produced the records, and that it moved; else InputError.
+    """Raises InputError if an axis of this ratio cannot have produced the records, or if it never moved.
 
     Time must increase, angles must be multi-turn, units and ratio must be right, and the motor must move in
-    at least one record. Keys are the paths for the messages.
+    at least one record. The paths are used in the messages.
     """
     for path, record in records.items():
         if len(record) > 1 and float(np.ptp(record.time_s)) == 0.0:
@@ -61,10 +61,10 @@ def check_records(records: Mapping[Path, Record], ratio: float) -> None:
 
 
 def zeros_apart_arcsec(records: Sequence[Record], ratio: float) -> float | None:
-    """Returns the spread of the zeros of records with the same direction of motion.
+    """Returns the spread of the zeros of records with the same direction of motion, arcsec.
 
-    None if the spread does not exceed the variation within the records, or if there is only one zero.
-    Directions are compared separately, because they differ by half the height of a loop.
+    Returns None if the spread does not exceed the variation within the records, or if each direction has at
+    most one record. Directions are compared separately, because hysteresis shifts their mean errors.
     """
     apart: list[float] = []
     for sign in (-1.0, 1.0):
@@ -83,7 +83,7 @@ def zeros_apart_arcsec(records: Sequence[Record], ratio: float) -> float | None:
 
 
 def check_once(paths: Sequence[Path], records: Sequence[Record]) -> None:
-    """Raises InputError if a measurement is given twice, because it would count twice."""
+    """Raises InputError if a measurement is given twice, because its evidence would count twice."""
     for number, (path, record) in enumerate(zip(paths, records, strict=True)):
         for other, before in zip(paths[:number], records[:number], strict=True):
             if len(record) == len(before) and all(
@@ -152,12 +152,12 @@ def _check_wrapped(path: Path, record: Record) -> None:
 
 
 def _shown(value: float) -> str:
-    """Formats a count in full, any other value with six significant digits."""
+    """Formats a whole number in full, and any other value with six significant digits."""
     return f"{value:.12g}" if value == round(value) else f"{value:.6g}"
 
 
 def _counter(period: float, unit: Unit, angle: FloatArray) -> str:
-    """Describes a counter or an angle with this period."""
+    """Describes the counter or angle that wraps with this period."""
     if abs(period * abs(unit.factor) - DEG_PER_TURN) < 1e-6 * DEG_PER_TURN:
         return "an angle that wraps after a turn"
     counts = period if unit.name == "counts" else period / (count_of(angle / unit.factor) or period)
@@ -166,7 +166,7 @@ def _counter(period: float, unit: Unit, angle: FloatArray) -> str:
 
 
 def _unwrapping(record: Record, channel: str, found: Mapping[str, Wraps]) -> str:
-    """Returns the instruction for unwrapping the angles found."""
+    """Returns an instruction for unwrapping the angles in ``found``."""
     origin = record.origin
     if origin is None:
         return f"unwrap it by {found[channel].period_deg:.10g} deg"
@@ -183,7 +183,7 @@ def _unwrapping(record: Record, channel: str, found: Mapping[str, Wraps]) -> str
 
 
 def _check_speed(path: Path, record: Record) -> None:
-    """Raises InputError for milliseconds or radians that were read as seconds or degrees."""
+    """Raises InputError if milliseconds or radians appear to have been read as seconds or degrees."""
     origin = record.origin
     if origin is None or "time" in origin.stated or not _moves(record):
         return
@@ -213,21 +213,22 @@ def _check_speed(path: Path, record: Record) -> None:
 
 
 def _check_turn(path: Path, record: Record, ratio: float) -> None:
-    """Raises InputError for angles in radians: the error repeats every 2 pi of the motor angle rather than
-    every 360.
+    """Raises InputError if the angles are in radians.
+
+    The error then repeats every 2 pi of the motor angle instead of every 360.
     """
     origin, motor = record.origin, record.motor_position_deg
     if origin is None or "motor" in origin.stated:
         return
     step = np.gradient(motor) if len(motor) > 1 else np.zeros(len(motor))
-    shown = (step != 0.0) & (np.abs(step) < math.tau / PLACES)  # a longer one is an alias of another period
+    shown = (step != 0.0) & (np.abs(step) < math.tau / PLACES)  # longer steps would alias other periods
     run = np.cumsum(np.diff(shown, prepend=False))
     begins = np.flatnonzero(np.diff(run, prepend=-1))
     spans = np.maximum.reduceat(motor, begins) - np.minimum.reduceat(motor, begins)
-    shown &= np.repeat(spans >= math.tau, np.diff(begins, append=len(motor)))  # slow over a whole period
+    shown &= np.repeat(spans >= math.tau, np.diff(begins, append=len(motor)))  # keep runs over a whole period
     places = len(np.unique(np.floor(PLACES / math.tau * motor[shown])))
     if places < PLACES * TURNS_SEEN:
-        return  # a few places agree with any period
+        return  # too few places to distinguish the periods
     base = np.column_stack([np.ones_like(motor), motor, np.sign(step)])
     error = record.transmission_error_arcsec(ratio)[shown]
 

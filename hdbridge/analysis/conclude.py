@@ -1,10 +1,10 @@
 """Covariance, residual tests, held-out test and result of an identification.
 
-The covariance of a fit under the noise model is the inverse information. If the noise model is wrong, the
-scores of longer stretches vary more than it predicts. A sandwich estimate over stretches (Liang and Zeger
-1986) shows the excess and replaces the model's variance wherever it is larger. The rounding error in a wave
-is constant along a sweep and differs in the next, so for waves whole legs also serve as stretches. Legs are
-few, so all waves are pooled.
+Under the noise model, the covariance of a fit is the inverse information matrix. If the noise model is wrong,
+the scores of longer stretches of time vary more than the model predicts. A sandwich estimate over stretches
+(Liang and Zeger 1986) measures this variation and replaces the model's variance wherever it is larger. The
+rounding error of a harmonic is constant along a sweep but differs in the next. For harmonics, whole legs
+therefore also serve as stretches. Because legs are few, all harmonics are pooled.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ CLUSTERS = 100
 
 
 def covariance(solution: Solution, precision: Precision, blocks: Blocks) -> FloatArray:
-    """Returns the covariance of the solution's columns, shape (p, p)."""
+    """Returns the covariance of the solution's parameters, one per column, shape (p, p)."""
     model = inverse_symmetric(solution.information)
     number = clusters(blocks, CLUSTERS)
-    # Turning points are noise (each has a single stretch), not parameters, and have no scores.
+    # Turning-point columns describe noise. Each lies in a single stretch, so their scores are meaningless.
     main = [at for at, column in enumerate(solution.columns) if not is_turn(column.name)]
     if int(number[-1]) + 1 < 2 * len(main):
         return model
@@ -73,16 +73,16 @@ def covariance(solution: Solution, precision: Precision, blocks: Blocks) -> Floa
 
 
 def of_effect(solution: Solution, index: int, cov: FloatArray) -> list[Interval]:
-    """Returns the intervals of one effect's parameters, from the covariance of the solution's columns."""
+    """Returns the confidence intervals of one effect's parameters, from the solution's covariance ``cov``."""
     mine = [at for at, column in enumerate(solution.columns) if column.effect == index]
     columns = [solution.columns[at] for at in mine]
     return intervals_of(solution.effects[index], columns, cov[np.ix_(mine, mine)])
 
 
 def _between_legs(waves: FloatArray, precision: Precision, residual: FloatArray, blocks: Blocks) -> float:
-    """Returns the variance of waves between legs relative to the noise model's; at least 1.
+    """Returns the variance of harmonics between legs, relative to that of the noise model; at least 1.
 
-    Waves (b, p) of one kind carry nearly equal information and overlap little, so each is an independent
+    The columns ``waves`` (b, p) carry nearly equal information and overlap little, so each is an independent
     estimate of the ratio.
     """
     scores = sums(waves * precision.apply(residual)[:, np.newaxis], blocks.leg)
@@ -97,9 +97,9 @@ def _between_legs(waves: FloatArray, precision: Precision, residual: FloatArray,
 
 
 SURE = 3.0
-"""Minimum significance of a difference, standard errors."""
+"""Minimum size of a significant deviation, standard errors."""
 WORTH_ARCSEC = 0.3
-"""Smallest deviation that fails a test, however significant."""
+"""Smallest deviation that fails a test; even a significant smaller one passes."""
 LEAST_REPORTED_ARCSEC = 0.005
 """Smallest deviation mentioned in the text; a smaller one would be printed as 0.00."""
 
@@ -111,7 +111,7 @@ def residual_tests(
     left: Sequence[Line],
     figures: NoiseFigures,
 ) -> tuple[ResidualTest, ...]:
-    """Runs all residual tests; ``left`` holds the orders that are not in the fit."""
+    """Runs all residual tests. ``left`` contains the spectral lines of orders that are not in the fit."""
     return (
         _orders("motor_angle", [each for each in left if each.order.family is not Family.LOAD]),
         _orders("load_angle", [each for each in left if each.order.family is Family.LOAD]),
@@ -133,7 +133,11 @@ def _orders(name: str, left: Sequence[Line]) -> ResidualTest:
 def _contrast(
     name: str, column: FloatArray, residual: FloatArray, precision: Precision, scale: float
 ) -> ResidualTest:
-    """Fits one column and a mean by generalised least squares; returns the size in ``scale`` columns."""
+    """Tests whether the residual depends on ``column``.
+
+    Fits the column and a mean by generalised least squares. The reported size is ``scale`` times the
+    coefficient.
+    """
     columns = np.stack([np.ones(len(column)), column], axis=1)
     weighted = precision.apply(columns)
     information = columns.T @ weighted
@@ -174,22 +178,21 @@ def _level(figures: NoiseFigures) -> ResidualTest:
     return ResidualTest("noise_level", size < max(rest, 1.0), size, text)
 
 
-# Held-out test: parts of the record are left out, the model is fitted to the rest and predicts them.
+# Held-out test: the model is fitted without parts of the record, and predicts these parts.
 
 
 FOLDS = 4
 STRETCHES = 40
-"""Number of stretches of time. Each fold contains every fourth stretch."""
+"""Approximate number of stretches of time. Each fold contains every fourth stretch."""
 
 
 def held_out(
     state: State, solution: Solution, measured_arcsec: FloatArray, inside_variance: float
 ) -> HeldOut:
-    """Cross-validates the model by folds, and compares it with the active model or, without one, with no
-    model.
+    """Cross-validates the model and compares it with the active model, or with no model if none is active.
 
     ``measured_arcsec`` (b,) is the measured error before delay correction. ``inside_variance`` is the
-    variance of samples within their blocks, which models of this kind do not change.
+    variance of samples within their blocks, which is independent of the model.
     """
     design, blocks, active = state.design, state.design.blocks, state.options.active
     fold, stretch, over = folds(design)
@@ -207,7 +210,7 @@ def held_out(
         steps = steps_without(fit, fold, lambda rows: Precision(state.noise, blocks.picked(rows)))
         for number, step in enumerate(steps):
             out = fold == number
-            # About the zeros of the other data, or about its own if a zero occurs only in this fold.
+            # Zeros are those of the other folds; a zero that occurs only in this fold is fitted here.
             lost = ~np.isin(blocks.zero, blocks.zero[~out])
             left = fit.residual - columns @ step
             added[row, out] = about_zeros(left, blocks.zero, blocks.count * lost)[out]
@@ -235,7 +238,10 @@ def held_out(
 
 
 def gain_of_law(before: tuple[State, Solution], after: tuple[State, Solution]) -> Gain:
-    """Compares two laws by the residual of each fold from a fit to the others, with nuisances refitted."""
+    """Returns the gain of the law in ``after`` over that in ``before`` on held-out data.
+
+    Each fold is predicted by a fit to the other folds, with nuisances refitted.
+    """
     design = before[0].design
     fold, stretch, over = folds(design)
     count = design.blocks.count
@@ -244,7 +250,7 @@ def gain_of_law(before: tuple[State, Solution], after: tuple[State, Solution]) -
 
 
 def _left_out(state: State, solution: Solution, fold: IntArray) -> FloatArray:
-    """Returns the residual of each block (b,), arcsec, from a fit without its fold."""
+    """Returns the residual of each block (b,), arcsec, from a fit without the block's fold."""
     blocks, left = state.design.blocks, solution.residual.copy()
     fit = Linearised(solution.jacobian, solution.residual, solution.known)
     steps = steps_without(fit, fold, lambda rows: Precision(state.noise, blocks.picked(rows)))
@@ -258,10 +264,10 @@ def _left_out(state: State, solution: Solution, fold: IntArray) -> FloatArray:
 def folds(design: Design) -> tuple[IntArray, IntArray, str]:
     """Returns the fold and the stretch of each block (b,), and a description of the parts left out.
 
-    Sweeps are divided by motor turns, every fourth one in both directions. Motion that turns back within a
-    motor turn (sines, reversals) is divided by stretches of time, because the loop is not determined without
-    reversals, and no fold may contain them all. Several short recordings of unknown motion are left out
-    whole, because a correlated residual would be predicted by neighbouring stretches.
+    In sweeps, a fold contains every fourth motor turn, in both directions. Motion that reverses within a
+    motor turn (sines, reversals) is divided into stretches of time. The loop is not determined without
+    reversals, so no fold may contain them all. Of several short recordings of unknown motion, whole
+    recordings are left out, because neighbouring stretches would predict a correlated residual.
     """
     blocks = design.blocks
     turns = (blocks.motor_deg - np.min(blocks.motor_deg)) / DEG_PER_TURN
@@ -281,20 +287,20 @@ def folds(design: Design) -> tuple[IntArray, IntArray, str]:
 
 
 MOST_NAMED = 4
-"""Maximum number of orders that are listed individually."""
+"""Maximum number of orders listed individually in a warning."""
 
 
 def conclude(
     state: State, solution: Solution, cov: FloatArray, system: System, warnings: list[str]
 ) -> FitResult:
-    """Assembles the result of an identification; ``system`` is that of the state with the final noise."""
+    """Assembles the result of an identification; ``system`` is that of ``state`` with its final noise."""
     design, blocks, samples = state.design, state.design.blocks, state.design.samples
     precision, chosen = state.precision(), state.selection.chosen
     intervals = [each for index in range(len(solution.effects)) for each in of_effect(solution, index, cov)]
     effects = tuple(each for each in solution.effects if not each.violations())
     uncertainty = {each.name: nested_half_widths(each, intervals) for each in effects}
     inside = _inside_variance(design, solution, state.columns().columns @ solution.nuisances)
-    # Samples were corrected by the delay, which is not part of any model.
+    # Undoes the delay correction of the samples, because the delay is not part of any model.
     measured = blocks.error_arcsec + state.delay_ms * delay_column(design)[:, 0]
     written = about_zeros(measured - design.predict(effects), blocks.zero, blocks.count)
 
@@ -356,7 +362,7 @@ def conclude(
 
 
 def _inside_variance(design: Design, solution: Solution, nuisances: FloatArray) -> float:
-    """Returns the variance of the residual of samples about their block means."""
+    """Returns the variance of the samples' residuals about their block means, arcsec squared."""
     blocks = design.blocks
     residual = design.residual(solution.effects, nuisances)
     off = residual[blocks.index] - np.repeat(blocks.mean(residual), blocks.sizes)
@@ -364,7 +370,10 @@ def _inside_variance(design: Design, solution: Solution, nuisances: FloatArray) 
 
 
 def _nuisances(state: State, further: Mapping[str, tuple[float, float]]) -> tuple[Nuisance, ...]:
-    """Returns the nuisances with a physical meaning; ``further`` maps names to value and half width."""
+    """Returns the nuisances that have a physical meaning.
+
+    ``further`` contains the value and 95 % half width of each nuisance by name.
+    """
     found = []
     for name in state.nuisances:
         if name in TEXTS and name in further:
@@ -414,7 +423,7 @@ def _describe_limits(state: State, lines: Sequence[Line], warnings: list[str]) -
 
 
 def _families(lines: Sequence[Line]) -> list[list[Order]]:
-    """Groups orders that are aliases of each other."""
+    """Groups the orders that are aliases of each other."""
     alike = [[other.order in each.aliases for other in lines] for each in lines]
     number = connected_components(np.array(alike).reshape(len(lines), -1))[1].tolist() if lines else []
     families = [
@@ -425,7 +434,7 @@ def _families(lines: Sequence[Line]) -> list[list[Order]]:
 
 
 def _named(orders: Sequence[Order]) -> str:
-    """Lists orders by name; a long list is abbreviated to its first and last orders."""
+    """Lists orders by name; abbreviates a long list to its first and last order."""
     if len(orders) > MOST_NAMED:
         return f"{orders[0]} to {orders[-1]} ({len(orders)} orders)"
     return " and ".join(map(str, orders))

@@ -1,7 +1,7 @@
 """Splits a concatenated record at its joins and drops invalid readings.
 
-A motor cannot jump between two samples. A jump is a join of two records with unknown motion in between or, if
-the angle returns within a sample or two, a misreading.
+A motor cannot jump between two samples. A jump is either a join of two records, with unknown motion between
+them, or a misreading if the angle returns after one or two samples.
 """
 
 from __future__ import annotations
@@ -25,30 +25,31 @@ FASTEST_DEG_S2 = 1e6
 """Upper limit of the motor acceleration: a small servo motor at peak torque (17,000 rad/s^2). A motor with a
 wave generator on its shaft reaches less."""
 JUMP_DEG = 30.0
-"""Minimum jump of the motor angle; smaller steps may be noise, a count or a lost count."""
+"""Minimum step of the motor angle that counts as a jump; smaller ones may be noise or a lost count."""
 SPIKE_ARCSEC = 900.0
-"""Change of the error to a single sample and back that no gear can produce."""
+"""Minimum deviation of a misread sample from its neighbours' transmission error; no gear can produce it."""
 SLOWEST_S = 1.0
-"""Sample period from which on a record is implausible; a record needs a few samples per motor turn."""
+"""Sample period from which a record is implausible, because it has too few samples per motor turn."""
 MISREAD_ROWS = 2
-"""Maximum duration of a misreading, samples."""
+"""Maximum length of a misreading, samples."""
 MISREAD_SHARE = 0.01
-"""Maximum share of misread samples; a larger share has another cause."""
+"""Maximum fraction of misread samples; a larger fraction has another cause, and no sample is dropped."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """A record without invalid readings, split at its cuts."""
+    """A record without invalid readings, split at jumps of the motor angle."""
 
     record: Record
     remarks: tuple[str, ...]
-    """Samples left out, and cuts, in words."""
+    """Descriptions of the samples left out and of the cuts."""
     cuts: tuple[int, ...] = ()
-    """Rows before which the motion is unknown; some of ``record.starts``."""
+    """Rows that follow a jump, before which the motion is unknown; a subset of ``record.starts``."""
 
 
 def observed(record: Record, ratio: float) -> Observed:
-    """Cleans a record: spreads coarse times, drops misread samples and cuts at jumps.
+    """Cleans a record: spreads coarse time stamps evenly, drops misread samples and cuts at jumps.
+
 
     Returns an intact record unchanged.
     """
@@ -107,7 +108,7 @@ def _picked(record: Record, kept: BoolArray) -> Record:
 
 
 def jumps(motor_deg: FloatArray, time_s: FloatArray) -> IntArray:
-    """Returns the indices of steps between samples that no motor can make from the speed before or after."""
+    """Returns the indices of steps that no motor can make, given the speeds before and after them."""
     step, time = np.diff(motor_deg), np.maximum(np.diff(time_s), 1e-6)
     if not len(step):
         return np.empty(0, dtype=np.intp)
@@ -119,7 +120,7 @@ def jumps(motor_deg: FloatArray, time_s: FloatArray) -> IntArray:
 
 
 def _misread(record: Record, ratio: float) -> BoolArray:
-    """Returns a mask of samples at which an angle jumps away and back."""
+    """Returns a mask of samples to which an angle jumps, only to return at once."""
     window = 2 * MISREAD_ROWS + 1
     found = np.zeros(len(record), dtype=np.bool_)
     if len(record) <= 2 * window:

@@ -1,4 +1,4 @@
-"""Diagnosis of a measurement against a model: all steps in order."""
+"""Diagnoses a measurement against a model: all steps in order."""
 
 from __future__ import annotations
 
@@ -75,12 +75,12 @@ def diagnose(
     scales: Scales | None = None,
     prior: Prior | None = None,
 ) -> Diagnosis:
-    """Diagnoses the causes of the difference between a model and one or several recordings.
+    """Finds the causes of the difference between a model and one or several recordings.
 
-    ``independent_zeros`` states that the encoders' zeros were lost between recordings. ``progress`` receives
-    a description of each step. ``scales`` overrides the decision thresholds; ``prior`` holds the fleet's
-    prior for the causes. InputError if a recording is too short, does not match the model's ratio, or lacks a
-    channel that the model needs.
+    Set ``independent_zeros`` if the encoders' zeros were lost between recordings. ``progress`` receives a
+    description of each step. ``scales`` overrides the decision thresholds, and ``prior`` is the fleet's prior
+    for the causes. Raises InputError if a recording is too short, does not match the model's ratio, or lacks
+    a channel that the model needs.
     """
     recordings = by_name(recording)
     agreed_ratio(recordings, [(str(model.path or "the model"), model.ratio)])
@@ -105,8 +105,8 @@ def diagnose(
     between = between_samples(base, scales)
     swing = seen_swing(base, between, scales)
     search, found = _searched(data, model, scales, between, swing)
-    if swing is None or not between.names:  # a larger cause may hide them
-        # Wind-up in acceleration is the slow part of both.
+    if swing is None or not between.names:  # a larger cause may mask them
+        # Inertial wind-up is the slow part of both, so it is excluded from the base.
         others = [each for each in found.hypothesis.effects if each.channels != {Channel.ACCELERATION}]
         base, before = Base.of(data, others), (between.names, swing)
         between = between if between.names else between_samples(base, scales)
@@ -121,7 +121,7 @@ def diagnose(
 def _searched(
     data: Observed, model: TransmissionModel, scales: Scales, between: Nuisances, swing: Swing | None
 ) -> tuple[Search, Fitted]:
-    """Returns the search and its result on the data less the swing."""
+    """Returns the search and its result, for the data after subtraction of the load's swing."""
     if swing is not None:
         data = without(data, swing)
     if swing is not None and swing.soft:
@@ -163,7 +163,7 @@ def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Judged:
     whole: Fitted
-    """Fit with any free-form loop."""
+    """Fit that may contain a free-form loop."""
     fitted: Fitted
     """Fit without a free-form loop."""
     findings: list[Finding]
@@ -177,14 +177,14 @@ class _Judge:
     model: TransmissionModel
     prior: Prior | None = None
     considered: list[str] = field(default_factory=list)
-    """Causes that were considered but not reported, with the reason."""
+    """Causes that were considered but not reported, each with the reason."""
 
     @property
     def estimator(self) -> Estimator:
         return self.search.estimator
 
     def of(self, fitted: Fitted) -> Diagnosis:
-        """Turns the result of the search into a diagnosis."""
+        """Derives the diagnosis from the result of the search."""
         estimator, given = self.estimator, self.model.effects
         while (passed := self.search.eliminated(fitted, self._stopped, self.considered)) is not fitted:
             names = [Counter(each.name for each in one.hypothesis.effects) for one in (fitted, passed)]
@@ -207,7 +207,7 @@ class _Judge:
         before, _ = estimator.left_by(given)
         after, start = estimator.left_by(extended.effects)
         measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
-        cleared = copy(estimator)  # the record without what was found in it
+        cleared = copy(estimator)  # the record without the errors found in it
         cleared.observed = estimator.observed - before + after
 
         def visible() -> tuple[Mapping[str, Identifiability], Capability]:
@@ -244,11 +244,11 @@ class _Judge:
     def _written(
         self, fitted: Fitted, findings: list[Finding]
     ) -> tuple[Fitted, list[Finding], TransmissionModel]:
-        """Returns the extended model, its fit, and the findings that it contains.
+        """Returns the fit of the extended model, the findings that the model contains, and the model.
 
-        A finding that cannot be written is dropped: its parameters are out of bounds, the compensation could
-        not invert the model with it, or the record does not determine it. The given effects stay as they are
-        if refitted ones do not predict what was left out.
+        A finding is dropped if its parameters are out of bounds, if the compensation could not invert the
+        model with it, or if the record does not determine it. The given effects remain unchanged if the
+        refitted ones do not predict held-out data.
         """
         estimator, given = self.estimator, self.model.effects
         while True:
@@ -272,7 +272,7 @@ class _Judge:
             findings = [each for each in findings if each not in missing]
 
     def _with_gains(self, fitted: Fitted, findings: list[Finding], added: list[int]) -> list[Finding]:
-        """Returns the findings with the gain of the written model; ``added`` are its new effects."""
+        """Returns the findings with the gain of the written model, which has new effects at ``added``."""
         effects, given = fitted.hypothesis.effects, self.model.effects
         written = [place for place, old in enumerate(given) if effects[place] != old] + added
         own = [
@@ -294,11 +294,15 @@ class _Judge:
         return [replace(each, gain=gains.get(at, each.gain)) for at, each in enumerate(findings)]
 
     def _uncalibrated(self, findings: Sequence[Finding]) -> str:
-        """Returns a remark if the probability formula was fitted to other kinds of records; else empty."""
+        """Returns a remark if the probability formula was not fitted to this kind of record; else empty."""
         return UNCALIBRATED if findings and len(self.estimator.data.full.kinds) == 1 else ""
 
     def _stopped(self, fitted: Fitted) -> tuple[int, str] | None:
-        """Returns the weakest cause that fails its gate; else an implausible or unidentifiable cause."""
+        """Returns the place of a rejected cause and the reason; None if all causes pass.
+
+        Causes that fail their acceptance tests come first, the weakest before the others, then causes that
+        are implausible or not identifiable.
+        """
         places = range(len(self.model.effects), len(fitted.hypothesis.effects))
         gates = {place: gate(self.estimator, fitted, place) for place in places}
         stopped = [place for place, each in gates.items() if each.reason]
@@ -313,7 +317,7 @@ class _Judge:
         return None
 
     def _likely_only(self, fitted: Fitted) -> _Judged:
-        """Judges the findings and removes those that are improbable or normal for any axis.
+        """Assesses the findings, and removes those that are improbable or normal for any axis.
 
         Improbable findings are also removed from the fit.
         """
@@ -330,14 +334,14 @@ class _Judge:
             )
             left = self._without(fitted, doubted)
             if left is fitted:
-                break  # the others are changes of the baseline, which stay in it
+                break  # the remaining doubtful ones are changes of the baseline, which stay in the fit
             fitted = left
         usual = {each.cause for each in likely if _ordinary(each)}
         self.considered.extend(f"{cause}: no more than usual" for cause in sorted(usual))
         return replace(judged, findings=[each for each in likely if each.cause not in usual])
 
     def _without(self, fitted: Fitted, findings: Sequence[Finding]) -> Fitted:
-        """Fits again without the effects of findings; changes of the baseline stay in it."""
+        """Refits without the effects of ``findings``; changes of the baseline stay in the fit."""
         effects, base = {id(each.effect) for each in findings}, len(self.model.effects)
         kept = tuple(
             each for i, each in enumerate(fitted.hypothesis.effects) if i < base or id(each) not in effects
@@ -347,7 +351,7 @@ class _Judge:
         return self.search.with_best_law(self.estimator.fit(replace(fitted.hypothesis, effects=kept)))
 
     def _judged(self, fitted: Fitted) -> _Judged:
-        """Judges the findings of a hypothesis."""
+        """Determines the findings of a fit, with their parameters and probabilities."""
         estimator, base = self.estimator, len(self.model.effects)
         precise = precisely(estimator, fitted)
         spread = covariance(estimator, precise)
@@ -369,7 +373,7 @@ class _Judge:
         return _Judged(whole, fitted, findings, left, context)
 
     def _one_way(self, finding: Finding) -> Finding:
-        """Limits the probability of a cause seen in one direction only."""
+        """Limits the probability of a cause in a record with motion in one direction only."""
         scales, repeated = self.estimator.scales, finding.gain is not None and finding.gain.repeated
         most = scales.one_way_repeated if repeated else scales.one_way
         return replace(finding, probability=min(finding.probability, most))
@@ -429,7 +433,7 @@ class _Judge:
         )
         loops = [each for each in findings if each.effect is not None and each.effect.changes is Part.LOOP]
         if many is None and loops and of_the_loop(self.estimator, left):
-            # The best law is only an approximation: one finding, with its residual in the note.
+            # The best hysteresis law is only an approximation. The residual is noted in that finding.
             note = f"the loop has another shape than either law: {figure(left.arcsec, 3)} arcsec rms are left"
             noted = replace(loops[0], note=note, lives_in=lives)
             return [noted if each is loops[0] else each for each in findings]
@@ -442,7 +446,7 @@ class _Judge:
         estimator = self.estimator
         points, direction = estimator.data.points, direction_of(estimator.motion)[estimator.index]
         masks = {name: points.of_kind(name)[estimator.index] for name in points.kinds}
-        if len(masks) == 1:  # without legs: divided into standing, slow and fast
+        if len(masks) == 1:  # a record without legs is divided into standing, slow and fast
             speed = np.abs(points.speed_deg_s)
             slow = speed <= np.median(speed[speed > 0.0]) if np.any(speed) else speed <= 1.0
             either = {"standing": speed == 0.0, "slow": (speed > 0.0) & slow, "fast": ~slow}
@@ -456,7 +460,7 @@ class _Judge:
 
 
 def _is_in(finding: Finding, changed: Sequence[Effect]) -> bool:
-    """Returns True if ``changed``, the effects that differ from the given model, contains the finding."""
+    """Returns True if the finding is among ``changed``, the effects that differ from the given model."""
     effect = finding.effect
     if effect is None:  # something unexplained
         return True

@@ -1,6 +1,6 @@
-"""Driving angle of the effects, with speed and acceleration; reversals without chatter.
+"""Motor angle at which the effects are evaluated, with speed and acceleration, freed of chatter.
 
-A reversal counts only if the motor returns by more than the chatter.
+A reversal counts only if the motor moves back by more than the chatter.
 """
 
 from __future__ import annotations
@@ -26,19 +26,18 @@ from hdbridge.analysis.readings import (
 from hdbridge.axis.effects import FloatArray
 
 REVERSAL_DEG = 0.3
-"""Minimum travel on either side of a reversal, motor degrees: less than the narrowest loop considered
-(0.5, `effects.elastic_loop`), and several times the settling motion of a motor (0.07 in measured
+"""Minimum travel on either side of a reversal, motor degrees. It is less than the width of the narrowest loop
+considered (0.5, `effects.elastic_loop`) and several times the settling motion of a motor (0.07 in measured
 records)."""
 JITTER_SIGMAS = 8.0
-"""Lower limit of the reversal travel, in standard deviations of the reading error."""
+"""Minimum travel on either side of a reversal, in standard deviations of the reading error."""
 
 
 def steadied(path_deg: FloatArray, measured_deg: FloatArray, band_deg: float) -> FloatArray:
-    """Removes reversals smaller than ``band_deg`` of the measured angle: the path is monotone between
-    turning points.
+    """Removes reversals of the measured angle smaller than ``band_deg``.
 
-    At each turning point the path is limited to the measured angle, because the largest of many noisy angles
-    lies too far out.
+    The resulting path is monotone between turning points. At each turning point it is clamped to the measured
+    angle, because the maximum of many noisy angles overestimates the true one.
     """
     changes = np.flatnonzero(np.diff(measured_deg, prepend=np.nan) != 0.0)
     until = np.append(changes[1:], len(measured_deg)) - 1
@@ -68,7 +67,7 @@ def steadied(path_deg: FloatArray, measured_deg: FloatArray, band_deg: float) ->
 
 
 def reversals(driving_deg: FloatArray, jitter_deg: float) -> int:
-    """Counts the reversals of one record that have travel on both sides (`REVERSAL_DEG`)."""
+    """Counts the reversals in one record with sufficient travel on both sides (`REVERSAL_DEG`)."""
     if len(driving_deg) < 3:
         return 0
     band = max(REVERSAL_DEG, JITTER_SIGMAS * jitter_deg)
@@ -82,37 +81,37 @@ def reversals(driving_deg: FloatArray, jitter_deg: float) -> int:
 BoolArray = NDArray[np.bool_]
 
 CHATTER_COUNTS = 2.6
-"""Minimum return for a reversal of a measured angle, counts. Noise of a third of a count flickers over two
-counts."""
+"""Minimum backward travel of a reversal of a measured angle, counts. Noise of a third of a count makes a
+reading flicker over two counts."""
 LEAST_STILL = 20
 """Minimum number of samples at a constant command for estimating the noise of the motor reading."""
 WINDOW_S = 0.03
 """Averaging window of speed and acceleration."""
 LONGEST_S = 0.05
-"""Longest window of the acceleration, because moves accelerate within a tenth of a second."""
+"""Longest window for the acceleration, because moves accelerate within a tenth of a second."""
 SETTLE_S = 0.1
 """Time for the load to settle after a fast move: two periods of an oscillation at 20 Hz."""
 
 
 class Driven(NamedTuple):
-    """Motion that drives the axis in one record, arrays of shape (n,)."""
+    """Motor motion in one record, as input of the effects; arrays of shape (n,)."""
 
     motor_deg: FloatArray
     speed_deg_s: FloatArray
     acceleration_deg_s2: FloatArray
     rested_deg: FloatArray
-    """Motor angle if a resting motor is in the middle of its count, not as close to the command as the count
-    allows. Without a command, the plain angle."""
+    """Motor angle if a resting motor is in the middle of its count. ``motor_deg`` assumes that it is as close
+    to the command as the count allows. Without a command, both are equal."""
 
 
 def reading_of_all(angle_deg: FloatArray, parts: Sequence[slice]) -> Reading:
-    """Returns the resolution of the motor encoder, determined from the longest part."""
+    """Returns the reading properties of an encoder: noise from the longest part, count from all parts."""
     largest = max(parts, key=lambda rows: rows.stop - rows.start)
     return replace(reading_of(angle_deg[largest]), count_deg=quantum_deg(angle_deg))
 
 
 def settling(fast: BoolArray, time_s: FloatArray) -> BoolArray:
-    """Returns a mask of the samples of fast moves and of the `SETTLE_S` after them."""
+    """Returns a mask of the samples in fast moves and within `SETTLE_S` after them."""
     last = np.maximum.accumulate(np.where(fast, time_s, -np.inf))
     return np.asarray(fast | ((time_s - last < SETTLE_S) & (time_s >= last)))
 
@@ -130,7 +129,7 @@ def kinematics(position: FloatArray, target: FloatArray | None, time: FloatArray
     speed, acceleration = _rates(_smooth(driving, window), driving, time, window, bent, exact=True)
     resting = _resting(driving if target is None else target, window)
     if count and target is None:
-        # Flickering counts are not motion: less than half a count over the span is rest.
+        # A flickering count is not motion. Less than half a count of travel over the span is rest.
         span = 4 * window + 1
         resting |= np.abs(_slope(driving, time, span)) * span * np.median(np.diff(time)) < 0.5 * count
     speed[resting] = acceleration[resting] = 0.0
@@ -150,15 +149,15 @@ def _rested(
 def _driving(
     position: FloatArray, target: FloatArray | None, time: FloatArray, window: int, reading: Reading
 ) -> FloatArray:
-    """Returns the command plus a smooth estimate of the lag, within the cell that the encoder read.
+    """Returns the command plus a smooth estimate of the motor's lag, limited to the count that was read.
 
-    Without a command, returns the angle without chatter.
+    Without a command, returns the measured angle without chatter.
     """
     if target is None:
         return steadied(position, position, CHATTER_COUNTS * reading.unaided_deg)
     count = reading.count_deg
     lag = position - target
-    # The scale of the acceleration does not matter here, because its share of the lag is fitted.
+    # The scale of the acceleration is irrelevant, because its contribution to the lag is fitted.
     speed, acceleration = _rates(target, target, time, window, window, exact=False)
     speed[_resting(target, window)] = 0.0
     columns = np.column_stack([np.ones(len(lag)), speed, acceleration])
@@ -168,16 +167,17 @@ def _driving(
     noise = _noise(lag, target, count)
     if noise >= 0.5 * count and float(np.std(rest)) > 0.45 * count + 1e-6:
         line = line + uniform_filter1d(rest, 2 * window + 1, mode="nearest")
-    # A line that misses its cell says nothing about the place in it: the mean, weighted by their variances.
+    # If the fit misses the cell, it does not determine the position within the cell. The reading and the fit
+    # are averaged, weighted by their variances.
     read = noise**2 + count**2 / 12.0
     cell = max(0.5 * count, 3.0 * noise)
     outside = np.abs(lag - line) > cell
     missed = uniform_filter1d(np.where(outside, (lag - line) ** 2, 0.0), 2 * window + 1, mode="nearest")
     line = lag + (read / (read + missed) if read else 1.0) * (line - lag)
-    # A motor that sticks at a reversal or overshoots a stop is where its encoder says.
+    # The reading takes precedence if a motor sticks at a reversal or overshoots a stop.
     line = np.clip(line, lag - cell, lag + cell)
     line = _averaged_at_rest(line, lag, _resting(target, window), window, count, math.sqrt(read))
-    # The path may cross its cell without reversing, and the cell moves with a noisy reading.
+    # The path may cross its cell without a reversal, and the cell moves with a noisy reading.
     band = max(CHATTER_COUNTS * reading.resolution_deg, 4.0 * cell)
     return steadied(target + line, target + line, band)
 
@@ -204,15 +204,15 @@ def _fitted(columns: FloatArray, lag: FloatArray, count: float, window: int) -> 
 def _averaged_at_rest(
     angle: FloatArray, reading: FloatArray, resting: BoolArray, window: int, count: float, error: float
 ) -> FloatArray:
-    """Replaces an angle, (n,), by the mean reading in each rest whose reading flickers.
+    """Replaces an angle (n,) by the mean reading in each rest with a flickering reading.
 
-    A rest begins when the reading stays within half a count and three standard ``error`` of the mean of the
-    second half; later, single readings may be farther. The largest reading of a resting encoder would look
-    like a reversal.
+    The largest reading of a resting encoder would look like a reversal. A rest begins when the reading stays
+    within half a count plus three standard deviations, ``error``, of its mean over the second half of the
+    rest. Later single readings may deviate further.
     """
     result, length = angle.copy(), 2 * window + 1
     for first, end in _rests(resting):
-        rows = slice(max(first - window, 0), end + window)  # as long as the command is constant
+        rows = slice(max(first - window, 0), end + window)  # the whole span of constant command
         off = reading[rows] - np.mean(reading[(first + end) // 2 : end])
         smooth = uniform_filter1d(off, length, mode="nearest")
         settled = _after_last(np.abs(smooth) > 0.5 * count + 4.0 * error / math.sqrt(length))
@@ -224,22 +224,22 @@ def _averaged_at_rest(
 
 
 def _rests(resting: BoolArray) -> Iterator[tuple[int, int]]:
-    """Yields the first sample of each rest, and the one after its last."""
+    """Yields the index of the first sample of each rest, and the index after its last sample."""
     edges = np.flatnonzero(np.diff(resting, prepend=False, append=False)).tolist()
     yield from zip(edges[::2], edges[1::2], strict=True)
 
 
 def _after_last(mask: BoolArray) -> int:
-    """Returns the index after the last True."""
+    """Returns the index after the last True value; 0 without one."""
     return int(np.flatnonzero(mask)[-1]) + 1 if np.any(mask) else 0
 
 
 def _noise(lag: FloatArray, target: FloatArray, count: float) -> float:
-    """Returns the noise of the motor reading in addition to quantisation, degrees.
+    """Returns the standard deviation of the motor reading beyond quantisation, degrees.
 
-    In a fast move the lag itself bends within a few samples, which is not noise. The noise is therefore at
-    most the noise of the reading while the command rests. It is zero if counts are visible and the command
-    never rests.
+    In a fast move the lag itself changes within a few samples, which is not noise. The result is therefore
+    limited to the noise at constant command. It is zero if counts are visible and the command is never
+    constant.
     """
     third = np.diff(lag, 3)
     if not len(third):
@@ -267,10 +267,10 @@ def _resting(angle: FloatArray, window: int) -> BoolArray:
 def _rates(
     smooth: FloatArray, angle: FloatArray, time: FloatArray, window: int, bent: int, *, exact: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns the speed of ``smooth`` and the acceleration of ``angle``, each over its window.
+    """Returns the speed of ``smooth`` over ``window`` and the acceleration of ``angle`` over ``bent``.
 
-    At an end of a record in motion the window is incomplete. There the acceleration is extrapolated as a
-    constant and the speed linearly.
+    At either end of the record the window is incomplete. There the acceleration is held constant, and the
+    speed is extrapolated linearly.
     """
     speed, acceleration = _slope(smooth, time, window), _curvature(_smooth(angle, bent), time, bent)
     reach = 2 * max(1, window // 2)
@@ -284,10 +284,10 @@ def _rates(
 
 
 def _unsmoothed(means: FloatArray, window: int) -> FloatArray:
-    """Corrects accelerations for the second moment of their averaging weights, by second differences.
+    """Corrects averaged accelerations for the second moment of the averaging weights, by second differences.
 
-    The means are a twentieth too small for a move that accelerates and decelerates in a third of a second and
-    is sampled fifty times per second. Effects would come out too large by as much.
+    At fifty samples per second, the averages are 5 % too small for a move that accelerates and decelerates
+    within a third of a second. Fitted effects would be 5 % too large.
     """
     result = means.copy()
     # Second moments in samples: differences (triangle) plus smoothing (rectangle).
@@ -298,7 +298,7 @@ def _unsmoothed(means: FloatArray, window: int) -> FloatArray:
 
 
 def _slope(values: FloatArray, time: FloatArray, window: int) -> FloatArray:
-    """Returns central differences over a window."""
+    """Returns the first derivative by central differences over a window."""
     half = max(1, window // 2)
     count = len(values)
     ahead = np.minimum(np.arange(count) + half, count - 1)
@@ -310,7 +310,7 @@ def _slope(values: FloatArray, time: FloatArray, window: int) -> FloatArray:
 
 
 def _curvature(values: FloatArray, time: FloatArray, window: int) -> FloatArray:
-    """Returns second differences, as close to the sample as the window allows."""
+    """Returns the second derivative by second differences over a window; 0 near the ends."""
     half = max(1, window // 2)
     count = len(values)
     result = np.zeros(count)

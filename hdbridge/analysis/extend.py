@@ -1,4 +1,4 @@
-"""Extended model: refitted baseline and findings, with uncertainty and provenance."""
+"""Builds the extended model: refitted baseline and findings, with uncertainty and provenance."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hdbridge.axis.model import TransmissionModel
 
 
 def as_named(estimator: Estimator, fitted: Fitted, given: Sequence[Effect], named: Container[str]) -> Fitted:
-    """Returns the fit with the ``given`` hysteresis law if a better law was found but not reported."""
+    """Returns a fit with the ``given`` hysteresis law if a better law was found but is not in ``named``."""
     for place, (old, new) in enumerate(zip(given, fitted.hypothesis.effects, strict=False)):
         if type(old) is not type(new) and new.changes is not None and new.name not in named:
             return estimator.fit(fitted.hypothesis.instead(place, *in_place(new, [type(old)])))
@@ -25,10 +25,10 @@ def as_named(estimator: Estimator, fitted: Fitted, given: Sequence[Effect], name
 def supported(
     estimator: Estimator, fitted: Fitted, given: Sequence[Effect], alone: Container[str] = ()
 ) -> tuple[Effect, ...]:
-    """Returns the effects, with those of the baseline as ``given`` if the record does not determine them.
+    """Returns the fitted effects, except that undetermined baseline effects keep their ``given`` parameters.
 
-    A loop without a reversal, and orders on a short arc of their turn, fit this record with almost any value.
-    A change of an effect in ``alone`` may be due to another cause.
+    A loop without a reversal, and orders over a fraction of a motor turn, fit the record with almost any
+    value. Effects in ``alone`` also remain as given, because their change may be due to another cause.
     """
     start = fitted.hypothesis.start
     one_way = estimator.data.reversals < 2
@@ -52,9 +52,9 @@ def extended_model(
     reason: str,
     base: int,
 ) -> TransmissionModel:
-    """Returns ``model`` with the fitted baseline (`supported`) and the findings at ``places``.
+    """Returns ``model`` with the fitted baseline (`supported`) and the effects of the findings at ``places``.
 
-    Effects that were not reported are not included.
+    Other effects of the fit are not included.
     """
     ratio = model.ratio
     effects: tuple[Effect, ...] = tuple(each.tidied(ratio) for each in fitted.hypothesis.effects[:base])

@@ -1,7 +1,7 @@
 """Findings and diagnosis as plain values, and the next experiment in words.
 
-Experiments come from the causes' descriptions and include those that need a person (move a mass, re-clock an
-encoder). Automatic experiments: `hdbridge.commissioning.improvement.further`.
+Experiments are taken from the descriptions of the causes. Some need a person (move a mass, re-clock an
+encoder). For automatic experiments see `hdbridge.commissioning.improvement.further`.
 """
 
 from __future__ import annotations
@@ -32,13 +32,11 @@ _UNEXPLAINED: Final = {
     "torque": "the same sweep with the load's mass at two places",
     "time": "an hour of returns to one reference pose, with the temperature recorded",
 }
-"""Experiments for an unexplained residual, by the coordinate that it depends on."""
+"""Experiments for an unexplained residual, by the coordinate on which the residual depends."""
 
 
 def next_experiment(cause: str, aliases: tuple[str, ...]) -> str:
-    """Returns the shortest experiment that separates the cause from its aliases or, without aliases,
-    confirms it.
-    """
+    """Returns the shortest experiment that separates the cause from an alias, else one that confirms it."""
     either = [pair for each in aliases for pair in ((cause, each), (each, cause))]
     known = [
         CATALOGUE[one].about.apart[other]
@@ -51,7 +49,7 @@ def next_experiment(cause: str, aliases: tuple[str, ...]) -> str:
 
 
 def for_unexplained(lives_in: str) -> str:
-    """Returns the experiment for an unexplained residual that depends on this coordinate."""
+    """Returns the experiment for an unexplained residual that depends on the coordinate ``lives_in``."""
     return _UNEXPLAINED[depends_on(lives_in)]
 
 
@@ -74,12 +72,12 @@ def depends_on(lives_in: str) -> str:
 SCHEMA = "hdbridge.diagnosis/1"
 UNEXPLAINED: Final = "unexplained"
 UNWEIGHED = math.nan
-"""Probability of a finding before it is computed."""
+"""Placeholder for a probability that has not been computed yet."""
 
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """Differences between measurement and model."""
+    """Size of the difference between measurement and model."""
 
     rms_arcsec: float
     three_sigma_arcsec: float
@@ -98,10 +96,10 @@ class Parameter:
     low: float
     high: float
     is_size: bool = False
-    """True for a size, which is zero if the effect is absent."""
+    """True if the parameter is a size, which is zero if the effect is absent."""
 
     def combined(self, middle: float, deviation: float) -> Self:
-        """Combines the parameter with a normal prior, unless they are three standard deviations apart."""
+        """Combines the parameter with a normal prior, unless they differ by three standard deviations."""
         own = (self.high - self.low) / (2.0 * NORMAL_95)
         if not 0.0 < own < math.inf or abs(self.value - middle) > 3.0 * math.hypot(own, deviation):
             return self
@@ -116,42 +114,41 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finding:
-    """One error of the model."""
+    """One cause of a difference between model and measurement."""
 
     cause: str
     """Name from the catalogue, or ``unexplained``."""
     probability: float
     """Probability that this cause, or one of its aliases, is present."""
     aliases: tuple[str, ...]
-    """Other causes that are not separable from it with these data."""
+    """Other causes that are not separable from this cause with these data."""
     parameters: Mapping[str, Parameter]
     gain: Gain | None
-    """Gain on held-out data; None without held-out data. During the search, everything else is refitted. In
-    a result, it is the gain of the written model over the given model with the other findings."""
+    """Gain on held-out data; None without held-out data. During the search, all other parameters are refitted
+    for it. In a result, it is the gain of the written model over the given model with the other findings."""
     experiment: str
     """Next measurement, in words."""
     peak_arcsec: float
-    """Half the span of the finding's contribution in this record."""
+    """Half the peak-to-peak contribution of the finding in this record."""
     robust: float = 0.0
-    """Block-robust fall in chi square due to the finding."""
+    """Fall in chi square due to the finding."""
     left_arcsec: float = 0.0
-    """Root mean square beyond the noise, for an unexplained residual."""
+    """Rms of an unexplained residual beyond the noise."""
     left_alone: bool = False
-    """True if the data do not separate a changed part of the model from another cause; the model then keeps
-    its part."""
+    """True if the data do not separate a change of a model part from another cause; the part is then kept."""
     within: bool = False
     """True for a change of a part of the model."""
     lives_in: str = ""
     """Coordinate on which an unexplained residual depends."""
     note: str = ""
     prior: str = ""
-    """Figures of other joints, if a fleet was given."""
+    """Description of the fleet's prior, if a fleet was given."""
     effect: Effect | None = field(default=None, repr=False)
     """Effect to add to the model."""
     gate: Gate | None = field(default=None, repr=False)
     """Acceptance tests; None for an unexplained residual."""
     terms: Mapping[str, float] = field(default_factory=dict, repr=False)
-    """Terms of the probability formula."""
+    """Values of the terms in the probability formula."""
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the JSON object."""
@@ -182,7 +179,7 @@ class Finding:
         return self.gain is not None and not (self.within or self.gain.predicts)
 
     def refusal(self) -> str:
-        """Returns the reason for not offering it as an improvement of the model; empty without a reason."""
+        """Returns the reason why the finding is not offered as an improvement; empty if it is offered."""
         if self.cause == "unexplained":
             return "there is no law that could be held out or compensated"
         if self.left_alone:
@@ -207,22 +204,22 @@ class Traces:
     measured_arcsec: FloatArray
     """Measured error about the zero of the fit."""
     model_arcsec: FloatArray
-    """Prediction of the given model."""
+    """Transmission error predicted by the given model."""
     extended_arcsec: FloatArray
     motion: Motion
-    """Motion of the whole record, along which the elastic state is carried."""
+    """Motion of the whole record, along which the elastic state is tracked."""
     rows: IntArray
-    """Points of ``motion`` that the arrays belong to."""
+    """Indices of the points of ``motion`` to which the arrays belong."""
     start: Start
     """Elastic state at the first point of ``motion``, as fitted."""
     samples: Motion
     """Motion at each sample."""
     runs: IntArray
-    """First sample of each point of ``motion``."""
+    """Index of the first sample of each point of ``motion``."""
 
     @property
     def time_s(self) -> FloatArray:
-        """Time on the record's clock."""
+        """Record time of each point, seconds."""
         assert self.motion.time_s is not None
         return self.motion.time_s[self.rows]
 
@@ -238,28 +235,27 @@ class Traces:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Difference between a model and a measurement, with its causes."""
+    """Difference between a model and a measurement, and the causes of the difference."""
 
     baseline: Figures
-    """Differences of the given model."""
+    """Difference between the measurement and the given model."""
     refitted: Figures
-    """Differences of the model with refitted parameters, without new causes."""
+    """Difference for the given model with refitted parameters, without new causes."""
     extended: Figures
     noise_floor_arcsec: float
     findings: tuple[Finding, ...]
     visible: Callable[[], tuple[Mapping[str, Identifiability], Capability]] = field(repr=False)
-    """Computes `identifiability` and `capability` on demand, because this takes a third of the time of a
-    diagnosis."""
+    """Computes `identifiability` and `capability` on demand; this takes a third of a diagnosis's time."""
     by_kind: Mapping[str, tuple[Figures, Figures]]
-    """Figures of the given and the extended model, by kind of motion and by direction."""
+    """Differences for the given and the extended model, by kind of motion and by direction."""
     remarks: tuple[str, ...]
     model: TransmissionModel = field(repr=False)
     """Extended model; the refitted one if nothing was found."""
     traces: Traces = field(repr=False)
     considered: tuple[str, ...] = ()
-    """Causes that were considered but not reported, with the reason."""
+    """Causes that were considered but not reported, each with the reason."""
     scales: Scales = field(default_factory=Scales, repr=False)
-    """Thresholds of this diagnosis."""
+    """Decision thresholds used in this diagnosis."""
 
     @cached_property
     def _visible(self) -> tuple[Mapping[str, Identifiability], Capability]:
@@ -267,12 +263,12 @@ class Diagnosis:
 
     @property
     def identifiability(self) -> Mapping[str, Identifiability]:
-        """Detection limit and aliases of each cause in the record."""
+        """Detection limit and aliases of each cause in this record."""
         return self._visible[0]
 
     @property
     def capability(self) -> Capability:
-        """Causes that the record can show."""
+        """Summary of the causes that the record can show."""
         return self._visible[1]
 
     def as_dict(self) -> dict[str, Any]:
@@ -300,7 +296,7 @@ class Diagnosis:
         }
 
     def views(self) -> ResidualViews:
-        """Returns the residuals, and the coordinates over which to view them."""
+        """Returns the residuals before and after extension, and the coordinates over which to view them."""
         traces = self.traces
         return ResidualViews(
             traces.measured_arcsec - traces.model_arcsec,

@@ -1,4 +1,4 @@
-"""Gain of a model on held-out data."""
+"""Gain of a model on held-out data: the fall of its prediction error."""
 
 from __future__ import annotations
 
@@ -16,51 +16,53 @@ from hdbridge.axis.effects import Effect, FloatArray, IntArray
 from hdbridge.axis.effects.kinematics import direction_of
 
 SURE = 2.0
-"""Minimum significance of a gain, standard errors."""
+"""Minimum size of a significant gain, standard errors."""
 NEARLY_ALL = 0.75
-"""Minimum share of recordings that a cause must predict better: all of three or four, four of five."""
+"""Lower limit of the fraction of recordings that a cause must predict better, itself excluded: all of three
+or four, four of five."""
 SHARED = 1.5
-"""Minimum number of stretches that share a gain; one event is one or, at their border, two unequal ones."""
+"""Minimum effective number of stretches that contribute to a gain. A single event contributes in one stretch
+or, at a border, unequally in two."""
 RECORDINGS = "recordings"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gain:
-    """Squared errors of stretches of a record, each predicted by a fit without it.
+    """Squared errors of stretches of a record, each predicted by a fit without that stretch.
 
-    Only a held-out test provides these errors: the difference between two rms values of one fit is not a
-    gain. Arrays of shape (stretches,).
+    Only a held-out test provides these errors. The difference between two rms residuals of fits to the same
+    data is not a gain. Arrays have shape (stretches,).
     """
 
     over: str
-    """Unit that was left out, in words: motor turns, stretches of time, recordings."""
+    """Kind of parts that were left out, in words: motor turns, stretches of time, recordings."""
     folds: int
     """Number of fits, each without a part of the record."""
     samples: FloatArray
-    """Weight of each stretch."""
+    """Number of samples in each stretch, or their total weight."""
     before_arcsec2: FloatArray
-    """Sum of squares without the tested part, or with the reference model."""
+    """Sum of squared errors without the tested part, or with the reference model."""
     after_arcsec2: FloatArray
-    """Sum of squares with the tested part."""
+    """Sum of squared errors with the tested part."""
 
     @property
     def before_arcsec(self) -> float:
-        """Root mean square without the tested part."""
+        """Rms prediction error without the tested part."""
         return math.sqrt(float(np.sum(self.before_arcsec2)) / float(np.sum(self.samples)))
 
     @property
     def after_arcsec(self) -> float:
-        """Root mean square with the tested part."""
+        """Rms prediction error with the tested part."""
         return math.sqrt(float(np.sum(self.after_arcsec2)) / float(np.sum(self.samples)))
 
     @property
     def recovered(self) -> float:
-        """Share of the mean square that the tested part removes; negative if the part increases the error."""
+        """Fraction of the mean square error removed by the tested part; negative if the error increases."""
         return 1.0 - (self.after_arcsec / max(self.before_arcsec, 1e-12)) ** 2
 
     @property
     def sure(self) -> bool:
-        """True if the squares fall significantly, by their scatter between stretches."""
+        """True if the fall of the squared error is significant, judged by its scatter between stretches."""
         fall = self.before_arcsec2 - self.after_arcsec2
         if len(fall) < 2:
             return False
@@ -68,16 +70,16 @@ class Gain:
 
     @property
     def repeated(self) -> bool:
-        """True if nearly all of several recordings, each left out whole, are predicted better."""
+        """True if whole recordings were left out, and nearly all of them are predicted better."""
         better = np.mean(self.after_arcsec2 < self.before_arcsec2)
         return self.over == RECORDINGS and bool(better > NEARLY_ALL)
 
     @property
     def predicts(self) -> bool:
-        """True if it lowers the error of what was left out, in nearly all recordings or more than one part.
+        """True if the held-out error falls, in nearly all recordings or in more than one stretch.
 
-        The square of the sum over the sum of squares is the number of stretches among which the fall is
-        shared.
+        The effective number of stretches that contribute is the squared sum of their falls divided by the sum
+        of the squared falls.
         """
         fall = self.before_arcsec2 - self.after_arcsec2
         shared = float(np.sum(fall)) ** 2 > SHARED * float(fall @ fall)
@@ -92,7 +94,7 @@ class Gain:
         }
 
 
-# Gain of a finding: what repeats is left out in turn.
+# Gain of a finding: repetitions of the motion are left out in turn.
 
 
 FOLDS = 8
@@ -100,9 +102,10 @@ STRETCHES = 64
 
 
 def repeats(estimator: Estimator) -> tuple[IntArray, str]:
-    """Returns the number of each point's repetition, (m,): recordings, else moves, else stretches of time.
+    """Returns the number of each point's repetition (m,), and the kind of repetition in words.
 
-    Errors that a repetition shares with another are not evidence.
+    Repetitions are recordings, else moves, else stretches of time. Points of one repetition are left out
+    together, because its errors may be correlated.
     """
     points = estimator.data.points
     if estimator.data.full.repeated:
@@ -114,13 +117,13 @@ def repeats(estimator: Estimator) -> tuple[IntArray, str]:
     if len(begins) < FOLDS:
         return counted(stretch), "stretches of time"
     move = np.searchsorted(begins, estimator.index, "right")
-    return counted(move * STRETCHES + stretch), "moves"  # a long one in several parts
+    return counted(move * STRETCHES + stretch), "moves"  # a long move is divided into several parts
 
 
 def held_out(estimator: Estimator, before: Fitted, after: Fitted) -> Gain | None:
-    """Cross-validates two fits with whole repetitions left out, and compares them.
+    """Returns the gain of the fit ``after`` over ``before``, with whole repetitions left out.
 
-    None if the record is too short.
+    Returns None if the record is too short.
     """
     parts = _Parts.of(estimator, after.count())
     return None if parts is None else parts.gain(parts.unseen(before), parts.unseen(after))
@@ -133,11 +136,11 @@ def of_written(
     others: Iterable[Collection[int]],
     written: Collection[int],
 ) -> list[Gain | None]:
-    """Returns the gain of the written model for each finding, over the ``given`` one with the other findings.
+    """Returns each finding's gain: that of the written model over the ``given`` one with the other findings.
 
-    ``others``, for each finding, and ``written`` are places of effects in the fit. No model is fitted again,
-    so a fresh record can repeat the comparison. The squares of the written model include the loss of its fit
-    in repetitions that are left out.
+    ``others`` contains the places of the other findings' effects for each finding, and ``written`` the places
+    of all changed effects. No model is refitted, so a fresh record can repeat the comparison. The squared
+    error of the written model includes the increase due to leaving out repetitions from its fit.
     """
     others = [*others]
     parts = _Parts.of(estimator, fitted.count())
@@ -160,16 +163,16 @@ def of_written(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Parts:
-    """Repetitions in a record, each of which is left out in turn."""
+    """Repetitions in a record, which are left out in turn."""
 
     estimator: Estimator
     stretch: IntArray
-    """Number of each point's stretch, shape (m,)."""
+    """Number of each point's repetition, shape (m,)."""
     over: str
 
     @classmethod
     def of(cls, estimator: Estimator, parameters: int) -> _Parts | None:
-        """Returns the parts; None if the record is too short for this number of parameters."""
+        """Divides the record; returns None if it is too short for this number of parameters."""
         stretch, over = repeats(estimator)
         largest = np.max(np.bincount(stretch % FOLDS))
         if np.max(stretch) + 1 < REPEATS or len(stretch) - largest < parameters:
@@ -177,11 +180,11 @@ class _Parts:
         return cls(estimator, stretch, over)
 
     def squares(self, left_arcsec: FloatArray) -> FloatArray:
-        """Returns the sum of squares of each stretch, arcsec2."""
+        """Returns the sum of squared residuals of each repetition, arcsec2."""
         return np.asarray(np.bincount(self.stretch, left_arcsec**2))
 
     def unseen(self, fitted: Fitted) -> FloatArray:
-        """Returns the squares of each stretch, as predicted by a fit without its fold.
+        """Returns the sum of squared errors of each repetition, predicted by a fit without its fold.
 
         Nuisances, such as zeros and the elastic state at the start, belong to the record. They keep their
         values, because no model predicts them.
@@ -195,6 +198,6 @@ class _Parts:
         return self.squares(left / self.estimator.weight)
 
     def gain(self, before: FloatArray, after: FloatArray) -> Gain:
-        """Returns the gain from the sums of squares."""
+        """Returns the gain, from the sums of squares without and with the tested part."""
         samples = np.bincount(self.stretch).astype(np.float64)
         return Gain(self.over, int(np.max(self.stretch % FOLDS)) + 1, samples, before, after)

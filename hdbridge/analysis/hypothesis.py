@@ -40,20 +40,21 @@ from hdbridge.axis.effects.play import stop
 from hdbridge.units import ARCSEC_PER_DEG
 
 ENOUGH = Effort(steps=8, converged=0.5, roughly=2e-5)
-"""Accuracy of fits in a search, because the compared chi squares differ by tens or more."""
+"""Reduced accuracy of fits in a search, which suffices because the compared chi squares differ by tens."""
 NOISY = frozenset({Channel.LOAD_TORQUE, Channel.MOTOR_TORQUE})
-"""Measured channels whose reading noise enters a column directly."""
+"""Measured channels whose noise enters a design-matrix column directly."""
 SMOOTH = 15
-"""Window of the parabolas that smooth such a channel, samples."""
+"""Window of the parabolas that smooth a noisy channel, samples."""
 WHITE = 1.17
-"""Noise variance of a channel relative to the part that smoothing removes: 6/5, less 3 %, as accurately
-as it is known."""
+"""Ratio of a channel's noise variance to the variance that smoothing removes. The theoretical value is 6/5;
+it is reduced by 3 %, the accuracy to which it is known."""
 MOST_TURNS = 100
-"""Maximum number of turning points with an error of their own. With more, their mean is known accurately."""
+"""Maximum number of turning points that have individual error columns. With more turning points, their mean
+error is known accurately."""
 SHORT = 10_000
 """Record length, samples, below which the number of rare samples shrinks in proportion."""
 MOST_PARTS = 20
-"""Maximum number of parts of a record with an elastic state of their own."""
+"""Maximum number of parts of a record whose initial elastic states are fitted."""
 STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Widths of the stop operators of the free-form hysteresis."""
 
@@ -65,7 +66,7 @@ class Hypothesis:
     effects: tuple[Effect, ...]
     start: Start = Start.VIRGIN
     nuisances: Nuisances | None = None
-    """Columns at the usable points in addition to the zeros; compared by identity."""
+    """Columns at the usable points in addition to those of every hypothesis; compared by identity."""
 
     def plus(self, effect: Effect) -> Hypothesis:
         """Returns the hypothesis with one more effect."""
@@ -82,20 +83,20 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A hypothesis with its best parameters."""
+    """A fitted hypothesis."""
 
     hypothesis: Hypothesis
     zeros: FloatArray
     residual: FloatArray
-    """Weighted residual of the usable points, shape (m,)."""
+    """Residual at the usable points, in standard deviations of the noise, shape (m,)."""
     parameters: tuple[Column, ...]
-    """Parameters of the columns of the tangent matrix."""
+    """Parameter of each column of the tangent matrix."""
     chi_square: float
     _solution: Solution = field(repr=False)
     _weight: FloatArray = field(repr=False)
 
     def having(self, effects: tuple[Effect, ...]) -> Fitted:
-        """Returns the fit with other effects at the same places."""
+        """Returns the fit with its effects replaced, place by place, and all else unchanged."""
         return replace(self, hypothesis=replace(self.hypothesis, effects=effects))
 
     @cached_property
@@ -106,12 +107,12 @@ class Fitted:
 
     @property
     def tangent(self) -> FloatArray:
-        """Weighted derivatives, shape (m, p)."""
+        """Tangent matrix: weighted derivatives of the prediction by the parameters, shape (m, p)."""
         return self.linearised.columns
 
     @property
     def information(self) -> FloatArray:
-        """Prior information of each column (one over its variance), shape (p,)."""
+        """Prior information (one over the variance) of each parameter, shape (p,)."""
         return self.linearised.known[:, 0]
 
     def count(self) -> int:
@@ -123,11 +124,11 @@ class Fitted:
         return self._solution.free()
 
     def places(self, effect: int) -> IntArray:
-        """Returns the columns of one effect."""
+        """Returns the column indices of one effect's parameters."""
         return np.array([i for i, each in enumerate(self.parameters) if each.effect == effect], dtype=np.intp)
 
     def without_parts(self, number: int) -> Linearised:
-        """Returns the linearised fit without its first ``number`` effects, which are the model's own."""
+        """Returns the linearised fit without its first ``number`` effects, those of the model."""
         others = [at for at, each in enumerate(self.parameters) if not 0 <= each.effect < number]
         return self.linearised.of(np.array(others, dtype=np.intp))
 
@@ -139,13 +140,13 @@ class Estimator:
         points = data.points
         self.data = data
         self.scales = scales or Scales()
-        """Thresholds of the decisions."""
+        """Decision thresholds."""
         self.index: IntArray = np.flatnonzero(points.usable)
         self.weight: FloatArray = 1.0 / points.sigma_arcsec[self.index]
         self.observed: FloatArray = points.error_arcsec[self.index]
         self.time_s: FloatArray = points.time_s[self.index]
         self.zero: IntArray = points.zero[self.index]
-        self.at_points = data.at_points  # not a method of its own: the cache below would be in a cycle
+        self.at_points = data.at_points  # a method of this class would form a reference cycle with the cache
         self._regressors = Regressors([data.full.motion], self.at_points, len(self.index))
         self._noise: dict[object, FloatArray] = {}
         self._free_loops: dict[Start, Nuisances] = {}
@@ -156,42 +157,42 @@ class Estimator:
         self.calibrated: tuple[CalibratedPart, ...] = ()
         """Priors from the calibration for the first effects of each hypothesis."""
         self.unknown: Nuisances = zeros(self.zero, data.full.zeros)
-        """Nuisances of every hypothesis: zeros, motion between samples, elastic states at the start."""
+        """Nuisances of every hypothesis: zeros, motion between samples, initial elastic states."""
 
     @property
     def motion(self) -> Motion:
-        """Motion at all points, usable or not, because the elastic state passes through each."""
+        """Motion at all points, usable or not, because the elastic state depends on all of them."""
         return self.data.points.motion
 
     @property
     def rare(self) -> float:
-        """Share of the record that is excluded from a span at either end."""
+        """Fraction of extreme values excluded at either end when a span is computed."""
         return self.scales.rare / max(len(self.data.full), SHORT)
 
     @property
     def count_arcsec(self) -> float:
-        """One count of the motor encoder at the load; 0 if none is visible."""
+        """One count of the motor encoder, referred to the load, arcsec; 0 if no count is visible."""
         return self.data.full.count_deg / self.data.ratio * ARCSEC_PER_DEG
 
     @property
     def floor_arcsec(self) -> float:
-        """Smallest relevant peak. At rest, both encoders round alike in all readings."""
+        """Smallest relevant peak. It includes the rounding of both encoders, which is constant at rest."""
         rounded = math.hypot(self.count_arcsec, self.data.load_count_arcsec) / math.sqrt(12.0)
         return max(self.scales.floor_arcsec, rounded, 0.5 * self.data.noise_arcsec)
 
     def half_span(self, values: FloatArray) -> float:
-        """Returns half the span of values without the rare extremes."""
+        """Returns half the peak-to-peak span of values, excluding rare extremes (`rare`)."""
         low, high = np.quantile(values, [self.rare, 1.0 - self.rare])
         return 0.5 * float(high - low)
 
     def columns(self, effect: Effect, start: Start) -> FloatArray:
-        """Returns regressors of an effect at the usable points (means over samples), arcsec, shape (m, p)."""
+        """Returns an effect's columns at the usable points (means over samples), arcsec, shape (m, p)."""
         return self._regressors.columns(effect, (start,))
 
     def does(self, effect: Effect, start: Start) -> FloatArray:
-        """Returns an effect's contribution to every usable sample, arcsec.
+        """Returns an effect's contribution to each usable sample, arcsec.
 
-        Averages over points would make fast effects seem smaller.
+        Averages over points would reduce the apparent size of fast effects.
         """
         full = self.data.full
         if len(full) == len(self.data.points):
@@ -199,17 +200,18 @@ class Estimator:
         return effect.predict(full.motion, start)[full.usable]
 
     def weighted(self, columns: FloatArray) -> FloatArray:
-        """Scales columns to units of the noise."""
+        """Divides the rows of columns by the standard deviation of the noise."""
         return np.asarray(columns * self.weight[:, np.newaxis])
 
     def law_discrepancy(self, effect: Effect, start: Start) -> FloatArray:
-        """Returns the uncertainty of an effect's law, one weighted column per standard deviation, (m, k)."""
+        """Returns an effect's law error as weighted columns (m, k), one standard deviation each."""
         return self.weighted(self.at_points(effect.law_discrepancy(self.data.full.motion, start)))
 
     def angle_discrepancy(self, effects: Sequence[Effect], start: Start) -> FloatArray:
-        """Returns the influence of the driving angle's uncertainty within its counts, weighted, shape (m, 1).
+        """Returns the change of the error due to the motor angle's uncertainty within a count, shape (m, 1).
 
-        The error refers to that angle, and a loop is steepest where the motor stops.
+        The change is weighted. The transmission error is relative to that angle, and a loop is steepest where
+        the motor stops.
         """
         full = self.data.full
         other = replace(full.motion, motor_deg=full.rested_deg)
@@ -219,11 +221,11 @@ class Estimator:
         return self.weighted(self.at_points(change)[:, np.newaxis])
 
     def turn_discrepancy(self, effects: Sequence[Effect], start: Start) -> FloatArray:
-        """Returns the influence of turning-point errors within counts, weighted columns of one standard
-        deviation, (m, k).
+        """Returns the effect of turning-point errors within a count, as weighted columns (m, k).
 
-        A motor with friction stops short of every turning point, by a common amount and an individual one.
-        One column is common to all; up to `MOST_TURNS` turning points also have their own.
+        Each column is one standard deviation. A motor with friction stops short of every turning point, by a
+        common and an individual amount. One column is common to all turning points. If there are at most
+        `MOST_TURNS`, each also has a column of its own.
         """
         turns, change = self.turned(effects, start)
         if not len(turns):
@@ -235,7 +237,7 @@ class Estimator:
         return self.weighted(np.column_stack(columns))
 
     def turned(self, effects: Sequence[Effect], start: Start) -> tuple[IntArray, FloatArray]:
-        """Returns the turning points and what their errors change in each sample, arcsec, shape (n,)."""
+        """Returns the turning points, and the change of each sample due to their errors, arcsec, (n,)."""
         full, loops = self.data.full, with_memory(effects)
         change = np.zeros(len(full))
         if not loops:
@@ -255,10 +257,10 @@ class Estimator:
         return turns, change
 
     def crept(self, effects: Sequence[Effect], start: Start) -> FloatArray:
-        """Returns the change of each sample at rest if the motor has crept back within a count, (n,), arcsec.
+        """Returns the change of each sample at rest if the motor has crept back within a count, arcsec, (n,).
 
-        Its servo does that until friction holds, and no reading shows it. A loop is steepest where the motor
-        turns. The way back is the root mean square of a uniform distribution over a count.
+        A servo creeps until friction holds it, which no reading shows. A loop is steepest where the motor
+        turns. The backward travel is the rms of a uniform distribution over a count.
         """
         full, loops = self.data.full, with_memory(effects)
         still = full.speed_deg_s == 0.0
@@ -268,7 +270,7 @@ class Estimator:
         return np.where(still, change, 0.0)
 
     def begun(self, effects: Sequence[Effect]) -> FloatArray:
-        """Returns half the range of each sample over all elastic states at the part's start, arcsec, (n,)."""
+        """Returns half the range of each sample over all possible initial elastic states, arcsec, (n,)."""
         change, loops = np.zeros(len(self.data.full)), with_memory(effects)
         for chain in self.data.full.chains if loops else ():
             motion = self.data.full.along(chain)
@@ -278,9 +280,10 @@ class Estimator:
         return change
 
     def first_branch(self, effects: Sequence[Effect]) -> FloatArray:
-        """Returns the error of each part's first branch as a standard deviation, arcsec, shape (n,).
+        """Returns the standard deviation of the error on each part's first branch, arcsec, shape (n,).
 
-        The level at the start is fitted, but its decay along the branch depends on the motion before.
+        The initial elastic state is fitted, but its decay along the branch depends on the unknown motion
+        before.
         """
         begun, result = np.abs(self.begun(effects)), np.zeros(len(self.data.full))
         for chain in self.data.full.chains:
@@ -291,9 +294,9 @@ class Estimator:
         return result
 
     def begins_of(self, effects: Sequence[Effect]) -> Nuisances:
-        """Returns a column for the elastic state at the start of each part; none without a loop.
+        """Returns a column for the elastic state at the start of each part; no columns without a loop.
 
-        The state lies anywhere between saturation in one direction and in the other.
+        Each state lies between saturation in one direction and saturation in the other.
         """
         change, columns = self.begun(effects), []
         for chain in self.data.full.chains[:MOST_PARTS]:
@@ -306,7 +309,7 @@ class Estimator:
         return Nuisances(found, names, (Prior(0.0, 1.0),) * len(names))
 
     def free_loop(self, start: Start) -> Nuisances:
-        """Returns a free-form hysteresis: stop operators of `STOPS_DEG`, which form any loop shape."""
+        """Returns a free-form hysteresis: stop operators of widths `STOPS_DEG`, which form any loop shape."""
         if start not in self._free_loops:
             angle = self.data.full.motion.motor_deg
             stops = {f"stop of {each:g} deg": self.at_points(stop(angle, each, start)) for each in STOPS_DEG}
@@ -314,10 +317,10 @@ class Estimator:
         return self._free_loops[start]
 
     def fit(self, hypothesis: Hypothesis, moves: frozenset[Moves] = LOCAL, effort: Effort = ENOUGH) -> Fitted:
-        """Fits a hypothesis from its present parameters; the result is never worse than the start.
+        """Fits a hypothesis, starting from its present parameters; the result is never worse than the start.
 
-        ``moves`` selects the shapes to fit. All parts start at their calibration. Parts whose strain exceeds
-        the cost of a change become free one by one.
+        ``moves`` selects the shape parameters to fit. Initially all calibrated parts have their priors. Parts
+        whose deviation (`strain`) exceeds the cost of a change are freed one by one.
         """
         parts, costs = list(self.calibrated), 0.0
         while True:
@@ -333,7 +336,7 @@ class Estimator:
     def _prior(
         self, hypothesis: Hypothesis, parts: Sequence[CalibratedPart]
     ) -> tuple[dict[tuple[int, str], Prior], float]:
-        """Returns the priors less the information due to channel noise, and the offset of chi square."""
+        """Returns the priors, corrected for channel noise, and the resulting offset of chi square."""
         known, offset = priors(parts), 0.0
         for place in {each.place for each in parts}:
             claimed = self.channel_noise(hypothesis.effects[place], hypothesis.start)
@@ -345,11 +348,11 @@ class Estimator:
         return known, offset
 
     def channel_noise(self, effect: Effect, start: Start) -> FloatArray:
-        """Returns the squared contribution of channel noise to an effect's columns, weighted, shape (p,).
+        """Returns the weighted sum of squares that channel noise adds to each column of an effect, (p,).
 
-        Errors in variables: a fit improves spuriously as the coefficient of a noisy column shrinks. The
-        correction (Fuller 1987, 2.2) applies to coefficients with a calibration; otherwise, a coefficient
-        distinguished only by noise could take any size.
+        With errors in variables, a fit improves spuriously as the coefficient of a noisy column shrinks. The
+        correction (Fuller 1987, 2.2) applies to calibrated coefficients only. Any other coefficient, if its
+        column contained little but noise, could take any size.
         """
         motion = self.data.full.motion
         channels = sorted(effect.needs() & NOISY & motion.measured.keys(), key=lambda each: each.value)
@@ -371,7 +374,7 @@ class Estimator:
         moves: frozenset[Moves],
         effort: Effort,
     ) -> Fitted:
-        """Fits with ``parts`` held at their calibration; adds the ``costs`` of the changes of the others."""
+        """Fits with the priors of ``parts``, and adds the ``costs`` of the freed parts to chi square."""
         start = hypothesis.start
         prior, offset = self._prior(hypothesis, parts)
         costs += offset
@@ -396,7 +399,7 @@ class Estimator:
         )
 
     def _nuisances(self, hypothesis: Hypothesis) -> Nuisances:
-        """Returns the columns of every hypothesis and this hypothesis's own nuisances."""
+        """Returns the nuisances of every hypothesis, followed by those of this one."""
         own = hypothesis.nuisances
         return self.unknown if own is None else self.unknown.and_also(own)
 
@@ -412,13 +415,13 @@ class Estimator:
         return fitted.zeros[self.data.full.zero] + self.level + self._regressors.predicted(effects, (start,))
 
     def predict(self, effects: Sequence[Effect], start: Start) -> FloatArray:
-        """Returns the sum of the effects at the usable points, arcsec, shape (m,)."""
+        """Returns the transmission error due to the effects at the usable points, arcsec, shape (m,)."""
         return self._regressors.predict(effects, (start,))
 
     def left_by(self, effects: Sequence[Effect]) -> tuple[FloatArray, Start]:
-        """Returns observed minus predicted at the usable points, arcsec, (m,), and the elastic start used.
+        """Returns the residual at the usable points, arcsec, (m,), and the initial elastic state.
 
-        Zeros and start are those that fit best.
+        Zeros and initial state are those that fit best.
         """
         left = {
             start: about_zeros(self.observed - self.predict(effects, start), self.zero, self.weight**2)
@@ -428,7 +431,7 @@ class Estimator:
         return left[best], best
 
     def with_load_angle(self, load_deg: FloatArray) -> None:
-        """Sets the load angle (n,) for the effects of the load encoder's lines."""
+        """Replaces the load angle (n,) that load-dependent effects use, such as subdivisional error."""
         data = self.data
         full = replace(data.full, motion=replace(data.full.motion, load_deg=load_deg))
         points = replace(data.points, motion=replace(data.points.motion, load_deg=data.mean(load_deg)))
@@ -442,9 +445,9 @@ def with_memory(effects: Sequence[Effect]) -> list[Effect]:
 
 
 def _smooth(values: FloatArray) -> FloatArray:
-    """Smooths a channel by parabolas over `SMOOTH` samples, which keep a sixth of the noise variance.
+    """Smooths a channel by parabolas over `SMOOTH` samples, which leaves a sixth of the noise variance.
 
-    This is the Savitzky-Golay filter. scipy.signal has it too, but takes a second to import.
+    This is a Savitzky-Golay filter. It is not taken from scipy.signal, which takes a second to import.
     """
     if len(values) <= SMOOTH:
         return values

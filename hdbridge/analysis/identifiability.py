@@ -1,4 +1,4 @@
-"""Detection limit and look-alikes of each cause in a measured or planned record."""
+"""Determines the detection limit and aliases of each cause in a measured or planned record."""
 
 from __future__ import annotations
 
@@ -32,22 +32,23 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 # Thresholds of identifiability; they do not affect findings.
 ENOUGH = 8_000
-"""Maximum number of points used to compare shapes."""
+"""Maximum number of points used in comparing the causes' columns."""
 WORST_ARCSEC = 30.0
 """Detection limit above which a cause counts as undetectable."""
 PEAKS = 80
-"""Number of trial peaks, each 5 % larger than the last."""
+"""Number of peaks tried, up to `WORST_ARCSEC`, each about 5 % larger than the last."""
 POWER = 2.0
-"""Margin of the evidence at the limit above the required evidence, standard deviations; 98 % are found."""
+"""Margin of the evidence at the detection limit above the required evidence, standard deviations. With this
+margin, 98 % of causes at the limit are found."""
 
 
 def identifiability(
     estimator: Estimator, fitted: Fitted, base: Sequence[Effect], context: Context
 ) -> dict[str, Identifiability]:
-    """Returns detection limit and look-alikes of each cause of the catalogue.
+    """Returns the detection limit and aliases of each cause of the catalogue.
 
-    ``estimator`` holds the record without the causes found in it, ``fitted`` is the fit of the model to it,
-    and ``context`` is the evidence against all findings.
+    ``estimator`` contains the record less the errors found in it, and ``fitted`` is the fit of the model to
+    that record. ``context`` contains the evidence against all findings.
     """
     best, reasons = _examples(estimator, fitted, base)
     scales, spans = estimator.scales, {name: orthonormal(each.rest) for name, each in best.items()}
@@ -69,7 +70,7 @@ def identifiability(
             _named_from(_injected(estimator, fitted, example, base), context, scales),
             _usual_arcsec(estimator, cause, base, fitted.hypothesis.start),
         )
-        own = [*type(example.effect).proposals(estimator.data, ())]  # any of them may be the one
+        own = [*type(example.effect).proposals(estimator.data, ())]  # each is a possible instance
         waves = set(waves_alike(estimator, own, fitted.hypothesis.start))
         alike = [
             name
@@ -79,12 +80,12 @@ def identifiability(
         known = limit if limit < math.inf else None
         result[cause] = Identifiability(limit <= WORST_ARCSEC, known, tuple(alike), share)
     for cause, each in result.items():
-        # A tone looks like a wave over an angle only at its frequency, which is that of no example.
+        # A tone resembles a wave over an angle only at one frequency, which no example has.
         tones = [name for name in each.aliases if CATALOGUE[name].sought is Sought.TONE]
         for tone in tones:
             result[tone] = replace(result[tone], aliases=tuple(dict.fromkeys((*result[tone].aliases, cause))))
     for candidate in candidates(estimator.data, ()):
-        # An effect of a missing channel may look like a measured one.
+        # An effect that needs a missing channel may resemble a visible one.
         each = result[candidate.name]
         for kind, _ in lookalikes(candidate, estimator.data.ratio):
             if kind.channels - estimator.motion.available() and kind.name not in each.aliases:
@@ -93,23 +94,23 @@ def identifiability(
 
 
 class _Example(NamedTuple):
-    """Most visible candidate of a cause in a record."""
+    """The candidate effect of a cause that is most visible in a record."""
 
     effect: Effect
     per_arcsec: FloatArray
-    """Coefficients of one arcsec at its peak, shape (p,)."""
+    """Coefficients with which the effect's peak is one arcsec, shape (p,)."""
     rest: FloatArray
-    """Weighted columns of one arcsec at their peaks, less the parts explained by the background, (m, k)."""
+    """Weighted columns with peaks of one arcsec, less the parts explained by the background, (m, k)."""
     strength: float
-    """Root of the chi square of one arcsec."""
+    """Square root of the chi square of an effect with a peak of one arcsec."""
     share: float
-    """Largest remaining share of a column's square."""
+    """Largest fraction of a column's sum of squares that the background does not explain."""
 
 
 def _examples(
     estimator: Estimator, fitted: Fitted, base: Sequence[Effect]
 ) -> tuple[dict[str, _Example], dict[str, str]]:
-    """Returns the best example of each visible cause, and the reason why each other cause is invisible."""
+    """Returns the best example of each visible cause, and the reasons why other causes are invisible."""
     best: dict[str, _Example] = {}
     reasons: dict[str, str] = {}
     stride = -(-len(estimator.index) // ENOUGH)
@@ -141,7 +142,7 @@ def _examples(
 
 
 def _columns(estimator: Estimator, candidate: Effect, base: Sequence[Effect], start: Start) -> FloatArray:
-    """Returns a candidate's columns, arcsec, shape (m, p); for a changed part, those of the change."""
+    """Returns a candidate's columns, arcsec, (m, p); for a changed part, one column with its change."""
     columns = estimator.columns(candidate, start)
     if candidate.changes is None:
         return columns
@@ -156,14 +157,14 @@ def _columns(estimator: Estimator, candidate: Effect, base: Sequence[Effect], st
 
 
 def _before(estimator: Estimator, candidate: Effect, base: Sequence[Effect], start: Start) -> FloatArray:
-    """Returns the part of a candidate that unknown motion before the record could cause, shape (m, k)."""
+    """Returns the changes of a candidate's columns due to other initial elastic states, shape (m, k)."""
     own = _columns(estimator, candidate, base, start)
     others = [_columns(estimator, candidate, base, each) - own for each in Start if each is not start]
     return side_by_side(others, len(estimator.index))
 
 
 def _injected(estimator: Estimator, fitted: Fitted, example: _Example, base: Sequence[Effect]) -> Gate:
-    """Injects a cause with a peak of `WORST_ARCSEC` into the record, and tests it as a finding."""
+    """Injects a cause with a peak of `WORST_ARCSEC` into the record, and runs its acceptance tests."""
     effect, start = example.effect, fitted.hypothesis.start
     does = WORST_ARCSEC * (_columns(estimator, effect, base, start) @ example.per_arcsec)
     if effect.changes is not None:
@@ -176,9 +177,7 @@ def _injected(estimator: Estimator, fitted: Fitted, example: _Example, base: Seq
 
 
 def _named_from(injected: Gate, context: Context, scales: Scales) -> float:
-    """Returns the smallest peak, arcsec, at which a cause passes its tests and is probable; infinity without
-    one.
-    """
+    """Returns the smallest peak, arcsec, at which a cause passes its tests and is probable; else infinity."""
     per_arcsec = math.sqrt(max(injected.robust, 0.0)) / WORST_ARCSEC
     for peak_arcsec in np.geomspace(scales.floor_arcsec, WORST_ARCSEC, PEAKS).tolist():
         robust = max(peak_arcsec * per_arcsec - POWER, 0.0) ** 2
@@ -203,7 +202,7 @@ def _usual_arcsec(estimator: Estimator, cause: str, base: Sequence[Effect], star
 
 
 class _Background:
-    """Explanations of a record without a cause: the model, the motion before, errors of turning points."""
+    """Columns that explain a record without new causes: model, earlier motion, turning-point errors."""
 
     def __init__(self, estimator: Estimator, fitted: Fitted, base: Sequence[Effect], stride: int) -> None:
         start = fitted.hypothesis.start
@@ -223,10 +222,10 @@ class _Background:
         self._bases: dict[tuple[Part | None, str], FloatArray] = {}
 
     def left(self, candidate: Effect, columns: FloatArray) -> FloatArray:
-        """Returns the part of columns (m, k) that the background does not explain, where the candidate is
-        visible.
+        """Returns the part of a candidate's columns (m, k) that the background does not explain.
 
-        For a change of a part of the model, the rest of the model belongs to the background.
+        Rows in which the candidate is not visible are zero. For a change of a part of the model, only the
+        rest of the model belongs to the background.
         """
         stretch = candidate.shows(self._estimator.motion)
         rows = np.ones(len(columns), dtype=bool)
@@ -248,7 +247,7 @@ def _missing(estimator: Estimator, cause: str) -> str:
 
 
 def _correlation(one: FloatArray, other: FloatArray) -> float:
-    """Returns the smallest canonical correlation between two spaces, over the directions of the smaller."""
+    """Returns the smallest canonical correlation between two spaces, given by orthonormal bases."""
     values = np.linalg.svd(one.T @ other, compute_uv=False)
     return float(np.min(values)) if len(values) else 0.0
 
@@ -256,7 +255,7 @@ def _correlation(one: FloatArray, other: FloatArray) -> float:
 def examined(
     record: Record, model: TransmissionModel, legs: Sequence[Segment] = (), start: Start = Start.VIRGIN
 ) -> tuple[dict[str, Identifiability], Capability]:
-    """Returns the visibility of each cause in a record, whether present or not, and the summary."""
+    """Returns the identifiability of each cause in a record, present or not, and its summary."""
     data = gather(record, model.ratio, legs, expected=lambda motion: model.predict(motion, start))
     estimator = Estimator(data)
     fitted = estimator.fit(Hypothesis(model.effects, start), effort=Effort(steps=2))
@@ -264,18 +263,18 @@ def examined(
     return found, capability(data, model.effects, found, estimator.scales)
 
 
-# Planned records: detectable causes, and those that are not separable.
+# Planned records: identifiability in a simulated record.
 
 
 PERIOD_S: Final = 0.04
 NOISE_ARCSEC: Final = 0.5
-"""Assumed white noise of a planned record, for one sample every `PERIOD_S`."""
+"""Standard deviation of the assumed white noise of a planned record, with one sample every `PERIOD_S`."""
 LIMITS: Final = MotionLimits(-400.0, 400.0, 20.0, 200.0, 4000.0)
-"""Assumed limits of the load without an axis."""
+"""Load-side motion limits that are assumed if no axis is given."""
 
 
 def plan_report(plan: Plan, model: TransmissionModel, limits: MotionLimits = LIMITS) -> dict[str, Any]:
-    """Returns the visibility of each cause in a plan, as in a diagnosis, and the plan's duration."""
+    """Returns the identifiability of each cause in a record of this plan, and the plan's duration."""
     view = AxisView(model.ratio, limits)
     tasks = plan.tasks(view)
     places: list[float] = []

@@ -1,4 +1,4 @@
-"""Results, options, sample selection and intermediate state of an identification."""
+"""Results, options, sample selection and intermediate state of an identification of a model."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 WORTH = 0.01
-"""Minimum relative fall of the held-out rms.
+"""Minimum relative fall of the held-out rms error for an improvement.
 
-A smaller improvement does not change any stepping test and can arise from noise alone: a second calibration
-of the unchanged demo axis improves the rms by 0.8 %."""
+A smaller fall does not affect any stepping test and can be due to noise alone: a second calibration of the
+unchanged demo axis lowers the rms by 0.8 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,19 +49,19 @@ class NoiseFigures:
     """Noise of the record, and the model's residual for comparison."""
 
     standing_arcsec: float | None
-    """Rms about the mean of each rest; None if the axis never stood for long enough."""
+    """Rms of the load encoder at rest, about the mean of each rest; None without a long enough rest."""
     laps_arcsec: float | None
-    """Rms difference between passes over the same angles in one direction, divided by the root of two."""
+    """Rms difference between passes over the same angles in one direction, divided by the root of 2."""
     model: NoiseModel
     """Noise model of the residual, white and correlated, on which the intervals are based."""
     residual_arcsec: float
-    """Rms residual of the samples with the stored model, about each zero."""
+    """Rms residual of the samples with the model to be stored, about each zero."""
     fitted_arcsec: float
-    """Rms residual if the nuisances (delay, rounding, other orders) are subtracted as well."""
+    """Rms residual of the samples if the nuisances (delay, rounding, other orders) are subtracted too."""
     samples: int
     """Number of samples in the fit."""
     effective_samples: float
-    """Number of independent samples of the same rms that would determine the zero as accurately."""
+    """Number of independent samples with the same rms that would determine the zero equally accurately."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class Outliers:
 
     samples: int
     swinging: int
-    """Number of samples in or just after a high acceleration, while the load swings on its spring."""
+    """Number of outliers in or just after high acceleration, while the load oscillates on its spring."""
     longest_run: int
     """Longest run of the other outliers, samples."""
 
@@ -80,10 +80,10 @@ class ResidualTest:
     """Result of one test of the residual."""
 
     name: str
-    """motor_angle, load_angle, direction, time, whiteness or noise_level."""
+    """Name of the test: motor_angle, load_angle, direction, time, whiteness or noise_level."""
     passed: bool
     size_arcsec: float
-    """Size of the deviation found."""
+    """Size of the deviation that the test found."""
     text: str
 
 
@@ -92,19 +92,20 @@ class HeldOut:
     """Prediction error on held-out parts of the record."""
 
     gain: Gain | None
-    """Gain over the active model (or over no model), each about its zero; None without held-out data."""
+    """Gain over the active model (or no model), with each residual about its zero; None without held-out
+    data."""
     in_addition: Gain | None
-    """Gain with the nuisances (delay, load orders) subtracted from both models."""
+    """Same gain with the nuisances (delay, load orders) subtracted for both models."""
     fitted_arcsec: float
-    """Rms residual of the fit with nuisances, on the same data."""
+    """Rms residual of the fit with nuisances, over the data that are held out in turn."""
     text: str
 
     @property
     def improves(self) -> bool:
         """True if the model is a significant improvement.
 
-        Without the nuisances, the rms must fall significantly and by at least `WORTH`; with the nuisances, it
-        must not rise.
+        With nuisances subtracted, the rms error must fall significantly and by at least `WORTH`. Without
+        subtraction, it must not rise.
         """
         gain = self.in_addition
         return (
@@ -116,13 +117,13 @@ class HeldOut:
 
     @property
     def worse(self) -> bool:
-        """True if the model predicts the held-out data less well than the active model (or no model)."""
+        """True if the model predicts held-out data less accurately than the active model (or no model)."""
         return self.gain is not None and self.gain.recovered < 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Nuisance:
-    """Parameter that is fitted to keep a measurement error out of the model."""
+    """Parameter that is fitted so that a measurement error does not bias the model."""
 
     name: str
     text: str
@@ -133,7 +134,7 @@ class Nuisance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Traces:
-    """Block means for plots; arrays of shape (b,)."""
+    """Block averages for plots; arrays of shape (b,)."""
 
     time_s: FloatArray
     motor_deg: FloatArray
@@ -144,13 +145,13 @@ class Traces:
     """Kinds of legs, indexed by ``kind_index``."""
     kind_index: np.ndarray[Any, np.dtype[np.intp]]
     error_arcsec: FloatArray
-    """Observed error minus its zero."""
+    """Observed transmission error minus its zero."""
     predicted_arcsec: FloatArray
     """Sum of the model's effects."""
     residual_arcsec: FloatArray
     """Observed error minus model, about the best-fitting zeros."""
     orders_arcsec: FloatArray
-    """Observed error minus hysteresis, zero and nuisances."""
+    """Observed error minus all effects except the motor orders, minus zero and nuisances."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,22 +159,22 @@ class FitResult:
     """Fitted model with its uncertainty, tests and plot data."""
 
     model: TransmissionModel
-    """Fitted model with ``uncertainty``: 95 % half widths, nested like the parameters."""
+    """Fitted model. Its ``uncertainty`` contains 95 % half widths, nested like the parameters."""
     intervals: tuple[Interval, ...]
     zeros_arcsec: tuple[float, ...]
-    """Offset of each absolute zero from the median error of its record."""
+    """Fitted offset of each absolute zero from the median error of its samples."""
     nuisances: tuple[Nuisance, ...]
     noise: NoiseFigures
     outliers: Outliers
     orders: tuple[Line, ...]
-    """Motor orders in the model."""
+    """Lines of the motor orders in the model."""
     spectrum: tuple[Line, ...]
-    """All candidate orders."""
+    """Lines of all candidate orders."""
     residual_tests: tuple[ResidualTest, ...]
     held_out: HeldOut
     traces: Traces
     warnings: tuple[str, ...]
-    """Limits of the data, in words."""
+    """Limitations of the data, in words."""
 
     def interval(self, effect: str, parameter: str) -> Interval:
         """Returns the interval of one parameter; KeyError if it was not fitted."""
@@ -183,14 +184,14 @@ class FitResult:
         raise KeyError(f"{effect}: {parameter}")
 
 
-# Noise measured without a model: at rest, and between repeated passes.
+# Estimates of the noise without a model: at rest, and between repeated passes.
 
 
 SHORTEST_REST_S = 1.0
 LONGEST_GAP_S = 0.5
 LAP_BIN_DEG = 30.0
 WINDOW = 51
-"""Window of the running median with which an outlier is compared, samples."""
+"""Window of the running median with which each sample is compared, samples."""
 OUTLYING = 6.0
 """Outlier threshold, robust standard deviations."""
 
@@ -198,8 +199,8 @@ OUTLYING = 6.0
 def standing_arcsec(samples: Samples) -> float | None:
     """Returns the rms of the load encoder about the mean of each rest, arcsec; None without a long rest.
 
-    A motor resting between two counts flickers, which is not noise of the load. Sines and sweeps are
-    excluded: within one count they seem to rest while the load moves.
+    Only the load encoder is used, because a motor encoder that rests between two counts flickers. Sines and
+    sweeps are excluded: within one motor count they seem to rest while the load moves.
     """
     still = samples.usable & (np.abs(samples.speed_deg_s) < REST_DEG_S)
     still &= ~samples.of_kind(*SLOW)
@@ -221,9 +222,9 @@ def standing_arcsec(samples: Samples) -> float | None:
 
 
 def laps_arcsec(samples: Samples) -> float | None:
-    """Returns the rms difference of passes in one direction, divided by the root of two.
+    """Returns the rms difference between passes in one direction, divided by the square root of 2, arcsec.
 
-    Errors are averaged over bins of `LAP_BIN_DEG`. None if too few bins have two passes.
+    Errors are averaged over bins of `LAP_BIN_DEG`. Returns None if too few bins have two passes.
     """
     passes: dict[int, list[dict[int, float]]] = {1: [], -1: []}
     sweep = samples.usable & samples.of_kind("sweep")
@@ -235,7 +236,7 @@ def laps_arcsec(samples: Samples) -> float | None:
             if len(rows) >= 20:
                 cells, inverse = np.unique(samples.motor_deg[rows] // LAP_BIN_DEG, return_inverse=True)
                 means = np.bincount(inverse, samples.error_arcsec[rows]) / np.bincount(inverse)
-                # In its first cells a pass still crosses the hysteresis.
+                # In its first cells a pass still traverses the hysteresis loop.
                 keep = slice(5, None) if sign > 0 else slice(None, -5)
                 passes[sign].append(dict(zip(cells[keep].tolist(), means[keep].tolist(), strict=True)))
     differences = [
@@ -250,12 +251,13 @@ def laps_arcsec(samples: Samples) -> float | None:
 def outlying(
     residual: FloatArray, swings: BoolArray, count_arcsec: float = 0.0
 ) -> tuple[FloatArray, Outliers]:
-    """Returns weights (n,): 0 for samples far from the median of their neighbours, else 1 (also for NaN).
+    """Returns the weight of each sample (n,), 0 for outliers and else 1 (also for NaN), and their numbers.
 
-    The comparison is with neighbours rather than with the model, so effects that the model lacks and lasting
-    steps (lost counts) are kept. ``swings`` is the mask of `swinging`, shape (n,). ``count_arcsec`` is the
-    motor encoder's count at the load: a motor between two counts alternates between them, and only the mean
-    is right.
+    Outliers are far from the median of their neighbours. The comparison is with neighbours rather than with
+    the model, so effects that the model lacks and lasting steps (lost counts) are kept. ``swings`` is the
+    mask of `swinging`, shape (n,). ``count_arcsec`` is one count of the motor encoder at the load. The
+    threshold is larger by this, because the reading of a motor between two counts alternates, and only its
+    mean is right.
     """
     weight = np.ones(len(residual))
     index = np.flatnonzero(np.isfinite(residual))
@@ -274,12 +276,12 @@ def outlying(
 
 
 def swinging(samples: Samples) -> BoolArray:
-    """Selects samples in an acceleration of the load above `GENTLE_DEG_S2`, or within `SETTLE_S` after it."""
+    """Returns a mask of samples with load acceleration above `GENTLE_DEG_S2`, or within `SETTLE_S` after."""
     return settling(_accelerating(samples), samples.time_s)
 
 
 def _accelerating(samples: Samples) -> BoolArray:
-    """Selects samples in an acceleration of the load above `GENTLE_DEG_S2`."""
+    """Returns a mask of the samples with a load acceleration above `GENTLE_DEG_S2`."""
     acceleration = samples.motion.motor_acceleration_deg_s2
     assert acceleration is not None
     return np.asarray(np.abs(acceleration / samples.ratio) > GENTLE_DEG_S2)
@@ -290,24 +292,23 @@ def _accelerating(samples: Samples) -> BoolArray:
 
 MINIMUM_SAMPLES = 8
 SETTLE_SHARE = 0.2
-"""Maximum share of the travel to the next turning point that is dropped after a turning point, where the
+"""Maximum fraction of the time to the next turning point that is dropped after a turning point, where the
 hysteresis changes too steeply for a load on a spring to follow."""
 STANDING_DEG_S = 1e-3
-"""Load speed below which an axis counts as standing."""
+"""Maximum load speed at which an axis counts as standing."""
 GENTLE_DEG_S2 = 40.0
-"""Maximum load acceleration of a usable motion of unknown kind."""
+"""Maximum load acceleration of usable samples in motion of unknown kind."""
 RESTING = ("reference", "standstill")
 SLOW = ("sweep", "sine", "reversal")
-"""Leg kinds that define slow speed."""
+"""Kinds of slow legs, whose speed is the default limit of slow motion."""
 KNOWN = (*RESTING, *ON_THE_WAY, *SLOW)
 
 
 def usable_samples(measured: Measured, ratio: float, slow_deg_s: float | None = None) -> Samples:
-    """Prepares the samples of a calibration: errors about the median of each zero, with usable samples
-    marked.
+    """Prepares the samples of a calibration: centres the errors of each zero, and marks the usable samples.
 
-    ``slow_deg_s`` is the maximum load speed of usable samples, by default that of the slow legs. InputError
-    if there are too few samples or the ratio does not match the record.
+    ``slow_deg_s`` is the maximum load speed of usable samples, by default that of the slow legs. Raises
+    InputError if there are too few samples or the ratio does not match the record.
     """
     count = len(measured.record)
     if count < MINIMUM_SAMPLES:
@@ -323,11 +324,11 @@ def usable_samples(measured: Measured, ratio: float, slow_deg_s: float | None = 
 
 
 def _slow(samples: Samples, slow_deg_s: float | None) -> BoolArray:
-    """Selects samples at rest and in slow motions, but not within `SETTLE_S` after fast ones.
+    """Returns a mask of the samples at rest or in slow motion, except within `SETTLE_S` after fast motion.
 
-    A motion is judged as a whole, from rest or turning point to the next, so the start of a fast move is not
-    slow. Only the rests of moves and steps are used. In motions of unknown kind, samples with high
-    acceleration are dropped.
+    Each motion, from a rest or turning point to the next, is slow or fast as a whole, so the start of a fast
+    move is not slow. Of moves and steps, only the rests are used. In motions of unknown kind, samples with
+    high acceleration are dropped.
     """
     speed = samples.speed_deg_s / samples.ratio
     moving = np.abs(speed)
@@ -337,7 +338,7 @@ def _slow(samples: Samples, slow_deg_s: float | None) -> BoolArray:
     under_way = moving > STANDING_DEG_S
     fast = under_way & samples.of_kind(*ON_THE_WAY)
     fast |= ~samples.of_kind(*KNOWN) & _accelerating(samples)
-    # Consecutive motions without a rest between them differ in kind or direction.
+    # Without a rest between them, consecutive motions differ in kind or direction.
     changes = [np.diff(each) != 0 for each in (under_way, samples.kind, np.sign(speed))]
     first = np.append(0, np.flatnonzero(np.any(changes, axis=0)) + 1)
     fastest = np.repeat(np.maximum.reduceat(moving, first), np.diff(np.append(first, len(samples))))
@@ -346,7 +347,7 @@ def _slow(samples: Samples, slow_deg_s: float | None) -> BoolArray:
 
 
 def _has_turned(time: FloatArray, motor_deg: FloatArray) -> BoolArray:
-    """Selects samples within `SETTLE_S` after a turning point."""
+    """Returns a mask of the samples within `SETTLE_S` after a turning point."""
     turned = np.zeros(len(time), dtype=bool)
     turning, _ = branches(motor_deg)
     for first, last in pairwise(turning[1:]):
@@ -367,25 +368,24 @@ class FitOptions:
     highest_order: int = 24
     """Highest candidate motor order."""
     load_orders: int = 4
-    """Highest order of load and flexspline that is fitted in addition to the model if significant."""
+    """Highest load and flexspline order; significant ones are fitted as nuisances."""
     family_wise: float = 0.01
-    """Probability that noise alone selects any order."""
+    """Probability that noise alone causes the selection of any order."""
     smallest_arcsec: float = 0.1
     """Minimum amplitude of an order, whatever its significance."""
     start: Start | None = None
-    """Elastic state at the first sample: `Start.FORWARD` after the bench's preconditioning; None to fit
-    it."""
+    """Elastic state at the first sample; `Start.FORWARD` after the bench's preconditioning. None fits it."""
     active: TransmissionModel | None = None
-    """Model to compare with, which also provides the undetermined shapes."""
+    """Model with which to compare. It also provides the shape parameters that the data do not determine."""
 
     def prototype(self, effect: Effect) -> Effect:
-        """Returns an effect of this kind with the parameters of the active model, else of the options."""
+        """Returns an effect of this kind, with parameters from the active model, else from the options."""
         known = (*(self.active.effects if self.active else ()), *self.effects)
         laws = (law for each in known for law in (each, *in_place(each, CATALOGUE.values())))
         return next((law for law in laws if law.name == effect.name), effect)
 
 
-# Start of the fit: the best point of a grid over all shapes.
+# Initial values of the fit: the best point of a grid over all shape parameters.
 
 
 GRID_LOGARITHMIC: Final = 12
@@ -394,7 +394,7 @@ LINEAR_ONLY: Final = Effort(steps=1)
 
 
 def searched(fit: Separable, effects: tuple[Effect, ...]) -> Solution:
-    """Fits from the best point of a grid over the shapes of the effects."""
+    """Fits the effects, starting from the best point of a grid over their shape parameters."""
     for index, effect in enumerate(effects):
         axes = [each.grid(GRID_LOGARITHMIC if each.logarithmic else GRID_LINEAR) for each in effect.shape]
         names = [each.name for each in effect.shape]
@@ -412,9 +412,9 @@ def searched(fit: Separable, effects: tuple[Effect, ...]) -> Solution:
 
 PARTS = ("cosine", "sine")
 WHOLE_TURN = 0.95
-"""Minimum travel that counts as a whole turn, turns."""
+"""Minimum travel that counts as one whole turn, turns."""
 COVERED_DEG = 30.0
-"""Cell size of the coverage of motor angles."""
+"""Size of the cells in which the coverage of motor angles is counted."""
 
 
 class State(NamedTuple):
@@ -434,14 +434,14 @@ class State(NamedTuple):
     """Ripple of the last fit."""
     outliers: Outliers = Outliers(0, 0, 0)
     delay_ms: float = 0.0
-    """Delay by which the samples have already been corrected."""
+    """Encoder delay for which the samples have already been corrected."""
 
     def precision(self) -> Precision:
-        """Returns the precision matrix of the current noise model."""
+        """Returns the precision matrix (inverse covariance) of the current noise model."""
         return Precision(self.noise, self.design.blocks)
 
     def in_addition(self) -> Nuisances:
-        """Returns the columns of zeros and nuisances."""
+        """Returns the columns of the zeros and of the nuisances."""
         waves = []
         for order, amplitude_arcsec, phase_deg in self.ripple.waves() if self.ripple else ():
             at = 2 * self.candidates.index(Order.motor(round(order)))
@@ -466,7 +466,7 @@ class State(NamedTuple):
         return self.in_addition().and_also(unknown(picked, [name for name, _ in others]))
 
     def model(self) -> tuple[Effect, ...]:
-        """Returns the ripple of the selected motor orders, and the other effects."""
+        """Returns the effects of the model: the ripple of the selected motor orders, and all others."""
         motor = [each.number for each in self.selection.chosen if each.family is Family.MOTOR]
         return ((ripple(motor),) if motor else ()) + self.effects
 
@@ -481,7 +481,7 @@ class State(NamedTuple):
     def information(self) -> System:
         """Returns the normal equations of [candidates | zeros and nuisances | effects and their tangents].
 
-        With the tangents, the shapes are refitted with every candidate order.
+        The tangents allow for a refit of the shape parameters with every candidate order.
         """
         precision, nuisances = self.precision(), self.candidate_waves().and_also(self.in_addition())
         found = self.under(precision, nuisances).fit(self.effects, LINEAR_ONLY)
@@ -492,8 +492,9 @@ class State(NamedTuple):
         return System(found.information, right, np.flatnonzero(known > 0.0), np.array(zeros))
 
     def selected(self, system: System | None = None) -> State:
-        """Selects the orders that are significant at the current noise; ``system``: `information` if
-        known.
+        """Returns the state with the orders that are significant at the current noise.
+
+        ``system`` is the result of `information`, if it is already known.
         """
         options = self.options
         found = select(
@@ -502,13 +503,13 @@ class State(NamedTuple):
         return self._replace(selection=found)
 
     def after(self, solution: Solution) -> State:
-        """Returns the state with the effects of a solution, and their blur within blocks."""
+        """Returns the state with the effects of a solution, and the block variances that follow from them."""
         effects = tuple(each for each in solution.effects if not is_ripple(each) and not each.violations())
         own = next(filter(is_ripple, solution.effects), None)
         return self._replace(effects=effects, design=self.design.blurred(effects), ripple=own)
 
     def remade(self, samples: Samples, weight: FloatArray, delay_ms: float) -> State:
-        """Rebuilds the blocks from delay-corrected samples without outliers."""
+        """Returns the state with blocks rebuilt from delay-corrected samples; outliers have zero weight."""
         design = Design.of(samples, make_blocks(samples, weight), self.design.starts).blurred(self.effects)
         waves = harmonics(design, [each.per_motor_turn for each in self.candidates])
         return self._replace(design=design, waves=waves, delay_ms=delay_ms)
@@ -517,8 +518,8 @@ class State(NamedTuple):
 def candidate_orders(design: Design, options: FitOptions) -> tuple[Order, ...]:
     """Returns the candidate orders that the travel can resolve.
 
-    Neighbouring orders are separable over at least one whole turn (Rayleigh criterion): motor orders need
-    a motor turn, orders of load and flexspline enough of a load turn.
+    Neighbouring orders are separable over at least one whole turn (Rayleigh criterion). Motor orders need a
+    motor turn. Load and flexspline orders need almost a whole load turn.
     """
     ratio = design.samples.ratio
     if turns_covered(design) < WHOLE_TURN:
@@ -538,7 +539,7 @@ def candidate_orders(design: Design, options: FitOptions) -> tuple[Order, ...]:
 
 
 def turns_covered(design: Design) -> float:
-    """Returns the distinct motor angles covered about one zero, in turns; the maximum over the zeros."""
+    """Returns the range of distinct motor angles covered by one zero, turns; the maximum over all zeros."""
     blocks = design.blocks
     cell = np.floor(blocks.motor_deg / COVERED_DEG).astype(np.intp)
     seen = (len(np.unique(cell[blocks.zero == zero])) for zero in range(design.samples.zeros))

@@ -1,4 +1,4 @@
-"""Identification of a model from a measurement: all steps in order."""
+"""Identifies a model from a measurement: all steps in order."""
 
 from __future__ import annotations
 
@@ -44,17 +44,18 @@ MINIMUM_USABLE = 50
 LEAST_TRAVEL_DEG = 10.0
 """Minimum motor travel. A shorter record has only a rest, the beginning of a move and half of a loop."""
 NO_DEGREES = "where the axis went further, both angles are in radians or turns: convert them to degrees"
-"""Hint about units. If both angles are in the same wrong unit, the ratio is right, and only the short travel
-reveals the error."""
+"""Hint about units. If both angles are in the same wrong unit, their ratio is still right, and only the short
+travel reveals the error."""
 EFFECT_SHARE = 1e-3
-"""Share of an effect's columns not explained by zeros and orders; below it, the effect is not visible."""
+"""Minimum fraction of a visible effect's sum of squares that zeros and orders do not explain."""
 ROUNDS = 3
 
 
 def fit(measured: Measured, ratio: float, options: FitOptions | None = None) -> FitResult:
     """Identifies an axis of gear ratio ``ratio`` from a measurement.
 
-    InputError if the record cannot be used at all. The result's ``warnings`` list what it cannot determine.
+    Raises InputError if the record cannot be used at all. The result's ``warnings`` list the quantities that
+    the record does not determine.
     """
     options = options or FitOptions()
     warnings: list[str] = []
@@ -91,7 +92,7 @@ def fit(measured: Measured, ratio: float, options: FitOptions | None = None) -> 
 
 
 def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> State:
-    """Prepares blocks and columns, and selects the effects and nuisances that the record can show."""
+    """Prepares blocks and columns, and selects the effects and nuisances that are visible in the record."""
     starts = [each.start or Start.FORWARD for each in samples.chains]
     design = Design.of(samples, make_blocks(samples), starts)
     candidates = candidate_orders(design, options)
@@ -139,7 +140,7 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
 
 
 def _search(state: State, warnings: list[str]) -> State:
-    """Finds shapes on a grid, unknown elastic states at the start, and an initial noise model."""
+    """Finds shape parameters on a grid, unknown initial elastic states, and an initial noise model."""
     simple = state._replace(nuisances=tuple(each for each in state.nuisances if each != TURNS))
     columns = simple.in_addition().and_also(state.candidate_waves())
 
@@ -167,7 +168,7 @@ def _search(state: State, warnings: list[str]) -> State:
 
 
 def _settle(state: State) -> tuple[State, Solution, System]:
-    """Iterates orders, outliers, delay and noise to convergence, refitting everything each time."""
+    """Determines outliers and delay, then refits and updates orders and noise until the orders settle."""
     state = state.selected()
     solution = state.fitted()
     samples = state.design.samples
@@ -191,7 +192,8 @@ def _settle(state: State) -> tuple[State, Solution, System]:
             break
     solution = state.fitted()
     if _value(solution, SWING) < 0.0:
-        # Below resonance a load amplifies the error. A negative swing has another, speed-dependent cause.
+        # Below its resonance a load amplifies the error. A negative swing thus has another speed-dependent
+        # cause.
         state = state._replace(nuisances=tuple(each for each in state.nuisances if each != SWING))
         solution = state.fitted()
         system = state.information()
@@ -204,7 +206,7 @@ def _settle(state: State) -> tuple[State, Solution, System]:
 
 
 def _with_best_law(state: State, solution: Solution, system: System) -> tuple[State, Solution, System]:
-    """Exchanges a law for an alternative with clearly better held-out predictions."""
+    """Replaces an effect's law by an alternative with clearly better held-out predictions, if any."""
     for effect in state.effects:
         for law in in_place(effect, CATALOGUE.values()):
             effects = tuple(law if each is effect else each for each in state.effects)
@@ -228,7 +230,10 @@ def _value(solution: Solution, nuisance: str) -> float:
 def _hold_what_is_unknown(
     state: State, solution: Solution, warnings: list[str]
 ) -> tuple[Solution, FloatArray]:
-    """Resets undetermined shapes to their initial values, and refits the rest."""
+    """Resets undetermined shape parameters to their initial values, and refits the rest.
+
+    Returns the solution and its covariance.
+    """
     options, blocks = state.options, state.design.blocks
     cov = covariance(solution, state.precision(), blocks)
     effects = list(solution.effects)

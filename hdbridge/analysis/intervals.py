@@ -1,4 +1,4 @@
-"""95 % intervals of an effect's parameters, from the covariance of a fit, nested as in a model file."""
+"""Derives 95 % intervals of an effect's parameters from the covariance of a fit."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ class Interval:
 
     effect: str
     parameter: str
-    """Path in the model file: ``offset_arcsec``, ``orders[2].amplitude_arcsec`` (2 is the order)."""
+    """Path in the model file: ``offset_arcsec``, or ``orders[2].amplitude_arcsec`` for order 2."""
     value: float
     half_width: float
     identifiable: bool = True
-    """False if the data do not determine the parameter; the interval is then its whole range."""
+    """False if the data do not determine the parameter; its interval is then the whole permitted range."""
 
     @property
     def low(self) -> float:
-        """Lower end."""
+        """Lower end of the interval."""
         return self.value - self.half_width
 
     @property
     def high(self) -> float:
-        """Upper end."""
+        """Upper end of the interval."""
         return self.value + self.half_width
 
 
 def intervals_of(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> list[Interval]:
-    """Returns the intervals of one effect's parameters; ``cov`` (c, c) is that of its ``columns``."""
+    """Returns the intervals of one effect's parameters; ``cov`` (c, c) is the covariance of ``columns``."""
     shapes = {each.name: each for each in effect.shape}
     base = dict(leaves(effect.parameters()))
     result = []
@@ -57,7 +57,7 @@ def intervals_of(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> 
 
 
 def half_widths(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> dict[str, float]:
-    """Returns `NORMAL_95` standard deviations of each parameter, from its derivatives."""
+    """Returns the 95 % half width of each parameter, by error propagation from the columns."""
     steps = 0.05 * np.sqrt(np.maximum(np.diag(cov), 1e-24))
     return {
         name: NORMAL_95 * math.sqrt(max(float(slope @ cov @ slope), 0.0))
@@ -66,9 +66,9 @@ def half_widths(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> d
 
 
 def slopes(effect: Effect, columns: Sequence[Column], steps: FloatArray) -> dict[str, FloatArray]:
-    """Returns the derivatives of an effect's parameters with respect to the columns of a fit, (c,) each.
+    """Returns the derivatives (c,) of each effect parameter with respect to the columns of a fit.
 
-    They are central differences with ``steps`` (c,), only for parameters that depend on a column.
+    They are central differences with ``steps`` (c,). Parameters that depend on no column are omitted.
     """
     coefficients = effect.coefficients()
     result: dict[str, FloatArray] = {}
@@ -91,7 +91,7 @@ def slopes(effect: Effect, columns: Sequence[Column], steps: FloatArray) -> dict
 
 
 def nested_half_widths(effect: Effect, intervals: list[Interval]) -> dict[str, Any]:
-    """Nests half widths like the effect's parameters; integers (orders) are copied."""
+    """Returns half widths, nested like the effect's parameters; integers (orders) are copied."""
     half = {each.parameter: each.half_width for each in intervals if each.effect == effect.name}
 
     def nest(value: Any, path: str) -> Any:
@@ -107,7 +107,7 @@ def nested_half_widths(effect: Effect, intervals: list[Interval]) -> dict[str, A
 
 
 def leaves(parameters: Any, path: str = "") -> Iterator[tuple[str, float]]:
-    """Yields each floating-point parameter with its path; list items are labelled by ``order`` if any."""
+    """Yields each floating-point parameter with its path; list items are labelled by ``order`` or index."""
     if isinstance(parameters, dict):
         for key, part in parameters.items():
             yield from leaves(part, joined(path, key))
@@ -123,12 +123,12 @@ def _label(part: Any, number: int) -> int:
 
 
 def joined(path: str, key: str) -> str:
-    """Extends a path (`leaves`) by one key."""
+    """Appends a key to a path (see `leaves`)."""
     return f"{path}.{key}" if path and key else path or key
 
 
 def labelled(parameters: Any, path: Iterable[str | int]) -> str:
-    """Returns the dotted path, as in `leaves`, of nested keys and list indices."""
+    """Returns the path, in the notation of `leaves`, for a sequence of keys and list indices."""
     said = ""
     for key in path:
         parameters = parameters[key]
@@ -137,14 +137,14 @@ def labelled(parameters: Any, path: Iterable[str | int]) -> str:
 
 
 def difference(name: str, low: float, high: float) -> float:
-    """Returns the difference of two values of the parameter at a path (`leaves`); phases are wrapped."""
+    """Returns ``high`` minus ``low`` for the parameter at a path (see `leaves`); phases are wrapped."""
     if re.search(r"phase_deg$", name):
         return (high - low + 180.0) % 360.0 - 180.0
     return high - low
 
 
 def _free_move(effect: Effect, name: str, step: float) -> Effect:
-    """Moves one shape parameter regardless of its range (only for differentiation)."""
+    """Changes one shape parameter regardless of its range (only for differentiation)."""
     shape = next(each for each in effect.shape if each.name == name)
     here = shape_value(effect, name)
     there = here * float(np.exp(step)) if shape.logarithmic else here + step

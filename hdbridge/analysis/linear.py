@@ -17,16 +17,15 @@ from hdbridge.axis.effects import BoolArray, Effect, FloatArray, IntArray
 from hdbridge.axis.effects.described import Moves
 
 NOTHING = 1e-20
-"""Information below which a column counts as invisible."""
+"""Minimum information used for scaling; a column with less is invisible."""
 SEEN = 1e-9
-"""Share of the largest eigenvalue of the scaled columns; a direction with a smaller eigenvalue is
-undetermined."""
+"""Minimum eigenvalue of a determined direction, relative to the largest eigenvalue of the scaled matrix."""
 SUSPECT = 1e-6
-"""Square of a Cholesky factor's diagonal below which the eigenvalues are computed instead."""
+"""Squared diagonal element of the Cholesky factor below which eigenvalues are used instead."""
 
 
 def solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solves a positive semi-definite system with scaled columns; undetermined directions stay at zero."""
+    """Solves a positive semi-definite system; the solution is zero in undetermined directions."""
     from scipy.linalg.lapack import dposv  # noqa: PLC0415 - the daemon's service starts without scipy
 
     if not len(matrix):
@@ -47,7 +46,7 @@ def solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def inverse_symmetric(matrix: FloatArray) -> FloatArray:
-    """Inverts a positive semi-definite matrix by its scaled eigenvalues; huge where it is singular."""
+    """Inverts a positive semi-definite matrix by eigenvalues; the result is huge in singular directions."""
     scale = np.sqrt(np.maximum(np.diag(matrix), NOTHING))
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     inverse = vectors @ ((1.0 / np.maximum(values, 1e-12 * values[-1]))[:, np.newaxis] * vectors.T)
@@ -57,8 +56,8 @@ def inverse_symmetric(matrix: FloatArray) -> FloatArray:
 def seen_directions(gram: FloatArray) -> FloatArray:
     """Returns a factor R, shape (p, r), with R' gram R = 1 over the directions determined by the data.
 
-    R R' is the pseudo-inverse of the scaled matrix, and ``columns @ R`` is an orthonormal basis of the
-    columns.
+    R R' is a pseudo-inverse of ``gram``. If ``gram`` is the Gram matrix of columns, ``columns @ R`` is an
+    orthonormal basis of their span.
     """
     if not len(gram):
         return np.empty((0, 0))
@@ -70,9 +69,9 @@ def seen_directions(gram: FloatArray) -> FloatArray:
 
 
 def side_by_side(parts: Sequence[FloatArray | BoolArray], rows: int) -> FloatArray:
-    """Concatenates columns into one matrix, shape (rows, p), each column contiguous in memory.
+    """Concatenates columns into one matrix, shape (rows, p), with each column contiguous in memory.
 
-    Reading or writing one column of a row-major matrix takes as long as the whole matrix.
+    In a row-major matrix, access to one column takes as long as access to the whole matrix.
     """
     result = np.empty((sum(each.shape[1] for each in parts), rows)).T
     at = 0
@@ -83,38 +82,38 @@ def side_by_side(parts: Sequence[FloatArray | BoolArray], rows: int) -> FloatArr
 
 
 def orthonormal(columns: FloatArray) -> FloatArray:
-    """Returns an orthonormal basis of the columns' span, shape (m, r)."""
+    """Returns an orthonormal basis of the span of the columns, shape (m, r)."""
     return np.asarray(columns @ seen_directions(columns.T @ columns))
 
 
-# Stretches of a record, numbered point by point, and sums over them.
+# Division of a record into stretches, each point with the number of its stretch, and sums over stretches.
 
 
 def of_length(time_s: FloatArray, length_s: float) -> IntArray:
-    """Numbers the points by stretches of equal length; empty stretches are skipped."""
+    """Returns the number of each point's stretch, for stretches of equal duration; skips empty stretches."""
     return counted(np.floor((time_s - time_s[0]) / length_s).astype(np.intp))
 
 
 def of_number(time_s: FloatArray, number: int) -> IntArray:
-    """Numbers the points by ``number`` stretches of time of equal length, shape (n,)."""
+    """Returns the number of each point's stretch, (n,), for ``number`` stretches of equal duration."""
     span = max(float(time_s[-1] - time_s[0]), 1e-9)
     return np.asarray(np.minimum((time_s - time_s[0]) / span * number, number - 1), dtype=np.intp)
 
 
 def counted(number: IntArray) -> IntArray:
-    """Renumbers stretches without gaps."""
+    """Renumbers stretches consecutively, without gaps."""
     return np.asarray(np.unique(number, return_inverse=True)[1])
 
 
 def sums(rows: FloatArray, number: IntArray) -> FloatArray:
-    """Sums rows (n, p) by their number, shape (numbers, p)."""
+    """Returns the sum of all rows (n, p) with the same number, shape (numbers, p)."""
     return np.stack([np.bincount(number, each) for each in rows.T], axis=1)
 
 
 def sandwich(influence: FloatArray, number: IntArray) -> FloatArray:
-    """Returns the covariance (p, p) of the sum of the influences of all points, (n, p).
+    """Returns the covariance (p, p) of the sum of all rows of ``influence`` (n, p).
 
-    Influences with the same number may be correlated (Liang and Zeger 1986).
+    Rows with the same number may be correlated (Liang and Zeger 1986).
     """
     summed = sums(influence, number)
     count = len(summed)
@@ -122,7 +121,7 @@ def sandwich(influence: FloatArray, number: IntArray) -> FloatArray:
 
 
 def about_zeros(left_arcsec: FloatArray, zero: IntArray, weight: FloatArray) -> FloatArray:
-    """Subtracts the weighted mean of each absolute zero from a residual (n,); unchanged without weight."""
+    """Subtracts from a residual (n,) its weighted mean at each absolute zero, or 0 if the weights are 0."""
     total, weights = np.bincount(zero, weight * left_arcsec), np.bincount(zero, weight)
     return np.asarray(left_arcsec - (total / np.maximum(weights, 1e-300))[zero])
 
@@ -131,9 +130,9 @@ def about_zeros(left_arcsec: FloatArray, zero: IntArray, weight: FloatArray) -> 
 
 
 LOCAL = frozenset({Moves.ANYWHERE})
-"""Shapes that local steps improve from any start."""
+"""Kinds of shape parameters for which local steps converge from any initial value."""
 FOUND = LOCAL | {Moves.NEARBY}
-"""`LOCAL` shapes, and shapes that a search has brought close to their best value."""
+"""`LOCAL` kinds, and those that converge if a search has found a value close to the best one."""
 
 Columns = Callable[[Effect], FloatArray]
 
@@ -147,7 +146,7 @@ class Weighting(Protocol):
 
 
 class Prior(NamedTuple):
-    """Prior of a coefficient or shape, or of the logarithm of a logarithmic shape."""
+    """Prior of a coefficient or a shape parameter; of the logarithm if the shape is logarithmic."""
 
     mean: float
     information: float
@@ -159,10 +158,10 @@ FREE = Prior(0.0, 0.0)
 
 
 class Column(NamedTuple):
-    """Parameter of one column of the fit."""
+    """Parameter to which a column of the fit belongs."""
 
     effect: int
-    """Place of the effect, or -1 for a nuisance."""
+    """Index of the effect in the fit; -1 for a nuisance."""
     name: str
     """Index of the coefficient, name of the shape, or name of the nuisance."""
     shape: bool = False
@@ -175,9 +174,9 @@ class Effort:
 
     steps: int = 25
     converged: float = 1e-4
-    """Predicted or actual fall in chi square below which the fit ends."""
+    """Fall in chi square, predicted or actual, below which the fit ends."""
     roughly: float = 0.0
-    """Tolerance as a share of chi square, because a large residual requires no accuracy."""
+    """Tolerance relative to chi square, because a large residual requires little accuracy."""
 
     def enough(self, chi_square: float) -> float:
         """Returns the fall in chi square below which the fit ends."""
@@ -186,15 +185,15 @@ class Effort:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Nuisances:
-    """Columns that belong to no effect."""
+    """Columns of a fit that belong to no effect."""
 
     columns: FloatArray
-    """Shape (b, q)."""
+    """Columns, shape (b, q)."""
     names: tuple[str, ...]
     prior: tuple[Prior, ...]
 
     def and_also(self, other: Nuisances) -> Nuisances:
-        """Returns these columns followed by others."""
+        """Returns these columns followed by those of ``other``."""
         return Nuisances(
             side_by_side([self.columns, other.columns], len(self.columns)),
             (*self.names, *other.names),
@@ -202,7 +201,7 @@ class Nuisances:
         )
 
     def without(self, left_out: Callable[[str], bool]) -> Nuisances:
-        """Returns the columns for whose names ``left_out`` returns False."""
+        """Returns the nuisances except those for whose names ``left_out`` returns True."""
         keep = np.array([not left_out(each) for each in self.names], dtype=np.bool_)
         return Nuisances(
             self.columns[:, keep], tuple(compress(self.names, keep)), tuple(compress(self.prior, keep))
@@ -216,37 +215,39 @@ def unknown(columns: FloatArray | BoolArray, names: Sequence[str]) -> Nuisances:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Terms:
-    """Inputs of a fit; arrays of m rows."""
+    """Inputs of a fit; arrays have m rows."""
 
     observed: FloatArray
     """Observations, arcsec, shape (m,)."""
     columns: Columns
-    """Returns the columns of an effect, (m, p), independent of its coefficients."""
+    """Function that returns an effect's columns (m, p), which do not depend on its coefficients."""
     weighting: Weighting
     nuisances: Nuisances
     prior: Mapping[tuple[int, str], Prior] = field(default_factory=dict)
-    """Priors by place of the effect, and index of the coefficient or name of the shape."""
+    """Priors, by the effect's index and the coefficient's index or shape parameter's name."""
     sign: Callable[[Effect], float] = lambda _: 0.0
-    """Sign required of an effect's coefficients; 0 for either sign."""
+    """Function that returns the required sign of an effect's coefficients; 0 permits either sign."""
     moves: frozenset[Moves] = LOCAL
-    """Kinds of shapes to fit; all others stay fixed."""
+    """Kinds of shape parameters to fit; all others stay fixed."""
 
     def known(self, columns: Sequence[Column]) -> FloatArray:
-        """Returns prior mean and information of columns, the nuisances first, shape (p, 2)."""
+        """Returns the prior mean and information of each column, nuisances first, shape (p, 2)."""
         others = columns[len(self.nuisances.prior) :]
         own = [self.prior.get((each.effect, each.name), FREE) for each in others]
         return np.array([*self.nuisances.prior, *own], dtype=np.float64).reshape(-1, 2)
 
 
-# Fit linearised near its minimum, in coefficients and (by tangents) in shapes.
+# Fit linearised near its minimum, in coefficients and (by tangents) in shape parameters.
 
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Fit linearised at or near its minimum; rows in units of the noise, except for `steps_without`."""
+    """Fit linearised at or near its minimum. Rows are in standard deviations of the noise, except for
+    `steps_without`.
+    """
 
     columns: FloatArray
-    """Derivatives, shape (m, p)."""
+    """Derivatives of the prediction by the parameters, shape (m, p)."""
     residual: FloatArray
     """Residual, shape (m,)."""
     known: FloatArray
@@ -254,41 +255,46 @@ class Linearised:
 
     @cached_property
     def directions(self) -> FloatArray:
-        """R, shape (p, r), with R' (columns' columns + information) R = 1 over the determined directions."""
+        """R, shape (p, r), with R' (C'C + prior information) R = 1 over the determined directions; C are the
+        columns.
+        """
         return seen_directions(self.columns.T @ self.columns + np.diag(self.known[:, 0]))
 
     @cached_property
     def basis(self) -> FloatArray:
-        """B, shape (m, r): a column's square c'c falls to c'c - (B'c)'(B'c); orthonormal without priors."""
+        """B, shape (m, r). The fit reduces a column's c'c to c'c - (B'c)'(B'c). Without priors, B is
+        orthonormal.
+        """
         return np.asarray(self.columns @ self.directions)
 
     @cached_property
     def slack(self) -> FloatArray:
-        """s, shape (r,): a column's moment c'r with the residual falls to c'r - (B'c)'s; 0 at the minimum."""
+        """s, shape (r,). The fit reduces a column's product c'r with the residual r to c'r - (B'c)'s. At the
+        minimum, s is 0.
+        """
         return np.asarray(self.directions.T @ (self.columns.T @ self.residual + self.known[:, 1]))
 
     def of(self, places: IntArray) -> Linearised:
-        """Returns the fit restricted to some of its columns."""
+        """Returns the fit restricted to the columns at ``places``."""
         return Linearised(self.columns[:, places], self.residual, self.known[places])
 
     def left(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Returns Gram matrix (k, k) and moment (k,) of other columns (m, k) after the fit."""
+        """Returns the Gram matrix (k, k) and the moment (k,) that the fit leaves of other columns (m, k)."""
         shadow = self.basis.T @ columns
         return columns.T @ columns - shadow.T @ shadow, columns.T @ self.residual - shadow.T @ self.slack
 
     def taken_over(self, columns: FloatArray) -> FloatArray:
-        """Returns the coefficients by which the fit would absorb other columns (m, k), shape (p, k)."""
+        """Returns the parameter changes (p, k) by which the fit would absorb other columns (m, k)."""
         return np.asarray(self.directions @ (self.basis.T @ columns))
 
 
 def steps_without(
     fit: Linearised, fold: IntArray, weighting: Callable[[BoolArray], Weighting]
 ) -> list[FloatArray]:
-    """Returns, for each fold, the step (p,) to the fit without that fold; ``weighting`` weights a subset of
-    rows.
+    """Returns, for each fold, the parameter step (p,) from the full fit to the fit without that fold.
 
-    Each fold is weighted separately, so correlated noise does not connect folds. Parameters that only the
-    fold itself determines stay unchanged.
+    ``weighting`` returns the weighting of a subset of rows. Each fold is weighted separately, so correlated
+    noise does not connect folds. Parameters that only the fold itself determines stay unchanged.
     """
     grams, moments = [], []
     for number in range(int(np.max(fold)) + 1):

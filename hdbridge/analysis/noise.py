@@ -1,11 +1,14 @@
-"""Coloured noise, and least squares weighted by it.
+"""Coloured noise, and least squares weighted by its inverse covariance.
 
-The noise has five parts: white noise, which may differ between standing and moving; a drift in time; a drift
-over the motor's *travel*, because an axis rests anywhere within a count of its encoder, constant during a
-stop and different at the next; the misfit of the loop's shape, which decays over each branch and differs
-between branches; and the rounding error that is constant over a leg, whose size follows from the count. The
-drifts are first-order Markov processes, so the inverse of their covariance is banded, and a fit costs no more
-than one with white noise (Rybicki and Press 1995).
+The noise has five parts:
+
+- white noise, which may differ between standing and moving; - a drift in time; - a drift over the motor's
+*travel*, because an axis rests anywhere within a count of its encoder; this error is constant during a stop
+and different at the next; - the misfit of the loop's shape, which decays over each branch and differs between
+branches; - the rounding error that is constant over a leg; its size follows from the count.
+
+Each drift is a first-order Markov process. The inverse of its covariance is therefore banded, and a fit takes
+no longer than one with white noise (Rybicki and Press 1995).
 """
 
 from __future__ import annotations
@@ -24,15 +27,16 @@ PIECES = 16
 PIECE_BLOCKS = 250
 SMALLEST_ARCSEC, LARGEST_ARCSEC = 1e-3, 1e3
 ABSENT_ARCSEC = 2.0 * SMALLEST_ARCSEC
-"""A drift that a fit leaves below this, at its lower limit, is omitted: each makes all products slower."""
+"""Minimum fitted size of a drift. A smaller one is at its lower limit and is omitted, because each drift
+slows down all products."""
 COLUMNS_AT_ONCE = 8
 LOOP_LENGTH = 0.3
-"""Correlation length of the misfit of a loop's shape, as a share of the travel over which the misfit
-decays."""
+"""Correlation length of the misfit of the loop's shape, as a fraction of its decay travel."""
 LOOP_DEG = 8.0, 40.0
-"""Range of that travel, derived from the widths of loops. A longer one is a drift, a shorter one ringing."""
+"""Range of the decay travel, motor degrees, derived from the widths of loops. A longer decay is a drift, a
+shorter one is ringing."""
 SHORTEST_STEP = 1e-8
-"""Step of a drift between blocks at one place, correlation lengths: practically zero."""
+"""Minimum distance between blocks, in correlation lengths of a drift: practically zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +55,7 @@ class NoiseModel:
     """Drift over the motor's travel: standard deviation and correlation length."""
     loop_arcsec: float = 0.0
     loop_deg: float = 10.0
-    """Misfit of the loop's shape: standard deviation at a turning point, and travel over which it decays."""
+    """Misfit of the loop's shape: standard deviation at a turning point, and decay travel."""
 
     def white_variance(self, blocks: Blocks) -> FloatArray:
         """Returns the white-noise variance of each block's mean; infinite for blocks without samples."""
@@ -65,7 +69,7 @@ BEGIN = NoiseModel(1.0, 1.0, 1.0, 10.0, 1.0, 0.3, 1.0, 10.0)
 
 
 class White:
-    """The inverse covariance of independent noise."""
+    """Inverse covariance of independent noise."""
 
     def __init__(self, weight: FloatArray) -> None:
         """``weight`` is one over the standard deviation of each row, shape (m,)."""
@@ -79,9 +83,10 @@ class White:
 
 
 class _Chain(NamedTuple):
-    """A drift of unit size along some blocks: its inverse covariance, and its share in each block's mean.
+    """A drift of unit size along the blocks: its tridiagonal inverse covariance, and its load on each block.
 
-    Each is followed by its derivative by the logarithm of the correlation length.
+    The load is the factor with which the drift enters the block's mean. Each quantity is followed by its
+    derivative with respect to the logarithm of the correlation length.
     """
 
     diagonal: FloatArray
@@ -95,9 +100,9 @@ class _Chain(NamedTuple):
 
 
 def _along(blocks: Blocks, place: FloatArray, extent: FloatArray, length: float) -> _Chain:
-    """Returns a drift along ``place``, averaged over the ``extent`` of each block."""
+    """Returns a drift along ``place`` (time or travel), averaged over the ``extent`` of each block."""
     step = np.where(np.diff(blocks.chain) != 0, np.inf, np.abs(np.diff(place)) / length)
-    # the variance of the mean over x correlation lengths
+    # Variance of the mean over x correlation lengths.
     x = np.maximum(extent / length, 1e-6)
     fallen = -np.expm1(-x)
     averaged = np.where(x < 1e-3, 1.0 - x / 3.0, 2.0 * (x - fallen) / x**2)
@@ -106,7 +111,7 @@ def _along(blocks: Blocks, place: FloatArray, extent: FloatArray, length: float)
 
 
 def _over_branches(blocks: Blocks, length_deg: float) -> _Chain:
-    """Returns the misfit of the loop's shape, which fades over each branch and differs between them."""
+    """Returns the misfit of the loop's shape, which decays over each branch and differs between branches."""
     crossed = blocks.since_turn_deg / length_deg
     fresh = (np.diff(blocks.chain) != 0) | (np.diff(blocks.leg) != 0)
     step = np.where(fresh, np.inf, np.abs(np.diff(crossed)) / LOOP_LENGTH)
@@ -115,13 +120,13 @@ def _over_branches(blocks: Blocks, length_deg: float) -> _Chain:
 
 
 def _over_legs(blocks: Blocks) -> _Chain:
-    """Returns the error that is constant over a leg, with the size given in the blocks."""
+    """Returns the rounding error that is constant over a leg, with the size given by the blocks."""
     step = np.where(np.diff(blocks.leg) != 0, np.inf, 0.0)
     return _chain(step, blocks.locked_arcsec, np.zeros(len(blocks)))
 
 
 def _chain(step: FloatArray, load: FloatArray, load_slope: FloatArray) -> _Chain:
-    """Builds a chain from the steps between blocks in correlation lengths (infinite: independent)."""
+    """Builds a chain from the distances between blocks, in correlation lengths; infinite for independence."""
     step_slope = np.where((step > SHORTEST_STEP) & np.isfinite(step), -step, 0.0)
     step = np.maximum(step, SHORTEST_STEP)
     decay = np.exp(-step)
@@ -143,12 +148,13 @@ def _chain(step: FloatArray, load: FloatArray, load_slope: FloatArray) -> _Chain
 class Precision:
     """Inverse covariance of the noise of a set of blocks, applied without forming the matrix.
 
-    K = W + H S H', with W white and S of the drifts. By Woodbury, with P = S^-1 (tridiagonal for each drift),
-    K^-1 = w - w H (P + H' w H)^-1 H' w, and the bracket is banded.
+    The covariance is K = W + H S H', with the white noise W, the drifts' covariance S and their loads H. With
+    w = W^-1 and P = S^-1 (tridiagonal for each drift), Woodbury's identity gives
+    K^-1 = w - w H (P + H' w H)^-1 H' w. The bracket is banded.
     """
 
     def __init__(self, noise: NoiseModel, blocks: Blocks, left_out: BoolArray | None = None) -> None:
-        """Blocks in ``left_out`` count as not observed."""
+        """Treats the blocks in ``left_out`` as not observed."""
         weight = 1.0 / noise.white_variance(blocks)
         if left_out is not None:
             weight = np.where(left_out, 0.0, weight)
@@ -177,7 +183,7 @@ class Precision:
             self._log_determinant -= 2.0 * float(np.sum(np.log(self._factor[0])))
 
     def _bracket(self) -> FloatArray:
-        """Returns P + H' w H as a lower band, with the drifts interleaved."""
+        """Returns P + H' w H in lower band storage, with the drifts interleaved."""
         width, count = len(self._chains), len(self.weight)
         band = np.zeros((width + 1, width * count))
         loads = self._loads
@@ -194,21 +200,21 @@ class Precision:
         if columns.ndim == 1:
             return np.asarray(self._applied(columns[np.newaxis])[0])
         result = np.empty(columns.shape)
-        # a few contiguous columns at a time suit the solver: four times as fast
+        # The solver is four times as fast with a few contiguous columns at a time.
         for first in range(0, columns.shape[1], COLUMNS_AT_ONCE):
             part = slice(first, first + COLUMNS_AT_ONCE)
             result[:, part] = self._applied(columns[:, part].T).T
         return result
 
     def _applied(self, rows: FloatArray) -> FloatArray:
-        """Returns K^-1 times columns given as rows, (p, b)."""
+        """Returns K^-1 times columns that are given as rows, shape (p, b)."""
         if not self._chains:
             return self.weight * rows
         back = np.einsum("pbw,wb->pb", self._drifts(rows), self._loads)
         return np.asarray(self.weight * (rows - back))
 
     def _drifts(self, rows: FloatArray) -> FloatArray:
-        """Returns the expected drifts given observations (p, b), shape (p, b, drifts)."""
+        """Returns the expected drifts, given the observations (p, b); shape (p, b, drifts)."""
         right = (self.weight * rows)[:, :, np.newaxis] * np.ascontiguousarray(self._loads.T)
         inner = cho_solve_banded(
             (self._factor, True), right.reshape(len(rows), -1).T, overwrite_b=True, check_finite=False
@@ -218,9 +224,9 @@ class Precision:
     def _drift_covariance(self) -> tuple[FloatArray, FloatArray]:
         """Returns the covariance of the drifts given the observations.
 
-        The first array is that within each block, (drifts, drifts, b), the second that of each drift with its
-        value in the next block, (drifts, b - 1). The inverse at a block follows from the elimination
-        of all blocks before it and of all behind it.
+        The first array contains the covariances within each block, shape (drifts, drifts, b). The second
+        contains the covariance of each drift with its value in the next block, shape (drifts, b - 1). The
+        inverse at a block is obtained by elimination of all blocks before it and of all blocks after it.
         """
         width = len(self._chains)
         mirrored = np.zeros_like(self._band)
@@ -237,14 +243,14 @@ class Precision:
         return within, between
 
     def log_likelihood(self, residual: FloatArray) -> float:
-        """Returns the Gaussian log likelihood of the observed blocks up to a constant."""
+        """Returns the Gaussian log likelihood of the observed blocks, up to a constant."""
         return 0.5 * (self._log_determinant - float(residual @ self.apply(residual)))
 
     def score(self, residual: FloatArray) -> FloatArray:
-        """Returns the derivatives of `log_likelihood` by the logarithms of the noise model's fields, (8,).
+        """Returns the derivatives (8,) of `log_likelihood` by the logarithms of the noise model's fields.
 
-        The model must have a drift. By Fisher's identity, they follow from the mean and the covariance of the
-        drifts given the residual.
+        The model must have a drift. By Fisher's identity, the derivatives follow from the mean and covariance
+        of the drifts, given the residual.
         """
         weight, loads, moving = self.weight, self._loads, self._blocks.moving
         drifts = np.ascontiguousarray(self._drifts(residual[np.newaxis])[0].T)
@@ -269,7 +275,7 @@ class Precision:
 
 
 def _pivots(factor: FloatArray) -> FloatArray:
-    """Returns the pivots of a block elimination, (drifts, drifts, b), from the banded Cholesky factor."""
+    """Returns the pivots (drifts, drifts, b) of a block elimination, from the banded Cholesky factor."""
     width = len(factor) - 1
     root = np.zeros((width, width, factor.shape[1] // width))
     for row in range(width):
@@ -292,8 +298,8 @@ def _inverses(matrices: FloatArray) -> FloatArray:
 def fit_noise(residual: FloatArray, blocks: Blocks, parameters: int, begin: NoiseModel = BEGIN) -> NoiseModel:
     """Fits the noise model to a residual (b,) by maximum likelihood.
 
-    It uses at most `PIECES` pieces of the record, spread evenly. The white noise is corrected for the
-    ``parameters`` that were fitted.
+    The fit uses at most `PIECES` pieces of the record, spread evenly. The white noise is corrected for the
+    number of fitted ``parameters``.
     """
     pieces = _pieces(blocks)
     part = blocks.picked(pieces)
@@ -331,7 +337,7 @@ def fit_noise(residual: FloatArray, blocks: Blocks, parameters: int, begin: Nois
 
 
 def _pieces(blocks: Blocks) -> IntArray:
-    """Selects the blocks of several pieces spread evenly over the record."""
+    """Returns the indices of the blocks in several pieces, spread evenly over the record."""
     count = len(blocks)
     if count <= PIECES * PIECE_BLOCKS:
         return np.arange(count)

@@ -1,13 +1,16 @@
-"""Nuisance columns, fitted so that measurement errors do not bias the model: zeros and encoder faults.
+"""Nuisance columns, fitted so that measurement errors do not bias the model.
 
-A delay of the load encoder looks like hysteresis at a single speed. If a motor creeps from count to count, or
-rests just short of a count, an encoder of whole counts is wrong by a fraction of a count *in the direction of
-motion*. This error also looks like hysteresis, and depends on speed. Each turning point is known only to
-within a count and the travel between two samples (its reach), and a narrow or steep hysteresis is known only
-as accurately as its turning points. Each turning point has a column whose coefficient is a bounded share of
-its reach. With fine encoders and fast sampling these columns vanish. The load on the gear's spring amplifies
-the error that excites it, more at higher speed. This swing is separable from the orders at two speeds; at a
-single speed the amplitudes are less certain.
+Delay: at a single speed, a delay of the load encoder looks like hysteresis.
+
+Rounding: if a motor creeps from count to count, or rests just short of a count, its reading is wrong by a
+fraction of a count *in the direction of motion*. This error also looks like hysteresis, and depends on speed.
+
+Turning points: each is known only to within a count and the travel between two samples (its reach). A narrow
+or steep hysteresis is known only as accurately as its turning points. The coefficient of a turning point's
+column is a bounded fraction of its reach. With fine encoders and fast sampling these columns vanish.
+
+Swing: the load on the gear's spring amplifies the error that excites it, more at higher speed. The swing is
+separable from the orders if there are two speeds. At a single speed the amplitudes are less certain.
 """
 
 from __future__ import annotations
@@ -35,32 +38,32 @@ TEXTS = {
 }
 UNITS = {DELAY: "ms", ROUNDING: "counts", SWING: "ms\N{SUPERSCRIPT TWO}"}
 SWING_MS2 = 25.0
-"""Prior standard deviation of the swing: 1 / (2 pi f)^2 of a load with natural frequency f = 32 Hz."""
+"""Prior standard deviation of the swing: 1 / (2 pi f)^2 for a load with natural frequency f = 32 Hz."""
 SWING_MS3 = 50.0
-"""Prior standard deviation of the swing's damping part, 2 z / (2 pi f)^3, with damping ratio z."""
+"""Prior standard deviation of the swing's damping term, 2 z / (2 pi f)^3, with damping ratio z."""
 SWING_COUNT_ARCSEC = 2.0
-"""Largest motor count for which swing is fitted. The sawtooth of a coarser encoder also depends on speed
-and looks like swing."""
+"""Upper limit of a motor count, referred to the load, for which swing is fitted. The sawtooth error of a
+coarser encoder also depends on speed and looks like swing."""
 MOST_TURNS = 80
 SMALLEST_TURN = 1e-3
 COUNTS = 0.29
-"""Standard deviation of a uniformly distributed position within a count, or within the reach of a
-turning point."""
+"""Standard deviation of a uniform distribution over a count or over a turning point's reach, in that unit."""
 SPEEDS_COUNTS_S = (
     0, 25, *range(50, 800, 50), *range(800, 1600, 100), *range(1600, 3200, 200),
     3200, 4800, 6400, 12800, np.inf,
 )  # fmt: skip
-"""Edges of the speed classes of equal rounding error, counts per second; rest is a class of its own. A drive
-that receives and is read in whole counts in the same cycles lags by a constant fraction of a count at
-constant speed. Simulated servos read wrong by 0.08 to 0.22 counts (rms over speeds) from 300 to 12,000
-counts per second. With a lag of 5 ms the error repeats every 200 counts per second; a class is a quarter
-of this."""
+"""Edges of the speed classes, counts per second. Within a class the rounding error is constant; rest is a
+separate class. If a drive receives and returns whole counts in the same cycles, it lags by a constant
+fraction of a count at constant speed. In simulated servos, the reading error is 0.08 to 0.22 counts (rms over
+speeds) from 300 to 12,000 counts per second. With a lag of 5 ms the error repeats every 200 counts per
+second; a class is a quarter of this."""
 SHARE = 0.1
-"""Share of a nuisance column that other columns do not explain, below which the nuisance is omitted."""
+"""Minimum fraction of a nuisance column's sum of squares that other columns leave unexplained; below it, the
+nuisance is omitted."""
 
 
 def zeros(zero: IntArray, number: int) -> Nuisances:
-    """Returns a column for each of ``number`` absolute zeros; ``zero`` (b,) assigns the blocks."""
+    """Returns a column for each of ``number`` absolute zeros; ``zero`` (b,) is the zero of each block."""
     return unknown(zero[:, np.newaxis] == np.arange(number), [f"zero {each}" for each in range(number)])
 
 
@@ -72,10 +75,10 @@ def delay_column(design: Design) -> FloatArray:
 
 
 def rounding_columns(design: Design) -> tuple[FloatArray, FloatArray]:
-    """Returns columns of one count in the direction of motion, arcsec, and their prior standard deviations,
-    counts.
+    """Returns rounding-error columns, arcsec per count, and their prior standard deviations, counts.
 
-    The columns, shape (b, classes + 2), belong to rest, all motion, and each speed class.
+    The columns, shape (b, classes + 2), belong to rest, all motion, and each speed class. They have the sign
+    of an error in the direction of motion.
     """
     blocks, samples = design.blocks, design.samples
     count_arcsec = samples.count_deg / samples.ratio * ARCSEC_PER_DEG
@@ -93,10 +96,11 @@ def rounding_columns(design: Design) -> tuple[FloatArray, FloatArray]:
 
 
 def turn_columns(design: Design, effects: Sequence[Effect]) -> tuple[FloatArray, list[Prior]]:
-    """Returns a column for each relevant turning point, shape (b, turns): the change if it lay further out.
+    """Returns a column for each relevant turning point, shape (b, turns), and the priors of the coefficients.
 
-    A turning point lies anywhere within its count, between its sample and the intersection of straight lines;
-    its expected position is halfway.
+    A column is the change of the error if the turning point lies further out by its reach. A turning point
+    lies anywhere within its count, and between its sample and the intersection of straight lines through the
+    neighbouring samples; its expected position is halfway.
     """
     change, missed, turn = design.turn_effects(effects)
     weight = np.bincount(turn, design.blocks.count * change**2)
@@ -110,7 +114,7 @@ def turn_columns(design: Design, effects: Sequence[Effect]) -> tuple[FloatArray,
 
 
 def is_turn(name: str) -> bool:
-    """Returns True for the column of a turning point."""
+    """Returns True if a column of this name belongs to a turning point."""
     return name.startswith("turn ")
 
 
@@ -119,13 +123,13 @@ def swing(
     waves: Iterable[tuple[float, FloatArray, FloatArray]],
     mean: Callable[[FloatArray], FloatArray] = lambda columns: columns,
 ) -> Nuisances:
-    """Returns the swing of the load beyond the waves that excite it, arcsec per ms squared and per ms cubed.
+    """Returns two columns of the load's swing beyond the waves that excite it, arcsec/ms^2 and arcsec/ms^3.
 
-    ``rate`` (n,) is the motor speed, radians per second. ``waves`` contain the orders, their contribution,
-    (n,), and that contribution a quarter of a wave later. ``mean`` averages columns (n, 2) like the
-    observations. Driven by a cos(w t) well below its natural frequency f, a load on a spring with damping
-    ratio z responds with (1 + (w / 2 pi f)^2) a cos(w t) + 2 z (w / 2 pi f)^3 a sin(w t): larger, and lagging
-    in both directions.
+    ``rate`` (n,) is the motor speed, radians per second. ``waves`` contains, for each order, the order, its
+    contribution (n,), and its contribution a quarter period later. ``mean`` averages columns (n, 2) like the
+    observations. A load on a spring with natural frequency f and damping ratio z responds to a cos(w t), well
+    below f, with (1 + (w / 2 pi f)^2) a cos(w t) + 2 z (w / 2 pi f)^3 a sin(w t). The response is larger than
+    the excitation and lags in both directions.
     """
     columns = np.zeros((len(rate), 2))
     for order, wave, later in waves:
@@ -138,8 +142,8 @@ def swing(
 def speeds_differ(speed_deg_s: FloatArray, count: FloatArray) -> bool:
     """Returns True if the speeds differ enough to separate swing from the orders that excite it.
 
-    More than `SHARE` of the squared speed must remain after subtracting the mean; ``count`` (n,) weights the
-    speeds.
+    More than the fraction `SHARE` of the squared speed's sum of squares must remain after a fit of its mean.
+    ``count`` (n,) weights the speeds.
     """
     squared = speed_deg_s**2
     fourth = float(count @ squared**2)
@@ -152,7 +156,7 @@ def nuisances_of(
     effects: Sequence[Effect],
     waves: Sequence[tuple[float, FloatArray, FloatArray]] = (),
 ) -> Nuisances:
-    """Returns the columns of zeros and the named nuisances; ``waves`` as for `swing`."""
+    """Returns the columns of the zeros and of the named nuisances; for ``waves`` see `swing`."""
     parts = [zeros(design.blocks.zero, design.samples.zeros)]
     if DELAY in nuisances:
         parts.append(unknown(delay_column(design), [DELAY]))
@@ -171,7 +175,7 @@ def nuisances_of(
 
 
 def share_left(columns: FloatArray, others: FloatArray, weight: FloatArray) -> float:
-    """Returns the smallest share of a column's weighted squares that the other columns do not explain."""
+    """Returns the smallest fraction of a column's weighted sum of squares that ``others`` do not explain."""
     both = np.concatenate([others, columns], axis=1)
     gram = both.T @ (weight[:, np.newaxis] * both)
     split = others.shape[1]

@@ -1,8 +1,9 @@
-"""Selection of the orders in a record, by least squares at the true angles.
+"""Selects the orders in a record, by least squares at the true angles.
 
-Samples are never evenly spaced in angle, and a stepping test of 43.56 degrees samples a motor turn 8.26
-times. A Fourier transform by sample number would show order 6 at 2.26 and order 8 at 0.26. A fit at the true
-angles shows each order at its own number, or reports that it is not separable from another.
+Samples are never evenly spaced in angle. A stepping test with steps of 43.56 degrees, for example, samples a
+motor turn 8.26 times, and a Fourier transform by sample number would show order 6 at 2.26 and order 8 at
+0.26. A fit at the true angles shows each order at its own number, or reports that it is not separable from
+another.
 """
 
 from __future__ import annotations
@@ -40,16 +41,16 @@ class Family(Enum):
     """Source of an order."""
 
     MOTOR = "motor"
-    """k: the wave generator, the motor encoder."""
+    """k periods per motor turn: wave generator, motor encoder."""
     LOAD = "load"
-    """k / N: load encoder, circular spline or flexspline pitch."""
+    """k / N periods per motor turn: load encoder, pitch of circular spline or flexspline."""
     FLEXSPLINE = "flexspline"
-    """k (1 + 1/N): the wave generator as the flexspline sees it."""
+    """k (1 + 1/N) periods per motor turn: wave generator relative to the flexspline."""
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """An order of the motor angle."""
+    """An order: a harmonic of the motor angle, the load angle or the angle relative to the flexspline."""
 
     family: Family
     number: int
@@ -67,7 +68,7 @@ class Order:
 
     @classmethod
     def flexspline(cls, number: int, ratio: float) -> Order:
-        """Returns the order with these periods per turn of the wave generator against the flexspline."""
+        """Returns the order with this number of periods per turn of the wave generator in the flexspline."""
         return cls(Family.FLEXSPLINE, number, number * (1.0 + 1.0 / ratio))
 
     def __str__(self) -> str:
@@ -76,7 +77,7 @@ class Order:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Result of the selection."""
+    """Result of the selection of orders."""
 
     chosen: tuple[Order, ...]
     unresolved: tuple[Order, ...]
@@ -85,7 +86,7 @@ class Selection:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Estimate of one order next to all others: its amplitude, or the amplitude that it would add."""
+    """Estimate of one order in a fit with the selected orders, whether or not it is selected itself."""
 
     order: Order
     amplitude_arcsec: float
@@ -94,18 +95,18 @@ class Line:
     standard_error_arcsec: float
     """Standard error of the cosine or sine coefficient, whichever is larger."""
     threshold_arcsec: float
-    """Amplitude that noise alone exceeds, at any of the orders, in one of a hundred records."""
+    """Amplitude that noise exceeds, for any candidate order, with the family-wise probability of error."""
     aliases: tuple[Order, ...] = ()
     """Orders that are not separable from this order in the record."""
 
     @property
     def significant(self) -> bool:
-        """True if the order exceeds noise and has no aliases."""
+        """True if the amplitude exceeds its threshold and the order has no aliases."""
         return self.amplitude_arcsec > self.threshold_arcsec and not self.aliases
 
     @property
     def fall_in_chi_square(self) -> float:
-        """Rise in chi square without the order."""
+        """Fall in chi square due to the order."""
         return (self.amplitude_arcsec / max(self.standard_error_arcsec, 1e-12)) ** 2
 
     @property
@@ -115,20 +116,20 @@ class Line:
 
 
 def threshold(candidates: int, family_wise: float) -> float:
-    """Returns the fall in chi square (two coefficients) that the best candidate exceeds by chance.
+    """Returns the fall in chi square that the best of the candidates exceeds by chance.
 
-    ``family_wise`` is the probability of this.
+    ``family_wise`` is the probability of this chance. Each candidate has two coefficients.
     """
     return -2.0 * math.log(family_wise / max(candidates, 1))
 
 
 class _Left(NamedTuple):
-    """Part of an order that the others in a fit do not explain."""
+    """Part of an order that the other orders in a fit do not explain."""
 
     share: float
-    """Remaining share of its information."""
+    """Fraction of the order's information that remains."""
     fall: float
-    """Fall in chi square."""
+    """Fall in chi square due to the order."""
     cosine: float
     sine: float
     error: float
@@ -144,7 +145,7 @@ class _Left(NamedTuple):
 
 
 class _Candidates:
-    """Candidate orders, with all other columns of the fit eliminated once."""
+    """Candidate orders, after elimination of all other columns of the fit."""
 
     def __init__(self, number: int, system: System) -> None:
         information, right, limited, _ = system
@@ -185,9 +186,9 @@ def select(
 ) -> Selection:
     """Selects orders by forward selection with removal.
 
-    An order enters if it lowers chi square by more than `threshold` (which all candidates together exceed by
-    chance with probability ``family_wise``) and its amplitude is at least ``smallest_arcsec``. It is removed
-    if later ones replace it.
+    An order enters if it lowers chi square by more than `threshold` and its amplitude is at least
+    ``smallest_arcsec``. The probability that any candidate exceeds the threshold by chance is
+    ``family_wise``. An order is removed if orders that enter later replace it.
     """
     waves = _Candidates(len(candidates), system)
     needed = threshold(len(candidates), family_wise)
@@ -218,7 +219,7 @@ def select(
 def spectrum(
     orders: Sequence[Order], chosen: Collection[Order], system: System, family_wise: float = 0.01
 ) -> tuple[Line, ...]:
-    """Returns the line of each order; the ``chosen`` orders are in the fit."""
+    """Returns the spectral line of each order, in a fit with the ``chosen`` orders."""
     waves = _Candidates(len(orders), system)
     root = math.sqrt(threshold(len(orders), family_wise))
     inside = [at for at, each in enumerate(orders) if each in chosen]

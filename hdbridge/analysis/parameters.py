@@ -1,9 +1,10 @@
 """Parameters of findings with 95 % intervals, including systematic errors that leave no residual.
 
-A sandwich over blocks does not see these errors, because they are constant over the whole record. Each is a
-column with a standard deviation, and shifts the parameters by the amount that the fit absorbs. Its sources
-are the uncertainty of an effect's law, and causes separable from a finding only by the noise of a measured
-channel (an eccentric mass winds the gear up once per turn, like run-out of the load encoder).
+A sandwich estimate over blocks does not include these errors, because they are constant over the whole
+record. Each error is a column of one standard deviation, and shifts the parameters by the amount that the fit
+absorbs. Its source is either the uncertainty of an effect's law, or an undetected cause that only a measured
+channel separates from the finding. An eccentric mass, for example, winds the gear up once per load turn, like
+run-out of the load encoder.
 """
 
 from __future__ import annotations
@@ -31,18 +32,18 @@ from hdbridge.units import unit_of
 
 
 class Confounded(NamedTuple):
-    """Undetected cause that may have biased a finding."""
+    """An undetected cause that may bias a finding."""
 
     name: str
     shift: FloatArray
-    """Shift of the fit's parameters per standard deviation of the undetected part, shape (p, k)."""
+    """Shift of the fit's parameters for one standard deviation of the undetected cause, shape (p, k)."""
 
 
 def confounded(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[Confounded]:
-    """Yields causes of typical size that would go undetected next to the effect at ``place``."""
+    """Yields causes that, at typical size, would be undetected in the presence of the effect at ``place``."""
     effects, scales = fitted.hypothesis.effects, estimator.scales
     held = zip(fitted.parameters, fitted.information.tolist(), strict=True)
-    known = {each.effect for each, information in held if information}  # as calibrated, not changed
+    known = {each.effect for each, information in held if information}  # held by their calibration
     if place in known:
         return
     for other, columns, noise in _alike(estimator, fitted, place):
@@ -74,9 +75,10 @@ def systematic(estimator: Estimator, fitted: Fitted) -> FloatArray:
 
 
 def _alike(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[tuple[Effect, FloatArray, float]]:
-    """Yields causes that are separable from the effect only by a measured channel.
+    """Yields causes that only a measured channel separates from the effect.
 
-    Each has its weighted columns at typical size, and the share of channel noise in their squares.
+    Each comes with its weighted columns at typical size, and with the fraction of their sum of squares that
+    is due to channel noise.
     """
     effect, ratio = fitted.hypothesis.effects[place], estimator.data.ratio
     start = fitted.hypothesis.start
@@ -99,13 +101,13 @@ def _alike(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[tuple[E
         yield other, estimator.weighted(columns * typical), noise
 
 
-# Final fit for the parameters, including the swing of the load.
+# Final fit of the parameters, including the swing of the load.
 
 
 def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
-    """Refits a hypothesis with the swing excited by its waves, and with the tangents of all shapes.
+    """Refits a hypothesis with the load swing that its waves excite, and with more shapes free (`FOUND`).
 
-    At a single speed the swing is left out, because it is indistinguishable from the orders.
+    At a single speed the swing is omitted, because it is not separable from the orders.
     """
     plain = estimator.fit(replace(fitted.hypothesis, nuisances=_shaken(estimator, fitted)))
     found = estimator.fit(plain.hypothesis, moves=FOUND)
@@ -115,9 +117,10 @@ def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
 
 
 def _shaken(estimator: Estimator, fitted: Fitted) -> Nuisances | None:
-    """Returns columns of the load's swing: in phase by frequency squared, lagging by frequency cubed.
+    """Returns two columns of the load's swing: in phase with frequency squared, and lagging with its cube.
 
-    The second changes sign with the direction. None without orders, or at a single speed.
+    The lagging column changes sign with the direction of motion. Returns None without orders, or at a single
+    speed.
     """
     motion = estimator.data.full.motion
     speed = motion.motor_speed_deg_s
@@ -132,24 +135,24 @@ def _shaken(estimator: Estimator, fitted: Fitted) -> Nuisances | None:
     return swing(RAD_PER_DEG * speed, both, estimator.at_points)
 
 
-# Parameters of a fitted effect with 95 % intervals, valid for coloured noise.
+# Parameters of a fitted effect with 95 % intervals that allow for coloured noise.
 
 
 WAVE: Final = ("amplitude_arcsec", "phase_deg")
 PARTS: Final = (6, 12)
-"""Numbers of equal parts into which a record is divided; each part counts as one observation."""
+"""Numbers of equal parts into which a record is divided. Each part contributes one observation."""
 STEP_95: Final = 11.03
-"""95 % point of the location of the maximum of a Brownian motion with drift -|t| / 2 on either side."""
+"""95 % range of the position of the maximum of a Brownian motion with drift -|t| / 2 on either side."""
 
 
 def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
-    """Returns the covariance of all parameters, (p, p), scaled for 95 % intervals by `NORMAL_95`.
+    """Returns the covariance of all parameters, (p, p), such that `NORMAL_95` gives 95 % intervals.
 
-    It is the largest of several sandwiches: over blocks of seconds, for wandering noise, and over `PARTS` of
-    the record, for errors of the hypothesis that differ between the parts. Few parts estimate a variance
-    poorly, so Student's quantile replaces the normal one, with one degree of freedom less than the parts that
-    carry the parameter (Bester, Conley and Hansen 2011; effective number of clusters as in Carter, Schnepel
-    and Steigerwald 2017). Systematic errors are added (`systematic`).
+    It is the largest of several sandwich estimates: over blocks of seconds, for correlated noise, and over
+    `PARTS` of the record, for errors of the hypothesis that differ between the parts. A variance estimated
+    from few parts is inaccurate, so Student's quantile replaces the normal one. Its degrees of freedom are
+    the effective number of parts that determine the parameter, less one (Bester, Conley and Hansen 2011;
+    Carter, Schnepel and Steigerwald 2017). Systematic errors are added (`systematic`).
     """
     tangent, residual = fitted.tangent, fitted.residual
     directions, known = fitted.linearised.directions, fitted.linearised.known
@@ -199,9 +202,9 @@ def parameters_of(
 
 
 def named_parameters(effect: Effect, columns: Sequence[Column], spread: FloatArray) -> dict[str, Parameter]:
-    """Returns an effect's parameters, with intervals from the covariance (c, c) of its ``columns``.
+    """Returns an effect's parameters, with intervals from the covariance ``spread`` (c, c) of its columns.
 
-    Omits parameters without influence on the record.
+    Omits parameters that do not influence the record.
     """
     names: dict[str, str] = {}
     for each in effect.named_coefficients():
@@ -231,10 +234,11 @@ def named_parameters(effect: Effect, columns: Sequence[Column], spread: FloatArr
 def _stepwise(
     estimator: Estimator, fitted: Fitted, effect: Effect, sizes: Mapping[str, Parameter]
 ) -> dict[str, Parameter]:
-    """Returns sizes and times of steps.
+    """Returns the sizes and times of steps, with their intervals.
 
-    A step first seen at one sample happened after the previous sample. Noise may shift it by up to `STEP_95`
-    (sigma / size)^2 samples, the 95 % range of the most likely position of a step in white noise (Yao 1987).
+    A step that is first seen at one sample occurred after the previous sample. Noise may shift its most
+    likely position by up to `STEP_95` (sigma / size)^2 samples, the 95 % range for a step in white noise (Yao
+    1987).
     """
     result: dict[str, Parameter] = {}
     time_s = estimator.time_s

@@ -1,11 +1,11 @@
-"""Preparation of records: white noise, driving angle, observed error, averaging.
+"""Prepares records: white noise, motor angle, observed error, averaging.
 
 White noise is estimated from the spectrum of the error, never from the residual of a fit, because a noise
 model fitted to a residual absorbs effects. Third differences suppress slow effects of any size. They retain
-fast effects (vibration, interpolation error of an encoder), so their deviation is an upper bound. Fast
-effects are a few lines of the spectrum, and the level between the lines is the noise. Standing and moving
-samples are treated separately, with quantisation as a lower bound. Slow noise (wander, drift) is handled
-later by statistics over blocks of seconds.
+fast effects (vibration, interpolation error of an encoder), so their standard deviation is an upper bound.
+Fast effects are a few lines of the spectrum, and the level between the lines is the noise. Standing and
+moving samples are treated separately, with quantisation as a lower bound. Slow noise (drift) is handled later
+by statistics over blocks of seconds.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from hdbridge.records.recording import Segment
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 SEGMENTS = (128, 64, 32)
-"""Segment lengths of the spectrum, samples. The longest length with enough segments is used, because it has
-the narrowest lines."""
+"""Segment lengths for the spectrum, samples. The longest one with enough segments is used, because its lines
+are narrowest."""
 ORDINATES = 150
-"""Number of spectral ordinates that determine the noise level to 10 %."""
+"""Minimum number of spectral ordinates, which determines the noise level to 10 %."""
 LOWEST = 0.125
-"""Frequency, as a share of the sampling rate, below which the spectrum may contain slow effects."""
+"""Frequency, relative to the sampling rate, below which the spectrum may contain slow effects."""
 QUARTILE = 0.25
-"""Quantile of the spectrum that is taken as the noise level. White noise has less than 0.29 of its mean
-power at this share of frequencies. If lines fill a third of the spectrum, the deviation is overestimated
-by a quarter."""
+"""Quantile of the spectrum from which the noise level is derived. White noise has less than 0.29 of its mean
+power at this fraction of the frequencies. If lines fill a third of the spectrum, the standard deviation is
+overestimated by a quarter."""
 
 
 def noise_arcsec(
@@ -49,7 +49,7 @@ def noise_arcsec(
 ) -> FloatArray:
     """Returns the standard deviation of the white noise of each sample, shape (n,).
 
-    ``starts`` are the first samples of concatenated records.
+    ``starts`` contains the indices of the first samples of concatenated records.
     """
     floor = load_count_arcsec / np.sqrt(12.0)
     if not commanded:
@@ -60,16 +60,17 @@ def noise_arcsec(
     for rows, part in ((still, third[inner]), (~still, third[~inner])):
         size = third_deviation(part) if len(part) >= 20 else 0.0
         result[rows] = max(min(size, between_lines(error_arcsec, rows, starts)), floor, 0.02)
-    if np.any(still) and np.any(~still):  # noise in motion is at least half of that at rest
+    if np.any(still) and np.any(~still):  # assume at least half of the noise at rest in motion
         result[~still] = max(float(result[~still][0]), 0.5 * float(result[still][0]))
     return result
 
 
 def between_lines(values: FloatArray, rows: BoolArray, starts: Sequence[int] = (0,)) -> float:
-    """Returns the white noise of ``values`` in the given rows, as a standard deviation.
+    """Returns the standard deviation of the white noise of ``values`` in the given rows.
 
-    It is the level between the lines of the spectra; infinite if too few rows are consecutive. Third
-    differences remove slow effects, and their spectrum is divided by that of differenced white noise.
+    It is the level between the lines of the spectrum, or infinity if too few rows are consecutive. Third
+    differences remove slow effects. Their spectrum is divided by that of the third differences of white
+    noise.
     """
     edge = np.zeros(len(rows) + 1, dtype=bool)
     edge[1:-1] = np.diff(rows)
@@ -81,7 +82,7 @@ def between_lines(values: FloatArray, rows: BoolArray, starts: Sequence[int] = (
             continue
         window = np.hanning(size - 1)[1:-1]
         power = np.abs(np.fft.rfft(np.diff(np.stack(segments), 3, axis=1) * window)) ** 2
-        # Power that one unit sample contributes to each frequency, summed over the samples.
+        # Power of unit white noise at each frequency: the sum of the contributions of unit samples.
         power /= np.sum(np.abs(np.fft.rfft(np.diff(np.eye(size), 3, axis=1) * window)) ** 2, axis=0)
         level = float(np.quantile(power[:, round(LOWEST * size) :], QUARTILE))
         return float(np.sqrt(level / -np.log1p(-QUARTILE)))
@@ -94,9 +95,10 @@ def between_lines(values: FloatArray, rows: BoolArray, starts: Sequence[int] = (
 REPEATS = 3
 """Minimum number of recordings that count as repetitions."""
 ALIKE = 2.0
-"""Maximum ratio of the durations, and of the travels, of recordings that repeat each other."""
+"""Maximum ratio of the longest to the shortest duration, and of the travels, of repeated recordings."""
 ON_THE_WAY = ("move", "precondition", "step", "settle")
-"""Legs that only move the axis into position. They carry the elastic state, but only their rests are used."""
+"""Kinds of legs that only move the axis into position. They determine the elastic state, but only their rests
+are used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,20 +106,20 @@ class Measured:
     """A record and the known properties of its samples; arrays of shape (n,)."""
 
     record: Record
-    """The measured record. The motion before each of its ``starts`` is unknown."""
+    """Measured record. The motion before each of its ``starts`` is unknown."""
     kinds: tuple[str, ...]
-    """Kinds of motion, by the names of a recording's legs."""
+    """Names of the kinds of motion, those of a recording's legs."""
     kind: IntArray
-    """Index into ``kinds``."""
+    """Index into ``kinds`` of each sample."""
     zero: IntArray
-    """Index of the absolute zero, 0 .. zeros - 1."""
+    """Index of each sample's absolute zero, 0 .. zeros - 1."""
     states: Mapping[int, Start] = field(default_factory=dict)
     """Known elastic states by sample index."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """Consecutive samples through which the elastic state is carried."""
+    """Consecutive samples over which the elastic state is tracked."""
 
     rows: slice
     start: Start | None
@@ -130,23 +132,23 @@ class Samples:
 
     ratio: float
     motion: Motion
-    """Driving angle, time, speed, acceleration and the recorded channels."""
+    """Motor angle, time, speed, acceleration and the recorded channels."""
     rested_deg: FloatArray
-    """Driving angle under another assumption about rests (`Driven`)."""
+    """Motor angle under another assumption about its position at rest (`Driven`)."""
     load_deg: FloatArray
     """Measured load angle."""
     error_arcsec: FloatArray
-    """Observed transmission error about an arbitrary zero."""
+    """Observed transmission error, relative to an arbitrary zero."""
     sigma_arcsec: FloatArray
-    """White noise of each sample, standard deviation."""
+    """Standard deviation of the white noise of each sample."""
     usable: BoolArray
     kinds: tuple[str, ...]
     kind: IntArray
-    """Index into ``kinds``."""
+    """Index into ``kinds`` of each sample."""
     zero: IntArray
-    """Index of the absolute zero, 0 .. zeros - 1."""
+    """Index of each sample's absolute zero, 0 .. zeros - 1."""
     chains: tuple[Chain, ...]
-    """Chains, by sample indices."""
+    """Chains of samples with a known motion between them; rows are those of the full record."""
     reading: Reading
     """Resolution of the motor encoder."""
     commanded: bool
@@ -162,7 +164,7 @@ class Samples:
 
     @property
     def repeated(self) -> bool:
-        """True for several recordings of similar duration and travel; not for the tasks of a plan."""
+        """True for several recordings of similar duration and travel; False for the tasks of a plan."""
         rows = [each.rows for each in self.chains]
         durations = np.array([np.ptp(self.time_s[each]) for each in rows])
         travels = np.array([np.sum(np.abs(np.diff(self.motor_deg[each]))) for each in rows])
@@ -171,7 +173,7 @@ class Samples:
 
     @property
     def count_deg(self) -> float:
-        """One count of the motor encoder; 0 if quantisation is not visible."""
+        """One count of the motor encoder; 0 if counts are not visible."""
         return self.reading.count_deg
 
     @property
@@ -181,13 +183,13 @@ class Samples:
 
     @property
     def time_s(self) -> FloatArray:
-        """Time on the record's clock."""
+        """Record time of each sample, seconds."""
         assert self.motion.time_s is not None
         return self.motion.time_s
 
     @property
     def speed_deg_s(self) -> FloatArray:
-        """Speed of the motor, signed."""
+        """Motor speed, signed."""
         assert self.motion.motor_speed_deg_s is not None
         return self.motion.motor_speed_deg_s
 
@@ -196,11 +198,11 @@ class Samples:
         return np.isin(self.kind, [at for at, each in enumerate(self.kinds) if each in names])
 
     def along(self, chain: Chain) -> Motion:
-        """Returns the motion of one chain."""
+        """Returns the motion over the rows of a chain."""
         return motion_at(self.motion, chain.rows)
 
     def delayed(self, delay_s: float) -> Samples:
-        """Returns the samples with the motor angle ``delay_s`` earlier, to correct a delayed load reading."""
+        """Corrects a delayed load reading: replaces the motor angle by its value ``delay_s`` earlier."""
         motor = self.motor_deg.copy()
         for chain in self.chains:
             time, angle = self.time_s[chain.rows], self.motor_deg[chain.rows]
@@ -211,12 +213,12 @@ class Samples:
 
 
 def motion_at(motion: Motion, rows: slice | IntArray) -> Motion:
-    """Returns a motion at some of its samples."""
+    """Returns a motion restricted to some of its samples."""
     return of_each(motion, lambda values: values[rows])
 
 
 def of_each(motion: Motion, change: Callable[[FloatArray], FloatArray]) -> Motion:
-    """Applies a function to each array of a motion."""
+    """Returns a motion after applying a function to each of its arrays."""
     given: dict[str, Any] = {each.name: getattr(motion, each.name) for each in fields(motion)}
     changed = {name: change(each) for name, each in given.items() if isinstance(each, np.ndarray)}
     measured = {channel: change(values) for channel, values in motion.measured.items()}
@@ -230,11 +232,12 @@ def observe(
     against_command: bool,
     expected: Callable[[Motion], FloatArray] | None = None,
 ) -> Samples:
-    """Derives driving angle, error and noise of all samples, all marked usable.
+    """Derives motor angle, transmission error and noise of all samples, and marks all samples usable.
 
-    With ``against_command``, the error is relative to the driving angle if there is a command, else to the
-    encoder's counts. ``expected`` is a model's prediction, subtracted before the noise is estimated.
-    InputError if the record holds unusable values or the ratio does not match it.
+    With ``against_command``, the error is relative to the motor angle derived from the command, if there is a
+    command, else to the encoder reading. ``expected`` is a model's prediction, which is subtracted before the
+    noise is estimated. Raises InputError if the record contains unusable values or the ratio does not match
+    it.
     """
     record = measured.record
     name = f"{record.source}: " if record.source else ""
@@ -265,7 +268,7 @@ def observe(
     ]
     driving, speed, acceleration, rested = (np.concatenate(each) for each in zip(*pieces, strict=True))
     for angle in (driving, rested):
-        angle.setflags(write=False)  # allows its reversals to be cached
+        angle.setflags(write=False)  # a read-only array's reversals can be cached
     motion = Motion(driving, time, record.measured, speed, acceleration, load_deg=driving / ratio)
     against = driving if against_command and target is not None else position
     error = (record.load_position_deg - against / ratio) * ARCSEC_PER_DEG
@@ -292,7 +295,7 @@ def observe(
     )
 
 
-# Data of a diagnosis: observed error and motion on at most `MOST_POINTS` points.
+# Data of a diagnosis: observed error and motion at no more than `MOST_POINTS` points.
 
 
 MOST_POINTS = 100_000
@@ -301,43 +304,43 @@ AVERAGED_POINTS = 50_000
 """Approximate number of points after averaging, which bounds time and memory and suffices for slow
 effects."""
 SHORT = 0.77
-"""Length of every other run as a share of the mean; the runs between are 1.6 times as long."""
+"""Length of every other run, relative to the mean length. The runs between are 1.6 times as long."""
 LEAST_SAMPLES = 60
 LEAST_SETTLED = 0.2
-"""Minimum share of samples outside fast moves; below it, fast moves are used as well."""
+"""Minimum fraction of samples outside fast moves; below it, fast moves are used as well."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Measurement prepared for diagnosis: samples and the points to fit."""
+    """A measurement prepared for diagnosis: all samples, and the points to fit."""
 
     ratio: float
     points: Samples
     """Points to fit: samples, or means over runs of samples."""
     full: Samples
-    """Every sample."""
+    """All samples."""
     runs: IntArray
-    """First sample of each point's run, shape (points,)."""
+    """Index of the first sample of each point's run, shape (points,)."""
     motor_count_arcsec: float
-    """One count of the motor encoder at the load; if not visible, the count with the same jitter."""
+    """One count of the motor encoder, referred to the load; if not visible, a count with the same noise."""
     load_count_arcsec: float
-    """One count of the load encoder; 0 if not visible."""
+    """One count of the load encoder; 0 if counts are not visible."""
     noise_arcsec: float
-    """White noise of a point."""
+    """Standard deviation of the white noise of a point, rms over all points."""
     period_s: float
     """Median time between samples."""
     standstill: bool
     reversals: int
-    """Number of reversals of the driving angle with travel on both sides, within single records."""
+    """Number of reversals of the motor with sufficient travel on both sides, summed over the chains."""
     remarks: tuple[str, ...]
     """Shortcomings of the record, in words."""
 
     def over(self, runs: IntArray) -> Observed:
-        """Returns the same samples averaged over other runs, given by their first samples."""
+        """Returns the same samples averaged over other runs, which are given by their first samples."""
         return replace(self, points=_averaged(self.full, runs), runs=runs)
 
     def having(self, full: Samples) -> Observed:
-        """Returns the same record with other samples."""
+        """Returns the measurement with its samples replaced, and averaged over the same runs."""
         return replace(self, full=full, points=_averaged(full, self.runs))
 
     @property
@@ -346,11 +349,11 @@ class Observed:
         return self.points.motion
 
     def mean(self, values: FloatArray) -> FloatArray:
-        """Averages a quantity of every sample, (n,) or (n, p), over the points: (points,) or (points, p)."""
+        """Averages a per-sample quantity, (n,) or (n, p), over each point: (points,) or (points, p)."""
         return means(values, self.runs)
 
     def at_points(self, values: FloatArray) -> FloatArray:
-        """Averages a quantity of every sample over the usable points, like the observations."""
+        """Averages a per-sample quantity over each usable point, like the observations."""
         found, usable = self.mean(values), self.points.usable
         return found if usable.all() else np.asarray(found[usable])
 
@@ -364,8 +367,8 @@ def gather(
 ) -> Observed:
     """Prepares a record for diagnosis.
 
-    ``expected`` is a model's prediction, subtracted before the noise is estimated. InputError if the record
-    is too short or the ratio does not match it.
+    ``expected`` is a model's prediction, which is subtracted before the noise is estimated. Raises InputError
+    if the record is too short or the ratio does not match it.
     """
     if len(record) < LEAST_SAMPLES:
         raise InputError(
@@ -415,7 +418,7 @@ def gather(
 
 
 def _kinds(time: FloatArray, legs: Sequence[Segment]) -> tuple[tuple[str, ...], IntArray]:
-    """Returns the kinds of legs, and the kind of each sample."""
+    """Returns the names of the kinds of legs, and the index of each sample's kind."""
     names = tuple(dict.fromkeys(["other", *(each.kind for each in legs)]))
     kind = np.zeros(len(time), dtype=np.intp)
     for each in legs:
@@ -425,9 +428,9 @@ def _kinds(time: FloatArray, legs: Sequence[Segment]) -> tuple[tuple[str, ...], 
 
 
 def _runs(count: int, starts: Sequence[int]) -> IntArray:
-    """Returns the first samples of runs to average; no run crosses a start.
+    """Returns the first samples of the runs to average; no run extends across a start.
 
-    Run lengths alternate, so no period is averaged out in all runs.
+    Run lengths alternate, so that no periodic effect is averaged out in all runs.
     """
     if count <= MOST_POINTS:
         return np.arange(count, dtype=np.intp)
@@ -440,7 +443,7 @@ def _runs(count: int, starts: Sequence[int]) -> IntArray:
 
 
 def means(values: FloatArray, runs: IntArray) -> FloatArray:
-    """Averages a quantity of every sample, (n,) or (n, p), over runs, given by their first samples."""
+    """Averages a per-sample quantity, (n,) or (n, p), over runs, which are given by their first samples."""
     if len(runs) == len(values):
         return values
     size = np.diff(np.append(runs, len(values)))

@@ -1,8 +1,8 @@
-"""Probability of a finding: a logistic formula of the evidence for and against it.
+"""Probability of a finding: a logistic function of the evidence for and against it.
 
-`Scales` holds its coefficients. tools/fit_probabilities.py fits them by ridge regression with fixed signs to
-findings of known cause, from two blind suites and synthetic records. docs/diagnosis.md reports the cross-
-validation.
+`Scales` contains the coefficients. tools/fit_probabilities.py fits them, by ridge regression with fixed
+signs, to findings with known causes from two blind suites and synthetic records. docs/diagnosis.md reports
+the cross-validation.
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ class Context:
     """Evidence against all findings of a record."""
 
     left_arcsec: float
-    """Root mean square of the residual beyond the noise."""
+    """Rms residual of the complete fit beyond the noise."""
     excess: float
-    """Chi square per point of the complete fit."""
+    """Chi square of the complete fit per degree of freedom."""
     unexplained: bool
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """Prior odds of a cause, from other joints of a fleet (`hdbridge.fleet.prior`)."""
+    """Prior of the causes, from other joints of a fleet (`hdbridge.fleet.prior`)."""
 
     right: Mapping[str, float]
     """Probability, by cause, that a finding of this cause is correct in a joint of this group."""
     words: Mapping[str, str]
     """Description of the prior by cause, for the output."""
     ranges: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
-    """Median and standard deviation between joints, by cause and parameter."""
+    """Median and standard deviation of a parameter over the joints, by cause and parameter name."""
 
     def log_odds(self, cause: str, scales: Scales) -> float:
-        """Returns the log odds of a cause relative to those in the records of the formula."""
+        """Returns the log odds of a cause, less those in the records to which the formula was fitted."""
         share = self.right.get(cause, scales.right)
         return math.log(share / (1.0 - share)) - math.log(scales.right / (1.0 - scales.right))
 
     def narrowed(self, finding: Finding) -> Finding:
-        """Combines the parameters with their ranges, unless the two disagree."""
+        """Combines a finding's parameters with their ranges in the fleet, unless the two disagree."""
         parameters = {
             name: each.combined(*self.ranges[finding.cause, name])
             if (finding.cause, name) in self.ranges
@@ -58,7 +58,7 @@ class Prior:
 
 
 def coefficients(scales: Scales) -> dict[str, float]:
-    """Returns the log odds per unit of each term, by name."""
+    """Returns the coefficient of each term, log odds per unit, by name."""
     return {
         "constant": scales.odds,
         "strength": scales.odds_strength,
@@ -72,7 +72,10 @@ def coefficients(scales: Scales) -> dict[str, float]:
 def features(
     gate: Gate, peak_arcsec: float, context: Context, scales: Scales, rank: float = 1.0
 ) -> dict[str, float]:
-    """Returns the terms of the formula by name; ``rank`` is the share of the largest finding's chi square."""
+    """Returns the terms of the formula by name.
+
+    ``rank`` is the finding's fall in chi square relative to that of the largest finding.
+    """
     return {
         "constant": 1.0,
         "strength": math.log(min(max(gate.robust, 1e-9) / gate.needed, scales.strong)),
@@ -107,9 +110,9 @@ def probability(terms: Mapping[str, float], scales: Scales, prior: float = 0.0) 
 
 
 def updated(score: float, prior: float, scales: Scales) -> float:
-    """Returns the probability from the log odds of the record and of a prior.
+    """Returns the probability from the log odds of the record (``score``) and of a prior.
 
-    A prior does not make a finding likely that the record alone does not support.
+    A prior cannot make a finding probable that the record alone does not support.
     """
     alone, most = 1.0 / (1.0 + math.exp(-score)), scales.surest
     if prior and alone < scales.named_from:

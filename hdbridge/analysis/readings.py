@@ -1,7 +1,7 @@
-"""Resolution of an angle: counts of its encoder, digits of its file, and jitter.
+"""Resolution of a recorded angle: encoder count, digits of the file, and jitter.
 
-Counts are visible in the record unless the file has too few digits or the noise is larger. The jitter is
-always known, from third differences during motion, which suppress slow changes.
+Counts are visible in a record unless the file has too few digits or the noise is larger than a count. The
+jitter is always known. It is derived from third differences during motion, which suppress slow changes.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from hdbridge.axis.effects import FloatArray
 
 SMALLEST_COUNT_DEG = 1e-5
 ROUNDED_DEG = 1e-6
-"""Floating-point tolerance for changes in whole counts."""
+"""Floating-point tolerance within which a change is a whole number of counts."""
 WHOLE_SHARE = 0.99
-"""Minimum share of the changes that are whole counts."""
+"""Minimum fraction of changes that are whole numbers of counts."""
 NEAREST = 200
 """Number of smallest differences between changes from which the count is determined."""
 DIGITS = 9
-"""Number of decimals from which a file counts as unrounded."""
+"""Number of decimals from which a file is treated as unrounded."""
 FINEST_COUNT_DEG = 360.0 / 2**20 - ROUNDED_DEG
-"""Smallest plausible count. A smaller step is a digit of the file, or a count hidden by noise."""
+"""Smallest plausible count. A smaller step is a digit of the file, or a count masked by noise."""
 COUNTS_PER_DIGIT = 6.0
 """Smallest count that can be recognised in a rounded file, in units of its last digit."""
 NEAR_COUNTS = 6
-"""Maximum span of four readings that show jitter, counts: twice the span of a flickering count."""
+"""Maximum span of four consecutive readings for estimating jitter, counts: twice the span of flicker."""
 LEAST_NEAR = 20
-"""Minimum number of such groups of readings."""
+"""Minimum number of groups of four readings for estimating jitter."""
 MOST_JITTER_DEG = 0.1
-"""Largest plausible standard deviation of a motor reading: the rounding of 1,000 counts a turn. Third
-differences above it are fast motion."""
+"""Largest plausible standard deviation of a motor reading: rounding at 1,000 counts per turn. Larger third
+differences are due to fast motion."""
 _THIRD = np.sqrt(20.0)
-"""Amplification of white noise by third differences: the root of 1 + 9 + 9 + 1."""
+"""Amplification of white noise by third differences: the square root of 1 + 9 + 9 + 1."""
 _MAD = 1.4826
 """Standard deviation of a normal distribution per median absolute deviation."""
 _UNIFORM = np.sqrt(12.0)
@@ -42,39 +42,40 @@ _UNIFORM = np.sqrt(12.0)
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Resolution and noise of the readings of an angle, degrees."""
+    """Resolution of an encoder angle: count and jitter, degrees."""
 
     count_deg: float
-    """One count of the encoder; 0 if not visible."""
+    """One count of the encoder; 0 if counts are not visible."""
     jitter_deg: float
-    """Standard deviation of a reading's error, including quantisation."""
+    """Standard deviation of the reading error, including quantisation."""
 
     @property
     def resolution_deg(self) -> float:
-        """Encoder count; if not visible, the count whose rounding equals the jitter."""
+        """Encoder count; if not visible, the count whose rounding error equals the jitter."""
         if self.count_deg >= FINEST_COUNT_DEG:
             return self.count_deg
         return max(self.count_deg, self._alike_deg)
 
     @property
     def unaided_deg(self) -> float:
-        """Resolution without a command, when motor vibration and reading noise are not separable.
+        """Resolution without a command, when motor vibration is not separable from reading noise.
 
-        Noise larger than the counts then limits the resolution too.
+        Noise larger than two counts then limits the resolution.
         """
         return self._alike_deg if self._alike_deg > 2.0 * self.count_deg else self.resolution_deg
 
     @property
     def _alike_deg(self) -> float:
-        """Encoder count whose rounding equals the jitter of the readings."""
+        """Encoder count whose rounding error equals the jitter."""
         return float(_UNIFORM * self.jitter_deg)
 
 
 def reading_of(angle_deg: FloatArray) -> Reading:
-    """Returns the resolution of an angle, shape (n,).
+    """Determines the resolution of a recorded angle, shape (n,).
 
-    A motion that bends within a few samples is not noise. If counts are visible, the jitter is therefore
-    taken from readings within a few counts of each other or, without such readings, from rounding.
+    A change of speed within a few samples is not noise. If counts are visible, the jitter is therefore
+    derived from consecutive readings within a few counts of each other or, without such readings, from
+    rounding.
     """
     count, jitter = quantum_deg(angle_deg), min(jitter_deg(angle_deg), MOST_JITTER_DEG)
     if not count or len(angle_deg) <= 3:
@@ -87,10 +88,10 @@ def reading_of(angle_deg: FloatArray) -> Reading:
 
 
 def jitter_deg(angle_deg: FloatArray) -> float:
-    """Returns the standard deviation of the reading error, degrees; 0 if too short or without motion.
+    """Returns the standard deviation of the reading error, degrees; 0 without motion or with few readings.
 
-    It uses third differences during motion, without the largest, which belong to the start or end of a
-    motion.
+    It is derived from third differences during motion. The largest are excluded, because they belong to the
+    start or end of a motion.
     """
     if len(angle_deg) < 8:
         return 0.0
@@ -102,9 +103,9 @@ def jitter_deg(angle_deg: FloatArray) -> float:
 
 
 def trimmed_deviation(third: FloatArray) -> float:
-    """Returns the standard deviation of noise from its third differences, without the largest.
+    """Returns the standard deviation of noise from its third differences, excluding the largest.
 
-    The median of whole counts is a whole count, however large the noise; their mean square is not.
+    The mean square is used, because the median of whole counts is a whole count, whatever the noise.
     """
     if not len(third):
         return 0.0
@@ -115,9 +116,9 @@ def trimmed_deviation(third: FloatArray) -> float:
 
 
 def median_deviation(off: FloatArray) -> float:
-    """Returns the standard deviation of Gaussian values about zero from the median of their sizes.
+    """Returns the standard deviation of Gaussian values about zero, from the median of their magnitudes.
 
-    Robust against a few outliers.
+    It is robust against a few outliers.
     """
     return float(_MAD * np.median(np.abs(off)))
 
@@ -130,15 +131,15 @@ def third_deviation(third: FloatArray) -> float:
 def quantum_deg(angle_deg: FloatArray) -> float:
     """Returns the count of an angle, degrees; 0 if no counts are visible.
 
-    The changes of a counted angle, and the differences between them, are multiples of the count. The smallest
-    difference is the count if nearly all changes are multiples of it, within the last digit of a rounded
-    file.
+    The changes between readings, and the differences of these changes, are multiples of the count. The
+    smallest difference is the count if nearly all changes are multiples of it, within the last digit of a
+    rounded file.
     """
     exact = _exact(angle_deg)
     digit = last_digit(angle_deg)
     if exact > 1.5 * digit or not digit:
         return exact
-    # Exact steps are those of the last digit of the file, or there are none.
+    # The exact steps are those of the file's last digit, or no exact step was found.
     return _through_rounding(angle_deg, digit)
 
 
@@ -161,7 +162,7 @@ def last_digit(angle_deg: FloatArray) -> float:
 
 
 def _exact(angle_deg: FloatArray) -> float:
-    """Returns the common divisor of the changes by Euclid's algorithm on their smallest differences."""
+    """Returns the common divisor of the changes, by Euclid's algorithm on their smallest differences."""
     steps = np.sort(np.abs(np.diff(angle_deg)))
     gaps = np.diff(steps)
     gaps = np.sort(gaps[gaps > SMALLEST_COUNT_DEG])[:NEAREST]
@@ -173,7 +174,7 @@ def _exact(angle_deg: FloatArray) -> float:
         count = float(np.min(left[left >= ROUNDED_DEG]))
     else:
         return 0.0
-    for values in (gaps, steps):  # many counts determine one more accurately
+    for values in (gaps, steps):  # larger multiples determine the count more accurately
         whole = np.round(values / count)
         count = float(values @ whole / (whole @ whole))
     off = np.abs(steps - np.round(steps / count) * count)
@@ -193,7 +194,7 @@ def _through_rounding(angle_deg: FloatArray, digit_deg: float) -> float:
     count = float(np.median(apart[apart < 1.5 * np.min(apart)]))
     if count < COUNTS_PER_DIGIT * digit_deg:
         return 0.0
-    # From the smallest change up, each improves the count, as long as its multiple is certain.
+    # In ascending order, each change improves the count, as long as its multiple is certain.
     products = squares = 0.0
     for size in sizes[sizes > 0.5 * count]:
         whole = round(size / count)
@@ -207,18 +208,18 @@ def _through_rounding(angle_deg: FloatArray, digit_deg: float) -> float:
     return count if len(near) and np.mean(off < 1.5 * digit_deg) > WHOLE_SHARE else 0.0
 
 
-# Clocks coarser than the sampling, so that several samples have the same time during motion.
+# Correction of clocks coarser than the sampling period, which repeat times during motion.
 
 
 def coarse(time_s: FloatArray, motor_deg: FloatArray) -> int:
-    """Counts the impossible samples: same time as the previous sample, different motor angle."""
+    """Counts the samples with the same time as the previous sample, but a different motor angle."""
     return int(np.count_nonzero((np.diff(time_s) == 0.0) & (np.diff(motor_deg) != 0.0)))
 
 
 def spread(time_s: FloatArray) -> FloatArray:
-    """Returns the times of samples spread evenly between the ticks of their clock, shape (n,).
+    """Spreads the times of samples evenly between the ticks of their clock, shape (n,).
 
-    The first sample of each tick keeps its time; after the last tick the previous spacing continues.
+    The first sample of each tick keeps its time. After the last tick the previous spacing is continued.
     """
     ticks = np.flatnonzero(np.diff(time_s, prepend=-np.inf) > 0.0)
     if len(ticks) < 2:

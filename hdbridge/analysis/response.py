@@ -1,10 +1,11 @@
-"""Response of the load to its correction, from runs at constant speed, and the compensating filter.
+"""Response of the load to a correction of its target, from runs at constant speed, and the filter that
+compensates this response.
 
 A correction u of the load target moves the load by G u. The transmission error moves it by E, with or without
-correction. With a correction c and the filter F (1 without a filter), the remaining error is E - G F c. From
-runs without and with correction, per order and speed, ``W = F E / (E - remainder)`` is the filter that
-cancels the error. The model's amplitudes cancel out. W depends only on frequency, so one filter along the
-path has the right gain and phase at every speed.
+correction. With a correction c and the filter F (1 without a filter), the remaining error is E - G F c. Runs
+without and with correction give, for each order and speed, the filter that cancels the error: ``W = F E / (E
+- remainder)``. The model's amplitudes cancel out. W depends only on frequency, so one filter has the right
+gain and phase at every speed.
 """
 
 from __future__ import annotations
@@ -32,70 +33,71 @@ ComplexArray = NDArray[np.complex128]
 FloatArray = NDArray[np.float64]
 
 LEAST_ARCSEC = 0.2
-"""Minimum amplitude of the orders that are evaluated."""
+"""Minimum amplitude of an order that is evaluated."""
 HIGHEST = 0.36
-"""Highest fully corrected frequency, as a share of the SYNC rate."""
+"""Highest fully corrected frequency, relative to the SYNC rate."""
 STOP = 0.46
-"""Lowest uncorrected frequency, as a share of the SYNC rate."""
+"""Lowest uncorrected frequency, relative to the SYNC rate."""
 MIN_Z_SCORE = 4.0
-"""Minimum ratio of amplitude to standard deviation for an order to show the response."""
+"""Minimum ratio of an order's amplitude to its standard deviation for determining the response."""
 MIN_DEVIATION = 0.01
-"""Minimum deviation of a point, as a share, because the response is not exactly linear."""
+"""Minimum relative standard deviation of a measured response, because it is not exactly linear."""
 MIN_APPLIED = 0.05
-"""Minimum gain of a filter for its trial to be used."""
+"""Minimum gain of a filter at the frequencies at which its trial is evaluated."""
 MAX_UNCERTAINTY = 0.5
-"""95 % half width, as a share of the gain, above which a frequency counts as unknown, because the correction
-might leave more than half of the order."""
+"""Maximum 95 % half width of a known response, relative to its gain. Above it, the correction might leave
+more than half of the order."""
 BIN_HZ = 0.5
-"""Points closer than this, or closer than `BIN_SHARE` of their frequency, are merged."""
+"""Frequency difference within which points are merged; at least the fraction `BIN_SHARE` of the frequency."""
 BIN_SHARE = 0.01
 MAX_GAP = 0.12
-"""Maximum gap between two points of the known range, as a share of the SYNC rate."""
+"""Maximum gap between two points of the known range, relative to the SYNC rate."""
 LEAD_CYCLES = 8
 LAG_CYCLES = 16
-"""Length of the filter into the past, in addition to the following lag."""
+"""Number of past cycles in the filter, in addition to the following lag."""
 POLES = 2
-"""Poles of the filter. A resonance of the axis or a notch of its servo rings longer than the weights."""
+"""Number of poles of the filter. The ringing of a resonance or a servo notch exceeds the filter's length."""
 REFINEMENTS = 5
 """Number of iterations for the poles (Sanathanan and Koerner, 1963)."""
 FADE = 0.12
-"""Width over which the filter falls to zero beyond the last point, as a share of the SYNC rate."""
+"""Frequency range over which the filter falls to zero beyond its edge, relative to the SYNC rate."""
 UNKNOWN = 0.5
 """Assumed response, relative to the transmission error, at frequencies without data."""
 DIFFERENT = 0.1
-"""Minimum relative rms difference of different responses. The correction leaves that much more error."""
+"""Minimum relative rms difference between responses that count as different. It is also the fraction of the
+error that the correction additionally leaves."""
 DIFFERENT_LAG = 0.15
-"""Minimum relative difference of different following lags."""
+"""Minimum relative difference between following lags that count as different."""
 LAG_NOISE_MS = 0.5
 REFINED = 0.05
-"""Minimum share of the ripple, as the root of the difference of squares, that a refinement must remove: half
-of `DIFFERENT`."""
+"""Minimum fraction of the ripple that a refinement must remove, as the root of the difference of squares:
+half of `DIFFERENT`."""
 SHARE_NOISE = 0.02
 ERROR_CHANGE = 0.5
-"""Standard deviations of the remainder and of the error without correction due to another servo, as shares
-of the latter."""
+"""Standard deviations of the remainder (`SHARE_NOISE`) and of the change of the uncorrected error due to
+another servo (`ERROR_CHANGE`), relative to the uncorrected error."""
 FIRST_STEP = 0.5
-"""Share of a filter's change that is applied first."""
+"""Fraction of a filter's change that is applied in the first step."""
 MAX_RUNS = 12
-"""Number of runs per frequency that are evaluated together, because one run shows only a few frequencies."""
+"""Maximum number of recent runs that are evaluated together, per order and frequency."""
 REGULARISATION = 1e-3
 FADE_SHARE = 0.3
 SUM_WEIGHT = 1e3
-"""Weight of the condition that nothing changes at rest."""
+"""Weight of the condition that the filter's gain at 0 Hz is one."""
 
 
 class Limits(NamedTuple):
-    """Limits of the axis on a correction, and the orders to correct."""
+    """Limits of the axis for a correction, and the orders to correct."""
 
     orders: tuple[tuple[float, float], ...]
-    """Highest frequency (at the speed limit) and amplitude in arcsec of each order."""
+    """Highest frequency, Hz (at the speed limit), and amplitude, arcsec, of each order."""
     maximum_arcsec: float
     slew_arcsec_s: float
     acceleration_deg_s2: float
 
     @classmethod
     def of(cls, axis: AxisConfig, model: TransmissionModel) -> Self:
-        """Returns the limits from the axis file on a correction of the model's motor orders."""
+        """Returns the limits of the axis file for a correction of the model's motor orders."""
         speed = axis.limits.velocity_deg_s
         return cls(
             tuple(
@@ -108,44 +110,47 @@ class Limits(NamedTuple):
         )
 
     def excess(self, gain: float, frequency_hz: float) -> float:
-        """Returns the factor by which the largest order exceeds half of the permitted size or slew, or 1."""
+        """Returns the factor by which the largest order's correction exceeds half of a limit; at least 1.
+
+        The limits are those of the correction's size and slew rate. Orders that reach ``frequency_hz`` count.
+        """
         largest_arcsec = max((size for top_hz, size in self.orders if top_hz >= frequency_hz), default=0.0)
         reach_arcsec = gain * largest_arcsec
         slew_arcsec_s = math.tau * frequency_hz * reach_arcsec
         return max(1.0, 2.0 * reach_arcsec / self.maximum_arcsec, 2.0 * slew_arcsec_s / self.slew_arcsec_s)
 
     def full_speed_deg_s(self, hertz: FloatArray, gains: FloatArray) -> float:
-        """Returns the load speed from which a filter with these gains works in full, deg/s.
+        """Returns the load speed, deg/s, from which a filter with these gains has its full effect.
 
-        While the correction fades out at the end of a stop, it may contribute up to `FADE_SHARE` of the
-        load's speed.
+        While the correction fades out at the end of a stop, it may contribute up to the fraction `FADE_SHARE`
+        of the load's speed.
         """
         reach_arcsec = max(size * np.max(gains[hertz <= top_hz], initial=0.0) for top_hz, size in self.orders)
         return math.sqrt(2.0 * self.acceleration_deg_s2 * reach_arcsec / ARCSEC_PER_DEG / FADE_SHARE)
 
 
 class Harmonics(NamedTuple):
-    """Orders of the load error in one run; arcsec."""
+    """Orders of the load error (load minus target) in one run; arcsec."""
 
     speed_deg_s: float
     amplitudes: ComplexArray
-    """Complex amplitudes, shape (orders,); the error is the real part of their sum over exp(i k motor
-    angle)."""
+    """Complex amplitude of each order k, shape (orders,). The error is the real part of the sum of amplitudes
+    times exp(i k motor angle)."""
     deviations: FloatArray
-    """Standard deviation of each component."""
+    """Standard deviation of the real or imaginary part of each amplitude."""
     mean_arcsec: float
     """Mean of load minus target."""
     ripple_arcsec: float
-    """Rms about a straight line."""
+    """Rms of the load error about a straight line."""
 
     @property
     def over_time(self) -> ComplexArray:
-        """Amplitudes over exp(i w t); conjugated in backward motion, where the angle decreases."""
+        """Amplitudes as factors of exp(i w t); conjugated in backward motion, when the angle decreases."""
         return self.amplitudes if self.speed_deg_s > 0.0 else self.amplitudes.conj()
 
 
 def _over_time(orders: Iterable[MotorOrder], speed_deg_s: float) -> ComplexArray:
-    """Returns the model's amplitudes like `Harmonics.over_time`."""
+    """Returns the model's complex amplitudes in the convention of `Harmonics.over_time`."""
     turned = math.copysign(math.pi / 180.0, speed_deg_s)
     return np.array([cmath.rect(each.amplitude_arcsec, turned * each.phase_deg) for each in orders])
 
@@ -156,9 +161,9 @@ def order_hz(order: ArrayLike, speed_deg_s: float, ratio: float) -> FloatArray:
 
 
 def harmonics(run: EvenRun, orders: Sequence[int], ratio: float) -> Harmonics:
-    """Fits orders to the load error over the uncompensated motor target.
+    """Fits orders of the uncompensated motor target to the load error of a run.
 
-    InputError if the run is too short.
+    Raises InputError if the run is too short.
     """
     if len(run.samples) < samples_needed(len(orders)):
         raise InputError(
@@ -171,14 +176,14 @@ def harmonics(run: EvenRun, orders: Sequence[int], ratio: float) -> Harmonics:
 
 
 def samples_needed(orders: int) -> int:
-    """Returns the minimum number of samples of a run for this number of orders."""
+    """Returns the minimum number of samples of a run to which this number of orders can be fitted."""
     return 4 * (2 * orders + 2)
 
 
 def harmonics_of(
     speed_deg_s: float, target: FloatArray, error: FloatArray, orders: Sequence[int], ratio: float
 ) -> Harmonics:
-    """Fits orders to an error in arcsec over the load target in degrees, both of shape (n,)."""
+    """Fits orders of the load target (n,), degrees, to an error (n,), arcsec."""
     line = np.linspace(-1.0, 1.0, len(target))
     angle = np.radians(ratio * target)[:, None] * np.array(orders, dtype=float)
     design = np.column_stack([np.ones_like(line), line, np.cos(angle), -np.sin(angle)])
@@ -198,20 +203,20 @@ def harmonics_of(
 
 
 def motor_orders(model: TransmissionModel) -> list[MotorOrder]:
-    """Returns the motor orders that the model corrects, by number, if at least `LEAST_ARCSEC`."""
+    """Returns the compensated motor orders of at least `LEAST_ARCSEC`."""
     return [each for each in compensated_orders(model.effects) if each.amplitude_arcsec >= LEAST_ARCSEC]
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Runs with one filter, in the same order as the runs without correction."""
+    """Runs with correction by one filter, in the same sequence as the runs without correction."""
 
     runs: tuple[Harmonics, ...]
     filter: LeadFilter | None = None
 
 
 def following_lag_s(runs: Iterable[Harmonics]) -> float:
-    """Fits the lag of the load behind its target, with the hysteresis offset of each direction."""
+    """Fits the time lag of the load behind its target, together with the hysteresis offset."""
     given = list(runs)
     speed = np.array([each.speed_deg_s for each in given])
     mean = np.array([each.mean_arcsec for each in given]) / ARCSEC_PER_DEG
@@ -220,19 +225,19 @@ def following_lag_s(runs: Iterable[Harmonics]) -> float:
 
 
 class Found(NamedTuple):
-    """Response at one frequency."""
+    """Measured response at one frequency."""
 
     frequency_hz: float
     response: complex
-    """Load motion per correction and transmission error."""
+    """Load motion per unit of correction (G), relative to load motion per unit of transmission error."""
     deviation: float
     """Standard deviation of the response."""
     load: complex = 1.0
-    """Load per transmission error without correction, following lag excluded."""
+    """Load motion per unit of transmission error without correction; the following lag is excluded."""
 
     @property
     def uncertainty(self) -> float:
-        """Half width of the 95 % interval, as a share of the gain."""
+        """Half width of the 95 % interval of the response, relative to its gain."""
         return 2.0 * self.deviation / abs(self.response)
 
 
@@ -247,10 +252,11 @@ def response_of(
     highest_hz: float = math.inf,
     explore: bool = False,
 ) -> Response | None:
-    """Computes response and filter from runs without and with correction; None if no frequency is known.
+    """Computes response and filter from runs without and with correction.
 
-    Above ``highest_hz``, the correction is partial. With ``explore``, the filter continues beyond the known
-    range with its last gain, so a run with it shows the response there.
+    Returns None if the response is known at no frequency. Above ``highest_hz``, the correction is partial.
+    With ``explore``, the filter continues beyond the known range with its last gain, so that a run with the
+    filter shows the response there.
     """
     lag_s = following_lag_s(none)
     points = _merged(_found(none, trials, orders, ratio, cycle_s, lag_s))
@@ -275,7 +281,7 @@ def response_of(
 
 
 def _columns(name: str, values: Iterable[complex]) -> dict[str, tuple[float, ...]]:
-    """Returns two columns of a `Response`."""
+    """Returns the gain and phase fields of a `Response`, with the prefix ``name``."""
     values = list(values)
     return {
         f"{name}gain": tuple(float(f"{abs(each):.5g}") for each in values),
@@ -291,7 +297,7 @@ def _found(
     cycle_s: float,
     lag_s: float,
 ) -> list[Found]:
-    """Returns the response per order and speed from each trial that shows it, sorted by frequency."""
+    """Returns the responses from all trials, orders and speeds with a clear signal, sorted by frequency."""
     found: list[Found] = []
     for trial in trials:
         for before, after in zip(none, trial.runs, strict=True):
@@ -313,7 +319,7 @@ def _found(
 
 
 def _merged(found: Sequence[Found]) -> list[Found]:
-    """Merges neighbouring points; scatter beyond the noise increases their deviation."""
+    """Merges points of neighbouring frequencies; scatter beyond the noise increases their deviation."""
     groups: list[list[Found]] = []
     for each in found:
         first_hz = groups[-1][0].frequency_hz if groups else -math.inf
@@ -334,7 +340,7 @@ def _mean(group: Sequence[Found]) -> Found:
 
 
 def _known(points: Sequence[Found], highest_hz: float, max_gap_hz: float, limits: Limits) -> list[Found]:
-    """Returns the points from zero up to the first gap; the last point may lie above ``highest_hz``.
+    """Returns the points up to the first gap in frequency; the last point may lie above ``highest_hz``.
 
     Uncertain points are skipped. If the inverse of a response would exceed the limits, the response is
     increased, so that the order is corrected in part.
@@ -357,17 +363,16 @@ class Left(NamedTuple):
 
     frequency_hz: float
     share: complex
-    """Share of the error without correction."""
+    """Remainder relative to the error without correction."""
     size_arcsec: float
     """Amplitude of the error without correction."""
 
 
 class Answers:
-    """Motor and load responses to the filtered correction in runs at constant speed, relative to the stored
-    response.
+    """Collects the responses of motor and load in runs with the filtered correction at constant speed.
 
-    They are stored by order and nearest frequency of the response, so that a few fast runs are not displaced
-    by many slow runs.
+    They are relative to the stored response. They are stored by order and nearest frequency of that response,
+    so that many slow runs do not displace a few fast runs.
     """
 
     def __init__(
@@ -377,9 +382,9 @@ class Answers:
         ratio: float,
         earlier: Answers | None = None,
     ) -> None:
-        """``earlier`` contains the runs with another filter on the same servo."""
+        """``earlier`` contains runs with another filter and the same servo settings."""
         self.lags_ms: deque[float] = deque(maxlen=MAX_RUNS)
-        """Lag of the motor behind its set-points in the last runs."""
+        """Time lag of the motor behind its set-points in each of the last runs."""
         self._response, self._orders, self._ratio = response, orders, ratio
         self._motor: dict[tuple[int, int], deque[Found]] = {}
         self._left: dict[tuple[int, int], deque[Left]] = {}
@@ -394,10 +399,10 @@ class Answers:
         load_deg: FloatArray,
         correction_arcsec: FloatArray | None = None,
     ) -> None:
-        """Adds a run: load target, motor set-points, both encoders, the filtered correction; shape (n,) each.
+        """Adds a run: load target, motor set-points, both encoders, filtered correction; shape (n,) each.
 
-        A distrusted load encoder reads NaN. Without the correction, the rounding of the set-points is not
-        subtracted from the remainder.
+        The load angle is NaN if the load encoder is not trusted. Without ``correction_arcsec``, the effect of
+        the set-points' rounding is not subtracted from the remainder.
         """
         ratio, stored, place_of = self._ratio, self._response, self._place
         lag_s = float(np.mean(issued_deg - motor_deg)) / (ratio * speed_deg_s)
@@ -419,11 +424,11 @@ class Answers:
 
     @property
     def difference(self) -> float:
-        """Rms difference of the motor's response from the stored response, as a share of the ripple, less
-        noise.
+        """Rms difference between the motor's response and the stored response, relative to the ripple.
 
-        It is limited by the remaining error at the load encoder, so neither a change of the gear nor a fault
-        of a single encoder counts as a difference.
+        The contribution of noise is subtracted. The result is limited to the relative error that remains at
+        the load encoder, so neither a change of the gear nor a fault of a single encoder counts as a
+        difference.
         """
         if not self._motor:
             return 0.0
@@ -441,25 +446,25 @@ class Answers:
         return min(apart, math.sqrt(left / whole)) if whole else apart
 
     def forget_load(self) -> None:
-        """Discards the readings of the load encoder."""
+        """Discards the remainders that were measured by the load encoder."""
         self._left.clear()
 
     def left_arcsec2(self) -> dict[tuple[int, int], float]:
-        """Returns the remaining mean square of each order at each frequency."""
+        """Returns the mean square of the remaining load error, by order and frequency."""
         return {
             place: sum(abs(each.share * each.size_arcsec) ** 2 for each in group) / len(group)
             for place, group in self._left.items()
         }
 
     def by_frequency(self) -> dict[int, _Seen]:
-        """Returns the remainders, grouped by frequency."""
+        """Returns the mean remainder over all orders, by frequency."""
         groups: dict[int, list[_Seen]] = {}
         for (_, place), seen in self._by_order().items():
             groups.setdefault(place, []).append(seen)
         return {place: _merged_seen(group) for place, group in groups.items()}
 
     def _by_order(self) -> dict[tuple[int, int], _Seen]:
-        """Returns the mean remainder of each order at each frequency."""
+        """Returns the mean remainder over the runs, by order and frequency."""
         found = {}
         for key, group in self._left.items():
             hertz, shares, sizes = (np.array(each) for each in zip(*group, strict=True))
@@ -476,12 +481,12 @@ class Answers:
     ) -> Response | None:
         """Returns the response whose filter removes the remaining load error; None without an improvement.
 
-        The remainder E - G F c is linear in the filter's gain F, which must change by E / (E - remainder).
-        This factor is interpolated between the frequencies. Until runs with another filter show E with the
-        present servo, E is that of the calibration and the step is shorter. Unless the servo is known to have
-        changed (``retuned``), the factor at each frequency must be predictable from the others, because on an
-        unchanged servo the remainder differs from one frequency to the next. ``bound`` limits the deviation
-        from the committed response, as a share.
+        The remainder E - G F c is linear in the filter's gain F, which must be multiplied by E / (E -
+        remainder). This factor is interpolated between the frequencies. E with the present servo settings is
+        known only after runs with another filter. Until then, E is that of the calibration, and the step is
+        shorter. Unless the servo is known to have been ``retuned``, the factor at each frequency must be
+        predictable from the others, because with an unchanged servo the remainder varies irregularly with
+        frequency. ``bound`` limits the relative deviation from the committed response.
         """
         seen = self.by_frequency()
         if len(seen) < 2:
@@ -512,20 +517,20 @@ class Answers:
 
 
 class _Seen(NamedTuple):
-    """Mean remainder at one frequency, with the filter's gain there."""
+    """Mean remainder at one frequency, and the filter's gain at that frequency."""
 
     frequency_hz: float
     share: complex
     size_arcsec: float
     gain: complex
     error: complex = 1.0
-    """Error without correction, relative to that of the calibration."""
+    """Error without correction, relative to that in the calibration."""
     certain: float = FIRST_STEP
-    """Share of the change that is applied."""
+    """Fraction of the filter's change that is applied."""
 
 
 def _merged_seen(group: Sequence[_Seen]) -> _Seen:
-    """Returns the mean of several orders at one frequency, weighted by their mean squares."""
+    """Returns the mean over several orders at one frequency, weighted by their mean squares."""
     columns = np.array(group)
     weight = columns[:, 2].real ** 2
     hertz, share, _, at, error, certain = weight / weight.sum() @ columns
@@ -533,11 +538,12 @@ def _merged_seen(group: Sequence[_Seen]) -> _Seen:
 
 
 def _error(now: _Seen, earlier: _Seen) -> complex:
-    """Returns an order's error without correction, relative to that of the calibration, at one frequency.
+    """Returns an order's error without correction, relative to that in the calibration, at one frequency.
 
-    The remainder is linear in the gain of the filter. Two points are weighed against the calibration, by the
-    noise of a share and the change of the error due to another servo. Both points are of one order, because
-    different orders at the same frequency differ more than two filters do.
+    The remainder is linear in the gain of the filter, and remainders with two filters determine the line. The
+    fit weighs them against the calibration, by the noise of a remainder and the change of the error due to
+    another servo. Both remainders are of one order, because different orders at the same frequency differ by
+    more than two filters do.
     """
     rows = np.array([[1.0, now.gain], [1.0, earlier.gain], [SHARE_NOISE / ERROR_CHANGE, 0.0]])
     wanted = np.array([now.share, earlier.share, SHARE_NOISE / ERROR_CHANGE])
@@ -545,12 +551,12 @@ def _error(now: _Seen, earlier: _Seen) -> complex:
 
 
 def _bounded(change: ComplexArray, bound: float) -> ComplexArray:
-    """Limits the magnitude of changes."""
+    """Limits the magnitude of each complex change to ``bound``."""
     return change * np.minimum(1.0, bound / np.maximum(abs(change), 1e-9))
 
 
 def lags_agree(one_ms: float, other_ms: float) -> bool:
-    """Returns False if two following lags differ beyond their noise."""
+    """Returns True unless two following lags differ by more than their noise."""
     return abs(one_ms - other_ms) <= max(DIFFERENT_LAG * max(abs(one_ms), abs(other_ms)), LAG_NOISE_MS)
 
 
@@ -564,12 +570,12 @@ def answers(
     orders: Sequence[int],
     ratio: float,
 ) -> Iterator[tuple[int, Found]]:
-    """Yields the motor's responses to its set-points in a run, relative to the stored one, by index of order.
+    """Yields the index of each order with the motor's response to its set-points, relative to the stored one.
 
-    All angles have the shape (n,); ``issued_deg`` are set-points of the motor. The errors of gear and model
-    have no influence. A change of the following lag ``lag_s`` alone has no influence either, because it
-    delays the transmission error and the correction alike. Orders beyond the known range and unclear orders
-    are left out.
+    All angles have the shape (n,); ``issued_deg`` contains the motor's set-points. Errors of the gear and the
+    model have no influence. A mere change of the following lag ``lag_s`` has no influence either, because it
+    delays the transmission error and the correction alike. Orders beyond the known range and uncertain orders
+    are omitted.
     """
     issued, motor = (
         harmonics_of(speed_deg_s, target_deg, ARCSEC_PER_DEG * (each / ratio - target_deg), orders, ratio)
@@ -596,10 +602,10 @@ def _left(
     orders: Sequence[MotorOrder],
     ratio: float,
 ) -> Iterator[tuple[int, Left]]:
-    """Yields the remaining load error of a run by index of order, up to the known frequency.
+    """Yields the index and the remaining load error of each order within the known frequency range.
 
-    The load's response to the rounding of the set-points, ``rounding_arcsec`` (n,), is subtracted. At speeds
-    with a simple fraction of a motor turn per cycle the rounding repeats with the orders, so that it does not
+    The load's response to the rounding of the set-points, ``rounding_arcsec`` (n,), is subtracted. If the
+    motor moves by a simple fraction of a turn per cycle, the rounding repeats with the orders and does not
     average out.
     """
     numbers = [each.order for each in orders]
@@ -619,7 +625,7 @@ def _left(
 
 
 def _points(response: Response) -> ComplexArray:
-    """Returns the response at its frequencies, without the following lag."""
+    """Returns the complex response at its frequencies, without the following lag."""
     turned = np.radians(response.phase_deg) + 0.002 * math.pi * response.following_lag_ms * np.array(
         response.frequency_hz
     )
@@ -628,14 +634,14 @@ def _points(response: Response) -> ComplexArray:
 
 
 def change_between(before: Response, after: Response) -> FloatArray:
-    """Returns the change at common frequencies as a share of ``before``, without lags, shape (f,)."""
+    """Returns the relative change of the response at each frequency, lags excluded, shape (f,)."""
     return np.asarray(abs(_points(after) / _points(before) - 1.0))
 
 
 def _between(
     hertz: ArrayLike, points_hz: ArrayLike, values: ComplexArray, at_rest: float = 1.0
 ) -> ComplexArray:
-    """Interpolates magnitude (logarithmically) and phase of a function of frequency that is real at 0 Hz."""
+    """Interpolates a complex function of frequency that is real at 0 Hz: its log magnitude and its phase."""
     at, known = np.asarray(hertz, dtype=float), np.append(0.0, points_hz)
     size = np.interp(at, known, np.log([at_rest, *abs(values)]))
     between: ComplexArray = np.exp(size + 1j * np.interp(at, known, np.unwrap([0.0, *np.angle(values)])))
@@ -663,10 +669,10 @@ def _denominator(hertz: FloatArray, feedback: FloatArray, cycle_s: float) -> Com
 def _filter(
     kept: Sequence[Found], edge_hz: float, lag_s: float, cycle_s: float, per_cycle: int, limits: Limits
 ) -> LeadFilter:
-    """Fits the filter by least squares on the relative error: the inverse response to ``edge_hz``, 0 beyond.
+    """Fits a filter to the inverse response up to ``edge_hz`` and to zero gain beyond, by least squares.
 
-    Between the points the inverse response without its poles is interpolated, because it has no peak narrower
-    than their spacing.
+    The errors are relative. Between the points the inverse response is interpolated after removal of its
+    poles, because the rest has no peak narrower than the spacing of the points.
     """
     lag_cycles = math.ceil(max(0.0, lag_s) / cycle_s) + LAG_CYCLES
     count = (LEAD_CYCLES + lag_cycles) * per_cycle + 1
@@ -676,13 +682,13 @@ def _filter(
     trust = np.array([each.uncertainty / 2.0 for each in kept])
     hertz, beyond = np.linspace(0.0, edge_hz, 160), np.linspace(edge_hz, 0.5 * per_cycle / cycle_s, 200)[1:]
     weight = 1.0 / (1.0 + 3.0 * np.interp(hertz, points_hz, trust))
-    # Beyond the edge the response is unknown: the filter falls steeply to zero and stays there.
+    # Beyond the edge the response is unknown, so the filter falls steeply to zero and stays there.
     fade = np.clip((beyond - edge_hz) / (FADE / cycle_s), 0.0, 1.0)
     inside, outside = _turned(hertz, ahead_s), _turned(beyond, ahead_s)
     late = _turned(hertz, -cycle_s * np.arange(1, POLES + 1))
     feedback = np.zeros(POLES)
     for refined in range(REFINEMENTS + 1):
-        # The poles are fitted to a plain interpolation, then removed before the final interpolation.
+        # The poles are fitted to a direct interpolation, and removed before the final interpolation.
         smooth = feedback if refined == REFINEMENTS else np.zeros(POLES)
         flat, rest = inverse * _denominator(points_hz, smooth, cycle_s), 1.0 + float(smooth.sum())
         wanted = _between(hertz, points_hz, flat, rest) / _denominator(hertz, smooth, cycle_s)
@@ -721,9 +727,9 @@ def _least_squares(within: ComplexArray, without: ComplexArray, goal: ComplexArr
 
 
 def _stable(feedback: FloatArray, points_hz: FloatArray, cycle_s: float) -> FloatArray:
-    """Returns the feedback with stable poles, and no peak narrower than the local spacing of points.
+    """Returns the feedback with its poles made stable, and no peak narrower than the local spacing of points.
 
-    A pole outside the unit circle is mirrored. Beyond the last point there are no poles.
+    A pole outside the unit circle is reflected into it. Poles beyond the last point are removed.
     """
     poles = np.roots(np.array([1.0, *feedback]))
     hertz = np.abs(np.angle(poles)) / (2.0 * math.pi * cycle_s)

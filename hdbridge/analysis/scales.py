@@ -1,7 +1,7 @@
-"""Thresholds of the diagnosis in one table, each with its unit and source.
+"""Decision thresholds of the diagnosis in one table, each with its unit and source.
 
-They are passed to a diagnosis and included in its JSON, so a result documents its criteria. At its
-``neutral`` value a threshold has no effect.
+They are passed to a diagnosis and included in its JSON, so a result documents its criteria. A threshold has
+no effect at its ``neutral`` value.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def _scale(value: float, unit: str, neutral: float, source: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Scales:
-    """Thresholds of a diagnosis; `described` gives their units and sources."""
+    """Decision thresholds of a diagnosis; `described` returns their units and sources."""
 
     # Required gain of a cause.
     penalty: float = _scale(
@@ -74,7 +74,7 @@ class Scales:
         0.01, "share of the chi square of a cause", 0.0, "a real law differs from its formula by some 7 %"
     )
 
-    # Loops of another shape, and changes of the model's own parts.
+    # Loops of another shape, and changes of the model's parts.
     calibrated: float = _scale(0.04, "share of a coefficient", 0.04, "typical change by temperature and age")
     calibrated_shape: float = _scale(
         0.06,

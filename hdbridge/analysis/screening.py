@@ -1,9 +1,9 @@
-"""Screening: scores of all candidates on the residual, with the present hypothesis projected out.
+"""Screens all candidates: scores them on the residual, with the present hypothesis projected out.
 
-One matrix product serves all columns. With Q an orthonormal basis of the hypothesis's tangent and C a
-candidate's columns, C'C - (Q'C)'(Q'C) is the remaining Gram matrix, and the score is the predicted fall in
-chi square. A grid of hundreds of shapes thus costs no more than one fit. A direction with a remaining
-share below `SHARE_LEFT` is not visible in the record.
+The score is the predicted fall in chi square. With Q an orthonormal basis of the hypothesis's tangent and C a
+candidate's columns, C'C - (Q'C)'(Q'C) is the remaining Gram matrix. One matrix product serves all columns, so
+a grid of hundreds of shapes takes no longer than one fit. A direction whose remaining fraction is below
+`SHARE_LEFT` is not visible in the record.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from hdbridge.axis.effects.orders import HIGHEST_MOTOR_ORDER
 from hdbridge.units import DEG_PER_TURN
 
 SHARE_LEFT = 1e-4
-"""Share of a column's squares below which the column counts as explained."""
+"""Minimum fraction of a column's sum of squares left by the hypothesis; below it, the column is explained."""
 
 
 def candidates(observations: Observations, base: Sequence[Effect], screened: bool = True) -> list[Effect]:
-    """Returns the catalogue's candidates for a record and the model ``base``, over grids of shapes.
+    """Returns the catalogue's candidates for a record and the model ``base``, over grids of shape parameters.
 
-    Includes only candidates whose channels were recorded; their coefficients are arbitrary. With
-    ``screened``, includes only additions to the model that a grid covers.
+    Only candidates whose channels were recorded are included. Their coefficients are arbitrary. With
+    ``screened``, only additions to the model that a grid covers are included.
     """
     kinds = [CATALOGUE[each] for each in causes()]
     if screened:
@@ -37,24 +37,24 @@ def candidates(observations: Observations, base: Sequence[Effect], screened: boo
 
 
 def proposed(kind: type[Effect], observations: Observations, base: Sequence[Effect] = ()) -> list[Effect]:
-    """Returns the proposals of a kind for a record and the model ``base``, if its channels were recorded."""
+    """Returns a kind's proposals for a record and the model ``base``; none if its channels are missing."""
     available = observations.motion.available()
     return [each for each in kind.proposals(observations, base) if not unmet([each], available)]
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Predicted gain of a candidate."""
+    """Predicted gain of adding a candidate to the hypothesis."""
 
     effect: Effect
     gain: float
-    """Predicted fall in chi square, linearised."""
+    """Predicted fall in chi square, from the linearised fit."""
     freedom: int
-    """Number of directions that the hypothesis does not span."""
+    """Number of directions of the candidate's columns that the hypothesis does not span."""
     share: float
-    """Largest share of a column's square that the causes in the hypothesis do not explain.
+    """Largest fraction of a column's sum of squares that the causes in the hypothesis do not explain.
 
-    The model's own parts do not count, because their calibration limits their size."""
+    The model's own parts do not count as causes, because their calibration limits their size."""
 
 
 class Screen:
@@ -72,7 +72,8 @@ class Screen:
         self._grams = [block.T @ block for block in blocks]
 
     def scores(self, fit: Linearised, causes: Linearised) -> list[Score]:
-        """Returns the score of each candidate, in the same order.
+        """Returns the score of each candidate, in the order of the candidates.
+
 
         ``causes`` is the fit without the model's own parts.
         """
@@ -87,7 +88,7 @@ class Screen:
 
 
 def score_of(effect: Effect, columns: FloatArray, fit: Linearised, causes: Linearised) -> Score:
-    """Scores one candidate by its weighted columns; ``causes`` is the fit without the model's own parts."""
+    """Scores one candidate, given its weighted columns; ``causes`` is the fit without the model's parts."""
     taken = np.sum((causes.basis.T @ columns) ** 2, axis=0)
     return _score(effect, np.sum(columns**2, axis=0), *fit.left(columns), taken)
 
@@ -95,8 +96,10 @@ def score_of(effect: Effect, columns: FloatArray, fit: Linearised, causes: Linea
 def _score(
     effect: Effect, size: FloatArray, gram: FloatArray, moment: FloatArray, taken: FloatArray
 ) -> Score:
-    """Computes the score from the columns' squares, the remaining Gram matrix and moment, and the squares
-    explained by other causes.
+    """Computes a score.
+
+    ``size`` and ``taken`` are the total and the explained sum of squares of each column. ``gram`` and
+    ``moment`` are what the hypothesis leaves.
     """
     seen = size > 0.0
     if not np.any(seen):
@@ -112,26 +115,26 @@ def _score(
     return Score(effect, float(np.sum(inner**2 / values[kept])), int(np.count_nonzero(kept)), share)
 
 
-# Matched filters for shapes whose place no grid covers, evaluated at all places at once (`Sought`).
+# Matched filters for effects that can be at any place (`Sought`), evaluated at all places at once.
 
 
 BINS = 1 << 17
 DEFECT_BINS = 3600
 HALF_WIDTHS_DEG = (0.5, 1.2, 2.5, 4.0, 6.5, 10.0)
-"""Grid of the searches by position. A fit refines the result, and `Scales` decides whether to report it."""
+"""Grid of the searches over position. A fit refines the result, and `Scales` decides whether to report it."""
 LEAST_LINES = 256
-"""Smallest number of periods per turn of an encoder with interpolation."""
+"""Minimum number of lines per turn of an encoder with interpolation."""
 LINE_OVER_MEAN = 12.0
-"""Minimum power of a line for a fit, relative to the mean. The line then gains twice that in chi square,
-half of the required gain."""
+"""Minimum power of a spectral line for a fit, relative to the mean power. Such a line lowers chi square by
+twice this number, less than half of the required gain."""
 LOWEST_HZ = 0.3
-"""Lowest frequency of a tone; slower lines belong to the motion itself."""
+"""Lowest frequency of a tone; slower spectral lines are due to the motion itself."""
 PEAKS = 3
-"""Maximum number of lines to fit, the highest first."""
+"""Maximum number of spectral lines to fit, the highest first."""
 
 
 def filtered(estimator: Estimator, fitted: Fitted) -> list[Effect]:
-    """Returns the most promising candidates of the kinds that matched filters find."""
+    """Returns the best candidates of the kinds for which matched filters search."""
     residual, load_deg = fast_residual(estimator, fitted)
     estimator.with_load_angle(load_deg)
     result: list[Effect] = []
@@ -160,7 +163,7 @@ def filtered(estimator: Estimator, fitted: Fitted) -> list[Effect]:
 
 
 def step(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float]]:
-    """Yields the exact time (s) of the best single step, with the hypothesis projected out."""
+    """Yields the time (s) of the single step that fits best, with the hypothesis projected out."""
     weight, basis = estimator.weight, fitted.linearised.basis
     after = np.cumsum((weight * fitted.residual)[::-1])[::-1]
     square = np.cumsum((weight**2)[::-1])[::-1]
@@ -175,12 +178,15 @@ def step(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float]]:
     gain = np.where(usable, after**2 / np.maximum(left, 1e-300), 0.0)
     place = int(np.argmax(gain))
     data = estimator.data
-    first = data.runs[estimator.index[place]]  # first sample of the point that shows it
+    first = data.runs[estimator.index[place]]  # first sample of the point at which the step appears
     yield (float(data.full.time_s[first]),)
 
 
 def bump(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float, float]]:
-    """Yields centre and half width (load degrees) of the best bump that does not cover most of the travel."""
+    """Yields the centre and half width (load degrees) of the bump that fits best.
+
+    Bumps over most of the travel are excluded.
+    """
     ratio = estimator.data.ratio
     load = estimator.motion.motor_deg[estimator.index] / ratio
     place = np.floor(np.mod(load, DEG_PER_TURN) * (DEFECT_BINS / DEG_PER_TURN)).astype(np.intp) % DEFECT_BINS
@@ -222,7 +228,7 @@ def fast_residual(estimator: Estimator, fitted: Fitted) -> tuple[FloatArray, Flo
     full = estimator.data.full
     predicted = estimator.predicted(fitted)
     residual = np.where(full.usable, full.error_arcsec - predicted, 0.0)
-    # The scale of the clipping comes from fast variations only.
+    # The clipping limits are derived from fast variations only.
     window = 9
     smooth = np.convolve(residual, np.ones(window) / window, mode="same")
     spread = 6.0 * median_deviation(residual - smooth) + 1e-9
@@ -242,8 +248,8 @@ def tones(estimator: Estimator, residual: FloatArray) -> Iterator[tuple[float]]:
     grid = np.bincount(slot, residual, length)
     power = np.abs(np.fft.rfft(grid, size)) ** 2
     frequency = np.arange(len(power)) / (size * data.period_s)
-    # Fewer than two periods are a bend, not a frequency. Similar moves bend alike, so the length of data
-    # about one zero counts.
+    # At least two periods are needed; fewer are only curvature. Similar moves have similar curvature, so
+    # the length of the data of one zero is decisive.
     unbroken = min(length, int(np.max(np.bincount(data.full.zero))))
     power[frequency < max(LOWEST_HZ, 2.0 / (unbroken * data.period_s))] = 0.0
     lobe = max(4, size // length * 4)
@@ -252,7 +258,7 @@ def tones(estimator: Estimator, residual: FloatArray) -> Iterator[tuple[float]]:
 
 
 def _highest(power: FloatArray, lobe: int, least: float) -> Iterator[int]:
-    """Yields the indices of peaks above ``least``, highest first, at least a ``lobe`` apart."""
+    """Yields the indices of the peaks above ``least``, highest first, more than ``lobe`` samples apart."""
     left = power.copy()
     for _ in range(PEAKS):
         at = int(np.argmax(left))
@@ -272,7 +278,7 @@ def _off_centre(height: FloatArray, at: int) -> float:
 
 
 def load_lines(estimator: Estimator, residual: FloatArray, load_deg: FloatArray) -> Iterator[int]:
-    """Yields the periods per load turn of the highest spectral lines beyond the mesh orders."""
+    """Yields the numbers of periods per load turn of the highest spectral lines above the gear's orders."""
     place = np.floor(np.mod(load_deg, DEG_PER_TURN) * (BINS / DEG_PER_TURN)).astype(np.intp) % BINS
     power = np.abs(np.fft.rfft(np.bincount(place, residual, BINS))) ** 2
     ratio = estimator.data.ratio

@@ -1,7 +1,8 @@
-"""Greedy search for causes: screens all candidates, fits the best few in full, adds the best one, repeats.
+"""Greedy search for causes.
 
-`Scales` defines the required gain of a cause. The hysteresis law is chosen again after each of the first
-additions. At the end, causes whose gain has fallen below the required gain are removed.
+Each round screens all candidates, fits the best few in full and adds the best one. `Scales` defines the
+required gain of a cause. After each of the first additions, the hysteresis law is chosen again. At the end,
+causes whose gain has fallen below the required gain are removed.
 """
 
 from __future__ import annotations
@@ -33,31 +34,31 @@ from hdbridge.units import DEG_PER_TURN
 
 MOST = 6
 BEST = 3
-"""Maximum number of additions (`MOST`) and of full fits for each (`BEST`), which limit the run time."""
+"""Limits of the run time: maximum number of additions (`MOST`), and of causes fitted for each (`BEST`)."""
 LAW_ROUNDS = 3
-"""Number of additions after which the hysteresis law is chosen again."""
+"""Number of initial additions after each of which the hysteresis law is chosen again."""
 
 
 class Search:
-    """Search for causes on one estimator, starting from the effects of a given model."""
+    """Search for causes in one record, starting from the effects of a given model."""
 
     def __init__(self, estimator: Estimator, base: Sequence[Effect]) -> None:
         self.estimator = estimator
         self.scales = estimator.scales
         self.base = len(base)
-        """Number of baseline effects, which come first in every hypothesis."""
+        """Number of baseline effects, which are the first effects of every hypothesis."""
         self._base = tuple(base)
         self._screens: dict[object, Screen] = {}
         self.refusals: dict[str, str] = {}
-        """Reason for each rejection of a cause that improved the fit."""
+        """Reason for rejecting each cause that improved the fit, by cause."""
         self._stopped: set[str] = set()
-        """Causes that failed a test of the result."""
+        """Causes that failed a test of the result and are not added again."""
         law = next((each for each in self._base if each.part is Part.LOOP), None)
         if law is not None:
             estimator.loop_sign = -1.0 if law.coefficients()[0] < 0.0 else 1.0
 
     def run(self) -> Fitted:
-        """Adds causes, best first, then removes causes that no longer improve the fit enough."""
+        """Adds causes, best first, then removes those that no longer improve the fit enough."""
         fitted = self.with_best_law(self._with_best_sign(self.begun()))
         for number in range(MOST):
             found = self._best_addition(fitted)
@@ -72,7 +73,7 @@ class Search:
             slow = left > self.scales.slow * fitted.chi_square
             fitted = found
             if number >= self.scales.few - 1 and slow and left > self.scales.large * len(found.residual):
-                break  # many small pieces approximate something that is not in the catalogue
+                break  # many small pieces approximate a cause that is not in the catalogue
             if number < LAW_ROUNDS:
                 fitted = self.with_best_law(fitted)
         if len(fitted.hypothesis.effects) - self.base <= self.scales.few:
@@ -80,7 +81,7 @@ class Search:
         return self.with_best_law(self.eliminated(fitted, self._least, []))
 
     def instead(self, fitted: Fitted, stopped: Iterable[str]) -> Fitted:
-        """Adds causes in place of those ``stopped`` by a test of the result."""
+        """Adds other causes in place of those in ``stopped``, which failed a test of the result."""
         self._stopped.update(stopped)
         while len(fitted.hypothesis.effects) < self.base + MOST:
             found = self._best_addition(fitted)
@@ -90,19 +91,19 @@ class Search:
         return self.with_best_law(self.eliminated(fitted, self._least, []))
 
     def begun(self) -> Fitted:
-        """Fits the model alone, from the best elastic state at the start."""
+        """Fits the model alone, with the best initial elastic state."""
         fits = [self.estimator.fit(Hypothesis(self._base, start)) for start in Start]
         return min(fits, key=lambda each: each.chi_square)
 
     def _with_best_sign(self, known: Fitted) -> Fitted:
-        """Chooses the sign of the hysteresis loop.
+        """Fits the model with the better sign of the hysteresis loop.
 
-        The sign is reversed if the reversal explains more than the model's sign together with the best cause
-        (play also makes the load lag).
+        The sign is reversed if this explains more than the model's sign together with the best cause. Play,
+        for example, also makes the load lag.
         """
         loops = [each for each in known.hypothesis.effects if each.part is Part.LOOP]
         if self.estimator.data.reversals < 2 or not loops or any(each.coefficients()[0] for each in loops):
-            return known  # a coefficient that is not held at zero confirms the model's sign
+            return known  # a coefficient other than zero confirms the model's sign
         self.estimator.loop_sign *= -1.0
         other = self.begun()
         self.estimator.loop_sign *= -1.0
@@ -112,7 +113,7 @@ class Search:
         return self.begun()
 
     def with_best_law(self, fitted: Fitted) -> Fitted:
-        """Replaces the hysteresis law with an equivalent law that fits better.
+        """Replaces the hysteresis law by an alternative law if that fits better.
 
         A law other than the model's must be better by the required gain of a cause.
         """
@@ -130,7 +131,7 @@ class Search:
         return 0.0 if same else self.scales.enter + self.scales.penalty
 
     def _with_free_loop(self, fitted: Fitted, found: Fitted | None) -> Fitted | None:
-        """Adds a free-form hysteresis; None if the best cause explains more."""
+        """Adds a free-form hysteresis to the fit; returns None if the best cause explains more."""
         free = self.estimator.free_loop(fitted.hypothesis.start)
         loose = self.estimator.fit(replace(fitted.hypothesis, nuisances=free))
         added = loose.free() - fitted.free()
@@ -143,8 +144,8 @@ class Search:
     def _swapped(self, fitted: Fitted) -> Fitted:
         """Replaces each finding in turn by the best alternative if that lowers the cost.
 
-        The comparison includes the entry penalty of each piece of a finding, because the replacement pays
-        only one.
+        The comparison includes the entry penalty of every addition that built the finding, because the
+        replacement is a single addition.
         """
         for place in range(self.base, len(fitted.hypothesis.effects)):
             if place >= len(fitted.hypothesis.effects):
@@ -160,7 +161,7 @@ class Search:
     def _additions(self, effect: Effect) -> int:
         """Returns the number of additions that built a finding.
 
-        Orders are added singly or in the groups that a cause proposes.
+        Orders are added one at a time, or in groups if a cause proposes groups.
         """
         offered = next(iter(type(effect).proposals(self.estimator.data, ())), effect)
         return max(1, len(effect.pieces()) // max(1, len(offered.pieces())))
@@ -168,9 +169,10 @@ class Search:
     def eliminated(
         self, fitted: Fitted, worst: Callable[[Fitted], tuple[int, str] | None], reasons: list[str]
     ) -> Fitted:
-        """Removes causes and refits until ``worst`` returns None.
+        """Removes causes one by one, with a refit after each, until ``worst`` returns None.
 
-        ``worst`` returns the place of the cause to remove and the reason, which is appended to ``reasons``.
+        ``worst`` returns the place of the cause to remove and the reason. The reason is appended to
+        ``reasons``.
         """
         while len(fitted.hypothesis.effects) > self.base and (found := worst(fitted)) is not None:
             place, why = found
@@ -179,7 +181,7 @@ class Search:
         return fitted
 
     def _least(self, fitted: Fitted) -> tuple[int, str] | None:
-        """Returns the weakest cause if its gain is below the required gain or its peak is below the floor."""
+        """Returns the weakest cause if its gain is insufficient or its peak is below the floor; else None."""
         effects = fitted.hypothesis.effects
         gains = {
             place: self._lacking(fitted, place).chi_square - fitted.chi_square
@@ -188,14 +190,14 @@ class Search:
         toll = {each: self.scales.penalty * len(fitted.places(each)) + self.scales.enter for each in gains}
         place = min(gains, key=lambda each: gains[each] - toll[each])
         small = self.peak(fitted, place) < self.estimator.floor_arcsec
-        # The error of a large effect's law resembles a small effect of the same kind.
+        # The law error of a large effect resembles a small effect of the same kind.
         alike = [each for each in gains if each != place and effects[each].name == effects[place].name]
         share = effects[place].inexact * max((gains[each] for each in alike), default=0.0)
         needed = max(toll[place], self.scales.leftover * max(gains.values()), share)
         return None if gains[place] > needed and not small else (place, "")
 
     def _lacking(self, fitted: Fitted, place: int) -> Fitted:
-        """Fits without an effect but with its incidental columns, which may be present without it."""
+        """Fits without an effect, but with its incidental columns, which other causes may also produce."""
         effect, hypothesis = fitted.hypothesis.effects[place], fitted.hypothesis.without(place)
         columns = sorted(set(range(len(effect.coefficients()))) - set(evident(effect)))
         if columns:
@@ -205,12 +207,12 @@ class Search:
             hypothesis = replace(hypothesis, nuisances=more if known is None else known.and_also(more))
         return self.estimator.fit(hypothesis)
 
-    # --- one more cause
+    # --- addition of a cause
 
     def _best_addition(self, fitted: Fitted) -> Fitted | None:
-        """Adds the best acceptable cause and refits; None if no cause improves the fit enough.
+        """Adds the best acceptable cause and refits; returns None if no cause improves the fit enough.
 
-        A rejected cause may be acceptable next to a later one, so rejections are not final.
+        Rejections are not final, because a rejected cause may be acceptable after a later addition.
         """
         scores = [each for each in self._scores(fitted) if each.effect.name not in self._stopped]
         refused = set[object]()
@@ -234,21 +236,21 @@ class Search:
         return None
 
     def _gain(self, fitted: Fitted, trial: Fitted, cause: str) -> float:
-        """Returns the fall in chi square due to the last effect of this cause."""
+        """Returns the fall in chi square due to the last effect with the name ``cause`` in ``trial``."""
         place = _last(trial, cause)
         incidental = trial.hypothesis.effects[place].incidental
         lacking = self._lacking(trial, place).chi_square if incidental else math.inf
         return min(lacking, fitted.chi_square) - trial.chi_square
 
     def _too_small(self, trial: Fitted, cause: str) -> bool:
-        """Returns True if the last effect of this cause is below the floor of practical relevance."""
+        """Returns True if the peak of the last effect of this cause is too small to be relevant."""
         return self.peak(trial, _last(trial, cause)) < self.estimator.floor_arcsec
 
     def _refusal(self, trial: Fitted, cause: str, as_alias: bool = False) -> str:
-        """Returns the reason to reject the last effect of this cause, or an empty string.
+        """Returns the reason to reject the last effect of this cause; empty if it is acceptable.
 
         The effect must be physically possible and visible in the record. An alias need not be identifiable,
-        and its size need not be known.
+        and the record need not determine its size.
         """
         place = _last(trial, cause)
         effect = trial.hypothesis.effects[place]
@@ -258,7 +260,7 @@ class Search:
         elif (
             not reason and Channel.TIME in effect.needs() and effect.shows(self.estimator.motion) is not None
         ):
-            # An effect in time can be placed anywhere. If it does not pass the gate, it stands for
+            # An effect in time can be at any place. If it does not pass its acceptance tests, it imitates
             # another cause, which would not be found with this one in the fit.
             reason = gate(self.estimator, trial, place).reason
             if not reason and not all_pieces_seen(self.estimator, trial, place):
@@ -266,10 +268,9 @@ class Search:
         return reason
 
     def _extrapolated(self, trial: Fitted, place: int) -> bool:
-        """Returns True if a piece of an effect is much larger than the visible sum of all effects of its
-        kind.
+        """Returns True if a piece of an effect is much larger than the visible sum of its kind of effects.
 
-        Pieces of one effect, and two effects of a kind, can cancel where the record shows them.
+        In the positions that the record covers, pieces of one effect, or two effects of a kind, can cancel.
         """
         effects = trial.hypothesis.effects
         own = self.peak(trial, place)
@@ -278,9 +279,9 @@ class Search:
         return max(effects[place].largest_piece_arcsec(), own) > self.scales.extrapolated * seen
 
     def refusal(self, effect: Effect, as_alias: bool = False) -> str:
-        """Returns the reason to reject an effect with its fitted parameters, or an empty string.
+        """Returns the reason to reject an effect with its fitted parameters; empty if it is acceptable.
 
-        An alias is rejected only if it is impossible, not if it is unidentifiable.
+        An alias is rejected only if it is physically impossible, not if it is unidentifiable.
         """
         if violations := effect.violations():
             return f"it fits best with impossible parameters: {violations[0]}"
@@ -290,8 +291,8 @@ class Search:
     def reported_refusals(self, fitted: Fitted) -> list[str]:
         """Returns the rejections to report.
 
-        These concern aliases of the causes found, and causes that by their linearised gain would still
-        improve the ``fitted`` hypothesis enough.
+        These concern aliases of the causes found, and causes that would still improve the ``fitted``
+        hypothesis enough, according to their linearised gain.
         """
         if not self.refusals:
             return []
@@ -306,16 +307,16 @@ class Search:
         return [f"{cause}: {why}" for cause, why in self.refusals.items() if cause in reported]
 
     def peak(self, fitted: Fitted, *places: int) -> float:
-        """Returns half the span of the sum of effects in this record, arcsec, without rare extremes."""
+        """Returns half the peak-to-peak sum of the effects at ``places``, arcsec, excluding rare extremes."""
         effects, start = fitted.hypothesis.effects, fitted.hypothesis.start
         return self.estimator.half_span(
             np.sum([self.estimator.does(effects[at], start) for at in places], axis=0)
         )
 
     def _shortlist(self, fitted: Fitted, scores: Sequence[Score], left_out: str = "") -> list[Score]:
-        """Returns, for each of the best causes, the best candidate of each number of parameters.
+        """Returns, for each of the best causes, the best candidate with each number of parameters.
 
-        A candidate with more parameters may be better only after its shapes are fitted.
+        A candidate with more parameters may become better only when its shape parameters are fitted.
         """
         passed = {each.name for each in fitted.hypothesis.effects if each.usual == 1} | {left_out}
         net = {id(each): each.gain - self.scales.penalty * each.freedom for each in scores}
@@ -350,18 +351,18 @@ class Search:
         return fitted.chi_square + self.scales.penalty * fitted.free()
 
     def instead_of_change(self, fitted: Fitted, place: int, given: Effect) -> list[str]:
-        """Returns causes that explain the data as well as a change of the part at ``place``."""
+        """Returns the causes that explain the data as well as a change of the model part at ``place``."""
         with self.held({place}):
             return self.as_well(fitted, self.with_given(fitted, place, given), given.name)
 
     def with_given(self, fitted: Fitted, place: int, given: Effect) -> Fitted:
-        """Fits with the model's part at ``place`` fixed exactly as ``given``."""
+        """Refits with the model part at ``place`` fixed exactly as ``given``."""
         with self.held({place}):
             return self.estimator.fit(fitted.hypothesis.instead(place, given))
 
     @contextmanager
     def held(self, places: Set[int]) -> Iterator[None]:
-        """Fixes some parts of the model at their given values (context manager)."""
+        """Fixes the model parts at ``places`` at their given values (context manager)."""
         known = self.estimator.calibrated
         self.estimator.calibrated = tuple(each.as_given() if each.place in places else each for each in known)
         try:
@@ -370,7 +371,8 @@ class Search:
             self.estimator.calibrated = known
 
     def as_well(self, fitted: Fitted, without: Fitted, cause: str) -> list[str]:
-        """Returns causes that fit nearly as well in place of ``cause``, best first.
+        """Returns other causes that fit nearly as well as ``cause``, best first.
+
 
         ``without`` is the fit without that cause.
         """
@@ -400,7 +402,7 @@ class Search:
 
 
 def joined(hypothesis: Hypothesis, effect: Effect, base: int) -> Hypothesis:
-    """Adds an effect to a hypothesis, merged into an existing finding if the two can be joined."""
+    """Adds an effect to a hypothesis; merges it into an existing finding if the two can be joined."""
     for place in range(base, len(hypothesis.effects)):
         both = hypothesis.effects[place].joined(effect)
         if both is not None:
@@ -422,15 +424,15 @@ def _key(score: Score) -> object:
     return (effect.name, tuple(each.name for each in effect.named_coefficients()), score.freedom)
 
 
-# Exchange of a finding for a look-alike that describes it better.
+# Replacement of a finding by an alias that describes it better.
 
 
 def with_measured(search: Search, fitted: Fitted) -> Fitted:
-    """Replaces a wave by a similar effect of a measured channel if this fits as well.
+    """Replaces a wave by a similar effect of a measured channel if that effect fits as well.
 
-    A wave can take any phase, a wind-up only the phase of the torque. If the wind-up fits as well, apart from
-    the loss due to the channel's noise, the wave is a coincidence. Fitted together, the wave would compensate
-    for that noise and absorb most of the wind-up.
+    A wave can have any phase, but a wind-up has the phase of the torque. If the wind-up fits as well, apart
+    from the loss due to the channel's noise, it is the cause. If both were fitted together, the wave would
+    compensate for that noise and absorb most of the wind-up.
     """
     estimator, scales, base = search.estimator, search.scales, search.base
     hypothesis = fitted.hypothesis
@@ -440,7 +442,7 @@ def with_measured(search: Search, fitted: Fitted) -> Fitted:
             without = hypothesis.instead(place, together(others)) if others else hypothesis.without(place)
             tried = [without]
             if not any(type(each) is kind for each in without.effects[base:]):
-                # Every shape that it proposes: a non-linear spring differs from a linear one.
+                # All proposals are tried, because a non-linear spring differs from a linear one.
                 own = proposed(kind, estimator.data, hypothesis.effects[:base])
                 tried = [without.plus(each) for each in own]
             for trial in sorted((estimator.fit(each) for each in tried), key=search.cost):
@@ -467,7 +469,10 @@ def together(pieces: Sequence[Effect]) -> Effect:
 
 
 def lookalikes(effect: Effect, ratio: float) -> list[tuple[type[Effect], Effect]]:
-    """Returns kinds that would resemble a piece of the effect without their channel, with that piece."""
+    """Returns the kinds that would resemble a piece of the effect if their channel were not recorded.
+
+    Each kind is paired with that piece.
+    """
     result = []
     for name in aliases_of(effect.name):
         look = CATALOGUE[name].unmeasured(ratio) if name in CATALOGUE else None
@@ -479,12 +484,12 @@ def lookalikes(effect: Effect, ratio: float) -> list[tuple[type[Effect], Effect]
 
 
 def waves_alike(estimator: Estimator, effects: Sequence[Effect], start: Start) -> Iterator[str]:
-    """Yields other kinds of waves that are not separable from one of the effects, which are all of one kind.
+    """Yields the other kinds of waves that are not separable from one of the effects, which are of one kind.
 
-    Kinds over the same angle count as similar if both can have the orders concerned. On an arc of a turn
-    different orders cancel, so the comparison uses their amplitudes, not their sum. A wave over an angle is
-    compared with a wave in time at the frequency that corresponds to the usual speed, because at a single
-    speed they are the same.
+    Kinds over the same angle are similar if both can have the same orders. Over a fraction of a turn
+    different orders cancel, so their amplitudes are compared, not their sum. A wave over an angle is compared
+    with a wave in time at the frequency that corresponds to the median speed, because at a single speed the
+    two are the same.
     """
     data, most = estimator.data, estimator.scales.in_step
     effects = [each for each in effects if each.waves()]
@@ -519,7 +524,7 @@ def waves_alike(estimator: Estimator, effects: Sequence[Effect], start: Start) -
 
 
 def in_time(kind: type[Effect], effect: Effect, motion: Motion) -> list[Effect]:
-    """Returns tones of a ``kind`` at the frequencies of an effect's waves at the median speed."""
+    """Returns tones of a ``kind`` with the frequencies that an effect's waves have at the median speed."""
     speed = motion.motor_speed_deg_s
     if speed is None or not np.any(speed):
         return []
@@ -532,7 +537,7 @@ def in_time(kind: type[Effect], effect: Effect, motion: Motion) -> list[Effect]:
 
 
 def _share_in(effect: Effect, orders: Container[float]) -> float:
-    """Returns the share of an effect's squared amplitudes that lies in the given orders."""
+    """Returns the fraction of an effect's summed squared amplitudes that the given orders contribute."""
     squares = {turns: amplitude**2 for turns, amplitude, _ in effect.waves()}
     return sum(each for turns, each in squares.items() if turns in orders) / max(
         sum(squares.values()), 1e-300
@@ -540,9 +545,9 @@ def _share_in(effect: Effect, orders: Container[float]) -> float:
 
 
 def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:
-    """Chooses, among equivalent parametrisations, the one that leaves the ``given`` model unchanged.
+    """Chooses, among equivalent parametrisations (`Effect.retold`), the one that keeps the ``given`` model.
 
-    Returns ``fitted`` if none does (`Effect.retold`).
+    Returns ``fitted`` if there is none.
     """
     effects = fitted.hypothesis.effects
     for place in range(len(given), len(effects)):

@@ -1,6 +1,6 @@
 """Separable non-linear least squares (variable projection), and the shape parameters of effects.
 
-Shapes are the parameters in which an effect is not linear.
+Shapes are the parameters in which an effect is non-linear.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from hdbridge.axis.effects.described import Moves, Shape
 
 LOGARITHM = 0.7
 RANGE = 0.15
-"""Largest step of a shape: in its logarithm (`LOGARITHM`), else as a share of its range (`RANGE`)."""
+"""Maximum step of a shape: in its logarithm (`LOGARITHM`), else relative to its range (`RANGE`)."""
 DIFFERENCE = 1e-3
-"""Step of numerical differentiation, in the logarithm of a shape or as a share of its range."""
+"""Step of numerical differentiation, in the logarithm of a shape or relative to its range."""
 LINEAR = 0.3
 """Maximum relative change of an effect within a differentiation step."""
 
 
 def unit(effect: Effect) -> Effect:
-    """Returns the key to an effect's columns: the effect with unit coefficients, if it is linear in them."""
+    """Returns the cache key of an effect's columns: the effect with unit coefficients, unless curved."""
     return effect.fitted(np.ones(len(effect.coefficients()))) if not effect.curved else effect
 
 
 def tangent(columns: Columns, effect: Effect, shape: Shape, central: bool = False) -> FloatArray:
-    """Returns the derivative of an effect by one of its shapes, shape (m,); one-sided at a bound."""
+    """Returns the derivative of an effect with respect to one shape, (m,); one-sided unless ``central``."""
     coefficients = effect.coefficients()
     here = shape_value(effect, shape.name)
     predicted = _predicted(columns(effect), coefficients)
@@ -72,9 +72,9 @@ def _predicted(columns: FloatArray, coefficients: FloatArray) -> FloatArray:
 def moved(
     effects: Sequence[Effect], where: Sequence[tuple[int, Shape]], step: FloatArray
 ) -> tuple[Effect, ...]:
-    """Returns the effects after a step of their shapes, clipped to the ranges.
+    """Returns the effects after a step of their shapes, clipped to the permitted ranges.
 
-    Logarithmic shapes are stepped in their logarithm.
+    The step of a logarithmic shape is that of its logarithm.
     """
     result = list(effects)
     for (place, shape), move in zip(where, step.tolist(), strict=True):
@@ -90,7 +90,7 @@ def moved(
 
 
 def free_shapes(effect: Effect, moves: frozenset[Moves]) -> list[Shape]:
-    """Returns the shapes to fit; a shape outside its range has no influence and stays fixed."""
+    """Returns the shapes to fit; a shape outside its range does not affect the fit and stays fixed."""
     return [
         each
         for each in effect.shape
@@ -99,7 +99,7 @@ def free_shapes(effect: Effect, moves: frozenset[Moves]) -> list[Shape]:
 
 
 def shape_value(effect: Effect, name: str) -> float:
-    """Returns the value of a shape; if it is not a field, the value of the first part."""
+    """Returns the value of a shape: the effect's field or, without such a field, that of its first part."""
     if name in type(effect).model_fields:
         return float(getattr(effect, name))
     parts = next(each for each in effect.parameters().values() if isinstance(each, list) and name in each[0])
@@ -123,14 +123,14 @@ def leaves(effect: Effect, shape: Shape, move: float) -> bool:
 
 DAMPING = 1e-4
 TRIES = 6
-"""Maximum number of reductions of an unsuccessful step."""
+"""Maximum number of attempts at a step, each with stronger damping."""
 EXCHANGES = 3
-"""Maximum number of updates of the effects' copies of each other while chi square rises at first."""
+"""Maximum number of steps that raise chi square because the effects' copies of each other were updated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fixed:
-    """Columns independent of the shapes: the nuisances, then the effects in ``places``."""
+    """Columns that do not depend on free shapes: of the nuisances, then of the effects at ``places``."""
 
     places: tuple[int, ...]
     units: tuple[Effect, ...]
@@ -142,7 +142,7 @@ class _Fixed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Point:
-    """Best coefficients at given shapes."""
+    """Fit of the coefficients for given shapes."""
 
     given: tuple[Effect, ...]
     """Effects from which the columns were computed."""
@@ -153,10 +153,10 @@ class _Point:
     """Places of the effects whose columns form ``matrix``, in the same order."""
     matrix: FloatArray
     gram: FloatArray
-    """Gram matrix of all linear columns, the fixed ones first, plus the prior information."""
+    """Gram matrix of all linear columns (fixed ones first) plus the prior information."""
     coefficients: FloatArray
     inside: BoolArray
-    """False for coefficients held at zero by their sign."""
+    """False for coefficients held at zero because of their sign constraint."""
     chi_square: float
 
 
@@ -170,11 +170,11 @@ class Solution:
     chi_square: float
     """Chi square, including priors."""
     columns: tuple[Column, ...]
-    """Nuisances, coefficients of the effects (those without free shapes first), then shapes."""
+    """Parameter of each column: nuisances, then coefficients (fixed columns first), then shapes."""
     residual: FloatArray
-    """Observed minus fitted, shape (m,)."""
+    """Observation minus fit, shape (m,)."""
     at_bound: tuple[tuple[int, str], ...]
-    """Shapes that ended at a bound, each with its effect and name."""
+    """Shapes that ended at a bound, as place of the effect and name of the shape."""
     _fit: Separable
     _point: _Point
 
@@ -189,7 +189,7 @@ class Solution:
 
     @cached_property
     def information(self) -> FloatArray:
-        """Jacobian' K^-1 Jacobian plus the prior information, shape (p, p)."""
+        """J' K^-1 J plus the prior information, with the Jacobian J, shape (p, p)."""
         kept = self._point.inside
         size = len(kept)
         cross = self.jacobian.T @ self._fit.terms.weighting.apply(self.jacobian[:, size:])
@@ -209,7 +209,7 @@ class Solution:
         """Returns the number of parameters that affect the data."""
         linear = self._point.inside & (np.diag(self._point.gram) > 0.0)
         idle = {place for place, each in enumerate(self.effects) if not np.any(each.coefficients())}
-        # A spring that is not loaded far enough shows neither its outer zone nor the beginning of that zone.
+        # A spring that is not loaded far enough determines neither its outer zone's stiffness nor its start.
         partly = {each.effect for each, seen in zip(self.columns, linear, strict=False) if not seen}
         shapes = [
             each.effect not in partly or bool(np.any(self.jacobian[:, at]))
@@ -220,7 +220,7 @@ class Solution:
 
 
 class Separable:
-    """Fits effects to one data set; caches everything that does not depend on shapes."""
+    """Fits effects to one data set; caches all results that do not depend on shapes."""
 
     def __init__(self, terms: Terms) -> None:
         self.terms = terms
@@ -229,7 +229,7 @@ class Separable:
         self._fixed: _Fixed | None = None
 
     def fit(self, effects: Sequence[Effect], effort: Effort | None = None) -> Solution:
-        """Fits effects from their present parameters; the result is never worse than the start."""
+        """Fits effects, starting from their present parameters; the result is never worse than the start."""
         effort = effort or Effort()
         here = best = self._at(refreshed(effects))
         damping, exchanged = DAMPING, 0
@@ -250,7 +250,7 @@ class Separable:
                 step, _ = self._step(here, where, system, damping)
             gained = here.chi_square - there.chi_square
             if not better:
-                # Only the carried copies have changed; updating them may help at the second step.
+                # Only the copies of other effects have changed; a second step with updated copies may help.
                 exchanged += 1
                 if not small or exchanged > EXCHANGES:
                     break
@@ -267,7 +267,7 @@ class Separable:
     def tangents(
         self, effects: Sequence[Effect], central: bool = False
     ) -> tuple[list[tuple[int, Shape]], FloatArray]:
-        """Returns the free shapes (place, shape) and the effects' derivatives by them, (m, s)."""
+        """Returns the free shapes as (place, shape), and the derivatives with respect to them, (m, s)."""
         where = [
             (place, each)
             for place, effect in enumerate(effects)
@@ -279,7 +279,7 @@ class Separable:
         return where, result
 
     def _at(self, effects: Sequence[Effect]) -> _Point:
-        """Finds the best coefficients at given shapes."""
+        """Fits the coefficients, with the shapes fixed."""
         terms = self.terms
         fixed = self._fixed_of(effects)
         moving = tuple(place for place in range(len(effects)) if place not in fixed.places)
@@ -306,7 +306,7 @@ class Separable:
             if not np.any(below):
                 break
             inside &= ~below
-        # Computed in full, because a ridge solution satisfies the normal equations only approximately.
+        # The full expression is used, because a ridge solution satisfies the normal equations only roughly.
         chi_square = self._total + float(information @ mean**2)
         chi_square += float(coefficients @ (gram @ coefficients) - 2.0 * (right @ coefficients))
         chi_square += self._of_shapes(effects)
@@ -335,7 +335,8 @@ class Separable:
             )
             if same:
                 return old
-            # An effect whose columns changed once will change again at the next step.
+            # Effects whose columns have changed are excluded, because these will change again at the next
+            # step.
             known = set(old.units)
             places = tuple(place for place, each in units.items() if each in known) or tuple(units)
         else:
@@ -354,7 +355,7 @@ class Separable:
         return self._fixed
 
     def _linear(self, effects: Sequence[Effect], *places: tuple[int, ...]) -> list[Column]:
-        """Lists the linear columns, nuisances first."""
+        """Lists the parameters of the linear columns, nuisances first."""
         columns = [Column(-1, name) for name in self.terms.nuisances.names]
         for place in chain(*places):
             columns += [Column(place, str(number)) for number in range(len(effects[place].coefficients()))]
@@ -415,7 +416,7 @@ class Separable:
         return step, float(slope @ step)
 
     def _stands(self, here: _Point, effects: Sequence[Effect]) -> bool:
-        """Returns True if the effects' copies of each other agree with the fit."""
+        """Returns True if the copies of other effects that effects contain agree with the fit."""
         return all(unit(one) == unit(other) for one, other in zip(here.given, effects, strict=True))
 
     def _solution(self, here: _Point) -> Solution:

@@ -1,9 +1,9 @@
-"""Swing of the load on its spring, which every axis has: wind-up in acceleration and ringing after a stop.
+"""Swing of the load on the gear's spring: wind-up during acceleration and ringing after a stop.
 
-The load follows the motor and the gear's error like a mass on a damped spring follows its base. A calibration
-moves too slowly to show the swing, which is not a fault. Its frequency and damping are therefore fitted to
-the residual of the given model, before any part of the model is free to imitate it, and the swing is
-subtracted. Samples in which the uncertainty of the swing is too large are left out.
+The load follows the motor and the gear's error as a mass on a damped spring follows its base. Every axis has
+this swing, and it is not a fault. A calibration moves too slowly to show it. Its frequency and damping are
+therefore fitted to the residual of the given model, before any part of the model is free to imitate it, and
+the swing is subtracted. Samples in which the uncertainty of the swing is too large are omitted.
 """
 
 from __future__ import annotations
@@ -33,56 +33,56 @@ from hdbridge.axis.effects.path import standing_s
 from hdbridge.units import ARCSEC_PER_DEG
 
 ORDINARY_HZ = 30.0
-"""Lowest natural frequency of an ordinary load. The demo axis has 42 Hz; of the axes that tools/blind draws,
-with 20 to 640 Hz, one in thirty is softer."""
+"""Lowest natural frequency of an ordinary load. The demo axis has 42 Hz. Of the axes that tools/blind
+generates (20 to 640 Hz), one in thirty has a lower frequency."""
 HERTZ = np.geomspace(0.4 * ORDINARY_HZ, 16.0 * ORDINARY_HZ, 23)
 DAMPING = (0.05, 0.2, 0.5)
-"""Initial natural frequencies and damping ratios, before the refinement."""
+"""Natural frequencies and damping ratios that are tried before the refinement."""
 MOST_DAMPED = 0.9
 LAGS = range(-3, 2)
-"""Samples whose second differences move a load that is too stiff for the sampling: from three before to the
-next, on which the motion before it depends."""
+"""Offsets, in samples, of the second differences to which a load too stiff for the sampling responds. The
+next sample is included, because the motion before it depends on it."""
 UNRESOLVED = 0.1
-"""Prior standard deviation of the response at each lag, relative to the second difference there."""
+"""Prior standard deviation of the response at each lag, relative to the second difference at that lag."""
 STATIC_S2 = 7e-6
-"""Prior standard deviation of the response to a steady acceleration: 1 / (2 pi f)^2 of a load with natural
+"""Prior standard deviation of the response to a constant acceleration: 1 / (2 pi f)^2 for a load with natural
 frequency f = 60 Hz."""
 UNEVEN = 0.3
-"""Deviation of a time step from the median, relative to it, above which second differences are not used."""
+"""Maximum relative deviation of a time step from the median for its second differences to be used."""
 LEAST_SEEN = 0.1
-"""Minimum share of a residual's sum of squares that a swing must explain, because any oscillation explains a
-little."""
+"""Minimum fraction of a residual's sum of squares that a swing must explain, because any oscillation explains
+a little."""
 CALMEST = 0.05
-"""Minimum share of the record that is used: its calmest samples."""
+"""Minimum fraction of the samples that are used, those with the smallest uncertainty of the swing."""
 RESOLVED = 4.0
-"""Number of samples per wave above which a spline begins to follow it; from twice this number, the spline
-follows in full."""
+"""Number of samples per period above which a spline begins to follow a wave. From twice this number on, the
+spline follows it fully."""
 REFINED = 40
-"""Number of trials of the refinement."""
+"""Maximum number of function evaluations of the refinement."""
 LONGEST = 20_000
-"""Maximum number of samples to which a swing is fitted: those of the highest accelerations."""
+"""Maximum number of consecutive samples to which a swing is fitted: those with the highest accelerations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Swing:
-    """Lag of the load behind its base."""
+    """Swing of the load relative to its base."""
 
     frequency_hz: float
     damping: float
     does_arcsec: FloatArray
-    """Error caused by the swing in each sample, shape (n,)."""
+    """Transmission error due to the swing in each sample, shape (n,)."""
     waves_arcsec2: FloatArray
-    """Squared amplitudes of the part due to waves too fast for the sampling, shape (n,)."""
+    """Squared amplitude of the swing due to waves that are too fast for the sampling, shape (n,)."""
 
     def wind_up_arcsec(self, full: Samples) -> FloatArray:
-        """Returns the slow part: the wind-up by the motor's acceleration, shape (n,)."""
+        """Returns the slow part of the swing, the wind-up due to the motor's acceleration, shape (n,)."""
         acceleration = full.motion.motor_acceleration_deg_s2
         assert acceleration is not None
         return -acceleration * ARCSEC_PER_DEG / full.ratio / (math.tau * self.frequency_hz) ** 2
 
     @property
     def soft(self) -> bool:
-        """True for a load softer than an ordinary load, whose wind-up is a cause to be found."""
+        """True if the load is softer than an ordinary load; its wind-up is then a cause to find."""
         return self.frequency_hz <= ORDINARY_HZ
 
     def remark(self) -> str:
@@ -97,16 +97,17 @@ class Swing:
 def swing(
     bend: FloatArray, step_s: FloatArray, first: Sequence[int], frequency_hz: float, damping: float
 ) -> Swing:
-    """Computes the load's motion relative to its base, whose second derivative is ``bend``, (n,).
+    """Computes the load's motion e relative to its base.
 
-    It is at rest at the ``first`` sample of each part; ``step_s`` (n - 1,) are the times between samples.
-    e'' + 2 z w e' + w^2 e = -bend, solved exactly for a bend that is linear between samples.
+    ``bend`` (n,) is the second derivative of the base's position, and ``step_s`` (n - 1,) contains the times
+    between samples. The load is at rest at the ``first`` sample of each part. The equation
+    e'' + 2 z w e' + w^2 e = -bend is solved exactly for a bend that is linear between samples.
     """
     w, begins = math.tau * frequency_hz, np.asarray(first)
     damped = w * math.sqrt(1.0 - damping**2)
     fall = np.exp(-damping * w * step_s)
     cosine, sine = fall * np.cos(damped * step_s), fall * np.sin(damped * step_s)
-    # Transition of deviation and speed over w, and the response to the second derivative.
+    # Transition matrix of position and of speed divided by w, and the response to the second derivative.
     own, cross = cosine + damping * w / damped * sine, w / damped * sine
     other = cosine - damping * w / damped * sine
     slope = np.diff(bend) / step_s / w**3
@@ -126,33 +127,33 @@ def swing(
 
 
 def bend_of(base_arcsec: FloatArray, step_s: FloatArray, parts: Sequence[slice]) -> FloatArray:
-    """Returns the second derivative of the natural spline through each part of the base, shape (n,)."""
+    """Returns the second derivative of a natural spline through each part of the base's path, shape (n,)."""
     ends = [row for each in parts for row in (each.start, each.stop - 1)]
     band, right = np.zeros((3, len(base_arcsec))), np.zeros(len(base_arcsec))
     band[1, 1:-1] = (step_s[:-1] + step_s[1:]) / 3.0
     band[0, 2:], band[2, :-2] = step_s[1:] / 6.0, step_s[:-1] / 6.0
     right[1:-1] = np.diff(np.diff(base_arcsec) / step_s)
     band[1, ends], right[ends] = 1.0, 0.0
-    for each in ends:  # their rows say that the derivative is zero
+    for each in ends:  # these rows set the second derivative to zero
         band[0, each + 1 : each + 2] = band[2, max(each - 1, 0) : each] = 0.0
     return np.asarray(solve_banded((1, 1), band, right, check_finite=False))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Base:
-    """Base of the spring: the motor behind the ratio, and the error of effects."""
+    """Base of the load's spring: the motor angle divided by the ratio, plus the error due to the effects."""
 
     full: Samples
     period_s: float
     residual_arcsec: FloatArray
-    """Measured error less that of the effects, shape (n,)."""
+    """Measured error minus the error due to the effects, shape (n,)."""
     slow_arcsec: FloatArray
-    """Angle of the base, load arcsec, without the waves too fast for a spline, shape (n,)."""
+    """Angle of the base, load arcsec, without the waves that are too fast for a spline, shape (n,)."""
     fast: tuple[_Fast, ...]
 
     @classmethod
     def of(cls, data: Observed, effects: Sequence[Effect]) -> Base:
-        """Returns the base of these effects, from the elastic start that fits best."""
+        """Returns the base for these effects, with the initial elastic state that fits best."""
         full = data.full
         weight = full.usable / full.sigma_arcsec**2
 
@@ -172,12 +173,13 @@ class Base:
 
 
 def between_samples(base: Base, scales: Scales) -> Nuisances:
-    """Returns the swing that depends on the motion between samples, for each sample, arcsec, shape (n, k).
+    """Returns columns of the swing that is due to motion between samples, arcsec, shape (n, k).
 
-    A drive that follows its command in straight lines, or with a ripple of its own, accelerates between
-    samples as no spline through them shows. The load's response at the samples is a filter of their second
-    differences: one column for a steady acceleration, and one for each other of `LAGS` less that. Without
-    columns if they explain little of the residual of the given model, or more than such a load can.
+    A drive may follow its command in straight lines, or with a ripple of its own. Its acceleration between
+    samples is then not visible in a spline through them. The load's response is modelled as a filter of the
+    samples' second differences. One column is for a constant acceleration; each other one is the difference
+    between another of `LAGS` and lag 0. There are no columns if they explain little of the residual, or more
+    than such a load can.
     """
     full = base.full
     even = np.abs(np.diff(full.time_s) / base.period_s - 1.0) < UNEVEN
@@ -195,16 +197,17 @@ def between_samples(base: Base, scales: Scales) -> Nuisances:
     (whole, _), (rest, sought) = (
         _beside(full, each, every)(base.residual_arcsec) for each in (nothing, found)
     )
-    strain = float(np.sum((sought / sizes) ** 2))  # of a load that is not too stiff for the sampling
+    strain = float(np.sum((sought / sizes) ** 2))  # large if the load is not too stiff for the sampling
     return found if _seen(whole, rest, len(names), scales) and strain < scales.enter else nothing
 
 
 def _beside(
     full: Samples, nuisances: Nuisances, rows: slice
 ) -> Callable[[FloatArray], tuple[float, FloatArray]]:
-    """Returns a function of a residual: its chi square in some rows after a fit, and the nuisances.
+    """Returns a function that fits zeros and ``nuisances`` to a residual in some rows.
 
-    A zero without a usable sample in these rows is left out.
+    The function returns the remaining chi square and the nuisances' values. Zeros without a usable sample in
+    these rows are omitted.
     """
     root = np.sqrt(full.usable[rows]) / full.sigma_arcsec[rows]
     columns = zeros(full.zero[rows], full.zeros).and_also(replace(nuisances, columns=nuisances.columns[rows]))
@@ -228,9 +231,9 @@ def _seen(whole: float, rest: float, parameters: int, scales: Scales) -> bool:
 
 
 def seen_swing(base: Base, between: Nuisances, scales: Scales) -> Swing | None:
-    """Fits the swing to the residual of the base's effects; None if no swing is seen.
+    """Fits the swing to the residual of the base's effects; returns None if no swing is visible.
 
-    It has to explain what ``between``, the motion between samples, does not.
+    The swing must improve on a fit of ``between``, the columns of the motion between samples.
     """
     full, residual = base.full, base.residual_arcsec
     step_s, parts = np.maximum(np.diff(full.time_s), 1e-9), [each.rows for each in full.chains]
@@ -266,17 +269,17 @@ def seen_swing(base: Base, between: Nuisances, scales: Scales) -> Swing | None:
 
 
 class _Fast(NamedTuple):
-    """Wave of the gear's error where it is too fast for a spline; it swings as at constant speed."""
+    """Part of a wave of the gear's error that is too fast for a spline; the response is quasi-steady."""
 
     rows: IntArray
-    """Samples with fewer than twice `RESOLVED` samples per wave, shape (k,)."""
+    """Indices of the samples with fewer than twice `RESOLVED` samples per period, shape (k,)."""
     phasor: NDArray[np.complex128]
-    """Wave, arcsec, faded in below that number, shape (k,)."""
+    """Complex value of the wave, arcsec, faded in below that number, shape (k,)."""
     rad_s: FloatArray
     """Angular frequency, signed, shape (k,)."""
 
     def within(self, rows: slice) -> _Fast:
-        """Returns the part in some rows, renumbered from the first of them."""
+        """Returns the part within ``rows``, with indices relative to the first of these rows."""
         part = slice(*np.searchsorted(self.rows, (rows.start, rows.stop)))
         return _Fast(self.rows[part] - rows.start, self.phasor[part], self.rad_s[part])
 
@@ -287,7 +290,7 @@ class _Fast(NamedTuple):
 
 
 def _fast_waves(full: Samples, effects: Sequence[Effect], period_s: float) -> Iterator[_Fast]:
-    """Yields the fast parts of the waves of a model's orders."""
+    """Yields the fast part of each wave of a model's orders."""
     for turns, amplitude, phase_deg in (
         wave for each in effects if each.part is Part.ORDERS for wave in each.waves()
     ):
@@ -300,19 +303,20 @@ def _fast_waves(full: Samples, effects: Sequence[Effect], period_s: float) -> It
 
 
 def without(data: Observed, found: Swing) -> Observed:
-    """Returns the data less the swing; a soft load's wind-up stays, as a cause to be found."""
+    """Returns the data after subtraction of the swing; a soft load's wind-up remains, as a cause to find."""
     full = data.full
     does = found.does_arcsec - found.wind_up_arcsec(full) if found.soft else found.does_arcsec
     return data.having(replace(full, error_arcsec=full.error_arcsec - does))
 
 
 def settled(estimator: Estimator, fitted: Fitted, effects: Sequence[Effect], found: Swing | None) -> Observed:
-    """Returns the data without the samples in which the uncertainty of the swing is too large.
+    """Excludes the samples in which the uncertainty of the swing is too large, and adds other uncertainties.
 
-    The error of a ``found`` swing is proportional to the wind-up and to waves too fast for the sampling. Its
-    share is found by regression on the squares of the residual in motion. The noise of a sample contains this
-    error and that of the turning points under the given ``effects``, because the ``fitted`` loop may have
-    changed to imitate it. The calmest samples are always kept.
+    The error of a ``found`` swing is proportional to the wind-up and to waves that are too fast for the
+    sampling. The factor is found by regression on the squared residuals in motion. The noise of each sample
+    is increased by this error and by that of the turning points. The latter is computed with the given
+    ``effects``, because the ``fitted`` loop may have changed to imitate it. The calmest samples are always
+    kept.
     """
     data, unknown = estimator.data, np.zeros(len(estimator.data.full))
     moving = (data.points.speed_deg_s != 0.0)[estimator.index]
@@ -322,7 +326,7 @@ def settled(estimator: Estimator, fitted: Fitted, effects: Sequence[Effect], fou
         swung = wind_up**2 + found.waves_arcsec2
         unknown = np.sqrt(_share(square[moving], estimator.at_points(swung)[moving]) * swung)
     crept = estimator.crept(effects, fitted.hypothesis.start)
-    calm = (standing_s(estimator.motion) > 2.0 * SETTLE_S)[estimator.index]  # without ringing
+    calm = (standing_s(estimator.motion) > 2.0 * SETTLE_S)[estimator.index]  # after the ringing has decayed
     crept = crept * math.sqrt(_share(square[calm], estimator.at_points(crept**2)[calm]))
     most = max(estimator.scales.floor_arcsec, float(np.quantile(unknown[data.full.usable], CALMEST)))
     usable = data.full.usable & (unknown <= most)
@@ -333,13 +337,16 @@ def settled(estimator: Estimator, fitted: Fitted, effects: Sequence[Effect], fou
 
 
 def _share(square: FloatArray, size: FloatArray) -> float:
-    """Returns the share, 0 to 1, of squared errors of a known ``size`` in squared residuals, (k,)."""
+    """Returns the factor, 0 to 1, by which ``size`` contributes to the squared residuals ``square``, (k,)."""
     about = size - np.mean(size) if len(size) else size
     return min(max(float(about @ square) / max(float(about @ about), 1e-300), 0.0), 1.0)
 
 
 def _accelerated(full: Samples, period_s: float) -> FloatArray:
-    """Returns the largest acceleration of the base from one sample after to `SETTLE_S` before each, (n,)."""
+    """Returns the largest acceleration of the base within `SETTLE_S` before each sample, arcsec/s^2, (n,).
+
+    The next sample is included.
+    """
     size, rows = full.motion.motor_acceleration_deg_s2, max(1, round(SETTLE_S / period_s))
     assert size is not None
     result = np.empty(len(full))

@@ -1,9 +1,9 @@
-"""Residual that no cause explains: its size and the coordinate it depends on.
+"""Unexplained residual: its size and the coordinate on which it depends.
 
-Non-parametric models (bins over every coordinate of `residual_views`) are tested on stretches of time to
-which they were not fitted, by the criteria for causes. If one of them is significant, or the residual exceeds
-the noise, a cause is missing from the catalogue. A residual near the reversals only may belong to the loop,
-whose law is not known exactly.
+Non-parametric models (bins over each coordinate, see `views`) are tested on stretches of time to which they
+were not fitted, by the criteria for causes. If one of them is significant, or if the residual exceeds the
+noise, a cause is missing from the catalogue. A residual that occurs only near reversals may belong to the
+loop, whose law is not known exactly.
 """
 
 from __future__ import annotations
@@ -27,41 +27,41 @@ from hdbridge.axis.effects.coordinate import since_reversal
 from hdbridge.axis.effects.kinematics import direction_of
 
 BINS = {"load angle": (72, 360, 1800), "position": (72, 360, 1800), "time": (25,)}
-"""Number of bins per coordinate. The angle bins suit a wide bump, a narrow bump and waves of the motor
-orders; each time bin contains several stretches."""
+"""Numbers of bins per coordinate. Those of the angles suit a wide bump, a narrow bump and waves of the motor
+orders. Each time bin contains several stretches of time."""
 BLOCK_S = 0.2
 FEW = 50
-"""Minimum number of points for a conclusion about a record."""
+"""Minimum number of points for a conclusion about a part of a record."""
 TAIL = 3.0
-"""Travel after a reversal, in loop widths, after which even a slowly fading memory has vanished."""
+"""Travel after a reversal, in units of the loop's memory, after which its influence has vanished."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rest:
-    """Unexplained residual."""
+    """Size of the unexplained residual, and the coordinate on which it depends."""
 
     arcsec: float
-    """Root mean square beyond the noise, over short blocks."""
+    """Rms beyond the noise, of means over short blocks."""
     apart_arcsec: float
-    """Root mean square in motion, beyond the reach of a loop's memory."""
+    """Rms beyond the noise, of samples in motion that the loop's memory of a reversal does not affect."""
     peak_arcsec: float
-    """Half the span of the residual beyond the noise, without rare extremes."""
+    """Half the peak-to-peak residual beyond the noise, excluding rare extremes."""
     fast_arcsec: float
-    """Root mean square over all points beyond the noise, including parts too fast for the blocks."""
+    """Rms beyond the noise, of all points, including variations too fast for the blocks."""
     standing_arcsec: float
-    """Drift at rest; 0 if the axis never rests."""
+    """Drift between neighbouring blocks at rest; 0 if the axis never rests."""
     crept_arcsec: float
-    """Root mean square if the motor has crept back within its count at every rest."""
+    """Rms error if the motor has crept back within its count at every rest."""
     lives_in: str
-    """Coordinate on which the residual depends most; time if on none."""
+    """Coordinate on which the residual depends most; time if it depends on none."""
     seen: bool
-    """True if that dependence passes the criteria for a cause."""
+    """True if this dependence passes the criteria for a cause."""
     remark: str
-    """Describes a dependence that passes the criteria but is too small to act on; else empty."""
+    """Description of a dependence that passes the criteria but is too small to report; else empty."""
 
 
 class _View(NamedTuple):
-    """A residual over one coordinate."""
+    """Dependence of the residual on one coordinate."""
 
     gain: float
     """Fall in chi square due to ``predicted_arcsec``."""
@@ -71,7 +71,7 @@ class _View(NamedTuple):
 
 
 def rest(estimator: Estimator, fitted: Fitted) -> Rest:
-    """Measures the unexplained residual of a fit."""
+    """Determines size and dependence of the unexplained residual of a fit."""
     residual = fitted.residual / estimator.weight
     near = near_reversals(estimator, fitted)
     apart = ~near & (estimator.data.points.speed_deg_s != 0.0)[estimator.index]
@@ -95,13 +95,13 @@ def rest(estimator: Estimator, fitted: Fitted) -> Rest:
 
 
 def is_unexplained(estimator: Estimator, left: Rest) -> bool:
-    """Returns True if the residual exceeds what an ordinary axis leaves."""
+    """Returns True if the residual is larger than that of an ordinary axis."""
     if not of_the_loop(estimator, left):
         return True
     data, scales = estimator.data, estimator.scales
-    # An axis rests anywhere within a count of its motor encoder, and noise wanders; neither has a cause.
+    # An axis rests anywhere within a count of its motor encoder, and noise drifts. Neither is a cause.
     counts = data.motor_count_arcsec / np.sqrt(12.0)
-    # If command and standstill separate noise and following error from the gear, fast residuals count.
+    # Fast residuals count only if command and standstill separate noise and following error from the gear.
     fast = float(np.hypot(max(scales.plain_arcsec, data.noise_arcsec), left.standing_arcsec))
     if data.full.commanded and data.standstill and left.fast_arcsec > fast:
         return True
@@ -110,7 +110,7 @@ def is_unexplained(estimator: Estimator, left: Rest) -> bool:
 
 
 def many_of_one(findings: Sequence[Finding], scales: Scales) -> list[Finding] | None:
-    """Returns the nearly equal findings of one kind that exceed its maximum number, else None.
+    """Returns the findings of one kind if more of them are nearly equal than an axis can have; else None.
 
     They are sidebands of a cause outside the catalogue.
     """
@@ -128,7 +128,7 @@ def many_of_one(findings: Sequence[Finding], scales: Scales) -> list[Finding] | 
 def of_the_loop(estimator: Estimator, left: Rest) -> bool:
     """Returns True if the whole residual may belong to the loop.
 
-    Where the axis moves beyond the memory of any loop, the residual must be below the threshold.
+    In motion that the loop's memory does not affect, the residual must be below the threshold.
     """
     counts = _angle_step_arcsec(estimator) / np.sqrt(12.0)
     most = np.linalg.norm((estimator.scales.floor_arcsec, counts, left.standing_arcsec))
@@ -136,13 +136,13 @@ def of_the_loop(estimator: Estimator, left: Rest) -> bool:
 
 
 def beyond_noise(estimator: Estimator, residual: FloatArray, rows: BoolArray | slice = slice(None)) -> float:
-    """Returns the root mean square over blocks of `BLOCK_S`, less the share of white noise, arcsec."""
+    """Returns the rms of means over blocks of `BLOCK_S`, less the contribution of white noise, arcsec."""
     mean, white = _blocks(estimator, residual, rows)
     return float(np.sqrt(max(float(np.mean(mean**2 - white)), 0.0)))
 
 
 def _peak(estimator: Estimator, residual: FloatArray) -> float:
-    """Returns half the span of the block means, less the share of white noise, arcsec."""
+    """Returns half the span of the block means, less the contribution of white noise, arcsec."""
     mean, white = _blocks(estimator, residual, slice(None))
     mean, white = (each[white <= np.median(white)] for each in (mean, white))  # complete blocks
     noise = NormalDist().inv_cdf(1.0 - estimator.rare) ** 2 * float(np.mean(white))
@@ -152,7 +152,7 @@ def _peak(estimator: Estimator, residual: FloatArray) -> float:
 def _blocks(
     estimator: Estimator, residual: FloatArray, rows: BoolArray | slice
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns means of some rows over blocks of `BLOCK_S`, and their variances due to white noise."""
+    """Returns the residual's means over blocks of `BLOCK_S`, and their variances due to white noise."""
     number = of_length(estimator.time_s[rows], BLOCK_S)
     count = np.bincount(number)
     variance = np.bincount(number, 1.0 / estimator.weight[rows] ** 2) / count**2
@@ -160,19 +160,19 @@ def _blocks(
 
 
 def _angle_step_arcsec(estimator: Estimator) -> float:
-    """Returns the step of the driving angle at the load: one motor count, or 0 with a command."""
+    """Returns the resolution of the motor angle, referred to the load: one count, or 0 with a command."""
     return 0.0 if estimator.data.full.commanded else estimator.data.motor_count_arcsec
 
 
 def near_reversals(estimator: Estimator, fitted: Fitted) -> BoolArray:
-    """Returns a mask (m,) of points within a loop's memory of the last reversal; else all True."""
+    """Returns a mask (m,) of the points within a loop's memory of the last reversal; all True if none is."""
     memory_deg = max((each.tracker().memory_deg for each in fitted.hypothesis.effects), default=0.0)
     near = (since_reversal(estimator.motion).values <= TAIL * memory_deg)[estimator.index]
     return np.asarray(near if np.any(near) else np.ones_like(near))
 
 
 def _views(estimator: Estimator, residual: FloatArray, rows: BoolArray) -> Iterator[_View]:
-    """Yields the views of some rows of a residual over all coordinates."""
+    """Yields the views of the selected rows of a residual over all coordinates."""
     motion, index = estimator.motion, estimator.index[rows]
     values, weight = residual[rows], estimator.weight[rows]
     fold, direction = folds(estimator.time_s[rows]), direction_of(motion)[index]
@@ -189,7 +189,7 @@ def _seen(
 ) -> tuple[list[_View], str]:
     """Returns the views that pass the criteria for a cause and are large enough to report, and a remark.
 
-    The remark describes the best view below that size; it is empty if a view is returned or none passes.
+    The remark describes the best view that is too small. It is empty if a view is returned or none passes.
     """
     scales, start, weight = estimator.scales, fitted.hypothesis.start, estimator.weight[rows]
     count_arcsec = estimator.count_arcsec
@@ -197,7 +197,7 @@ def _seen(
     half_steps = 0.5 * _angle_step_arcsec(estimator), 0.5 * estimator.data.load_count_arcsec
     peak = max(count_arcsec, math.hypot(scales.plain_arcsec, *half_steps))
     laws = [each for each in fitted.hypothesis.effects if each.part is None]
-    for law in laws:  # the larger its contribution, the larger the error of its formula
+    for law in laws:  # the law error of an effect grows with its contribution
         does = estimator.columns(law, start)[rows] @ law.coefficients()
         gain = max(gain, scales.alias * len(does) * float(np.var(weight * does)))
         peak = max(peak, scales.plain_arcsec + math.sqrt(scales.alias) * estimator.half_span(does))
@@ -225,7 +225,7 @@ def _seen(
 
 
 def _standing(estimator: Estimator, residual: FloatArray) -> float:
-    """Returns the drift between neighbouring blocks at rest, which is wandering noise, not physics."""
+    """Returns the typical step between neighbouring block means at rest, arcsec, which is slow noise."""
     speed = estimator.motion.motor_speed_deg_s
     if speed is None:
         return 0.0
@@ -239,18 +239,18 @@ def _standing(estimator: Estimator, residual: FloatArray) -> float:
     return float(np.median(np.abs(step))) * 1.05 if len(step) else 0.0
 
 
-# Check for a model that was never fitted: it has no loop although the axis has one.
+# Check for a model that was never fitted: it has no loop, although the axis has one.
 
 
 MOST = 0.5
-"""Share of the model's squared residual above which a missing loop is its main error. Used only for a
-remark."""
+"""Minimum fraction of the squared residual that a loop must explain for its absence to be the model's main
+error. Used only for a remark."""
 
 
 def unfitted(estimator: Estimator, effects: tuple[Effect, ...]) -> str:
     """Returns a remark if the model lacks a loop that would explain most of its residual; else empty.
 
-    Other errors become visible only with the loop in the fit, so findings without it mean little.
+    Other errors become visible only with the loop in the fit, so findings without the loop mean little.
     """
     if estimator.data.reversals < 2 or any(each.part is Part.LOOP for each in effects):
         return ""

@@ -1,8 +1,8 @@
-"""Residuals of a model over every coordinate that a cause may depend on.
+"""Residuals of a model over each coordinate on which a cause may depend.
 
 The coordinates are motor angle, load angle, direction, speed, acceleration, torque, temperature, time, and
-travel and time since the last reversal. Residuals are averaged over bins, and the bin means are tested as
-predictions of stretches of time from which they were not computed.
+travel and time since the last reversal. Residuals are averaged over bins. The bin means are tested as
+predictions of other stretches of time than those from which they were computed.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from hdbridge.axis.effects.coordinate import Coordinate
 from hdbridge.axis.effects.kinematics import direction_of
 
 COARSE: Final = 16
-"""Number of time bins, few enough that each has several stretches."""
+"""Number of time bins, small enough for each to contain several stretches of time."""
 SHRUNK: Final = 2.0
-"""Number of zero-valued points added to each bin, because a mean of few points has no predictive value."""
+"""Number of zero-valued points added to each bin, because a mean of few points is a poor prediction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,7 +31,7 @@ class ResidualViews:
     """Two residuals, and the coordinates over which to view them; arrays of shape (m,)."""
 
     given_arcsec: FloatArray
-    """Measurement minus the given model, about zero."""
+    """Measurement minus the given model."""
     left_arcsec: FloatArray
     """Measurement minus the extended model."""
     direction: FloatArray
@@ -39,10 +39,9 @@ class ResidualViews:
     coordinates: Mapping[str, Coordinate]
 
     def shares(self) -> dict[str, tuple[float, float]]:
-        """Returns, per coordinate, the shares of the mean square that bin means predict, 0 to 1.
+        """Returns the fractions of the mean square, 0 to 1, that bin means predict, by coordinate.
 
-        The first share is that of the given model, the second that of the extended model. Noise has a share
-        of zero.
+        The first fraction is for the given model, the second for the extended model. For noise it is zero.
         """
         fold = folds(self.time_s)
 
@@ -58,7 +57,7 @@ class ResidualViews:
 
 
 def coordinates(motion: Motion, rows: IntArray, ratio: float) -> dict[str, Coordinate]:
-    """Returns the recorded coordinates that vary, at some points of a record."""
+    """Returns the recorded coordinates that vary over the selected points, by name."""
     found = (
         over.motor_angle(motion),
         over.load_angle(motion, ratio),
@@ -84,7 +83,7 @@ def folds(time_s: FloatArray) -> IntArray:
 def predicted(
     coordinate: Coordinate, values: FloatArray, direction: FloatArray, fold: IntArray
 ) -> FloatArray:
-    """Predicts the points of each fold by the bin means of all other folds, shape (m,)."""
+    """Predicts the points of each fold from the bin means of all other folds, shape (m,)."""
     number = coordinate.numbers()
     if coordinate.both_ways:
         number = 2 * number + (direction < 0.0)
