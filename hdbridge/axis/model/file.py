@@ -46,7 +46,7 @@ class EffectEntry(BaseModel):
 
 
 class ModelFile(BaseModel):
-    """Content of a model file; each effect checks its own parameters."""
+    """Content of a model file. The parameters of an effect are validated by the effect itself."""
 
     schema_: Literal["hdbridge.model/1"] = Field(
         alias="schema", description="schema and version of this file"
@@ -58,7 +58,8 @@ class ModelFile(BaseModel):
 
 
 def effects_of(document: Document, file: ModelFile) -> tuple[tuple[Effect, ...], dict[str, dict[str, Any]]]:
-    """Returns the effects of a model file and their uncertainties, by name.
+    """Returns the effects of a model file, and their uncertainties by name.
+
 
     Raises `InputError` with file:line:column and the nearest valid name.
     """
@@ -118,7 +119,7 @@ def hexadecimal(provenance: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _in_lines(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the data with each list on one line."""
+    """Returns the data, marked such that each list is written on one line."""
     return {
         name: Line(value)
         if isinstance(value, list)
