@@ -1,7 +1,7 @@
 """Optional measured channels of the axis file, in addition to the encoders.
 
-Each is an object of the drive that arrives by PDO, with its unit, its plausible range, and the time for which
-the last reading is held. `hdbridge.drive.channels` tracks them on line.
+Each channel is an object of the drive that is received by PDO. It has a unit, a plausible range, and a time
+for which the last reading is held. `hdbridge.drive.channels` tracks the channels on line.
 """
 
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, Self
@@ -20,7 +20,7 @@ HoldMs = Annotated[
 
 
 class Scale(NamedTuple):
-    """Linear scale ``at_zero + per_count * counts``, with the plausible range ``least`` to ``greatest``."""
+    """Conversion ``at_zero + per_count * counts``, and plausible range from ``least`` to ``greatest``."""
 
     per_count: float
     at_zero: float
@@ -29,7 +29,7 @@ class Scale(NamedTuple):
 
 
 class ChannelSource(Strict):
-    """Object of the drive that carries a channel."""
+    """Object of the drive that contains a channel's reading."""
 
     index: int = Field(ge=0x1000, le=0xFFFF, description="index of the object")
     subindex: int = Field(0, ge=0, le=255, description="sub-index of the object")
@@ -51,7 +51,7 @@ class LoadTorque(Strict):
 
     @property
     def scale(self) -> Scale:
-        """Scale to newton metres at the load, positive forward."""
+        """Conversion from counts to newton metres at the load; forward torque is positive."""
         limit = self.maximum_nm
         return Scale(self.direction * self.newton_metres_per_count, 0.0, -limit, limit)
 
@@ -81,12 +81,12 @@ class Temperature(Strict):
 
     @property
     def scale(self) -> Scale:
-        """Scale to degrees Celsius."""
+        """Conversion from counts to degrees Celsius."""
         return Scale(self.celsius_per_count, self.celsius_at_zero, self.minimum_celsius, self.maximum_celsius)
 
 
 class Quantity(Strict):
-    """Any other measured channel, in its unit."""
+    """Any other measured quantity, in its unit."""
 
     source: ChannelSource = Field(description="object with the reading")
     per_count: float = Field(ge=-1e6, le=1e6, description="its unit per count")
@@ -98,13 +98,13 @@ class Quantity(Strict):
 
     @property
     def scale(self) -> Scale:
-        """Scale to the channel's unit."""
+        """Conversion from counts to the channel's unit."""
         return Scale(self.per_count, self.at_zero, self.minimum, self.maximum)
 
 
 MeasuredChannel = LoadTorque | Temperature | Quantity
 BY_KEY: Final = {each.axis_key: each for each in MEASURED if each.axis_key}
-"""Channels of the axis file by their key."""
+"""Channels that the axis file can contain, by key."""
 
 OWN_KEYS: Final = frozenset({"load_torque", "temperature"})
 if TYPE_CHECKING:

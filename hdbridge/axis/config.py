@@ -1,7 +1,7 @@
 """Axis file: drive and bus, encoders and gear, and the motion limits.
 
-``profiles/NAME/axis.yaml`` is written by the user and never changed by the program. Its whole content is
-checked before anything moves; an error names file, line and column.
+The user writes ``profiles/NAME/axis.yaml``, and the program never changes it. The whole file is checked
+before the axis moves. Error messages state file, line and column.
 """
 
 import math
@@ -148,7 +148,7 @@ class DriveConfig(Strict):
 
     @property
     def interpolation_period(self) -> tuple[int, int]:
-        """Value of 60C2h: mantissa (:01) and exponent (:02) of the period in seconds."""
+        """Value of 60C2h: mantissa (:01) and exponent (:02) of the SYNC period in seconds."""
         period = _interpolation_period(self.cycle_ms)
         assert period is not None  # validated
         return period
@@ -175,7 +175,7 @@ class Teeth(Strict):
 
     @property
     def ratio(self) -> float:
-        """Motor turns per load turn, without its sign."""
+        """Motor turns per load turn, without sign."""
         teeth = self.flexspline if self.output == "flexspline" else self.circular_spline
         return teeth / (self.circular_spline - self.flexspline)
 
@@ -228,7 +228,7 @@ class Limits(Strict):
 
 
 class CompensationConfig(Strict):
-    """Limits of the compensation's changes to the target."""
+    """Limits of the correction that the compensation adds to the target."""
 
     maximum_arcsec: float = Field(300.0, gt=0, le=36_000, description="largest correction, at the load")
     slew_arcsec_s: float = Field(
@@ -238,7 +238,7 @@ class CompensationConfig(Strict):
 
 
 class RealtimeConfig(Strict):
-    """Scheduling of the master's process while it moves the axis over a real bus."""
+    """Scheduling of the master process while it moves the axis over a real bus."""
 
     priority: int = Field(50, ge=0, le=99, description="SCHED_FIFO priority of the control loop; 0: none")
     cpus: tuple[Annotated[int, Field(ge=0, le=4095)], ...] = Field(
@@ -279,14 +279,15 @@ class AxisConfig(OtherChannels):
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Reads an axis file, or that of a profile's folder; raises `InputError` with file:line:column."""
+        """Reads an axis file, given its path or profile folder; raises `InputError` with file:line:column."""
         path = Path(path)
         return cls._from_document(read_yaml(path / "axis.yaml" if path.is_dir() else path))
 
     @classmethod
     def from_text(cls, text: str, path: Path | str = "axis.yaml") -> Self:
-        """Reads the text of an axis file. ``path`` names the file in messages; the EDS is searched for in
-        its folder.
+        """Reads an axis file from its text.
+
+        ``path`` is used in messages, and its folder is searched for the EDS file.
         """
         return cls._from_document(document_from_text(text, path))
 
@@ -351,13 +352,14 @@ class AxisConfig(OtherChannels):
 
     @property
     def channels(self) -> dict[str, MeasuredChannel]:
-        """Measured channels of the axis, by their key."""
+        """Measured channels of the axis, by key."""
         given = {key: getattr(self, key) for key in BY_KEY}
         return {key: channel for key, channel in given.items() if channel is not None}
 
     def on_bus(self, **changes: str | int | None) -> Self:
-        """Returns the axis on another bus (keys of `BusConfig`); options are kept only for the same
-        interface.
+        """Returns the axis with changes to its bus, by key of `BusConfig`.
+
+        Bus options are kept only if the interface stays the same.
         """
         bus = {**self.bus.model_dump(), **changes}
         if bus["interface"] != self.bus.interface:
@@ -366,7 +368,7 @@ class AxisConfig(OtherChannels):
 
     @property
     def path(self) -> Path:
-        """File from which this axis was read."""
+        """File from which the axis was read; ``axis.yaml`` if it was not read from a file."""
         return self._document.path if self._document is not None else Path("axis.yaml")
 
     def states(self, key: str) -> bool:
@@ -381,8 +383,8 @@ class AxisConfig(OtherChannels):
     def where(self, key: str) -> str:
         """Returns the location of a key for messages: ``axis.yaml:12:3: drive.node_id``.
 
-        A key with its default value has the location of its parent mapping. An axis that was not read from a
-        file has no line.
+        The location of a key that the file does not set is that of its parent mapping. Without a file, there
+        is no line number.
         """
         if self._document is None:
             return f"{self.path}: {key}"
@@ -390,7 +392,7 @@ class AxisConfig(OtherChannels):
         return f"{self.path}:{line}:{column}: {key}"
 
     def require_load_encoder(self) -> None:
-        """Raises `InputError` if the axis has no encoder at its load."""
+        """Raises `InputError` if the axis has no encoder at the load."""
         if self.load_encoder.is_motor_encoder:
             raise InputError(
                 f"{self.where('load_encoder.source')}: found the motor encoder (6064h); expected an encoder "
@@ -399,7 +401,7 @@ class AxisConfig(OtherChannels):
 
     @property
     def is_from_file(self) -> bool:
-        """True if the axis was read from a file, so that its EDS file can be found."""
+        """True if the axis was read from a file, so that its EDS file is known."""
         return self._eds_path is not None
 
     @property
@@ -420,7 +422,7 @@ def _interpolation_period(cycle_ms: float) -> tuple[int, int] | None:
 
 
 def _teeth_for(ratio: float, difference: int, teeth: Teeth) -> str:
-    """Returns the tooth counts for a ratio, with the stated output and the same difference of teeth."""
+    """Describes tooth counts that give a ratio with the stated output, if possible with this difference."""
     for more in (difference, 2, 1):
         held = round(ratio * more)
         if math.isclose(held, ratio * more, rel_tol=1e-9):

@@ -1,4 +1,4 @@
-"""Encoders of the axis file: their scaling, and the source of the load encoder's reading."""
+"""Encoders of the axis file: their scaling, and the object with the load encoder's reading."""
 
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Final, Literal, Self
@@ -17,18 +17,19 @@ INT32_MAX = 2**31 - 1
 class Scale:
     """Conversion between an encoder's counts and degrees of its shaft.
 
-    Made for the control cycle, where pydantic's attribute look-up would take longer than the computation.
+    It is separate from `Encoder` for use in the control cycle, where pydantic's attribute access would take
+    longer than the computation.
     """
 
     direction: int
     counts_per_turn: int
 
     def counts(self, deg: float) -> float:
-        """Returns the (fractional) counts at a shaft angle in degrees."""
+        """Converts a shaft angle in degrees to (fractional) counts."""
         return self.direction * deg * self.counts_per_turn / 360.0
 
     def degrees(self, counts: float) -> float:
-        """Returns the shaft angle in degrees at a reading in counts."""
+        """Converts a reading in counts to the shaft angle in degrees."""
         return self.direction * counts * 360.0 / self.counts_per_turn
 
 
@@ -52,12 +53,12 @@ class Encoder(Strict):
 
     @property
     def resolution_arcsec(self) -> float:
-        """One count in arcseconds of its own shaft."""
+        """Size of one count, arcseconds of the encoder's own shaft."""
         return 1_296_000.0 / self.counts_per_turn
 
 
 class MotorEncoder(Encoder):
-    """Encoder of the motor, with which the drive closes its loop (6064h, 607Ah)."""
+    """Motor encoder, with which the drive closes its position loop (6064h, 607Ah)."""
 
 
 class Source(Strict):
@@ -93,12 +94,12 @@ class Source(Strict):
 
     @property
     def wraps_at_counts(self) -> int:
-        """Modulus of the reading, in counts."""
+        """Number of counts after which the reading wraps."""
         return self.range_counts or self.WRAPS[self.type]
 
 
 POSITION_ACTUAL: Final = (0x6064, 0)
-"""Position actual value of the motor (CiA 402-2)."""
+"""Object with the position actual value of the motor (CiA 402-2)."""
 
 
 class LoadEncoder(Encoder):
@@ -108,5 +109,5 @@ class LoadEncoder(Encoder):
 
     @property
     def is_motor_encoder(self) -> bool:
-        """True if the reading is that of the motor encoder, so the axis has no encoder at its load."""
+        """True if the source is the motor encoder, which means that the axis has no encoder at the load."""
         return self.source.node is None and self.source.address == POSITION_ACTUAL

@@ -66,14 +66,14 @@ CATALOGUE = {each.name: each for each in _KINDS}
 
 
 def causes() -> tuple[str, ...]:
-    """Returns the causes that a diagnosis can find in addition to the two basic parts of a model."""
+    """Returns the names of the causes that a diagnosis can find, all except the two basic model parts."""
     return tuple(name for name in CATALOGUE if name not in BASIC)
 
 
 def register(kind: type[Effect]) -> type[Effect]:
-    """Adds a kind of effect to the catalogue of this process; a decorator for custom effects.
+    """Adds a kind of effect to the catalogue of this process; usable as a decorator for custom effects.
 
-    Model files may then contain it, fits and compensation use it, and a diagnosis can find it. Raises
+    Model files may then contain the effect, fits and compensation use it, and a diagnosis can find it. Raises
     `InputError` if another kind has the same name.
     """
     if CATALOGUE.get(kind.name, kind) is not kind:
@@ -91,7 +91,7 @@ def withdraw(kind: type[Effect]) -> None:
 
 
 def aliases_of(name: str) -> tuple[str, ...]:
-    """Returns the causes that can be confused with this one, as declared by either, in catalogue order."""
+    """Returns the causes that either cause declares as an alias of the other, in catalogue order."""
     own = CATALOGUE[name].about.aliases if name in CATALOGUE else ()
     return tuple(other for other, kind in CATALOGUE.items() if other in own or name in kind.about.aliases)
 

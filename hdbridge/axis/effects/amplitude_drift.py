@@ -1,9 +1,9 @@
 """Temperature dependence of ripple and friction.
 
-A ripple and a loop that grow with warmth can be expressed at any reference temperature, with different
-amplitudes and growth but the same sum. The reference is chosen so that the amplitudes are those of the model.
-At any other temperature, the drift would be accompanied by an apparent change of the model's own orders or
-loop.
+A ripple and a loop that grow with temperature can be expressed relative to any reference temperature, with
+different amplitudes and growth but the same sum. The reference is chosen so that the amplitudes are those of
+the model. With any other reference, the drift would be accompanied by an apparent change of the model's own
+orders or loop.
 """
 
 import math
@@ -36,25 +36,25 @@ from hdbridge.axis.effects.torque import TorqueGrowth
 from hdbridge.axis.effects.warmth import Warmed, WarmthState
 
 REACH_K: Final = 30.0
-"""Maximum difference between the temperature of the model's calibration and those of the record; K."""
+"""Maximum difference between the reference temperature and the temperature range of the record, K."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reparametrised:
-    """A model re-expressed at another reference temperature."""
+    """A model expressed relative to another reference temperature."""
 
     warmer_k: float
-    """Temperature above the former reference, K."""
+    """New reference temperature minus the former one, K."""
     orders: FloatArray
-    """Cosines and sines, arcsec."""
+    """Cosine and sine coefficients of the orders, arcsec."""
     offsets: FloatArray
-    """Offsets of the loops, arcsec."""
+    """Offsets of the model's loops, arcsec."""
     per_ripple: float
     per_loop: float
-    """Factors that convert a share of the former ripple or loop into a share of the present one."""
+    """Factors that convert growth relative to the former ripple or loop to growth relative to the new one."""
 
     def counted(self, effect: Effect) -> Effect:
-        """Re-expresses an effect of the model, or an effect that is given as a share of the model."""
+        """Converts an effect that is a part of the model, or that is relative to a part of the model."""
         if isinstance(effect, Synchronous):
             return effect.fitted(self.orders)
         if isinstance(effect, Hysteresis | HysteresisMemory):
@@ -71,12 +71,12 @@ def nearest(
     now: Sequence[Effect],
     given: Sequence[Effect],
 ) -> Reparametrised | None:
-    """Returns ``now`` re-expressed at the temperature where it is closest to ``given``; None if impossible.
+    """Expresses ``now`` relative to the reference temperature that brings it closest to ``given``.
 
-    ``growth_percent`` is the growth of ripple and of loop per kelvin.
+    ``growth_percent`` is the growth of ripple and of loop per kelvin. Returns None if this is impossible.
     """
     numbers = {order.order for each in now if isinstance(each, Synchronous) for order in each.orders}
-    # A fit that has not settled may carry other orders than the model has: growth refers to the carried ones.
+    # Growth refers to the carried orders. Before convergence they may differ from the model's orders.
     ripple = coefficients_of(each for each in carried if each.order in numbers)
     loops = np.full(len(_offsets(now)), loop.offset_arcsec)
     if len(ripple) != len(_orders(now)):
@@ -107,8 +107,8 @@ def _offsets(base: Sequence[Effect]) -> FloatArray:
 class AmplitudeDrift(Modulating, Warmed):
     """w (ripple S(theta_M) + friction H): the model's ripple and loop change with the gear's warmth w.
 
-    The torque-dependent part of the ripple is scaled as well, so relative growth with torque is the same warm
-    or cold.
+    The torque-dependent part of the ripple is scaled too, so its relative growth with torque does not depend
+    on warmth.
     """
 
     name = "amplitude_drift"
@@ -151,7 +151,7 @@ class AmplitudeDrift(Modulating, Warmed):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields effects driven by temperature if it varies, else by time."""
+        """Yields effects that depend on temperature if it varies in the record, else on time."""
         if has_orders(base) and has_loop(base):
             for driven_by, tau_s in cls.lags(observations):
                 yield cls(
@@ -160,7 +160,7 @@ class AmplitudeDrift(Modulating, Warmed):
                 )  # fmt: skip
 
     def scales(self) -> tuple[Part, Effect]:
-        """Returns the part that changes more: loop or ripple."""
+        """Returns the part that changes by more arcsec, loop or ripple."""
         ripple = math.sqrt(0.5 * sum(each.amplitude_arcsec**2 for each in self.orders))
         friction = abs(self.friction_percent_per_k * self.loop.offset_arcsec)
         if abs(self.ripple_percent_per_k) * ripple <= friction:
@@ -170,9 +170,7 @@ class AmplitudeDrift(Modulating, Warmed):
     def retold(
         self, now: Sequence[Effect], given: Sequence[Effect], observations: Observations
     ) -> tuple[Effect, ...] | None:
-        """Re-expresses the drift at the reference temperature where the rest of the model is closest to
-        ``given``.
-        """
+        """Expresses the drift relative to the temperature that brings the model closest to ``given``."""
         temperature = observations.motion.measured.get(Channel.TEMPERATURE)
         if temperature is None or self.driven_by != "temperature":
             return None
@@ -195,12 +193,12 @@ class AmplitudeDrift(Modulating, Warmed):
         )
 
     def needs(self) -> frozenset[Channel]:
-        """Returns the warmth's channels, and the torque if the orders grow with it."""
+        """Returns the channels of the warmth, and the torque channel if the orders grow with torque."""
         load = self.under_load
         return super().needs() | (frozenset() if load is None else {Channel(load.torque)})
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the effect of 1 % per kelvin on ripple and on loop, shape (n, 2)."""
+        """Returns the error for a growth of 1 % per kelvin, of the ripple and of the loop, shape (n, 2)."""
         orders = ripple(motion.motor_deg, phasors(self.orders))
         if self.under_load is not None:
             orders = orders * self.under_load.factor(motion, self.name)
@@ -212,8 +210,10 @@ class AmplitudeDrift(Modulating, Warmed):
         return _Tracker(self, self.loop.law().tracker(start))
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """Returns, if the load lags, a tracker whose loop falls no more steeply than this at the highest
-        warmth.
+        """Returns a tracker whose total fall is limited to this at the highest warmth.
+
+        Returns None if the effect does not change the loop, if the load leads, or if the ripple alone exceeds
+        the limit.
         """
         left = fall_arcsec_per_deg - self.ripple_fall()
         if not self.loop_share() or left <= 0.0:
@@ -227,10 +227,10 @@ class AmplitudeDrift(Modulating, Warmed):
         return 0.01 * self.limit_k * (ripple + abs(self.friction_percent_per_k * self.loop.offset_arcsec))
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Returns the steepest fall of the ripple; infinite if the loop changes.
+        """Returns the steepest fall of the ripple, arcsec per motor degree; infinity if the loop changes.
 
-        A changed loop falls as steeply as the loop rises. It removes only a share of the model's loop, so the
-        sum of both does not fall (`combine.fall_bound`).
+        A reduction of the loop falls as steeply as the loop rises. It removes only a fraction of the model's
+        loop, so the sum of both does not fall (`combine.fall_bound`).
         """
         return self.ripple_fall() if not self.friction_percent_per_k else math.inf
 
@@ -240,7 +240,7 @@ class AmplitudeDrift(Modulating, Warmed):
         return 0.01 * self.limit_k * RAD_PER_DEG * abs(self.ripple_percent_per_k) * slope * self._most()
 
     def loop_share(self) -> float:
-        """Returns the largest share of the loop that the effect can remove."""
+        """Returns the largest fraction of the loop by which the effect can change the loop."""
         return 0.01 * abs(self.friction_percent_per_k) * self.limit_k
 
     def _most(self) -> float:

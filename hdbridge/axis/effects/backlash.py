@@ -1,4 +1,4 @@
-"""Dead zone behind the gear: a loose key, a worn coupling, a gear stage on the output."""
+"""Backlash behind the gear, from a loose key, a worn coupling or a gear stage on the output."""
 
 from collections.abc import Iterator, Sequence
 from typing import Self
@@ -13,16 +13,16 @@ from hdbridge.axis.effects.play import Stop, stop
 from hdbridge.units import ARCSEC_PER_DEG
 
 _SOFTNESS = 1.25
-"""Minimum crossing angle of an invertible gap, relative to that of an ideal gap."""
+"""Minimum crossing angle of a gap that can be inverted, relative to that of an ideal gap."""
 
 
 class Backlash(Linear):
-    """-gap / 2 times the stop operator of the motor angle: the load lags by half the gap on either side.
+    """-gap / 2 times the stop operator of the motor angle: the load lags by half the gap in either direction.
 
-    In an ideal gap the load stands still while the motor crosses ``gap N / 3600`` degrees, and the total has
-    no inverse, because many motor angles correspond to one load angle. `crossing_deg` may be larger (a soft
-    contact). If a gap is too steep to invert, the compensation treats it as a softer gap (`gentle_tracker`)
-    and makes the motor jump most of the gap at once.
+    In an ideal gap the load stands still while the motor crosses ``gap N / 3600`` degrees. The load angle
+    then has no inverse, because many motor angles correspond to one load angle. `crossing_deg` may be larger
+    (a soft contact). If a gap is too steep to invert, the compensation treats it as a softer gap
+    (`gentle_tracker`), and makes the motor jump across most of the gap at once.
     """
 
     name = "backlash"
@@ -53,7 +53,7 @@ class Backlash(Linear):
     )
     shape = (Shape("crossing_deg", 0.02, 20.0, logarithmic=True),)
     ordinary_arcsec = 1.0
-    """Half a gap of 2 arcsec, which an elastic loop of another shape can leave as a residual."""
+    """Peak of a gap of 2 arcsec. An elastic loop of another shape can leave such a residual."""
     linear = ("gap_arcsec",)
     typical = {"gap_arcsec": 10.0, "crossing_deg": 0.02}
 
@@ -64,24 +64,23 @@ class Backlash(Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields gaps from a hard contact to a soft one."""
+        """Yields gaps with crossing angles from hard to soft contact."""
         yield from (cls(gap_arcsec=1.0, crossing_deg=each) for each in (0.05, 0.15, 0.4, 1.0, 2.5, 6.0))
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Requires reversals, because only they show backlash."""
+        """Requires reversals, because backlash is visible only there."""
         return "" if observations.reversals >= 2 else "no reversal in which play would show"
 
     def tidied(self, ratio: float) -> Self:
-        """Widens the crossing to the minimum angle of an invertible gap.
+        """Increases the crossing angle to the minimum of a gap that can be inverted.
 
-        The load stands still while the motor crosses, but noise can make a fit return a smaller angle than is
-        physically possible.
+        Because of noise, a fit may return a smaller crossing angle than is physically possible.
         """
         crossing = _SOFTNESS * self.gap_arcsec * ratio / ARCSEC_PER_DEG
         return self.model_copy(update={"crossing_deg": max(crossing, self.crossing_deg)})
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the effect of a gap of 1 arcsec, shape (n, 1)."""
+        """Returns the error due to a gap of 1 arcsec, shape (n, 1)."""
         return (-0.5 * stop(motion.motor_deg, self.crossing_deg, start))[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:

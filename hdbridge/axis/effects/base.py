@@ -1,16 +1,16 @@
 """Base class of effects: one physical cause of transmission error, written once.
 
-From one description an effect is predicted over a whole record (vectorised), tracked on line (sample by
-sample, in plain floats), fitted (columns that are linear in its coefficients, for given shape parameters),
-proposed for a record, and named as a cause. Batch and on-line results are equal, as `tests/effects` verifies
-for every effect.
+A single description serves to predict an effect over a whole record (vectorised), to track it on line (sample
+by sample, in plain floats), to fit it (columns for its linear coefficients, at given shape parameters), to
+propose it for a record, and to name it as a cause. Batch and on-line results are equal, which `tests/effects`
+verifies for each effect.
 
-An effect is a frozen pydantic model: its fields are the parameters of the model file, with the unit in the
-name, a physical range and a description. Nothing here does any I/O.
+An effect is a frozen pydantic model. Its fields are the parameters in the model file, each with its unit in
+the name, a physical range and a description. The module does no I/O.
 
-Speed, acceleration and direction are channels like any other. They are those of the *uncompensated* command
-(`kinematics.py` defines them once), so an effect that depends on them does not depend on the angle that the
-inverse is trying. Otherwise the correction of one cycle would be differenced into the next.
+Speed, acceleration and direction are channels like any other. They are derived from the *uncompensated*
+command (see `kinematics.py`), so effects that depend on them do not depend on the angle that the inverse is
+trying. Otherwise the correction of one cycle would affect the speed in the next.
 """
 
 from __future__ import annotations
@@ -47,20 +47,20 @@ GRID: Final[Mapping[int, int]] = {1: 6, 2: 4, 3: 3}
 
 
 class Law(Strict, ABC):
-    """Law of an effect, as required by every model: its equation, in batch and on line, and its bounds."""
+    """Law of an effect, which each model needs: its equation, in batch and on line, and its bounds."""
 
     name: ClassVar[str]
     """Canonical name, used in model files, findings and tests."""
     about: ClassVar[Cause]
     channels: ClassVar[frozenset[Channel]] = frozenset()
-    """Channels usually required in addition to the motor angle; `needs` returns those of an instance."""
+    """Channels usually required in addition to the motor angle; for those of an instance see `needs`."""
     compensable: ClassVar[Compensable]
-    """Decision whether to compensate the effect, with the reason; see `is_compensable`."""
+    """Statement of whether the effect is compensated, with the reason; see `is_compensable`."""
     shape: ClassVar[tuple[Shape, ...]] = ()
-    """Non-linear parameters; `columns` covers all others."""
+    """Shape parameters, in which the error is non-linear; `columns` covers the linear parameters."""
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error at the load for each sample, arcsec, shape (n,)."""
+        """Returns the error at the load in each sample, arcsec, shape (n,)."""
         error: FloatArray = self.columns(motion, start) @ self.coefficients()
         return error
 
@@ -70,13 +70,14 @@ class Law(Strict, ABC):
 
     @abstractmethod
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the regressors at the present shape parameters, shape (n, p); predict = columns @
-        coefficients.
+        """Returns the design-matrix columns at the present shape parameters, shape (n, p).
+
+        The prediction is ``columns @ coefficients``.
         """
 
     @abstractmethod
     def coefficients(self) -> FloatArray:
-        """Returns the linear coefficients in the order of `columns`, arcsec, shape (p,)."""
+        """Returns the linear coefficients in the order of `columns`, shape (p,)."""
 
     @abstractmethod
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
@@ -84,21 +85,21 @@ class Law(Strict, ABC):
 
     @abstractmethod
     def bound_arcsec(self) -> float:
-        """Returns a bound on the absolute error, arcsec."""
+        """Returns an upper bound of the absolute error, arcsec."""
 
     @abstractmethod
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Returns a bound on the steepest *fall* of the error with the motor angle, arcsec per motor degree.
+        """Returns an upper bound of the *fall* of the error with the motor angle, arcsec per motor degree.
 
-        The compensation can invert a sum of effects if this bound stays below the gear's own slope of 3600 /
-        N. A hysteresis only rises along its path, so its bound is zero.
+        The compensation can invert a sum of effects if this bound is less than the gear's own slope of
+        3600 / N. A hysteresis only rises along its path, so its bound is zero.
         """
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """Returns a tracker for the inverse that falls no more steeply than this; None without one.
+        """Returns an approximate tracker with a limited fall, for the inverse; None if the effect has none.
 
-        Backlash has one, because the error on either side of the gap is known, and the load's path across it,
-        within a fraction of a motor degree, hardly matters.
+        Backlash has such a tracker: the error on either side of the gap is known, and the load's path across
+        the gap, within a fraction of a motor degree, hardly matters.
         """
         return None
 
@@ -116,45 +117,45 @@ class Law(Strict, ABC):
 
 
 class Effect(Law):
-    """Cause of transmission error: its law, and hints for a diagnosis, all of which have defaults."""
+    """Cause of transmission error: its law, and hints for a diagnosis, which all have defaults."""
 
     part: ClassVar[Part | None] = None
     """Part of a model that the effect constitutes."""
     changes: ClassVar[Part | None] = None
     """Part of a model that the effect modifies; None for an addition."""
     replaces: ClassVar[str] = ""
-    """Name of the effect that it replaces in a model; empty for an addition."""
+    """Name of the effect that this effect replaces in a model; empty for an addition."""
     carries: ClassVar[Mapping[Part, str]] = {}
-    """Copies of the parts that it scales: each part, and the field that holds its copy."""
+    """Model parts that the effect scales, each with the name of the field that contains its copy."""
     typical: ClassVar[Mapping[str, Any]] = {}
     """Typical parameters, for `candidate`."""
     usual: ClassVar[int] = 1
     """Maximum number of similar instances on one axis. More point to a single cause outside the catalogue; 1
     permits no second instance."""
     nonnegative: ClassVar[bool] = False
-    """True if coefficients cannot be negative."""
+    """True if the coefficients cannot be negative."""
     curved: ClassVar[bool] = False
-    """True if its columns depend on its coefficients, so that a linear fit must be iterated."""
+    """True if the columns depend on the coefficients, so that a linear fit must be iterated."""
     sought: ClassVar[Sought | None] = None
-    """Form for a matched-filter search over the first shape parameters, if no grid covers the possible
-    locations."""
+    """Form of the matched filter that searches for the first shape parameters, if the possible locations are
+    too many for a grid."""
     ordinary_arcsec: ClassVar[float] = 0.0
-    """Peak amplitude on a healthy axis, of this cause or an indistinguishable one."""
+    """Peak error that this cause, or an indistinguishable one, has on a healthy axis."""
     incidental: ClassVar[frozenset[str]] = frozenset()
-    """Names of coefficients that are no evidence of the cause, because they are non-zero without it."""
+    """Names of coefficients that are no evidence of the cause, because they can be non-zero without it."""
     inexact: ClassVar[float] = 0.0
-    """Share of the effect's power that may appear as a smaller instance, because a real effect deviates from
-    its law."""
+    """Fraction of the effect's mean square that may appear as a smaller instance, because a real effect
+    deviates from its law."""
     drifting: ClassVar[tuple[str, ...]] = ()
-    """Parameters that wear and temperature change over months and that no load encoder fault alone imitates:
-    either all parameters covered by `columns`, or none."""
+    """Parameters that change over months with wear and temperature, if no fault of the load encoder alone
+    imitates such a change: either all parameters covered by `columns`, or none."""
 
     @classmethod
     def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:
-        """Returns an effect of typical size for a gear ratio, as the start of a fit or a plan.
+        """Returns an effect of typical size for a gear ratio, as the initial value of a fit or for a plan.
 
-        An effect that carries orders or a loop (because it modulates them) copies them from the effects in
-        ``base``; without them, it carries typical values.
+        An effect that modulates orders or a loop contains copies of them, taken from the effects in ``base``
+        or, if ``base`` has none, with typical values.
         """
         values = {**cls.typical, **cls._carried(base)}
         if "ratio" in cls.model_fields:
@@ -163,15 +164,15 @@ class Effect(Law):
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
-        """Returns the parameters that are copies of parts of the model ``base``."""
+        """Returns the fields that are copies of parts of the model ``base``."""
         return {}
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields candidates of this kind for a record and the model ``base``, over their shape parameters.
 
-        Their coefficients are arbitrary. The default is a grid over the ranges of `shape`, around
-        `candidate`; it is empty if the model lacks a part that the effect would scale.
+        Their coefficients are arbitrary. By default, they are `candidate` with shape parameters on a grid
+        over their ranges. There are none if the model lacks a part that the effect would scale.
         """
         if not set(cls.carries) <= {each.part for each in base} | {Part.GROWTH}:
             return
@@ -184,25 +185,25 @@ class Effect(Law):
 
     @classmethod
     def at_lines(cls, periods_per_turn: int) -> Iterator[Self]:
-        """Yields the effects that could cause a spectral line at this many periods per load turn
-        (`Sought.LINE`).
+        """Yields the effects that could cause a spectral line at this number of periods per load turn.
+
+        See `Sought.LINE`.
         """
         return iter(())
 
     def implausible(self, observations: Observations) -> str:
-        """Returns the reason why this instance is physically impossible, whatever the fit; else empty."""
+        """Returns the reason why this instance is physically impossible, however well it fits; else empty."""
         return ""
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Returns the reason why this instance is not separable from another cause in such a record; else
-        empty.
+        """Returns the reason why this record cannot separate this instance from another cause; else empty.
 
-        The cause is then not reported, but may be listed as an alias of the reported cause.
+        Such a cause is not reported, but it may be listed as an alias of a reported cause.
         """
         return ""
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the quantity on which the effect depends, for plots; by default its first channel."""
+        """Returns the coordinate on which the effect depends, for plots; by default its first channel."""
         needs = self.needs()
         for channel in MEASURED:
             if channel in needs:
@@ -219,38 +220,39 @@ class Effect(Law):
         return over.since_reversal(motion) if self.tracker().memory_deg else over.motor_angle(motion)
 
     def shows(self, motion: Motion) -> Stretch | None:
-        """Returns the samples at which the effect must be visible on its own; None for all samples."""
+        """Returns the samples that by themselves must show the effect; None without this requirement."""
         return None
 
     def changing(self, motion: Motion) -> FloatArray | None:
-        """Returns the change of the prediction if the coefficient changed by one along the record or beside
-        the effect.
+        """Returns test columns that must have zero coefficients if the effect is as its law states, (n, k).
 
-        One column per location of the change, shape (n, k), for an effect with one piece; None if such a
-        change does not contradict the effect.
+        Each column is the change of the prediction if the coefficient changed by one at one location along
+        the record, or is a similar effect nearby. The effect must have one piece. Returns None if such
+        changes do not contradict the effect.
         """
         return None
 
     def scales(self) -> tuple[Part, Effect] | None:
-        """Returns the part of a model that the effect scales, if a plot can show its growth."""
+        """Returns the model part that the effect scales, with an effect to plot; None if no plot shows it."""
         return None
 
     def pieces(self) -> tuple[Self, ...]:
-        """Returns the components of the effect, for example one order or one step each."""
+        """Returns the components of the effect as separate effects, each with one order or step."""
         return (self,)
 
     def joined(self, other: Effect) -> Self | None:
-        """Returns one effect that combines both; None if the two remain separate."""
+        """Returns one effect that combines this one and ``other``; None if they remain separate."""
         return None
 
     def largest_piece_arcsec(self) -> float:
-        """Returns the amplitude of the largest component over its full range, observed or not; 0 if observed
-        in full.
+        """Returns the largest component's amplitude over its full range, of which a record may show a part.
+
+        Returns 0 for an effect that a record always shows in full.
         """
         return 0.0
 
     def left_in_mean(self, order: int) -> float:
-        """Returns the share of a motor order that remains in the mean over both directions."""
+        """Returns the fraction of a motor order that this effect leaves in the mean over both directions."""
         return 1.0
 
     def waves(self) -> tuple[tuple[float, float, float], ...]:
@@ -265,14 +267,12 @@ class Effect(Law):
 
     @classmethod
     def of_change(cls, before: Effect, now: Effect) -> Self | None:
-        """Returns this cause if it can explain the change of ``before`` to ``now``, else None; see
-        `changes`.
-        """
+        """Returns this cause if it can explain the change from ``before`` to ``now``, else None."""
         return None
 
     @classmethod
     def unmeasured(cls, ratio: float) -> Effect | None:
-        """Returns its characteristic appearance if its channel was not measured; None if it has none."""
+        """Returns the effect that this cause resembles if its channel is not measured, or None."""
         return None
 
     def retold(
@@ -281,30 +281,29 @@ class Effect(Law):
         given: Sequence[Effect],
         observations: Observations,
     ) -> tuple[Effect, ...] | None:
-        """Returns ``now``, which contains this effect, reparametrised so that its parts are closest to
-        ``given``.
+        """Reparametrises ``now``, which contains this effect, to bring its parts closest to ``given``.
 
-        None if there is no alternative parametrisation.
+        Returns None if there is no alternative parametrisation.
         """
         return None
 
     def found_in(self, effects: Sequence[Effect]) -> Effect:
-        """Returns the model's instance of this effect; the effect itself if the model has no instance."""
+        """Returns the instance of this kind among ``effects``; the effect itself if there is none."""
         return next((each for each in effects if type(each) is type(self)), self)
 
     def tidied(self, ratio: float) -> Self:
-        """Returns the effect in the form in which a model of this ratio stores it."""
+        """Returns the effect in the form in which a model with this gear ratio stores it."""
         return self
 
     def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the possible deviations of a real effect from this law, arcsec, (n, k).
+        """Returns the possible deviations of a real effect from this law, arcsec, shape (n, k).
 
-        One column per standard deviation.
+        Each column is one standard deviation of an independent deviation.
         """
         return np.empty((len(motion), 0))
 
     def violations(self) -> list[str]:
-        """Describes the parameters outside their physical ranges, which `fitted` does not reject."""
+        """Describes the parameters that are outside their physical ranges; `fitted` does not reject them."""
         try:
             type(self).model_validate(self.parameters())
         except ValidationError as error:
@@ -318,9 +317,9 @@ class Effect(Law):
 
 
 class Linear(Effect):
-    """Base class of effects whose coefficients are some of their parameters, listed in `linear`.
+    """Base class of effects whose coefficients are parameters, listed in `linear`.
 
-    A subclass only needs to define `columns`, in the units of these parameters.
+    A subclass only defines `columns`, in the units of these parameters.
     """
 
     linear: ClassVar[tuple[str, ...]]
@@ -340,18 +339,18 @@ class Linear(Effect):
 
 
 class Momentary(Effect):
-    """Base class of effects without state, determined by angle and moment alone."""
+    """Base class of effects without state, which depend only on the motor angle and the moment."""
 
     @abstractmethod
     def at(self, motor_deg: float, moment: Moment) -> float:
-        """Returns the error at the load at one moment, arcsec, in plain floats for the control loop."""
+        """Returns the error at the load at one moment, arcsec; uses plain floats for the control loop."""
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
         return Memoryless(self.at)
 
 
 class Angleless(Momentary):
-    """Base class of effects determined by the moment alone, not by the motor angle."""
+    """Base class of effects without state that depend only on the moment, not on the motor angle."""
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
         return Level(self.at)
@@ -361,11 +360,10 @@ class Angleless(Momentary):
 
 
 def unmet(effects: Iterable[Effect], available: frozenset[Channel]) -> dict[str, frozenset[Channel]]:
-    """Returns the missing channels of each effect; empty if all are available.
+    """Returns the missing channels of each effect, by name; empty if all channels are available.
 
     ``available`` is `Motion.available()` for a record, or the channels that a control loop can supply. Check
-    this before the axis moves, because on line a missing channel does not raise an error: a `Moment` has
-    defaults.
+    this before the axis moves. On line, a missing channel raises no error, because a `Moment` has defaults.
     """
     lacking = {each.name: each.needs() - available for each in effects}
     return {name: channels for name, channels in lacking.items() if channels}

@@ -1,8 +1,8 @@
-"""Parts of a model that a modulating effect carries: synchronous orders, their growth with torque, the loop.
+"""Model parts of which a modulating effect contains copies: orders, their growth with torque, the loop.
 
-An effect such as `torque_modulation` states that the synchronous part grows with torque. For prediction,
-tracking and reading on its own, it carries a copy of the modulated part, taken from the model at its
-creation; `combine.refreshed` keeps the copy up to date.
+`torque_modulation`, for example, states that the synchronous part grows with torque. The effect contains a
+copy of the modulated part, so that it can be predicted, tracked and read without the rest of the model. The
+copy is taken from the model when the effect is created, and `combine.refreshed` keeps it up to date.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -21,7 +21,7 @@ from hdbridge.strictness import Strict
 
 
 class Loop(Strict):
-    """Modulated elastic loop: parameters of `hysteresis`, and its law."""
+    """Copy of the elastic loop that an effect modulates: the parameters of its law."""
 
     offset_arcsec: float = Field(
         ge=-3600, le=3600, description="half the height, at the load; negative where it lags"
@@ -32,24 +32,24 @@ class Loop(Strict):
 
     def law(self) -> Hysteresis | HysteresisMemory:
         kind = HysteresisMemory if self.memory else Hysteresis
-        # During a fit it may be out of its range, like the effect it was copied from.
+        # Not validated: during a fit the parameters may be out of range, like those of the original.
         return kind.model_construct(
             offset_arcsec=self.offset_arcsec, width_deg=self.width_deg, exponent=self.exponent
         )
 
 
 TYPICAL_LOOP = Loop(offset_arcsec=40.0, width_deg=20.0, exponent=1.6)
-"""Loop of a published gear of ratio 50 (Table 2 of the article that hdbridge implements)."""
+"""Loop of a published gear with ratio 50 (Table 2 of the article that hdbridge implements)."""
 
 
 BASIC: Final = frozenset({Synchronous.name, Hysteresis.name})
-"""Names of the two basic parts."""
+"""Names of the two basic parts of a model."""
 USUAL_LOOP: Final[Effect] = Hysteresis(offset_arcsec=40.0, width_deg=20.0, exponent=1.8)
-"""Initial loop for a fit."""
+"""Initial value of the loop in a fit."""
 
 
 def ripple(numbers: Iterable[int]) -> Effect:
-    """Returns a ripple with these motor orders at zero amplitude, as the start of a fit."""
+    """Returns a ripple with these motor orders at zero amplitude, as the initial value of a fit."""
     return Synchronous(orders=orders_from(numbers, 0.0))
 
 
@@ -85,7 +85,7 @@ def has_orders(base: Iterable[Effect]) -> bool:
 
 
 def growth_of(base: Iterable[Effect]) -> TorqueGrowth | None:
-    """Returns the growth of a model's orders with torque, possibly out of its range after a fit, or None."""
+    """Returns the growth of a model's orders with torque, or None; a fit may have moved it out of range."""
     for each in base:
         if isinstance(each, TorqueGrowth):
             values = {name: getattr(each, name) for name in TorqueGrowth.model_fields}
@@ -94,7 +94,7 @@ def growth_of(base: Iterable[Effect]) -> TorqueGrowth | None:
 
 
 class Modulating(Linear):
-    """Base class of effects that scale parts of a model and carry copies of them."""
+    """Base class of effects that scale parts of a model and contain copies of them."""
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:

@@ -15,12 +15,11 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 
 class ChannelSkew(Angleless, Linear):
-    """delay omega_L + second alpha_L / 2: the load encoder, sampled later than the motor's, reads further
-    on.
+    """delay omega_L + second alpha_L / 2: the load encoder is sampled later than the motor encoder.
 
-    A pure delay has second = delay^2. It is a separate parameter because the speed is a difference over a
-    sample, delayed by half a step, and a delay is rarely a whole number of samples. Without this parameter,
-    the residual would be attributed to inertial wind-up.
+    For a pure delay, second = delay^2. It is a separate parameter, because the speed is a difference between
+    samples and thus delayed by half a sample, and because a delay is rarely a whole number of samples.
+    Without the parameter, the residual would be attributed to inertial wind-up.
     """
 
     name = "channel_skew"
@@ -48,9 +47,9 @@ class ChannelSkew(Angleless, Linear):
     )
     compensable = Compensable(False, "it is an error of the measurement")
     ordinary_arcsec = 1.0
-    """Usual skew, because no two encoders are sampled at exactly the same instant."""
+    """Error due to ordinary skew, because no two encoders are sampled at exactly the same instant."""
     incidental = frozenset({"second_order_ms2"})
-    """Includes the load's own inertial wind-up."""
+    """The second-order coefficient is not evidence, because it includes the load's inertial wind-up."""
     linear = ("delay_ms", "second_order_ms2")
     typical = {"delay_ms": 0.5, "second_order_ms2": 0.25}
 
@@ -72,7 +71,7 @@ class ChannelSkew(Angleless, Linear):
         yield cls(ratio=observations.ratio, delay_ms=1.0, second_order_ms2=1.0)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the effect of 1 ms and of 1 ms^2, shape (n, 2)."""
+        """Returns the errors due to a delay of 1 ms and a second-order term of 1 ms^2, shape (n, 2)."""
         speed = np.clip(speed_of(motion, self.name), -self.limit_deg_s, self.limit_deg_s)
         acceleration = np.clip(acceleration_of(motion, self.name), -self.limit_deg_s2, self.limit_deg_s2)
         gain = ARCSEC_PER_DEG / self.ratio

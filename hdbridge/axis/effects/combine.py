@@ -1,6 +1,4 @@
-"""Combination of effects in one model: extension, updating of carried parts, choice of
-compensable effects.
-"""
+"""Combines effects in one model: extends it, updates copies of parts, selects compensable effects."""
 
 import math
 from collections.abc import Iterable
@@ -21,12 +19,12 @@ _LAWS = (Hysteresis, HysteresisMemory)
 
 
 def extended(effects: Iterable[Effect], new: Effect) -> tuple[Effect, ...]:
-    """Returns the effects of a model extended by a new one.
+    """Returns the effects of a model after addition of a new one.
 
-    The new effect replaces one of the same name or the one that it replaces by definition
-    (`hysteresis_memory` replaces `hysteresis`, and vice versa). Changed hysteresis parameters go into the
-    model's own loop. Everything else is added. Copies of the changed part in other effects are updated
-    (`refreshed`).
+    The new effect replaces an effect of the same name, or the one that it replaces by definition
+    (`hysteresis_memory` replaces `hysteresis`, and vice versa). Changed hysteresis parameters are written
+    into the model's own loop. Any other effect is added. Copies of the changed part in other effects are
+    updated (`refreshed`).
     """
     given = list(effects)
     if isinstance(new, HysteresisParameters):
@@ -44,15 +42,16 @@ def extended(effects: Iterable[Effect], new: Effect) -> tuple[Effect, ...]:
 def refreshed(effects: Iterable[Effect]) -> tuple[Effect, ...]:
     """Returns the effects with their copies of orders and loop updated to the present model.
 
-    The orders are those of the synchronous part and of added motor orders, because a change of the tooth
-    error changes all of them. If the model has no synchronous part, the orders stay as they are.
+    The orders are those of the synchronous part and of any added motor orders, because a change of the tooth
+    error affects all of them. If the model has no synchronous part, the copies remain unchanged.
     """
     given = tuple(effects)
     loop = loop_of(given) if any(isinstance(each, _LAWS) for each in given) else None
     series = [each for each in given if isinstance(each, Synchronous | MotorOrders)]
     orders: tuple[MotorOrder, ...] | None = None
     if any(isinstance(each, Synchronous) for each in series):
-        # For an order that occurs twice, the synchronous part's is used: a fit cannot separate their shares.
+        # If an order occurs twice, that of the synchronous part is used, because a fit cannot separate the
+        # two.
         by_number = {order.order: order for each in reversed(series) for order in each.orders}
         orders = tuple(by_number[number] for number in sorted(by_number))
     growth = growth_of(given)
@@ -74,9 +73,9 @@ def _refreshed(
 
 
 def in_place(effect: Effect, kinds: Iterable[type[Effect]]) -> tuple[Effect, ...]:
-    """Returns the alternatives that can replace an effect, with its parameters; see `Effect.replaces`.
+    """Returns alternative laws for an effect, with its parameters (see `Effect.replaces`).
 
-    A fit may have moved the parameters out of their ranges, which `violations` reports.
+    A fit may have moved the parameters out of their ranges. `violations` reports this.
     """
     return tuple(
         kind.model_construct(**effect.parameters())
@@ -91,11 +90,11 @@ def compensable(effects: Iterable[Effect]) -> tuple[Effect, ...]:
 
 
 def fall_bound(effects: Iterable[Effect]) -> float:
-    """Returns a bound on the steepest fall of the *sum*, arcsec per motor degree.
+    """Returns an upper bound of the fall of the *sum* of effects, arcsec per motor degree.
 
-    This is the sum of the effects' own bounds, with one exception. An effect that removes a share of the
-    model's loop falls as steeply as the loop rises. The sum still rises if no more than the whole loop is
-    removed. (An effect on a loop with lagging load may fall without bound in either direction.)
+    It is the sum of the effects' own bounds, with one exception. An effect that removes a fraction of the
+    model's loop falls as steeply as the loop rises. The sum of both still rises if no more than the whole
+    loop is removed. (An effect on the loop of a lagging load may fall without bound.)
     """
     given = tuple(effects)
     left = {
@@ -119,7 +118,7 @@ def _key(loop: Loop) -> tuple[object, ...]:
 
 
 def conflicts(effects: Iterable[Effect], ratio: float) -> tuple[str, ...]:
-    """Returns the reasons why these effects cannot form one model with this gear ratio; empty if they can."""
+    """Returns the reasons why the effects cannot form one model with this gear ratio; empty if they can."""
     given = tuple(effects)
     names = {each.name for each in given}
     return (

@@ -1,4 +1,4 @@
-"""Wind-up of the gear by the load torque: a spring that stiffens at two torques."""
+"""Wind-up of the gear due to load torque: a spring that stiffens at two torques."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
@@ -15,16 +15,16 @@ from hdbridge.axis.effects.orders import orders_from
 from hdbridge.axis.effects.torque import TorqueChannel, TorqueLimit, top
 
 SOFTER = 1.05
-"""Factor by which noise alone may make a zone softer than the zone before it."""
+"""Maximum ratio of a zone's compliance to that of the zone below it, to allow for noise."""
 
 _Softness = Annotated[float, Field(ge=0, le=1000)]
 
 
 class Compliance(Angleless, Linear):
-    """sense * (c1, c2, c3 per Nm in the zones up to T1, up to T2, beyond); c = 206265 / K.
+    """sense * wind-up, with compliance c1 up to torque T1, c2 up to T2, and c3 beyond.
 
-    The parameters are compliances, because the error is linear in them: c1 = 206265 / K1 arcsec/Nm with K1 in
-    Nm/rad.
+    The parameters are compliances, because the error is linear in them: c1 = 206265 / K1 arcsec/Nm with the
+    stiffness K1 in Nm/rad.
     """
 
     name = "compliance"
@@ -59,7 +59,7 @@ class Compliance(Angleless, Linear):
         "torque1_nm": 7.0,
         "torque2_nm": 25.0,
     }
-    """Size 20, ratio 50: K1, K2, K3 of 1.3, 1.8 and 2.3e4 Nm/rad, T1 and T2 of 7 and 25 Nm."""
+    """Gear of size 20, ratio 50: K1, K2 and K3 are 1.3, 1.8 and 2.3e4 Nm/rad, T1 and T2 are 7 and 25 Nm."""
 
     c1_arcsec_per_nm: _Softness = Field(description="compliance up to T1: 206265 / K1, K1 in Nm/rad")
     c2_arcsec_per_nm: _Softness = Field(description="compliance from T1 to T2")
@@ -80,7 +80,7 @@ class Compliance(Angleless, Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields a linear spring, and springs that stiffen once or twice within the torques of the record."""
+        """Yields a linear spring, and springs that stiffen once or twice within the record's torque range."""
         largest = top(observations.motion, Channel.LOAD_TORQUE)
         if largest:
             beyond = (1e4, 2e4)
@@ -92,23 +92,21 @@ class Compliance(Angleless, Linear):
                 )  # fmt: skip
 
     def implausible(self, observations: Observations) -> str:
-        """Requires that the spring stiffens with torque; a zone that the record does not reach has no
-        compliance.
-        """
+        """Requires a spring that stiffens with torque; ignores zones that the record does not reach."""
         zones = [each for each in self.coefficients().tolist() if each != 0.0]
         stiffens = all(later <= SOFTER * earlier for earlier, later in pairwise(zones))
         return "" if stiffens else "a gear's spring does not soften with torque"
 
     @classmethod
     def unmeasured(cls, ratio: float) -> Effect:
-        """Returns load order 1, because the torque of an off-centre mass goes round once per load turn."""
+        """Returns load order 1, because the torque of an off-centre mass has one period per load turn."""
         return LoadOrders(ratio=ratio, orders=orders_from([1]))
 
     def needs(self) -> frozenset[Channel]:
         return frozenset({Channel(self.torque)})
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the signed part of the torque in each of the three zones, shape (n, 3)."""
+        """Returns the signed part of the torque that lies in each of the three zones, Nm, shape (n, 3)."""
         given = motion.channel(Channel(self.torque), self.name)
         torque = np.minimum(np.abs(given), self.limit_nm)
         low, high = self.torque1_nm, self.torque2_nm
@@ -123,8 +121,9 @@ class Compliance(Angleless, Linear):
         return signed
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns other compliances; if their sum is negative, the sense flips, because a torque's sign is a
-        convention.
+        """Returns the effect with other compliances.
+
+        If their sum is negative, it is the sense that is reversed, because a torque's sign is a convention.
         """
         values = np.asarray(coefficients, dtype=np.float64)
         turned = values.sum() < 0.0

@@ -1,4 +1,4 @@
-"""Quantities along a motion on which an error may depend: for plots and unexplained residuals."""
+"""Coordinates: quantities on which an error may depend, for plots and unexplained residuals."""
 
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -13,12 +13,12 @@ from hdbridge.units import DEG_PER_TURN
 POINTS_PER_BIN: Final = 8
 LEAST_BINS: Final = 2
 SAME: Final = 1e-6
-"""Relative range below which a quantity counts as constant, to allow for rounding."""
+"""Range, relative to the largest value, below which a quantity counts as constant, to allow for rounding."""
 NOTHING: Final = 1e-9
 """Absolute range below which a quantity counts as constant, in its unit."""
 SMALLEST_WAY_DEG: Final = 0.01
 SMALLEST_TIME_S: Final = 0.01
-"""Minimum time since a reversal, s, for a finite logarithm."""
+"""Lower limits of the angle and the time since a reversal, for a finite logarithm."""
 
 
 class Spacing(Enum):
@@ -26,13 +26,13 @@ class Spacing(Enum):
 
     EVEN = "even"
     FILLED = "filled"
-    """Equal numbers of points per bin, for quantities that take few values, such as a speed."""
+    """Equal numbers of points per bin, for quantities with few different values, such as a speed."""
     LOGARITHMIC = "logarithmic"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coordinate:
-    """Quantity along a motion."""
+    """A quantity on which an error may depend, at each sample of a motion."""
 
     name: str
     unit: str
@@ -42,7 +42,7 @@ class Coordinate:
     """True if forward and backward motion are shown separately."""
     spacing: Spacing = Spacing.EVEN
     bins: int = 72
-    """Maximum number of bins; fewer if there are not `POINTS_PER_BIN` points for each."""
+    """Maximum number of bins; fewer if there would be less than `POINTS_PER_BIN` points per bin."""
 
     @property
     def label(self) -> str:
@@ -54,11 +54,11 @@ class Coordinate:
         return replace(self, values=self.values[rows])
 
     def varies(self) -> bool:
-        """Returns True if it has more than one value, apart from rounding."""
+        """Returns True if the quantity is not constant, apart from rounding."""
         return bool(np.ptp(self.values) > SAME * np.max(np.abs(self.values)) + NOTHING)
 
     def edges(self) -> FloatArray:
-        """Returns the bin edges, ascending, shape (b + 1,); two equal edges for a single value."""
+        """Returns the bin edges in ascending order, shape (b + 1,)."""
         low, high = float(np.min(self.values)), float(np.max(self.values))
         bins = min(self.bins, max(len(self.values) // POINTS_PER_BIN, LEAST_BINS))
         if self.spacing is Spacing.FILLED:
@@ -68,19 +68,19 @@ class Coordinate:
         return np.linspace(low, high, bins + 1)
 
     def numbers(self) -> IntArray:
-        """Returns the bin of each point, shape (m,)."""
+        """Returns the bin number of each sample, shape (n,)."""
         edges = self.edges()
         found = np.searchsorted(edges, self.values, "right") - 1
         return np.asarray(np.clip(found, 0, max(len(edges) - 2, 0)), dtype=np.intp)
 
 
 def motor_angle(motion: Motion) -> Coordinate:
-    """Returns the angle within one turn of the motor."""
+    """Returns the motor angle modulo one turn."""
     return Coordinate("motor angle", "deg", np.mod(motion.motor_deg, DEG_PER_TURN), both_ways=True)
 
 
 def load_angle(motion: Motion, ratio: float) -> Coordinate:
-    """Returns the angle within one turn of the load."""
+    """Returns the load angle modulo one turn."""
     return Coordinate("load angle", "deg", np.mod(motion.motor_deg / ratio, DEG_PER_TURN), both_ways=True)
 
 
@@ -90,7 +90,7 @@ def position(motion: Motion, ratio: float) -> Coordinate:
 
 
 def speed(motion: Motion) -> Coordinate:
-    """Returns the signed motor speed; `time` if it is not known."""
+    """Returns the signed motor speed; falls back to `time` if the speed is not known."""
     values = motion.motor_speed_deg_s
     if values is None:
         return time(motion)
@@ -98,7 +98,7 @@ def speed(motion: Motion) -> Coordinate:
 
 
 def acceleration(motion: Motion) -> Coordinate:
-    """Returns the motor acceleration; `time` if it is not known."""
+    """Returns the motor acceleration; falls back to `time` if the acceleration is not known."""
     values = motion.motor_acceleration_deg_s2
     if values is None:
         return time(motion)
@@ -108,7 +108,7 @@ def acceleration(motion: Motion) -> Coordinate:
 
 
 def time(motion: Motion) -> Coordinate:
-    """Returns the time on the record's clock; the sample number if there is none."""
+    """Returns the time on the record's clock, or the sample number of a motion without time."""
     values = motion.time_s
     if values is None:
         return Coordinate("sample", "", np.arange(len(motion), dtype=np.float64), bins=100)
@@ -116,7 +116,7 @@ def time(motion: Motion) -> Coordinate:
 
 
 def measured(motion: Motion, channel: Channel) -> Coordinate:
-    """Returns a measured channel; `time` if it was not measured."""
+    """Returns a measured channel; falls back to `time` if the channel was not measured."""
     values = motion.measured.get(channel)
     if values is None:
         return time(motion)
@@ -139,7 +139,7 @@ def time_since_reversal(motion: Motion) -> Coordinate:
 
 
 def since_change(motion: Motion) -> Coordinate:
-    """Returns the time since the axis last stopped, started or reversed; `time` if the speed is not known."""
+    """Returns the time since the axis last stopped, started or reversed; `time` if speed is not known."""
     if motion.motor_speed_deg_s is None:
         return time(motion)
     clock = time(motion).values

@@ -1,4 +1,4 @@
-"""Counts lost by an encoder, or a jumped tooth: a persistent step at one time."""
+"""Lost encoder counts or a skipped tooth: a persistent step of the error."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Self
@@ -22,18 +22,18 @@ from hdbridge.axis.effects.path import away_from_reversals
 from hdbridge.strictness import Strict
 
 NEAR_S, LEAST_NEAR = 1.0, 5
-"""Neighbourhood of a step: duration in seconds, and minimum number of samples."""
+"""Neighbourhood in which a step must be sudden: duration in seconds, and minimum number of samples."""
 
 
 class Step(Strict):
-    """One loss: from this time on the error is larger by its size."""
+    """One step: from ``time_s`` on, the error is larger by ``size_arcsec``."""
 
     time_s: float = Field(ge=-1e10, le=1e10, description="when it happened, on the record's clock")
     size_arcsec: float = Field(ge=-1e6, le=1e6, description="the step, at the load")
 
 
 class CountLoss(Angleless):
-    """Sum of size_j for all steps with time_j <= t."""
+    """Sum of size_j over all steps with time_j <= t."""
 
     name = "count_loss"
     channels = frozenset({Channel.TIME})
@@ -59,7 +59,7 @@ class CountLoss(Angleless):
     usual = 2
     sought = Sought.STEP
     inexact = 0.03
-    """Slow effects leave small steps next to a large one."""
+    """Slow effects can produce small apparent steps next to a large one."""
     typical = {"steps": (Step(time_s=0.0, size_arcsec=10.0),)}
 
     steps: tuple[Step, ...] = Field(
@@ -74,19 +74,15 @@ class CountLoss(Angleless):
             yield cls(steps=(Step(time_s=middle, size_arcsec=1.0),))
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Requires reversals. If the axis never revisits a position, a step in time may be a step in
-        position.
-        """
+        """Requires reversals, because without them a step in time may also be a step in position."""
         return "" if observations.reversals >= 2 else "a step in time may as well be one at a place"
 
     def shows(self, motion: Motion) -> Stretch | None:
-        """Returns the samples away from reversals, where a loop of another shape does not leave steps."""
+        """Returns the samples away from reversals, where a loop of another shape leaves no steps."""
         return away_from_reversals(motion)
 
     def changing(self, motion: Motion) -> FloatArray:
-        """Returns steps before and after the real one, which is sudden: slow effects barely change
-        meanwhile.
-        """
+        """Returns steps shortly before and after the real one, which a slow change would need."""
         time_s = motion.channel(Channel.TIME, self.name)
         first = int(np.searchsorted(time_s, self.steps[0].time_s))
         near = max(LEAST_NEAR, round(NEAR_S / float(np.median(np.diff(time_s)))))
@@ -113,7 +109,7 @@ class CountLoss(Angleless):
         return sum((each.size_arcsec for each in self.steps if now >= each.time_s), 0.0)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns a unit step per loss, shape (n, steps)."""
+        """Returns a unit step for each step, shape (n, steps)."""
         time_s = motion.channel(Channel.TIME, self.name)
         return (time_s[:, np.newaxis] >= [each.time_s for each in self.steps]).astype(np.float64)
 
@@ -121,7 +117,7 @@ class CountLoss(Angleless):
         return np.array([each.size_arcsec for each in self.steps])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns other step sizes; ``time_s`` in ``shape`` moves the last step."""
+        """Returns the effect with other step sizes; ``time_s`` in ``shape`` is the time of the last step."""
         times = [each.time_s for each in self.steps]
         if shape and "time_s" in shape:
             times[-1] = float(shape["time_s"])

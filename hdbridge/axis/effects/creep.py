@@ -26,11 +26,11 @@ from hdbridge.axis.effects.recurrence import recurrence
 from hdbridge.strictness import Strict
 
 RESTS = 3.0
-"""Maximum ratio of the shortest time constant to the longest rest; above it, the curvature is not visible."""
+"""Maximum ratio of the shortest time constant to the longest rest. Above it, the decay is not visible."""
 
 
 class Relaxation(Strict):
-    """One exponential."""
+    """One exponential of a relaxation."""
 
     amplitude_arcsec: float = Field(
         ge=-3600, le=3600, description="strain after a long move forward, at the load"
@@ -39,11 +39,11 @@ class Relaxation(Strict):
 
 
 class Creep(Effect):
-    """Sum of A_j y_j; y_j approaches the direction in motion, and zero at rest.
+    """Sum of A_j y_j; y_j approaches the direction of motion (1 or -1) in motion, and zero at rest.
 
-    In motion the time constant is ``build_up`` tau_j. With a value of 1 this is a linear viscoelastic
-    element, which short moves strain only a little. Well below 1, each move strains it fully, and the error
-    after each stop is A_j exp(-t / tau_j).
+    The time constant is tau_j at rest and ``build_up`` tau_j in motion. If ``build_up`` is 1, each y_j is a
+    linear viscoelastic element, which short moves strain only a little. If it is much less than 1, each move
+    strains the element fully, and the error after each stop is A_j exp(-t / tau_j).
     """
 
     name = "creep"
@@ -65,7 +65,7 @@ class Creep(Effect):
         Shape("tau_s", 0.05, 3600.0, logarithmic=True),
         Shape("build_up", 0.01, 1.0, logarithmic=True),
     )
-    """Time constant of the first exponential; the others keep their ratio to it."""
+    """``tau_s`` is the time constant of the first exponential; the others keep their ratio to it."""
 
     usual = 8
     """A real relaxation is a sum of several exponentials."""
@@ -89,7 +89,7 @@ class Creep(Effect):
                 yield cls(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=tau_s),), build_up=build_up)
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Requires a time constant comparable to a rest; a much slower relaxation need not end with it."""
+        """Requires a time constant comparable to a rest; a slower relaxation cannot be told from a drift."""
         if min(each.tau_s for each in self.parts) <= RESTS * longest_rest_s(observations.motion):
             return ""
         return "no rest is long enough to see it bend"
@@ -111,7 +111,7 @@ class Creep(Effect):
         return self.model_copy(update={"parts": (*self.parts, *other.parts)})
 
     def largest_piece_arcsec(self) -> float:
-        """Returns the largest amplitude, because exponentials may cancel."""
+        """Returns the largest amplitude, because exponentials may cancel each other."""
         return max(abs(each.amplitude_arcsec) for each in self.parts)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
@@ -139,8 +139,9 @@ class Creep(Effect):
         return np.array([each.amplitude_arcsec for each in self.parts])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns other amplitudes and, if given, other time constants (``tau_s`` scales them all) and
-        build-up.
+        """Returns the effect with other amplitudes and, if given, other time constants and build-up.
+
+        ``tau_s`` scales all time constants.
         """
         given = dict(shape or {})
         scale = given.pop("tau_s", self.parts[0].tau_s) / self.parts[0].tau_s
@@ -158,7 +159,7 @@ class Creep(Effect):
 
 
 class _Tracker(Tracker):
-    """State: y_j and the time they refer to."""
+    """Tracker whose state contains all y_j and their time."""
 
     def __init__(self, parts: list[tuple[float, float]], build_up: float) -> None:
         self._amplitudes = [amplitude for amplitude, _ in parts]

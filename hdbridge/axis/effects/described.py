@@ -1,4 +1,4 @@
-"""Terms that describe an effect: texts, shape parameters, its part in a model, on-line tracker."""
+"""Types that describe an effect: texts, shape parameters, its part in a model, on-line tracker."""
 
 import math
 from abc import ABC, abstractmethod
@@ -14,13 +14,13 @@ class Part(Enum):
     """Part of a model that other effects may scale, and therefore copy."""
 
     ORDERS = "ripple"
-    """Orders of the motor angle."""
+    """Motor orders of the model."""
     LOOP = "elastic loop"
     GROWTH = "growth of the ripple with torque"
 
 
 class Sought(Enum):
-    """Form of an effect for which a matched filter searches at all locations simultaneously."""
+    """Form of an effect for which a matched filter searches, at all locations simultaneously."""
 
     STEP = "a step in time"
     BUMP = "a bump at one load angle"
@@ -29,13 +29,13 @@ class Sought(Enum):
 
 
 class Moves(Enum):
-    """Range in which a local step improves a shape parameter."""
+    """Distance from the optimum within which local steps of a fit improve a shape parameter."""
 
     ANYWHERE = "anywhere"
     NEARBY = "nearby"
-    """A local step improves it only near the optimum, which a search must find."""
+    """Local steps improve it only near the optimum, which a search must find first."""
     NEVER = "never"
-    """A local step never improves it, because the error does not depend smoothly on the parameter."""
+    """Local steps never improve it, because the error does not depend smoothly on the parameter."""
 
 
 class Experiment(NamedTuple):
@@ -47,19 +47,19 @@ class Experiment(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Parameter in which the effect is *not* linear, with the range of a fit."""
+    """Parameter in which an effect is *not* linear, with its range in a fit."""
 
     name: str
     lower: float
     upper: float
     logarithmic: bool = False
-    """True if the fit should step in the logarithm (widths, time constants)."""
+    """True if a fit steps in the parameter's logarithm (for widths and time constants)."""
     moves: Moves = Moves.ANYWHERE
     is_frequency: bool = False
     """True for a frequency in time, whose resolution depends on the length of the record."""
 
     def grid(self, points: int) -> tuple[float, ...]:
-        """Returns ``points`` values over the range, evenly spaced (logarithmically if logarithmic)."""
+        """Returns ``points`` values over the range, evenly spaced (in the logarithm if logarithmic)."""
         if points < 2:
             return (
                 math.sqrt(self.lower * self.upper) if self.logarithmic else 0.5 * (self.lower + self.upper),
@@ -72,10 +72,10 @@ class Shape:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Texts about an effect, for reports and the generated page of the catalogue."""
+    """Texts that describe an effect, for reports and the generated page of the catalogue."""
 
     title: str
-    """Short name in standard terms."""
+    """Short descriptive name in standard terms."""
     equation: str
     """Law in plain text."""
     signature: str
@@ -92,14 +92,14 @@ class Cause:
     size: str = ""
     """Typical size."""
     subject: str = ""
-    """Plural noun for summaries of several causes; empty for the name."""
+    """Noun for summaries that cover several causes; if empty, the cause's name is used."""
     apart: Mapping[str, Experiment] = field(default_factory=dict)
-    """Measurement that separates the cause from another, by that cause's name. Either may declare it."""
+    """Measurements that separate this cause from others, by the other's name. Either cause may declare it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Compensable:
-    """Decision whether to compensate an effect, with the reason."""
+    """Statement of whether an effect is compensated, with the reason."""
 
     possible: bool
     why: str
@@ -107,28 +107,28 @@ class Compensable:
 
 @dataclass(frozen=True, slots=True)
 class Coefficient:
-    """Name and place of one coefficient, or of a cosine with its sine."""
+    """Name and location of one coefficient, or of the cosine and sine of an order."""
 
     name: str
-    """Name of the parameter with its unit; for a cosine and sine the prefix of amplitude and phase."""
+    """Name of the parameter with its unit; for a cosine and sine, the prefix of amplitude and phase."""
     columns: tuple[int, ...]
-    """Column of the coefficient, or both columns for a cosine and sine."""
+    """Column of the coefficient; for a cosine and sine, both columns."""
     path: tuple[str | int, ...]
-    """Path of the parameter in `Effect.parameters`; for a cosine and sine the path of their parent."""
+    """Path of the parameter in `Effect.parameters`; for a cosine and sine, the path of their order."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretch:
-    """Samples at which an effect, if present, must be visible, whatever else acts elsewhere."""
+    """Samples that by themselves must show an effect, because other effects may imitate it elsewhere."""
 
     rows: BoolArray
     """Mask of the samples, shape (n,)."""
     otherwise: str
-    """Reason for rejecting the effect if it is not visible there, for messages."""
+    """Reason for rejecting the effect if these samples do not show it, for messages."""
 
 
 class Observations(Protocol):
-    """Record as seen by an effect."""
+    """Properties of a record that effects use."""
 
     @property
     def motion(self) -> Motion: ...
@@ -145,37 +145,37 @@ class Observations(Protocol):
 
     @property
     def reversals(self) -> int:
-        """Number of motor reversals with travel on both sides."""
+        """Number of motor reversals with sufficient travel on both sides."""
         ...
 
     @property
     def motor_count_arcsec(self) -> float:
-        """One count of the motor encoder at the load, arcsec."""
+        """One count of the motor encoder, referred to the load, arcsec."""
         ...
 
 
 class Tracker(ABC):
     """On-line state of an effect.
 
-    `peek` returns the error at a motor angle reached from the present state, and may be called repeatedly.
-    Only `advance` changes the state.
+    `peek` returns the error after a move from the present state to a motor angle, and may be called
+    repeatedly. Only `advance` changes the state.
     """
 
     @property
     def memory_deg(self) -> float:
-        """Motor travel in one direction after which the state no longer depends on the start.
+        """Motor travel in one direction after which the error no longer depends on the earlier path.
 
-        0 if the path is not remembered. Memory in time (creep, warmth) does not count.
+        0 for an effect that does not depend on the path. Memory in time (creep, warmth) does not count.
         """
         return 0.0
 
     @abstractmethod
     def peek(self, motor_deg: float, moment: Moment) -> float:
-        """Returns the error at the load after a straight move to ``motor_deg``, arcsec; changes nothing."""
+        """Returns the error at the load after a move to ``motor_deg``, arcsec, without changing the state."""
 
     @abstractmethod
     def advance(self, motor_deg: float, moment: Moment) -> float:
-        """Moves to ``motor_deg``, keeps the new state and returns the error at the load, arcsec."""
+        """Moves to ``motor_deg``, updates the state and returns the error at the load, arcsec."""
 
 
 class Memoryless(Tracker):
@@ -193,4 +193,4 @@ class Memoryless(Tracker):
 
 
 class Level(Memoryless):
-    """Tracker whose error is the same at all motor angles and depends only on the moment."""
+    """Tracker of an error that depends only on the moment, not on the motor angle."""

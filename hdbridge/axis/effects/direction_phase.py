@@ -1,4 +1,4 @@
-"""Shift of the synchronous part with the direction of travel, because other tooth flanks carry the load."""
+"""Shift of the synchronous part with the direction of motion, because other tooth flanks carry the load."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -15,19 +15,19 @@ from hdbridge.axis.effects.motion import Channel, FloatArray, Motion, Start
 from hdbridge.axis.effects.orders import RAD_PER_DEG, Orders, OrderTracker, phasors, ripple
 
 STEEPEST = 3.0
-"""Limit of tan(k shift), reached at k shift = 72 deg; up to 108 deg the mean is under a third
-of the order.
+"""Limit of tan(k shift), reached at k shift = 72 deg. From there up to 108 deg, the mean over both directions
+is less than a third of the order.
 """
 
 
 class DirectionPhase(Modulating):
-    """Direction-odd part of a tooth error T(theta_M + d shift), S being the mean over both flanks.
+    """Direction-odd part of a tooth error T(theta_M + d shift) in direction d.
 
-    An order A_k of the tooth error appears as A_k cos(k shift) in the mean over both directions, to which the
-    model's synchronous part was fitted, and as A_k sin(k shift) in the odd part. The odd part is therefore
-    tan(k shift) times the mean's order, a quarter of its period ahead. The tangent is limited to `STEEPEST`,
-    beyond which hardly anything of an order remains in the mean. One angle shifts all orders, because a free
-    amplitude per order would be many parameters for one cause.
+    The model's synchronous part was fitted to the mean over both directions. An order A_k of the tooth error
+    contributes A_k cos(k shift) to this mean, and A_k sin(k shift) to the odd part. The odd part is therefore
+    tan(k shift) times the mean's order, and leads it by a quarter period. The tangent is limited to
+    `STEEPEST`, beyond which hardly anything of an order remains in the mean. One angle shifts all orders,
+    because a separate amplitude for each order would mean many parameters for one cause.
     """
 
     name = "direction_phase"
@@ -57,12 +57,12 @@ class DirectionPhase(Modulating):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields a start at zero shift."""
+        """Yields the effect with zero shift, as the initial value of a fit."""
         if has_orders(base):
             yield cls(orders=orders_of(base), shift_deg=0.0)
 
     def left_in_mean(self, order: int) -> float:
-        """Returns the cosine of the shift, because the mean of two shifted flanks is the smaller."""
+        """Returns cos(k shift), by which the shift reduces an order in the mean over both directions."""
         return math.cos(order * math.radians(self.shift_deg))
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
@@ -71,9 +71,9 @@ class DirectionPhase(Modulating):
         return Memoryless(lambda motor_deg, now: (now.direction or before) * orders.peek(motor_deg, now))
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the effect per degree of shift *at the present shift*, shape (n, 1).
+        """Returns the error per degree of shift *at the present shift*, shape (n, 1).
 
-        It is nearly linear, so the fit must be iterated.
+        The error is not exactly proportional to the shift, so the fit must be iterated.
         """
         error: FloatArray = direction_of(motion, start) * ripple(motion.motor_deg, self._odd())
         return error[:, np.newaxis]
@@ -86,9 +86,7 @@ class DirectionPhase(Modulating):
         return RAD_PER_DEG * abs(self.shift_deg) * steepness
 
     def _odd(self) -> tuple[complex, ...]:
-        """Returns the phasors of the odd part per degree of shift: j A_k tan(k shift) / shift exp(j
-        phi_k).
-        """
+        """Returns the phasors of the odd part per degree: j A_k exp(j phi_k) tan(k shift) / shift."""
         given = phasors(self.orders)
         highest = len(given) - 1
         return tuple(1j * each * self._tangent(highest - i) for i, each in enumerate(given))

@@ -1,12 +1,12 @@
 """Common base of the elastic-loop laws: offset, width and exponent, and the branch.
 
-The error is the offset times a loop of unit height (`_unit`), in which the laws differ.
+The error is the offset times a loop of unit offset (`_unit`), in which the laws differ.
 
-The offset has a sign. Positive: the load leads in the direction of motion, and the error rises along the
-path. Negative: the load lags, as it does behind friction at the load, and the error falls along the path. In
-that case the load stands still until the gear has wound up in the other direction, so the fall is at most the
-gear's own slope, 3600 / N arcsec per motor degree. Just after a reversal the formula is steeper; there the
-inverse uses a smaller slope (`gentle_tracker`).
+If the offset is positive, the load leads in the direction of motion, and the error rises along the path. If
+it is negative, the load lags, as it does with friction at the load, and the error falls along the path. After
+a reversal a lagging load stands still until the gear has wound up in the other direction, so the error falls
+by no more than the gear's own slope, 3600 / N arcsec per motor degree. Just after a reversal the formula is
+steeper. The inverse therefore uses a smaller slope there (`gentle_tracker`).
 """
 
 import math
@@ -24,10 +24,10 @@ from hdbridge.axis.effects.path import once
 
 
 def rise(xi: FloatArray, n: float) -> FloatArray:
-    """Returns the branch g(xi): 0 at 0, 1 with zero slope from 1 on.
+    """Returns the branch g(xi), which rises from 0 at xi = 0 to 1 at xi = 1 and remains constant beyond.
 
-    g(xi) = (xi^(n-1) - (n-1) xi) / (2-n), and xi (1 - ln xi) for n = 2; the form with expm1 is exact at n = 2
-    and on both sides.
+    g(xi) = (xi^(n-1) - (n-1) xi) / (2-n), and xi (1 - ln xi) for n = 2. The form with expm1 is accurate at
+    and near n = 2.
     """
     clipped = np.minimum(xi, 1.0)
     result = np.zeros_like(clipped)
@@ -40,9 +40,7 @@ def rise(xi: FloatArray, n: float) -> FloatArray:
 
 
 def rise_at(xi: float, n: float, steepest: float = math.inf) -> float:
-    """Returns `rise` for one number, in plain floats for the control loop, limited to
-    ``steepest`` times xi.
-    """
+    """Returns `rise` for one number in plain floats, for the control loop; at most ``steepest`` times xi."""
     if xi <= 0.0:
         return 0.0
     if xi >= 1.0:
@@ -54,7 +52,7 @@ def rise_at(xi: float, n: float, steepest: float = math.inf) -> float:
 
 
 class ElasticLoop(Effect):
-    """Base class of laws of a loop between plus and minus the offset, proportional to the offset."""
+    """Base class of hysteresis laws: a loop between plus and minus the offset, proportional to the offset."""
 
     compensable = Compensable(True, "the load really moves so, and the command says where it reverses")
     shape = (
@@ -62,10 +60,10 @@ class ElasticLoop(Effect):
         Shape("exponent", 1.02, 4.0),
     )
     typical = {"offset_arcsec": 40.0, "width_deg": 20.0, "exponent": 1.6}
-    """A published gear of ratio 50."""
+    """Loop of a published gear with ratio 50."""
     part = Part.LOOP
     drifting = ("offset_arcsec",)
-    """Only the offset, because preload settles and friction changes; width and exponent do not."""
+    """Only the offset, because settling of the preload and friction change it, but not width and exponent."""
 
     offset_arcsec: float = Field(
         ge=-3600,
@@ -88,7 +86,7 @@ class ElasticLoop(Effect):
         return (Coefficient("offset_arcsec", (0,), ("offset_arcsec",)),)
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns another offset and, if given, another width and exponent."""
+        """Returns the loop with another offset and, if given, another width and exponent."""
         return self.model_copy(update={"offset_arcsec": float(coefficients[0]), **dict(shape or {})})
 
     def bound_arcsec(self) -> float:
@@ -100,7 +98,7 @@ class ElasticLoop(Effect):
     def slope_bound_arcsec_per_deg(self) -> float:
         """Returns 0 if the load leads, because the error only rises along its path.
 
-        If the load lags, returns the slope at a reversal, which is unbounded for exponents up to 2.
+        If the load lags, returns the slope just after a reversal, which is infinite for exponents up to 2.
         """
         if self.offset_arcsec >= 0.0:
             return 0.0
@@ -108,7 +106,7 @@ class ElasticLoop(Effect):
         return -2.0 * self.offset_arcsec / self.width_deg * (n - 1.0) / (n - 2.0) if n > 2.0 else math.inf
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """Returns, if the load lags, the same branch with its slope after each reversal limited to this."""
+        """Returns a tracker with limited slope after each reversal if the load lags, else None."""
         if self.offset_arcsec >= 0.0:
             return None
         height = -2.0 * self.offset_arcsec
@@ -117,10 +115,10 @@ class ElasticLoop(Effect):
 
     @abstractmethod
     def _tracker(self, start: Start, width_deg: float, steepest: float) -> Tracker:
-        """Returns a tracker with this width whose branch rises by at most ``steepest`` per width."""
+        """Returns a tracker with this width; the slope of its branch is at most ``steepest`` per width."""
 
     def _loop(self, motor_deg: FloatArray, start: Start) -> FloatArray:
-        """Returns `_unit`, computed once for all effects that carry this loop."""
+        """Returns `_unit`, computed only once for all effects that contain this loop."""
         if not len(motor_deg):
             return np.empty(0)
         key = (self.name, self.width_deg, self.exponent, start)
@@ -128,4 +126,4 @@ class ElasticLoop(Effect):
 
     @abstractmethod
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
-        """Returns the loop for an offset of one, shape (n,)."""
+        """Returns the loop for an offset of 1 arcsec, shape (n,)."""

@@ -1,4 +1,4 @@
-"""Orders of the wave generator relative to the flexspline, which turns backwards."""
+"""Orders of the wave generator relative to the flexspline, which rotates in the opposite direction."""
 
 import numpy as np
 
@@ -35,7 +35,7 @@ class FlexsplineOrders(OrderSeries):
     ratio: Ratio
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the wave generator's angle relative to the flexspline."""
+        """Returns the wave generator's angle relative to the flexspline, modulo one turn."""
         angle = np.mod(motion.motor_deg * (1.0 + 1.0 / ratio), DEG_PER_TURN)
         return Coordinate("angle of the wave generator to the flexspline", "deg", angle)
 

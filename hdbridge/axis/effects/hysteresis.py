@@ -1,16 +1,17 @@
 """Nonlinear-elastic part: hysteresis of the flexspline after each reversal of the motor.
 
-The law is the rolling-friction law of the transmission-error literature, made exact in three places that are
-usually left open:
+The law is the rolling-friction law of the literature on transmission error, with three points defined that
+are usually left open:
+
 
 * At a reversal the error is continuous: each branch starts from the last value of the one before, and
   rises by ``2 offset g(xi)`` along the new direction until it meets the offset.
 * It saturates only in the direction of travel. (Taken literally, "saturated when |error| >= offset" would
   be a relay that jumps by twice the offset at each reversal.)
-* At rest the last direction holds.
+* At rest the last direction is held.
 
-For 1 < n <= 2 the slope at the reversal is infinite, so a measured, quantised angle must not be used as
-input: one encoder count of chatter is several arcseconds. Drive it with the command.
+For 1 < n <= 2 the slope at a reversal is infinite. The input must therefore be the command, not a measured,
+quantised angle: one encoder count of chatter would cause an error of several arcseconds.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,8 +27,9 @@ from hdbridge.axis.effects.path import path_of
 
 
 class Hysteresis(ElasticLoop):
-    """Continuous branches ``theta_rev + sgn 2 offset g(|theta_M - theta_M,rev| / width)``, up
-    to the offset.
+    """Continuous branches ``theta_rev + sgn 2 offset g(|theta_M - theta_M,rev| / width)``.
+
+    Each branch is limited to the offset in its direction.
     """
 
     name = "hysteresis"
@@ -49,7 +51,7 @@ class Hysteresis(ElasticLoop):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields a narrow, a typical and a wide loop for a model without one."""
+        """Yields a narrow, a typical and a wide loop for a model without a loop."""
         if all(each.part is not Part.LOOP for each in base):
             for width in (3.0, 20.0, 60.0):
                 yield cls(offset_arcsec=1.0, width_deg=width, exponent=1.6)
@@ -58,7 +60,7 @@ class Hysteresis(ElasticLoop):
         return _HysteresisTracker(self.offset_arcsec, width_deg, self.exponent, start, steepest)
 
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
-        """Returns the loop for an offset of one, with a Python loop over the reversals only."""
+        """Returns the loop for an offset of 1 arcsec; only reversals need a Python loop."""
         path = path_of(motor_deg, start)
         value = float(start.value)
         values = []
@@ -72,7 +74,7 @@ class Hysteresis(ElasticLoop):
         first = path.turning[0] + 1
         result = np.full(len(motor_deg), float(start.value))
         result[first:] = path.sense
-        # Only samples closer to the reversal than the width are not saturated.
+        # All samples further from the reversal than the width are saturated.
         way_deg = np.abs(path.away_deg)
         near = np.flatnonzero(way_deg < self.width_deg)
         sense, begun = path.sense[near], np.repeat(values, path.lengths)[near]
@@ -86,9 +88,10 @@ class Hysteresis(ElasticLoop):
 
 
 class _HysteresisTracker(Tracker):
-    """State: the present branch (starting angle, starting value, direction), the last angle and its value.
+    """Tracker of a hysteresis loop.
 
-    Values are those of a loop of unit offset.
+    The state consists of the present branch (initial angle and value, direction) and the last angle and
+    value. Values are those of a loop of unit offset.
     """
 
     def __init__(self, offset: float, width: float, exponent: float, start: Start, steepest: float) -> None:
@@ -105,7 +108,7 @@ class _HysteresisTracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """The width, which is the motor angle from side to side."""
+        """The width, the motor travel from one side of the loop to the other."""
         return self._width
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
@@ -122,7 +125,7 @@ class _HysteresisTracker(Tracker):
             origin, value, virgin = last, self._value, self._virgin and self._sign == 0
         xi = abs(motor_deg - origin) / self._width
         if xi >= 1.0:
-            return float(sign)  # end of every branch
+            return float(sign)  # every branch ends here
         if virgin:
             height = rise_at(2.0 * xi, self._exponent, self._steepest)
         else:

@@ -1,20 +1,20 @@
 """Elastic loop with return-point memory: a closed inner loop is forgotten and the outer branch continues.
 
 The plain law (`hysteresis`) begins a new branch at each reversal and forgets the earlier ones. Real friction
-in a mesh remembers: once a small excursion has been undone, the path continues as if it had never happened.
-This law has the same branch, offset, width and exponent, with Masing's rules:
+in a mesh has a memory: after a small excursion and return, the path continues as if the excursion had not
+happened. This law has the same branch, offset, width and exponent, with Masing's rules:
 
 * from a reversal the branch is the virgin curve scaled by two,
   value_rev + sgn 2 offset g(|theta - theta_rev| / width);
-* on return to the angle of the preceding reversal, the small loop is closed and both reversals are
+* on return to the angle of the preceding reversal, the inner loop is closed and both reversals are
   forgotten: the path continues along the branch that it was on before;
 * the virgin curve is sgn offset g(2 |theta - theta_0| / width), which saturates at half the width.
 
 g is concave, so the same law is a Prandtl-Ishlinskii sum of stop operators with thresholds up to half the
 width.
 
-**In a model it replaces `hysteresis`** (`replaces`) instead of adding to it: as a difference it would fall
-infinitely steeply where the plain law rises, and would have to repeat the plain law's parameters.
+**In a model it replaces `hysteresis`** (`replaces`) and is not added to it. A difference between the two laws
+would fall infinitely steeply where the plain law rises, and would have to repeat the plain law's parameters.
 """
 
 import math
@@ -32,12 +32,12 @@ from hdbridge.axis.effects.motion import FloatArray, Moment, Start
 from hdbridge.axis.effects.path import path_of
 
 _DEPTH = 200
-"""Number of remembered reversals; beyond it, the innermost loop (a fraction of its height) is forgotten
+"""Maximum number of remembered reversals. With more, the innermost loop, which is tiny, is forgotten
 early."""
 
 
 class HysteresisMemory(ElasticLoop):
-    """Hysteresis with Masing's rules over the branch of `Hysteresis`; replaces it in a model."""
+    """Hysteresis with the branch of `Hysteresis` and Masing's rules; replaces `Hysteresis` in a model."""
 
     name = "hysteresis_memory"
     replaces = "hysteresis"
@@ -61,7 +61,7 @@ class HysteresisMemory(ElasticLoop):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields the model's plain loop under this law."""
+        """Yields this law with the parameters of the model's plain loop."""
         for each in base:
             if isinstance(each, Hysteresis):
                 yield cls(**each.parameters())
@@ -78,8 +78,8 @@ class HysteresisMemory(ElasticLoop):
         return {}
 
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
-        """Returns the loop for an offset of one, with a Python loop over the reversals only."""
-        # A saturated start is a direction, but only true reversals of the motion count here.
+        """Returns the loop for an offset of 1 arcsec; only reversals need a Python loop."""
+        # A saturated start implies a direction, but only reversals of the motion begin a branch here.
         way = path_of(motor_deg, start)
         turning, signs = way.turning, way.signs
         memory = _Memory(self.width_deg, self.exponent, float(motor_deg[0]), start.value)
@@ -109,12 +109,14 @@ class HysteresisMemory(ElasticLoop):
 
 
 def _reached(motor_deg: FloatArray, angle: float, begin: int, end: int, sign: int) -> int:
-    """Returns the first index at which a stretch in direction ``sign`` has reached ``angle``."""
+    """Returns the first index, from ``begin`` to ``end``, at which motion in direction ``sign`` reaches
+    ``angle``.
+    """
     return bisect_left(motor_deg, sign * angle, begin, end, key=lambda each: sign * each)
 
 
 class _Segment(NamedTuple):
-    """Segment of the path on one branch: value + sign (1 if virgin else 2) g(...), limited to one."""
+    """Segment of the path on one branch: value + sign (1 if virgin else 2) g(...), limited to 1 or -1."""
 
     angle: float
     value: float
@@ -125,9 +127,9 @@ class _Segment(NamedTuple):
 class _Memory:
     """Remembered reversals of a loop of unit offset, outermost first.
 
-    ``_points`` holds pairs of angle and value; the last pair is the start of the present branch, and the
-    branch closes at the pair before it. If empty, the path is on the virgin curve through ``_origin`` in
-    direction ``_sign``.
+    ``_points`` contains pairs of angle and value. The last pair is the start of the present branch, and the
+    branch closes at the pair before it. If there are no pairs, the path is on the virgin curve through
+    ``_origin`` in direction ``_sign``.
     """
 
     def __init__(
@@ -138,19 +140,20 @@ class _Memory:
         self._steepest = steepest
         self._points: list[tuple[float, float]] = []
         self._sign = start
-        # A saturated start is half a width up the virgin curve.
+        # A saturated start is half a width along the virgin curve.
         self._origin = angle - 0.5 * start * width
 
     def branch(self, depth: int, sign: int) -> tuple[_Segment, float | None]:
-        """Returns the branch at this depth, and the angle at which it closes (None for the virgin curve)."""
+        """Returns the branch with ``depth`` points, and the angle at which it closes (virgin curve: None)."""
         if depth < 2:
             return _Segment(self._origin, 0.0, sign, True), None
         angle, value = self._points[depth - 1]
         return _Segment(angle, value, sign, False), self._points[depth - 2][0]
 
     def value_at(self, last: float, value: float, angle: float, sign: int) -> float:
-        """Returns the value after a straight move from ``last`` (with ``value``) to ``angle``; changes
-        nothing.
+        """Returns the value after a move in one direction from ``last`` (with ``value``) to ``angle``.
+
+        Does not change the state.
         """
         depth = len(self._points)
         if sign == -self._sign:  # a reversal starts a branch that closes at the start of the last one
@@ -170,13 +173,13 @@ class _Memory:
             depth -= 2
 
     def move(self, last: float, value: float, angle: float, sign: int) -> float:
-        """Moves straight from ``last`` (with ``value``) to ``angle``; returns the value there."""
+        """Moves in one direction from ``last`` (with ``value``) to ``angle``; returns the value there."""
         return self.walk(last, value, angle, sign)[1]
 
     def walk(
         self, last: float, value: float, angle: float, sign: int
     ) -> tuple[list[tuple[float | None, _Segment]], float]:
-        """Moves like `move`; returns the segments, each with its closing angle, and the value."""
+        """Moves like `move`; returns the segments, each with its closing angle, and the final value."""
         points = self._points
         if sign == -self._sign:
             if not points:
@@ -189,7 +192,7 @@ class _Memory:
         path = [(closing, segment)]
         while closing is not None and sign * angle >= sign * closing:
             del points[-2:]
-            if len(points) < 2:  # back on the virgin curve: its mirror point is no longer needed
+            if len(points) < 2:  # back on the virgin curve, so its mirror point is no longer needed
                 points.clear()
             segment, closing = self.branch(len(points), sign)
             path.append((closing, segment))
@@ -211,7 +214,7 @@ class _Memory:
 
 
 class _MemoryTracker(Tracker):
-    """State: the remembered reversals, the last angle and the value there."""
+    """Tracker whose state consists of the remembered reversals and the last angle and value."""
 
     def __init__(self, offset: float, width: float, exponent: float, start: Start, steepest: float) -> None:
         self._offset = offset
@@ -225,7 +228,7 @@ class _MemoryTracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """The width, which is the motor angle from side to side; after it, all inner loops are forgotten."""
+        """The width, the motor travel across the loop, after which all inner loops are forgotten."""
         return self._width
 
     def peek(self, motor_deg: float, moment: Moment) -> float:

@@ -1,4 +1,4 @@
-"""Changed elastic loop: another offset, width or exponent than in the model."""
+"""Change of the elastic loop: offset, width or exponent differ from those in the model."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,9 +17,10 @@ from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
 class HysteresisParameters(Effect):
     """Loop with new parameters minus the loop with the model's parameters (`base`).
 
-    This cause describes a change. If a model is extended by it, the model's loop takes the new parameters
-    (`combine.extended`) and no entry is added. A separate entry would predict the same, but a difference of
-    loops falls infinitely steeply where the old loop rises, so the compensation could not invert it.
+    If a model is extended by this cause, the new parameters are written into the model's loop
+    (`combine.extended`), and no effect is added. A separate effect would predict the same error, but a
+    difference of loops falls infinitely steeply where the old loop rises, so the compensation could not
+    invert it.
     """
 
     name = "hysteresis_parameters"
@@ -61,7 +62,7 @@ class HysteresisParameters(Effect):
         return cls(base=loop_of([before]), **loop_of([now]).model_dump(exclude={"memory"}))
 
     def found_in(self, effects: Sequence[Effect]) -> Effect:
-        """Returns the change from its own base to the loop of the model."""
+        """Returns the change from this effect's ``base`` to the loop among ``effects``."""
         return self.model_copy(update=loop_of(effects).model_dump(exclude={"memory"}))
 
     def changed(self) -> Loop:
@@ -77,16 +78,16 @@ class HysteresisParameters(Effect):
         return _Tracker(self.changed().law().tracker(start), self.base.law().tracker(start))
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the loops of unit offset, new and old, shape (n, 2)."""
+        """Returns the new and the old loop for an offset of 1 arcsec, shape (n, 2)."""
         new, old = self.changed().law(), self.base.law()
         return np.hstack([new.columns(motion, start), old.columns(motion, start)])
 
     def coefficients(self) -> FloatArray:
-        """Returns the new offset and minus the old one, arcsec."""
+        """Returns the new offset and the negative old offset, arcsec."""
         return np.array([self.offset_arcsec, -self.base.offset_arcsec])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns other offsets and, if given, another new width and exponent."""
+        """Returns the effect with other offsets and, if given, another new width and exponent."""
         base = self.base.model_copy(update={"offset_arcsec": -float(coefficients[1])})
         update = {"offset_arcsec": float(coefficients[0]), "base": base, **dict(shape or {})}
         return self.model_copy(update=update)
@@ -95,8 +96,10 @@ class HysteresisParameters(Effect):
         return abs(self.offset_arcsec) + abs(self.base.offset_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Returns infinity if the subtracted loop starts infinitely steeply, because the difference then
-        falls as steeply.
+        """Returns infinity if a loop that falls contributes to the difference, else 0.
+
+        A subtracted leading loop falls infinitely steeply after a reversal, and so does an added lagging
+        loop.
         """
         return math.inf if self.base.offset_arcsec > 0.0 or self.offset_arcsec < 0.0 else 0.0
 

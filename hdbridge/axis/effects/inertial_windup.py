@@ -36,10 +36,10 @@ class InertialWindup(Angleless, Linear):
         True, "the load really moves so and the acceleration is commanded; at rest it is nothing"
     )
     ordinary_arcsec = 1.5
-    """Wind-up of any axis in its fastest moves."""
+    """Peak wind-up of an ordinary axis in its fastest moves."""
     linear = ("inertia_over_stiffness_s2",)
     typical = {"inertia_over_stiffness_s2": 1e-5}
-    """A resonance at 50 Hz."""
+    """Value for a resonance at 50 Hz."""
 
     ratio: Ratio
     inertia_over_stiffness_s2: float = Field(
@@ -52,13 +52,13 @@ class InertialWindup(Angleless, Linear):
         yield cls(ratio=observations.ratio, inertia_over_stiffness_s2=1e-5)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the effect of J / K = 1 s^2, shape (n, 1)."""
+        """Returns the error for J / K = 1 s^2, shape (n, 1)."""
         limit = self.limit_deg_s2
         acceleration = np.clip(acceleration_of(motion, self.name), -limit, limit)
         return (-ARCSEC_PER_DEG / self.ratio * acceleration)[:, np.newaxis]
 
     def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the next term of the resonance, which this law neglects, shape (n, 1).
+        """Returns the next term in the expansion of the resonance, which this law neglects, shape (n, 1).
 
         The term is J / K times the second time derivative of the wind-up.
         """

@@ -1,15 +1,16 @@
 """Speed, acceleration and direction of the command, defined once for records and for the control loop.
 
-Backward differences over the samples' own time steps:
+They are backward differences over the actual time steps:
+
 
     v[i] = (theta[i] - theta[i-1]) / (t[i] - t[i-1])        v[0] = 0
     a[i] = (v[i] - v[i-1]) / (t[i] - t[i-1])                a[0] = a[1] = 0
     d[i] = sign(theta[i] - theta[i-1]), held at rest
 
-A time step of zero gives a speed of zero. On line the angle is the uncompensated command (N times the load
-target): the compensation is far slower than the motion, and with feedback each cycle's correction would be
-differenced into the next. If a record has a better speed (from the procedure, or smoothed from the load
-encoder), `Motion` contains it, and it is used directly.
+A time step of zero gives a speed of zero. On line, the angle is the uncompensated command (N times the load
+target). The correction itself is much slower than the motion and need not be included. If it were, each
+cycle's correction would affect the speed in the next. If a better speed is known (from the procedure, or
+smoothed from the load encoder), `Motion` contains it, and it is used directly.
 """
 
 from collections.abc import Iterator
@@ -46,7 +47,7 @@ def acceleration_of(motion: Motion, effect: str) -> FloatArray:
 
 
 def direction_of(motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-    """Returns the direction of the last motion, -1 or 1, held at rest; ``start`` before the first motion."""
+    """Returns the direction of the last motion, -1 or 1, held at rest; at first that of ``start``."""
     if motion.motor_speed_deg_s is not None:
         signs = np.sign(motion.motor_speed_deg_s)
     else:
@@ -70,9 +71,7 @@ def _differences(values: FloatArray, time_s: FloatArray) -> FloatArray:
 
 
 class Observer:
-    """On-line counterpart of the functions above: computes the `Moment` of each control cycle from the
-    command.
-    """
+    """Computes the `Moment` of each control cycle from the command; on-line form of the functions above."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -87,9 +86,9 @@ class Observer:
         measured: tuple[float, ...] = AT_REST,
         load_deg: float = 0.0,
     ) -> Moment:
-        """Returns the moment of a cycle; to be called once per cycle.
+        """Returns the moment of a control cycle; must be called exactly once per cycle.
 
-        ``motor_deg`` is the uncompensated command, N times the load target; ``measured`` is
+        ``motor_deg`` is the uncompensated command, N times the load target. For ``measured`` see
         `Moment.measured`.
         """
         speed = acceleration = 0.0
@@ -108,7 +107,7 @@ class Observer:
 
 
 def moments(motion: Motion) -> Iterator[Moment]:
-    """Yields the moments of a record as in the control loop, with defaults for missing channels."""
+    """Yields the moment of each sample as in the control loop, with defaults for missing channels."""
     here = motion.available()
     zeros = np.zeros(len(motion))
     known = [motion.measured.get(each, zeros + each.at_rest).tolist() for each in MEASURED]
@@ -128,7 +127,7 @@ def _or(values: FloatArray | None, default: FloatArray) -> FloatArray:
 
 
 def top_speed_deg_s(motion: Motion) -> float:
-    """Returns the highest motor speed, ignoring outliers; one turn per second if the speed is unknown."""
+    """Returns the highest motor speed, excluding outliers; one turn per second if the speed is unknown."""
     speed = motion.motor_speed_deg_s
     return 360.0 if speed is None else float(np.quantile(np.abs(speed), 0.99))
 

@@ -1,4 +1,4 @@
-"""Errors that repeat with every load turn: eccentricity of the load encoder, or pitch error of the spline."""
+"""Errors that repeat with each load turn: eccentricity of the load encoder, or pitch error of a spline."""
 
 from dataclasses import replace
 from typing import Annotated, Literal
@@ -62,5 +62,5 @@ class LoadOrders(OrderSeries):
         return 1.0 / self.ratio
 
     def is_compensable(self) -> bool:
-        """Returns True only if the gear is known to be the source, so that the load really moves."""
+        """Returns True if the gear is known to be the source, because then the load really moves."""
         return self.origin == "gear"

@@ -19,11 +19,11 @@ from hdbridge.units import DEG_PER_TURN
 
 PASSES = 3
 OTHER_SPEED = 1.5
-"""Minimum ratio of speeds among the passes, if all are in one direction."""
+"""Minimum ratio of the highest to the lowest speed of the passes, if all are in one direction."""
 
 
 FORM = 0.07
-"""Share of its height by which a real bump deviates from the formula."""
+"""Deviation of a real bump from the formula, relative to its height."""
 
 
 class LocalDefect(Momentary, Linear):
@@ -55,7 +55,7 @@ class LocalDefect(Momentary, Linear):
     usual = 2
     sought = Sought.BUMP
     inexact = 0.15
-    """The bump of a real damaged tooth never has exactly this shape."""
+    """The bump of a damaged tooth never has exactly this shape."""
     linear = ("height_arcsec",)
     typical = {"height_arcsec": 5.0, "centre_deg": 0.0, "half_width_deg": 3.6}
 
@@ -73,18 +73,16 @@ class LocalDefect(Momentary, Linear):
         )
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Requires varied passes. In identical passes, a location is not separable from a moment of the
-        move.
-        """
+        """Requires different passes, because identical ones do not separate a position from a time."""
         return "" if self._is_met(observations) else "not passed often enough, or always alike"
 
     def _is_met(self, observations: Observations) -> bool:
-        """Returns True if the axis passed the location repeatedly, both ways or at different speeds."""
+        """Returns True if the axis passed the bump repeatedly, in both directions or at different speeds."""
         motion = observations.motion
         if motion.motor_speed_deg_s is None or motion.time_s is None:
             return False
         turns = (motion.motor_deg / self.ratio - self.centre_deg) / DEG_PER_TURN
-        # Between two records the axis may have skipped it, which shows as a speed that it never reached.
+        # A jump between two records is not a pass. It implies a speed that the axis never reached.
         steps, moved = np.diff(motion.time_s), np.abs(np.diff(motion.motor_deg))
         real = moved <= 3.0 * float(np.max(np.abs(motion.motor_speed_deg_s))) * steps
         speed = motion.motor_speed_deg_s[np.flatnonzero((np.diff(np.floor(turns)) != 0.0) & real)]
@@ -95,13 +93,11 @@ class LocalDefect(Momentary, Linear):
         return both or float(np.max(fast)) > OTHER_SPEED * float(np.min(fast))
 
     def shows(self, motion: Motion) -> Stretch | None:
-        """Returns the samples away from reversals, where a loop of another shape leaves no bumps at a fixed
-        angle.
-        """
+        """Returns the samples away from reversals, where a loop of another shape leaves no bumps."""
         return away_from_reversals(motion)
 
     def changing(self, motion: Motion) -> FloatArray:
-        """Returns the neighbouring bumps: none beside a damaged tooth, one on either side in a wave."""
+        """Returns bumps on either side, which a wave would have but a damaged tooth would not."""
         apart = 2.0 * self.half_width_deg
         beside = [self.model_copy(update={"centre_deg": self.centre_deg + each}) for each in (-apart, apart)]
         return np.hstack([each.columns(motion) for each in beside])
@@ -110,11 +106,11 @@ class LocalDefect(Momentary, Linear):
         return replace(over.load_angle(motion, ratio), bins=120)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns a bump of 1 arcsec, shape (n, 1)."""
+        """Returns the error due to a bump of 1 arcsec, shape (n, 1)."""
         return self._bump(motion, self.half_width_deg)[:, np.newaxis]
 
     def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the columns of a sharper top and a wider foot, shape (n, 2)."""
+        """Returns the deviations of a bump with a sharper top or a wider foot, shape (n, 2)."""
         widths = (0.5 * self.half_width_deg, 2.0 * self.half_width_deg)
         return FORM * self.height_arcsec * np.column_stack([self._bump(motion, each) for each in widths])
 
@@ -135,5 +131,5 @@ class LocalDefect(Momentary, Linear):
         return abs(self.height_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Slope at the steepest point of the flank."""
+        """Returns the slope at the steepest point of the bump's flank."""
         return 0.5 * math.pi * abs(self.height_arcsec) / self.half_width_deg / self.ratio

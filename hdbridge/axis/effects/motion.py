@@ -1,4 +1,4 @@
-"""Motion of an axis as input of effects: channels, motions of whole records, moments of a control loop."""
+"""Motion of an axis as input of effects: channels, the motion of a record, the moment of a control cycle."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,10 +17,10 @@ IntArray = NDArray[np.intp]
 
 
 class Channel(Enum):
-    """Quantity that an effect uses in addition to the motor angle; the value is its column in a record.
+    """Quantity that effects use in addition to the motor angle; the value is its column in a record.
 
-    This is the only table of measured channels: each row is read from the drive, recorded, passed to effects
-    and offered to a diagnosis without other edits.
+    This is the only table of measured channels. A channel added here is read from the drive, recorded, passed
+    to effects and used by diagnoses without further changes of the code.
     """
 
     _value_: str
@@ -30,12 +30,12 @@ class Channel(Enum):
     at_rest: float
     """Default reading of a measured channel."""
     axis_key: str
-    """Key of the axis file that defines the source; empty if every drive provides it."""
+    """Key of the axis file that defines the channel's source; empty if every drive provides the channel."""
 
     def __new__(
         cls, column: str, about: str = "", unit: str = "", at_rest: float = 0.0, axis_key: str = ""
     ) -> Self:
-        """Creates a row of the table; derived channels only have a column."""
+        """Creates a row of the table; derived channels have only a column name."""
         self = object.__new__(cls)
         self._value_, self.about, self.unit, self.at_rest, self.axis_key = (
             column,
@@ -52,38 +52,38 @@ class Channel(Enum):
 
     TIME = "time_s"
     SPEED = "motor_speed_deg_s"
-    """Speed of the command; derived from angle and time if not given."""
+    """Motor speed of the command; derived from angle and time if not given."""
     ACCELERATION = "motor_acceleration_deg_s2"
-    """Acceleration of the command; derived from angle and time if not given."""
+    """Motor acceleration of the command; derived from angle and time if not given."""
     DIRECTION = "direction"
-    """Sign of the last motion of the command, held at rest; always derived."""
+    """Direction of the last motion of the command, held at rest; always derived."""
     LOAD_ANGLE = "load_deg"
-    """Predicted load angle: motor angle / N plus the model's error (never the noisy measured one)."""
+    """Predicted load angle: motor angle / N plus the model's error (never the noisy measured angle)."""
 
     @property
     def title(self) -> str:
-        """Name of its column in words, without the unit."""
+        """Name of the channel in words, without the unit."""
         return without_unit(str(self.value)).removesuffix("_c").replace("_", " ")
 
 
 MEASURED: Final = tuple(each for each in Channel if each.about)
-"""Measured channels in the order of a `Moment`."""
+"""Measured channels in the order of `Moment.measured`."""
 SLOT: Final[Mapping[Channel, int]] = {each: slot for slot, each in enumerate(MEASURED)}
 """Index of each measured channel in `Moment.measured`."""
 AT_REST: Final = tuple(each.at_rest for each in MEASURED)
-"""Default readings."""
+"""Default readings of the measured channels, in the order of `MEASURED`."""
 
 
 def readings(known: Mapping[Channel, float]) -> tuple[float, ...]:
-    """Returns `Moment.measured` for the known channels, with defaults for the others."""
+    """Returns a value for `Moment.measured`: the known readings, with defaults for other channels."""
     return tuple(known.get(each, each.at_rest) for each in MEASURED)
 
 
 class Start(Enum):
-    """Knowledge of the gear's past at the first sample.
+    """Elastic state of the gear at the first sample.
 
-    A pre-conditioning move leaves a saturated start: the last motion of the axis was in that direction and
-    longer than any memory. A virgin start assumes nothing and sets the elastic state to zero.
+    A pre-conditioning move leaves a saturated state: the last motion was in that direction and longer than
+    any memory of the gear. The virgin state is zero and assumes nothing about the earlier motion.
     """
 
     VIRGIN = 0
@@ -92,18 +92,18 @@ class Start(Enum):
 
 
 class Moment(NamedTuple):
-    """Channels of one control cycle, without the motor angle, because the inverse varies it.
+    """Channels of one control cycle, without the motor angle, which the inverse varies.
 
-    `kinematics.Observer` creates one per cycle from the command, with the derived channels filled in.
+    `kinematics.Observer` creates a moment in each cycle from the command, including the derived channels.
     """
 
     time_s: float = 0.0
     measured: tuple[float, ...] = AT_REST
-    """Readings of the channels in `MEASURED`, in that order; `SLOT` contains their indices."""
+    """Readings of the measured channels, in the order of `MEASURED`; for their indices see `SLOT`."""
     motor_speed_deg_s: float = 0.0
     motor_acceleration_deg_s2: float = 0.0
     direction: int = 0
-    """1 or -1, held at rest; 0 before the first motion, in which case `Start` applies."""
+    """Direction of the last motion, 1 or -1; 0 before the first motion, when `Start` applies."""
     load_deg: float = 0.0
     """Predicted load angle, degrees of the load, multi-turn."""
 
@@ -112,24 +112,24 @@ class Moment(NamedTuple):
 class Motion:
     """Motion of an axis: the inputs of a prediction, as arrays of equal length.
 
-    ``motor_deg`` is the *commanded* multi-turn motor angle if the record has it. A quantised encoder chatters
-    at every reversal, and a hysteresis law with an infinite initial slope turns the chatter into error.
+    If the record contains the command, ``motor_deg`` is the *commanded* multi-turn motor angle. A quantised
+    reading chatters at every reversal, and a hysteresis law with an infinite initial slope would convert the
+    chatter into an error.
     """
 
     motor_deg: FloatArray
     """Motor angle, degrees, multi-turn, shape (n,)."""
     time_s: FloatArray | None = None
     measured: Mapping[Channel, FloatArray] = field(default_factory=dict)
-    """Known measured channels (`MEASURED`), each of shape (n,)."""
+    """Measured channels that are known, each of shape (n,)."""
     motor_speed_deg_s: FloatArray | None = None
-    """Motor speed, if a better value is known than differences of a quantised angle."""
+    """Motor speed, if a better value is known than the differences of a quantised angle."""
     motor_acceleration_deg_s2: FloatArray | None = None
     load_deg: FloatArray | None = None
-    """Predicted load angle, degrees of the load. Only the load encoder's line errors require this
-    accuracy."""
+    """Predicted load angle, degrees. Only the load encoder's subdivisional errors require its accuracy."""
 
     def __len__(self) -> int:
-        """Number of samples."""
+        """Returns the number of samples."""
         return len(self.motor_deg)
 
     def available(self) -> frozenset[Channel]:
@@ -141,7 +141,7 @@ class Motion:
         return frozenset(found)
 
     def channel(self, channel: Channel, effect: str) -> FloatArray:
-        """Returns a given channel, shape (n,); raises `InputError` naming ``effect`` if it is missing."""
+        """Returns a channel, shape (n,); if it is missing, raises `InputError` that names ``effect``."""
         values = self._given(channel)
         if values is None:
             raise missing_error(effect, frozenset({channel}))
@@ -155,7 +155,7 @@ class Motion:
 
 
 def missing_error(effect: str, channels: frozenset[Channel]) -> InputError:
-    """Returns the error for missing channels."""
+    """Returns the `InputError` for channels that an effect needs and a record lacks."""
     names = ", ".join(sorted(each.value for each in channels))
     return InputError(
         f"the effect '{effect}' needs the channel {names}, which is not there; "

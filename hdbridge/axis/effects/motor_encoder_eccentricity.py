@@ -1,4 +1,4 @@
-"""Eccentricity of the motor encoder disc, whose reading error becomes a real motor position error."""
+"""Eccentricity of the motor encoder's disc, whose reading error becomes a real error of the motor."""
 
 from collections.abc import Iterator, Sequence
 from typing import Self
@@ -37,7 +37,7 @@ class MotorEncoderEccentricity(OrderSeries):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields both orders, even if the model has one, because they come from one disc."""
+        """Yields both orders, even if the model already has one, because one disc causes both."""
         yield cls(orders=orders_from((1, 2)))
 
     @classmethod

@@ -9,7 +9,7 @@ from hdbridge.axis.effects.orders import HIGHEST_MOTOR_ORDER, OrderSeries, order
 
 
 class MotorOrders(OrderSeries):
-    """Sum of A_k cos(k theta_M + phi_k) over orders that are not in the model."""
+    """Sum of A_k cos(k theta_M + phi_k) over orders that the model's synchronous part does not contain."""
 
     name = "motor_order"
     about = Cause(
@@ -35,7 +35,7 @@ class MotorOrders(OrderSeries):
     part = Part.ORDERS
     searched = range(1, HIGHEST_MOTOR_ORDER + 1)
     usual = 4
-    """A worn wave generator bearing has several orders."""
+    """A worn wave-generator bearing causes several orders."""
     drifting = ("orders",)
     """All orders, because wear of teeth and bearing changes them."""
 

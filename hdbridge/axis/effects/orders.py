@@ -1,4 +1,4 @@
-"""Harmonic series over an angle that turns with the motor: common base of all order effects."""
+"""Harmonic series over an angle proportional to the motor angle: common base of all order effects."""
 
 import cmath
 import math
@@ -17,11 +17,11 @@ from hdbridge.strictness import Strict
 
 RAD_PER_DEG = math.pi / 180.0
 HIGHEST_MOTOR_ORDER: Final = 24
-"""Highest candidate motor order: six times order 4, the strongest of a strain wave gear (two contacts, each
-with harmonics from encoders or bearings)."""
+"""Highest candidate motor order: six times order 4, the strongest of a strain wave gear (two contacts), so
+that the harmonics of encoders and bearings are included."""
 _ComplexArray = np.ndarray[tuple[int], np.dtype[np.complex128]]
 _AT_ONCE: Final = 1 << 14
-"""Number of samples whose powers fit in the processor's cache."""
+"""Number of samples processed at once, so that their powers fit in the processor's cache."""
 _Phasor = TypeVar("_Phasor", complex, _ComplexArray)
 
 
@@ -42,7 +42,7 @@ class HarmonicSum(Effect):
     """Sum of A_k cos(k angle + phi_k) over an angle that a subclass defines."""
 
     few: ClassVar[frozenset[int]] = frozenset()
-    """Permitted orders, if only a few are physically possible."""
+    """Permitted orders, if only a few are physically possible; empty if all are permitted."""
 
     orders: Orders
 
@@ -58,14 +58,14 @@ class HarmonicSum(Effect):
 
     @abstractmethod
     def _angle(self, motion: Motion) -> FloatArray:
-        """Returns the angle of order 1, radians, shape (n,)."""
+        """Returns the phase angle of order 1, radians, shape (n,)."""
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         error: FloatArray = horner(phasors(self.orders), turn_of(self._angle(motion))).real
         return error
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns cosine and sine of each order, shape (n, 2 * orders)."""
+        """Returns the cosine and sine of each order, shape (n, 2 * orders)."""
         return cosines_and_sines(self._angle(motion), [each.order for each in self.orders])
 
     def coefficients(self) -> FloatArray:
@@ -86,7 +86,7 @@ class HarmonicSum(Effect):
         return away_from_reversals(motion)
 
     def largest_piece_arcsec(self) -> float:
-        """Returns the largest amplitude, because a partly sampled order is only partly visible."""
+        """Returns the largest amplitude, because a record over part of a period shows only part of it."""
         return max((each.amplitude_arcsec for each in self.orders), default=0.0)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
@@ -97,14 +97,14 @@ class HarmonicSum(Effect):
 
 
 class OrderSeries(HarmonicSum):
-    """Harmonic sum of an angle that turns with the motor, at c times its speed."""
+    """Harmonic sum over an angle that is c times the motor angle."""
 
     usual = 2
     searched: ClassVar[Sequence[int]] = ()
-    """Orders for which a record is screened, one by one."""
+    """Orders that are proposed for a record, one by one."""
 
     def turns_per_motor_turn(self) -> float:
-        """Returns c, the periods of order 1 per motor turn."""
+        """Returns c, the number of periods of order 1 per motor turn."""
         return 1.0
 
     @classmethod
@@ -144,8 +144,10 @@ class OrderSeries(HarmonicSum):
 
     @classmethod
     def _change(cls, before: Effect, now: Effect) -> Self | None:
-        """Returns the difference of two series of motor orders, as orders of this kind; None without a
-        difference.
+        """Returns the difference between two series of motor orders as an effect of this kind.
+
+        Returns None if the two are not series of the same orders, or if this kind does not permit these
+        orders.
         """
         if not isinstance(before, OrderSeries) or not isinstance(now, type(before)):
             return None
@@ -160,7 +162,7 @@ class OrderSeries(HarmonicSum):
 
 
 def _present(base: Iterable[Effect], turns_per_motor_turn: float) -> dict[int, MotorOrder]:
-    """Returns the orders of a model over one reference angle, by number."""
+    """Returns the model's orders over the angle with these turns per motor turn, by number."""
     series = [each for each in base if isinstance(each, OrderSeries)]
     return {
         order.order: order
@@ -171,7 +173,7 @@ def _present(base: Iterable[Effect], turns_per_motor_turn: float) -> dict[int, M
 
 
 def orders_from(numbers: Iterable[int], amplitude_arcsec: float = 1.0) -> tuple[MotorOrder, ...]:
-    """Returns harmonics of equal amplitude and zero phase, as the start of a fit."""
+    """Returns harmonics of equal amplitude and zero phase, as initial values of a fit."""
     return tuple(MotorOrder(order=each, amplitude_arcsec=amplitude_arcsec, phase_deg=0.0) for each in numbers)
 
 
@@ -188,7 +190,7 @@ def cosines_and_sines(angle_rad: FloatArray, numbers: Sequence[int]) -> FloatArr
 def waves(angle_rad: FloatArray, numbers: Iterable[float]) -> Iterator[_ComplexArray]:
     """Yields exp(j k angle), shape (n,), for each k.
 
-    Whole numbers are computed as powers of exp(j angle), because a multiplication is several times faster
+    For integer k it is computed as a power of exp(j angle), because a multiplication is several times faster
     than a cosine and a sine.
     """
     turn = turn_of(angle_rad)
@@ -214,7 +216,7 @@ def coefficients_of(orders: Iterable[MotorOrder]) -> FloatArray:
 
 
 def orders_fitted(orders: Sequence[MotorOrder], coefficients: FloatArray) -> tuple[MotorOrder, ...]:
-    """Returns the same orders with amplitudes and phases from the coefficients."""
+    """Returns the same orders with amplitudes and phases from cosine and sine coefficients."""
     pairs = np.asarray(coefficients, dtype=np.float64).reshape(len(orders), 2)
     return tuple(
         MotorOrder.model_construct(  # not validated: a fit may leave the range (`violations`)
@@ -233,7 +235,7 @@ def phasors(orders: Iterable[MotorOrder]) -> tuple[complex, ...]:
 
 
 def ripple(motor_deg: FloatArray, amplitudes: tuple[complex, ...]) -> FloatArray:
-    """Returns the sum of motor orders, arcsec, shape (n,); ``amplitudes`` as from `phasors`."""
+    """Returns the sum of motor orders, arcsec, shape (n,); ``amplitudes`` is a result of `phasors`."""
 
     def make() -> FloatArray:
         return np.ascontiguousarray(horner(amplitudes, turn_of(RAD_PER_DEG * motor_deg)).real)
@@ -242,9 +244,7 @@ def ripple(motor_deg: FloatArray, amplitudes: tuple[complex, ...]) -> FloatArray
 
 
 def turn_of(angle_rad: FloatArray) -> _ComplexArray:
-    """Returns exp(j angle), shape (n,), from cosine and sine, several times faster than numpy's
-    complex one.
-    """
+    """Returns exp(j angle), shape (n,), from cosine and sine; numpy's complex exponential is much slower."""
     result = np.empty(len(angle_rad), dtype=np.complex128)
     np.cos(angle_rad, out=result.real)
     np.sin(angle_rad, out=result.imag)
@@ -254,8 +254,8 @@ def turn_of(angle_rad: FloatArray) -> _ComplexArray:
 def horner(amplitudes: tuple[complex, ...], turn: _Phasor) -> _Phasor:
     """Evaluates the polynomial in ``turn`` = exp(j theta), for one angle or for a whole record.
 
-    One exponential and a few multiplications per order are several times faster in the control loop than a
-    cosine per order, and the same lines serve a record.
+    In the control loop, one exponential and a few multiplications per order are several times faster than a
+    cosine per order.
     """
     total = 0.0 * turn
     for amplitude in amplitudes:
@@ -264,20 +264,20 @@ def horner(amplitudes: tuple[complex, ...], turn: _Phasor) -> _Phasor:
 
 
 def compensated_orders(effects: Iterable[Effect]) -> list[MotorOrder]:
-    """Returns the orders of the motor angle that a compensation corrects, by number."""
+    """Returns the motor orders that a compensation corrects, in ascending order."""
     found = _present((each for each in effects if each.is_compensable()), 1.0)
     return [found[number] for number in sorted(found)]
 
 
 class OrderTracker(Memoryless):
-    """On-line tracker of a series of harmonics; ``scale`` is radians of order 1 per motor degree."""
+    """On-line tracker of a harmonic series; ``scale`` is the phase of order 1, radians per motor degree."""
 
     def __init__(self, amplitudes: tuple[complex, ...], scale: float = RAD_PER_DEG) -> None:
         self._highest, *self._lower = amplitudes
         self._scale = scale
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
-        # `horner`, inlined because it is called several times in each control cycle.
+        # `horner` is inlined, because this method is called several times in each control cycle.
         turn = cmath.rect(1.0, self._scale * motor_deg)
         total = self._highest
         for amplitude in self._lower:

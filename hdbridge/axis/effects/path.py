@@ -1,4 +1,4 @@
-"""Motor path divided at its reversals: the basis of loops, dead zones and memory."""
+"""Motor path divided at its reversals, which loops, dead zones and memory are computed from."""
 
 import weakref
 from collections.abc import Callable
@@ -11,11 +11,11 @@ from hdbridge.axis.effects.described import Stretch
 from hdbridge.axis.effects.motion import FloatArray, IntArray, Motion, Start
 
 LOOP_DEG: Final = 60.0
-"""Motor travel after a reversal within which an elastic loop is noticeable: three times the loop width of a
+"""Motor travel after a reversal within which an elastic loop is noticeable, three times the loop width of a
 published gear."""
 
 KEPT_BYTES: Final = 24_000_000
-"""Memory for cached per-sample quantities of a path, bytes: three of a million samples."""
+"""Memory for cached per-sample quantities of a path, bytes: three arrays of a million samples."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,19 +25,18 @@ class Path:
     turning: tuple[int, ...]
     signs: tuple[int, ...]
     lengths: IntArray
-    """Number of samples of each branch."""
+    """Number of samples in each branch."""
     steps_deg: FloatArray
-    """Signed angle of each branch."""
+    """Signed motor travel of each branch."""
     away_deg: FloatArray
-    """Signed angle from the reversal at the start of the branch, for the samples after the first of
-    ``turning``."""
+    """Signed motor travel since the start of the branch, for each sample after the first of ``turning``."""
     sense: FloatArray
-    """Direction of motion for the same samples."""
+    """Direction of motion at the same samples."""
     _kept: dict[object, FloatArray] = field(default_factory=dict)
 
     @classmethod
     def of(cls, motor_deg: FloatArray, start: Start) -> Self:
-        """Divides an angle of at least one sample."""
+        """Divides a motor angle of at least one sample at its reversals."""
         turning, signs = branches(motor_deg, start)
         angles, lengths = motor_deg[turning], np.diff(turning)
         away = motor_deg[turning[0] + 1 :] - np.repeat(angles[:-1], lengths)
@@ -45,7 +44,7 @@ class Path:
         return cls(tuple(turning), tuple(signs), lengths, np.diff(angles), away, sense)
 
     def once(self, key: object, make: Callable[[], FloatArray]) -> FloatArray:
-        """Returns the quantity ``key``, computing it only if it is not cached."""
+        """Returns the quantity ``key`` from the cache, or computes it by ``make``."""
         found = self._kept.pop(key, None)
         if found is None:
             found = make()
@@ -57,11 +56,11 @@ class Path:
 
 
 _PATHS: dict[tuple[int, bool], tuple[weakref.ref[FloatArray], Path]] = {}
-"""Cache by the identity of the angle's array, for the lifetime of that array."""
+"""Cache of paths, by the identity of the angle's array and for the lifetime of that array."""
 
 
 def path_of(motor_deg: FloatArray, start: Start) -> Path:
-    """Returns `Path.of`, cached for read-only arrays because a fit requests it a thousand times."""
+    """Returns `Path.of`, cached for read-only arrays, because a fit calls it a thousand times."""
     if motor_deg.flags.writeable:
         return Path.of(motor_deg, start)
     key = (id(motor_deg), start is Start.VIRGIN)
@@ -74,11 +73,11 @@ def path_of(motor_deg: FloatArray, start: Start) -> Path:
 
 
 def once(motor_deg: FloatArray, start: Start, key: object, make: Callable[[], FloatArray]) -> FloatArray:
-    """Returns a read-only quantity that several effects compute from the same angle; ``key`` is its
-    dependencies.
+    """Returns a quantity that several effects compute from the same angle; cached for read-only angles.
 
-    Elastic loop and ripple occur in the model, in each effect that scales them, and in each derivative with
-    respect to that scaling. Cached for read-only arrays.
+    ``key`` contains all other inputs of the quantity. Elastic loop and ripple occur in the model, in each
+    effect that scales them, and in each derivative with respect to that scaling. A cached result is
+    read-only.
     """
     if motor_deg.flags.writeable or not len(motor_deg):
         return make()
@@ -86,11 +85,10 @@ def once(motor_deg: FloatArray, start: Start, key: object, make: Callable[[], Fl
 
 
 def branches(motor_deg: FloatArray, start: Start = Start.VIRGIN) -> tuple[list[int], list[int]]:
-    """Returns the indices between which the motor moves in one direction (including rests), and the
-    directions.
+    """Divides a motor angle into b branches, in each of which the motor moves in one direction or rests.
 
-    ``turning`` has length b + 1 (first index, each turning point, last index) and ``signs`` length b. A
-    saturated start counts as a direction, so continuing in it does not begin a new branch.
+    Returns b + 1 indices (first index, each turning point, last index) and the b directions. A saturated
+    start counts as a direction, so continued motion in that direction does not begin a new branch.
     """
     steps = np.diff(motor_deg)
     moving = np.flatnonzero(steps)
@@ -107,7 +105,7 @@ def branches(motor_deg: FloatArray, start: Start = Start.VIRGIN) -> tuple[list[i
 
 
 def since_reversal_deg(motor_deg: FloatArray) -> FloatArray:
-    """Returns the motor travel since the last reversal or the start, degrees, shape (n,)."""
+    """Returns the motor travel since the last reversal or the first sample, degrees, shape (n,)."""
     turning, _ = branches(motor_deg)
     result = np.zeros(len(motor_deg))
     if len(turning) > 1:
@@ -117,7 +115,7 @@ def since_reversal_deg(motor_deg: FloatArray) -> FloatArray:
 
 
 def away_from_reversals(motion: Motion) -> Stretch:
-    """Returns the samples at which no elastic loop of any shape is noticeable."""
+    """Returns the samples at which no elastic loop, whatever its shape, is noticeable."""
     rows = since_reversal_deg(motion.motor_deg) > LOOP_DEG
     return Stretch(rows, "seen only where the axis reverses")
 

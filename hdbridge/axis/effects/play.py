@@ -1,4 +1,4 @@
-"""Stop operator: follows the motor, limited to plus or minus one. The building block of dead zones."""
+"""Stop operator, which follows the motor within the limits -1 and 1: the building block of dead zones."""
 
 import numpy as np
 
@@ -7,9 +7,9 @@ from hdbridge.axis.effects.path import path_of
 
 
 def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:
-    """Returns s[i] = clip(s[i-1] + 2 (theta[i] - theta[i-1]) / width, -1, 1), shape (n,); linear time.
+    """Returns s[i] = clip(s[i-1] + 2 (theta[i] - theta[i-1]) / width, -1, 1), shape (n,), in linear time.
 
-    One clipping between two reversals suffices, so only the reversals need a Python loop.
+    Between two reversals, clipping once suffices, so only the reversals need a Python loop.
     """
     if not len(motor_deg):
         return np.empty(0)
@@ -30,7 +30,7 @@ def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:
 
 
 class Stop:
-    """On-line stop operator: `at` evaluates, `to` moves."""
+    """On-line stop operator: `at` evaluates it, `to` changes its state."""
 
     def __init__(self, width_deg: float, start: Start) -> None:
         self._gain = 2.0 / width_deg
@@ -39,11 +39,11 @@ class Stop:
 
     @property
     def memory_deg(self) -> float:
-        """Motor angle from stop to stop."""
+        """Motor travel from one limit to the other."""
         return 2.0 / self._gain
 
     def at(self, motor_deg: float) -> float:
-        """Returns the value after a straight move to ``motor_deg``; changes nothing."""
+        """Returns the value after a move to ``motor_deg`` in one direction, without changing the state."""
         if self._angle is None:
             return self._value
         value = self._value + self._gain * (motor_deg - self._angle)

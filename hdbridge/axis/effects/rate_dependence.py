@@ -1,4 +1,4 @@
-"""Growth of the elastic loop with speed: friction rises with the logarithm of the sliding rate."""
+"""Growth of the elastic loop with speed, because friction rises with the logarithm of the sliding speed."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -16,7 +16,7 @@ from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, St
 
 
 class RateDependence(Modulating):
-    """growth log10(1 + |v| / reference) H: zero at rest, ``growth`` per decade above the reference."""
+    """growth log10(1 + |v| / reference) H, H being the loop: zero at rest, ``growth`` per decade of speed."""
 
     name = "rate_dependence"
     channels = frozenset({Channel.SPEED})
@@ -45,7 +45,7 @@ class RateDependence(Modulating):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields references far below and just below the speeds of the record."""
+        """Yields reference speeds far below and just below the record's highest speed."""
         fastest = top_speed_deg_s(observations.motion)
         if has_loop(base):
             for share in (0.02, 0.2):
@@ -62,7 +62,7 @@ class RateDependence(Modulating):
         return Part.LOOP, self.loop.law()
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the effect of 1 % growth, shape (n, 1)."""
+        """Returns the error due to a growth of 1 % per decade, shape (n, 1)."""
         speed = np.minimum(np.abs(speed_of(motion, self.name)), self.limit_deg_s)
         rate = np.log1p(speed / self.reference_deg_s) * (0.01 / math.log(10.0))
         return (rate * self.loop.law().predict(motion, start))[:, np.newaxis]
@@ -74,16 +74,14 @@ class RateDependence(Modulating):
         return self._most() * abs(self.loop.offset_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Returns 0 for a growing loop, which only rises along its path.
+        """Returns 0 for growth of a loop with leading load, because the error only rises along its path.
 
-        A shrinking loop, or a loop with lagging load, falls as steeply as the loop starts.
+        Otherwise returns infinity, because the error falls infinitely steeply after a reversal.
         """
         return 0.0 if self.growth_percent * self.loop.offset_arcsec >= 0.0 else math.inf
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """Returns, if the load lags, a tracker whose loop falls no more steeply than this at the highest
-        speed.
-        """
+        """Returns a tracker with a limited fall at the highest speed if the load lags, else None."""
         if self.growth_percent <= 0.0:
             return None
         loop = self.loop.law().gentle_tracker(start, fall_arcsec_per_deg / self._most())

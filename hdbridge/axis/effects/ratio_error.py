@@ -1,4 +1,4 @@
-"""Gear ratio that differs from the model's."""
+"""Difference between the true gear ratio and that of the model."""
 
 from collections.abc import Iterator, Sequence
 from typing import Self
@@ -14,17 +14,17 @@ from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 TEETH_PER_TURN = 2.0
-"""Teeth passed per motor turn: the difference of the tooth numbers of circular spline and flexspline."""
+"""Teeth passed per motor turn: the usual difference in tooth count between circular spline and flexspline."""
 SCALE = 1e-3
 """Largest scale error of a correctly mounted encoder: a tape on a drum of 100 mm whose radius is 0.1 mm off.
-A disc has none, because its line count per turn is whole."""
+A disc has no scale error, because its number of lines per turn is an integer."""
 SAME_TEETH = 1e-4
-"""Accuracy of a ratio found from a ramp in the presence of other causes, as a share of the ratio: a tenth of
+"""Relative accuracy of a ratio that is derived from a ramp in the presence of other causes: a tenth of
 `SCALE`."""
 
 
 class RatioError(Momentary, Linear):
-    """(1 / N_true - 1 / N) theta_M: a ramp in the motor angle."""
+    """(1 / N_true - 1 / N) theta_M, an error proportional to the motor angle."""
 
     name = "ratio_error"
     about = Cause(
@@ -51,7 +51,7 @@ class RatioError(Momentary, Linear):
     limit_deg: float = Field(1e6, gt=0, le=1e9, description="motor angle beyond which it is held")
 
     def true_ratio(self, ratio: float) -> float:
-        """Returns the ratio without a ramp, for a model with ``ratio``."""
+        """Returns the true gear ratio, for which a model with ``ratio`` has this ramp."""
         return 1.0 / (1.0 / ratio + self.ramp_arcsec_per_turn / (DEG_PER_TURN * ARCSEC_PER_DEG))
 
     @classmethod
@@ -59,10 +59,10 @@ class RatioError(Momentary, Linear):
         yield cls(ramp_arcsec_per_turn=1.0)
 
     def implausible(self, observations: Observations) -> str:
-        """Requires whole tooth numbers, a whole load turn, or the small scale error of an encoder.
+        """Requires a ratio of whole tooth counts, a whole load turn, or an encoder's small scale error.
 
-        The ratio of a strain wave gear is half the tooth number of its flexspline, or one more. Within a load
-        turn, any other ramp is an arc of a periodic error.
+        The ratio of a strain wave gear is half the tooth count of its flexspline, or one more. Within a load
+        turn, any other ramp may be a part of a periodic error.
         """
         ratio = self.true_ratio(observations.ratio)
         teeth = TEETH_PER_TURN * ratio
@@ -73,20 +73,18 @@ class RatioError(Momentary, Linear):
         return f"no teeth have the ratio {ratio:.6g}, and no encoder's scale is so wrong"
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the load angle over all turns."""
+        """Returns the multi-turn load angle."""
         return over.position(motion, ratio)
 
     def changing(self, motion: Motion) -> FloatArray:
-        """Returns bends at one third and two thirds of the travel, because a wrong ratio has the same slope
-        everywhere.
-        """
+        """Returns bends at one and two thirds of the travel, because a wrong ratio has a constant slope."""
         angle = motion.motor_deg
         low, span = float(np.min(angle)), float(np.ptp(angle))
         bends = [np.maximum(angle - low - share * span, 0.0) for share in (1.0 / 3.0, 2.0 / 3.0)]
         return np.column_stack(bends) / DEG_PER_TURN
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the effect of 1 arcsec per motor turn, shape (n, 1)."""
+        """Returns the error due to a ramp of 1 arcsec per motor turn, shape (n, 1)."""
         angle = np.clip(motion.motor_deg, -self.limit_deg, self.limit_deg)
         return (angle / DEG_PER_TURN)[:, np.newaxis]
 

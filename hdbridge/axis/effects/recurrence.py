@@ -1,4 +1,4 @@
-"""First-order lags over a whole record: the exact exponential step, for any sampling."""
+"""First-order lags over a whole record, with exact exponential steps for any sampling."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from hdbridge.axis.effects.motion import FloatArray
 def recurrence(decay: FloatArray, drive: FloatArray, first: float) -> FloatArray:
     """Returns y[0] = first, y[i] = decay[i] y[i-1] + drive[i]; shape (n,), linear time, any decay in [0, 1].
 
-    The bidiagonal system with unit main diagonal is solved by forward substitution (BLAS).
+    It solves a bidiagonal system with unit main diagonal by forward substitution (BLAS).
     """
     from scipy.linalg.blas import dtbsv  # noqa: PLC0415 - a model is read and compensated without scipy
 
@@ -23,8 +23,9 @@ def recurrence(decay: FloatArray, drive: FloatArray, first: float) -> FloatArray
 
 
 def lagged(values: FloatArray, time_s: FloatArray, tau_s: float) -> FloatArray:
-    """Returns the first-order lag of a sampled quantity, held between samples, in equilibrium at the first
-    sample.
+    """Applies a first-order lag to a sampled quantity, which is held between samples.
+
+    The lag is in equilibrium at the first sample.
     """
     if not len(values):
         return np.empty(0)

@@ -1,4 +1,4 @@
-"""Interpolation error of the load encoder, whose sine signals are not perfect sines."""
+"""Interpolation error of the load encoder, because its sine signals are not perfect."""
 
 import cmath
 from collections.abc import Iterator, Sequence
@@ -19,17 +19,18 @@ LEAST_LINES = 256
 """Minimum line count of an encoder that interpolates."""
 
 RESOLVED = 0.05
-"""Share of moving samples denser than half a line that suffices to show a line."""
+"""Minimum fraction of the moving samples that must be less than half a line apart to show a line."""
 IN_STEP = 0.85
-"""Mean resultant length of the steps within a line, above which a slow wave has the same values. The wave
-explains the square, 0.72, of the line's power."""
+"""Mean resultant length of the sampling steps, as phases within a line, from which a slow wave has nearly the
+same values. The wave explains the square of it, 0.72, of the line's power."""
 
 
 class SubdivisionalError(HarmonicSum):
     """Sum over k = 1, 2, 4 of A_k cos(k lines theta_L + phi_k).
 
-    The load angle must be the predicted one, including the error. A line is often only a few hundred arcsec
-    wide, so motor angle / N is too inaccurate, and noise of the measured angle would imitate the effect.
+    theta_L must be the predicted load angle, including the transmission error. A line is often only a few
+    hundred arcsec wide, so motor angle / N is too inaccurate. Noise of a measured angle would imitate the
+    effect.
     """
 
     name = "subdivisional_error"
@@ -53,20 +54,23 @@ class SubdivisionalError(HarmonicSum):
     usual = 2
     sought = Sought.LINE
     typical = {"lines_per_turn": 9000, "orders": orders_from(_HARMONICS, 0.5)}
-    """9000 lines, as an example; the real line count comes from a search or the data sheet."""
+    """The line count is an example; that of an encoder is found by a search or in its data sheet."""
 
     lines_per_turn: int = Field(ge=16, le=10_000_000, description="signal periods per load turn")
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields an encoder whose lines span a few samples of the record, as an example."""
+        """Yields one effect with a line width of a few samples, as an example."""
         step_deg = float(np.median(np.abs(np.diff(observations.motion.motor_deg)))) / observations.ratio
         lines = round(DEG_PER_TURN / max(2.7 * step_deg, 0.02))
         yield cls(lines_per_turn=max(lines, 1800), orders=orders_from([1]))
 
     @classmethod
     def at_lines(cls, lines_per_turn: int) -> Iterator[Self]:
-        """Yields the effects that have a spectral line at this number of periods per load turn."""
+        """Yields the effects that have a spectral line at this number of periods per load turn.
+
+        The number is the line count, or two or four times the line count.
+        """
         for numbers in ((1,), _HARMONICS):
             yield cls(lines_per_turn=lines_per_turn, orders=orders_from(numbers))
         for part in (2, 4):
@@ -75,10 +79,9 @@ class SubdivisionalError(HarmonicSum):
                 yield cls(lines_per_turn=lines_per_turn // part, orders=orders_from(few))
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Requires samples denser than the lines, or varied speeds.
+        """Requires samples denser than the lines, or different speeds.
 
-        Otherwise, equal steps over many lines cannot be distinguished from equal steps of a slow wave within
-        a line.
+        Otherwise the samples are equal steps over many lines, and a slow wave has the same values at them.
         """
         speed = observations.motion.motor_speed_deg_s
         if speed is None or not np.any(speed):
@@ -90,7 +93,7 @@ class SubdivisionalError(HarmonicSum):
         return "sampled in equal steps over many lines, which a slow wave explains as well"
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the load angle within a line."""
+        """Returns the load angle modulo one line."""
         line_deg = DEG_PER_TURN / self.lines_per_turn
         load = motion.load_deg if motion.load_deg is not None else motion.motor_deg / ratio
         name = f"load angle within a division of {line_deg * ARCSEC_PER_DEG:.4g} arcsec"

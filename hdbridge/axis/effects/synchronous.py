@@ -10,7 +10,7 @@ TYPICAL_ORDERS = tuple(
         (4, 12.21, 105.7), (6, 3.18, -127.0), (8, 1.87, 124.3),
     ]
 )  # fmt: skip
-"""A published gear of ratio 50 (Table 1 of the article that hdbridge implements)."""
+"""Orders of a published gear with ratio 50 (Table 1 of the article that hdbridge implements)."""
 
 
 class Synchronous(OrderSeries):
@@ -30,7 +30,7 @@ class Synchronous(OrderSeries):
     )
     compensable = Compensable(True, "the load really moves so, and it repeats")
     typical = {"orders": TYPICAL_ORDERS}
-    """The published gear."""
+    """Orders of the published gear."""
     part = Part.ORDERS
     drifting = ("orders",)
-    """All orders, because teeth and wave generator bearing wear."""
+    """All orders, because the teeth and the wave generator's bearing wear."""

@@ -1,4 +1,4 @@
-"""Growth with torque: the torque channel, its limit, and the growth of the ripple."""
+"""Growth with torque: the torque channel, its limit, and the resulting growth of the ripple."""
 
 from collections.abc import Iterable
 from typing import Annotated, Final, Literal
@@ -24,11 +24,11 @@ TorqueLimit = Annotated[
 
 
 TOP: Final = 0.98
-"""Quantile of a channel's magnitude that counts as its maximum, because single readings may be wrong."""
+"""Quantile of a channel's magnitude that serves as its maximum, because single readings may be wrong."""
 
 
 def top(motion: Motion, channel: Channel) -> float:
-    """Returns the largest magnitude of a measured channel; 0 if unmeasured or constant."""
+    """Returns the largest magnitude of a measured channel; 0 if the channel is missing or constant."""
     values = motion.measured.get(channel)
     if values is None or not float(np.ptp(values)) > 0.0:
         return 0.0
@@ -65,26 +65,27 @@ class TorqueGrowth(Strict):
     limit_nm: TorqueLimit = 100.0
 
     def load_nm(self, motion: Motion, effect: str) -> FloatArray:
-        """Returns the effective torque, Nm, shape (n,); raises `InputError` naming ``effect`` if it is
-        missing.
+        """Returns the torque with which the amplitudes grow, Nm, shape (n,).
+
+        If the channel is missing, raises `InputError` that names ``effect``.
         """
         torque = np.clip(motion.channel(Channel(self.torque), effect), -self.limit_nm, self.limit_nm)
         return np.asarray(torque if self.signed else np.abs(torque))
 
     def load_at_nm(self, moment: Moment) -> float:
-        """Returns the effective torque at one moment, Nm."""
+        """Returns the torque with which the amplitudes grow at one moment, Nm."""
         torque = moment.measured[_SLOT[self.torque]]
         torque = min(max(torque, -self.limit_nm), self.limit_nm)
         return torque if self.signed else abs(torque)
 
     def factor(self, motion: Motion, effect: str) -> FloatArray:
-        """Returns the factor of the amplitudes, shape (n,)."""
+        """Returns the factor by which the amplitudes grow at each sample, shape (n,)."""
         return np.asarray(1.0 + 0.01 * self.growth_percent_per_nm * self.load_nm(motion, effect))
 
     def factor_at(self, moment: Moment) -> float:
-        """Returns the factor of the amplitudes at one moment."""
+        """Returns the factor by which the amplitudes grow at one moment."""
         return 1.0 + 0.01 * self.growth_percent_per_nm * self.load_at_nm(moment)
 
     def most(self) -> float:
-        """Returns the largest relative growth."""
+        """Returns the largest relative growth of the amplitudes, that at the torque limit."""
         return 0.01 * abs(self.growth_percent_per_nm) * self.limit_nm

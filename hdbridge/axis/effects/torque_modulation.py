@@ -1,4 +1,4 @@
-"""Growth of the synchronous part with load, because the mesh deflects."""
+"""Growth of the synchronous part with load torque, because the tooth mesh deflects."""
 
 from collections.abc import Iterator, Sequence
 from typing import Self
@@ -24,7 +24,7 @@ from hdbridge.axis.effects.torque import TorqueGrowth, top
 
 
 class TorqueModulation(TorqueGrowth, Modulating):
-    """growth |T| S(theta_M): all carried orders grow alike. For fewer orders to grow, carry fewer."""
+    """growth |T| S(theta_M): all orders that the effect contains grow by the same percentage."""
 
     name = "torque_modulation"
     channels = frozenset({Channel.LOAD_TORQUE})
@@ -54,11 +54,11 @@ class TorqueModulation(TorqueGrowth, Modulating):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields growth with the torque and with its magnitude, over the range of the record."""
+        """Yields growth with the torque's magnitude and with the signed torque, within the record's range."""
         largest = top(observations.motion, Channel.LOAD_TORQUE)
         if not largest or not has_orders(base):
             return
-        # Beyond its limit an effect is clamped, so the record's torques must lie within.
+        # An effect is clamped beyond its limit, so the limit must exceed the record's torques.
         limit = max(TorqueGrowth.model_fields["limit_nm"].default, 2.0 * largest)
         for signed in (False, True):
             yield cls(orders=orders_of(base), growth_percent_per_nm=1.0, signed=signed, limit_nm=limit)
@@ -77,7 +77,7 @@ class TorqueModulation(TorqueGrowth, Modulating):
         return frozenset({Channel(self.torque)})
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the effect of a growth of 1 % per Nm, shape (n, 1)."""
+        """Returns the error due to a growth of 1 % per Nm, shape (n, 1)."""
         orders = ripple(motion.motor_deg, phasors(self.orders))
         column: FloatArray = 0.01 * self.load_nm(motion, self.name) * orders
         return column[:, np.newaxis]
@@ -90,5 +90,5 @@ class TorqueModulation(TorqueGrowth, Modulating):
         return self.most() * sum(each.amplitude_arcsec for each in self.orders)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Returns the slope of the ripple's growth at the highest torque."""
+        """Returns the steepest slope of the added ripple at the torque limit, arcsec per motor degree."""
         return self.most() * RAD_PER_DEG * sum(each.order * each.amplitude_arcsec for each in self.orders)

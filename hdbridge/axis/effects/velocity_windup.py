@@ -1,4 +1,4 @@
-"""Wind-up of the gear by drag on the output: seals, bearings, grease, a cable."""
+"""Wind-up of the gear due to drag on the output, from seals, bearings, grease or a cable."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -13,21 +13,21 @@ from hdbridge.axis.effects.kinematics import speed_of, top_speed_deg_s
 from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
 
 STRAIGHT = 20.0
-"""Ratio of shear speed to top speed above which the drag deviates from a straight line by less than 1/20."""
+"""Ratio of shear speed to top speed from which the drag deviates from a straight line by less than 5 %."""
 
 
 EXPONENT = 0.58
-"""Standard deviation of the exponent of speed over shear speed.
+"""Standard deviation of the exponent of (speed / shear speed) in the law.
 
-The exponent lies between 0, an oil without shear thinning, and 1, a paste with a yield stress. With a uniform
-distribution, this is the rms distance from the law's value of 1."""
+The exponent lies between 0 (an oil without shear thinning) and 1 (a paste with a yield stress). For a uniform
+distribution, this is the rms deviation from the law's value of 1."""
 
 
 class VelocityWindup(Angleless, Linear):
-    """-(coulomb sgn(v) + viscous v / (1 + |v| / shear)): drag over stiffness; zero at rest.
+    """-(coulomb sgn(v) + viscous v / (1 + |v| / shear)): drag divided by stiffness; zero at rest.
 
     Dry friction that remains at rest belongs to the elastic loop. Because of shear thinning, the viscous part
-    is half of the linear value at the shear speed, and constant far above it.
+    is half the linear value at the shear speed, and constant far above it.
     """
 
     name = "velocity_windup"
@@ -48,14 +48,15 @@ class VelocityWindup(Angleless, Linear):
     compensable = Compensable(True, "the load really lags and the speed is commanded; at rest it is nothing")
     shape = (Shape("shear_deg_s", 10.0, 100_000.0, logarithmic=True),)
     nonnegative = True
-    """A drag never pushes. The estimate of an absent drag would otherwise have a random sign."""
+    """Drag always opposes the motion. Without this constraint, the estimate of an absent drag could have
+    either sign."""
     linear = ("coulomb_arcsec", "viscous_arcsec_s_per_deg")
     typical = {
         "coulomb_arcsec": 3.0,
         "viscous_arcsec_s_per_deg": 0.015,
         "shear_deg_s": 1000.0,
     }
-    """About 10 arcsec at 1000 motor degrees per second."""
+    """Drag with a wind-up of about 10 arcsec at 1000 motor degrees per second."""
 
     coulomb_arcsec: float = Field(ge=0, le=3600, description="dry drag over stiffness, while it moves")
     viscous_arcsec_s_per_deg: float = Field(
@@ -66,7 +67,7 @@ class VelocityWindup(Angleless, Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields drags that bend below, at and above the speeds of the record."""
+        """Yields drags with shear speeds below, at and above the record's highest speed."""
         fastest = top_speed_deg_s(observations.motion)
         for share in (0.15, 1.0, 6.0):
             yield cls(
@@ -74,10 +75,10 @@ class VelocityWindup(Angleless, Linear):
             )
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Requires curvature, because a linear drag is indistinguishable from a delayed sample.
+        """Requires curvature over speed, because a linear drag is not separable from a sampling delay.
 
-        A small dry part is not evidence either. A drive follows a command in whole counts with a fixed lag of
-        a fraction of a count, whose sign is that of the direction, and this looks the same.
+        A small dry part is not evidence either. If a drive follows a command in whole counts, it lags by a
+        constant fraction of a count in the direction of motion, which looks the same.
         """
         speed = observations.motion.motor_speed_deg_s
         if speed is None or self.coulomb_arcsec > 0.5 * observations.motor_count_arcsec:
@@ -87,12 +88,12 @@ class VelocityWindup(Angleless, Linear):
         return "a straight line in speed is a delay, not a drag"
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the dry and the viscous part, shape (n, 2)."""
+        """Returns the errors due to unit dry drag and unit viscous drag, shape (n, 2)."""
         speed = np.clip(speed_of(motion, self.name), -self.limit_deg_s, self.limit_deg_s)
         return -np.column_stack([np.sign(speed), speed / (1.0 + np.abs(speed) / self.shear_deg_s)])
 
     def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the derivative with respect to the shear exponent, which is 1 here, shape (n, 1)."""
+        """Returns the error due to one standard deviation (`EXPONENT`) of the shear exponent, (n, 1)."""
         speed = np.clip(speed_of(motion, self.name), -self.limit_deg_s, self.limit_deg_s)
         share = np.abs(speed) / self.shear_deg_s
         bent = share * np.log(np.maximum(share, 1e-300)) / (1.0 + share) ** 2

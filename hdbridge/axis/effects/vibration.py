@@ -1,4 +1,4 @@
-"""Vibration at a fixed frequency in time: a fan, a pump, a neighbouring machine, a resonance."""
+"""Vibration at a fixed frequency, from a fan, a pump, a neighbouring machine or a resonance."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +23,7 @@ from hdbridge.axis.effects.orders import cosines_and_sines
 
 
 class Vibration(Angleless):
-    """amplitude cos(2 pi f t + phase)."""
+    """amplitude cos(2 pi f t + phase): a sinusoid in time."""
 
     name = "vibration"
     channels = frozenset({Channel.TIME})
@@ -52,7 +52,7 @@ class Vibration(Angleless):
     """No source has an exactly constant frequency and amplitude, and the gear's loop responds at other
     frequencies."""
     typical = {"frequency_hz": 50.0, "amplitude_arcsec": 1.0, "phase_deg": 0.0}
-    """1 arcsec at 50 Hz, as an example; the real frequency comes from a search."""
+    """The frequency is an example; that of a real vibration is found by a search."""
 
     frequency_hz: float = Field(gt=0, le=1e5, description="frequency")
     amplitude_arcsec: float = Field(ge=0, le=3600, description="amplitude at the load")
@@ -60,7 +60,7 @@ class Vibration(Angleless):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields a fast vibration that the record can resolve, as an example."""
+        """Yields one vibration at a high frequency that the record resolves, as an example."""
         fast_hz = 0.137 / max(observations.period_s, 1e-6)
         yield cls(frequency_hz=min(max(fast_hz, 0.3), 40.0), amplitude_arcsec=1.0, phase_deg=0.0)
 
@@ -81,7 +81,7 @@ class Vibration(Angleless):
         return self.amplitude_arcsec * math.cos(angle)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns cosine and sine, shape (n, 2)."""
+        """Returns the cosine and sine at the vibration's frequency, shape (n, 2)."""
         return cosines_and_sines(self._angle(motion), (1,))
 
     def coefficients(self) -> FloatArray:
@@ -90,7 +90,7 @@ class Vibration(Angleless):
         return self.amplitude_arcsec * np.array([math.cos(phase), -math.sin(phase)])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns another amplitude and phase and, if given, another frequency."""
+        """Returns the vibration with another amplitude and phase and, if given, another frequency."""
         cosine, sine = (float(each) for each in coefficients)
         update = {
             "amplitude_arcsec": math.hypot(cosine, sine),

@@ -1,4 +1,4 @@
-"""Warmth of the gear, which drives the drifts."""
+"""Warmth of the gear, on which the drifts depend."""
 
 import math
 from collections.abc import Iterator
@@ -14,19 +14,18 @@ from hdbridge.axis.effects.motion import SLOT, Channel, FloatArray, Moment, Moti
 from hdbridge.axis.effects.recurrence import lagged
 
 VARIES_K: Final = 0.3
-"""Minimum temperature change with a visible effect; K."""
+"""Minimum temperature change in a record for a visible effect, K."""
 QUICK_S: Final = (2.0, 15.0)
 SLOW_S: Final = (60.0, 240.0, 600.0, 1500.0, 4000.0)
 _TEMPERATURE = SLOT[Channel.TEMPERATURE]
 
 
 class Warmed(Effect):
-    """Base class of effects that follow the gear's warmth: a temperature excess in kelvin, as a first-order
-    lag.
+    """Base class of effects that depend on the gear's warmth, its temperature above a reference, in kelvin.
 
-    With a temperature channel, the gear follows the sensor with the time constant, in equilibrium at the
-    first sample; warmth is the excess over the reference. Without a sensor, the gear warms up from a cold
-    start at the first sample, by ``warm_up_k`` in the end.
+    With a temperature channel, the gear's temperature follows the sensor with a first-order lag, in
+    equilibrium at the first sample. Without a sensor, the gear is assumed to be cold at the first sample, and
+    to warm up by ``warm_up_k`` in the long term.
     """
 
     channels = frozenset({Channel.TIME})
@@ -46,10 +45,10 @@ class Warmed(Effect):
 
     @classmethod
     def lags(cls, observations: Observations) -> Iterator[tuple[Literal["temperature", "time"], float]]:
-        """Yields the possible drivers in a record and their time constants (s).
+        """Yields the possible inputs (temperature or time) for a record, each with a time constant (s).
 
-        A sensor on the gear itself hardly leads it. Without a sensor, a change that settles within a minute
-        is creep, and a change that takes far longer than the record is a straight line.
+        The temperature of a gear with its own sensor hardly lags the reading. Without a sensor, a change that
+        settles within a minute is creep, and a change much slower than the record is a straight line.
         """
         temperature = observations.motion.measured.get(Channel.TEMPERATURE)
         if temperature is not None and float(np.ptp(temperature)) > VARIES_K:
@@ -59,11 +58,11 @@ class Warmed(Effect):
             yield from (("time", each) for each in SLOW_S if each <= longest)
 
     def needs(self) -> frozenset[Channel]:
-        """Returns time, and the temperature channel if the effect is driven by it."""
+        """Returns the time channel, and the temperature channel if the effect uses it."""
         return self.channels | ({Channel.TEMPERATURE} if self.driven_by == "temperature" else frozenset())
 
     def warmth(self, motion: Motion) -> FloatArray:
-        """Returns the warmth in kelvin, shape (n,)."""
+        """Returns the warmth at each sample, K, shape (n,)."""
         time_s = motion.channel(Channel.TIME, self.name)
         if self.driven_by == "time":
             warmth = self.warm_up_k * -np.expm1(-(time_s - time_s[:1]) / self.tau_s)
@@ -74,7 +73,7 @@ class Warmed(Effect):
 
 
 class WarmthState:
-    """On-line warmth: `at` evaluates, `to` advances."""
+    """On-line state of the warmth: `at` evaluates it, `to` advances it."""
 
     def __init__(self, effect: Warmed) -> None:
         self._tau = effect.tau_s
@@ -86,7 +85,7 @@ class WarmthState:
         self._time = self._temperature = 0.0
 
     def at(self, moment: Moment) -> float:
-        """Returns the warmth at this moment, kelvin; changes nothing."""
+        """Returns the warmth at this moment, K, without changing the state."""
         if self._by_time:
             since = 0.0 if self._start is None else moment.time_s - self._start
             warmth = -self._final * math.expm1(-since / self._tau)
@@ -95,7 +94,7 @@ class WarmthState:
         return min(max(warmth, -self._limit), self._limit)
 
     def to(self, moment: Moment) -> float:
-        """Advances to this moment and returns the warmth, kelvin."""
+        """Advances the state to this moment and returns the warmth, K."""
         warmth = self.at(moment)
         self._temperature = self._followed(moment)
         if self._start is None:

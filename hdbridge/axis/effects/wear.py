@@ -17,11 +17,11 @@ from hdbridge.units import DEG_PER_TURN
 
 
 class Wear(Linear):
-    """(growth / 2) (run / 1000)^exponent s: a loop whose height grows with the motor turns run.
+    """(growth / 2) (run / 1000)^exponent s: a loop whose height grows with the number of motor turns run.
 
-    Growth is signed: positive for a loop that widens in the sense of the elastic loop, negative for a growing
-    gap (the load lags). Steady wear has exponent 1; running-in, fast at first and then slower, has an
-    exponent below 1. Within the first turn the height grows linearly, because no power law holds there.
+    Growth is positive for a loop in the sense of a leading elastic loop, and negative for a growing gap (the
+    load lags). Steady wear has an exponent of 1. Running-in, which slows down, has an exponent below 1.
+    Within the first turn the height grows linearly, because no power law holds there.
     """
 
     name = "wear"
@@ -58,18 +58,18 @@ class Wear(Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields widths from that of a gap to that of the elastic loop."""
+        """Yields loops with widths from that of a gap to that of the elastic loop."""
         yield from (cls(growth_arcsec_per_kiloturn=1.0, width_deg=each) for each in (0.5, 4.0, 20.0))
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the motor turns since the record began."""
+        """Returns the motor turns run since the start of the record."""
         run = np.cumsum(np.abs(np.diff(motion.motor_deg, prepend=motion.motor_deg[:1]))) / DEG_PER_TURN
         return Coordinate("motor turns run", "", run, both_ways=True, bins=20)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the effect of a growth of 1 arcsec in 1000 turns, shape (n, 1)."""
+        """Returns the error due to a growth of 1 arcsec in 1000 turns, shape (n, 1)."""
         angle = motion.motor_deg
-        # The derivative with respect to the width uses the same growth.
+        # Cached, because the derivative with respect to the width uses the same growth.
         key = (self.name, self.turns_before, self.turns_limit, self.exponent)
         half = once(angle, start, key, lambda: self._growth(angle))
         column: FloatArray = half * stop(angle, self.width_deg, start)
@@ -82,7 +82,7 @@ class Wear(Linear):
         return np.asarray(0.5 * _kiloturns(1.0, self.exponent) * share)
 
     def after(self, turns: float) -> Self:
-        """Returns the effect after this many more motor turns."""
+        """Returns the effect after ``turns`` more motor turns."""
         return self.model_copy(update={"turns_before": self.turns_before + turns})
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
@@ -98,30 +98,30 @@ class Wear(Linear):
         return abs(self._half(self.turns_limit))
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Returns the slope of a downward crossing at full height, plus the growth with travel."""
+        """Returns the slope of a downward crossing at maximum height, plus that due to growth with travel."""
         crossing = max(-2.0 * self._half(self.turns_limit) / self.width_deg, 0.0)
         return crossing + self._fastest_growth()
 
     def _half(self, turns: float) -> float:
-        """Returns half the height after this many turns, arcsec, signed."""
+        """Returns half the signed height of the loop after this number of motor turns, arcsec."""
         return 0.5 * self.growth_arcsec_per_kiloturn * _kiloturns(turns, self.exponent)
 
     def _fastest_growth(self) -> float:
-        """Returns the fastest growth of half the height, arcsec per motor degree."""
+        """Returns the maximum growth rate of half the loop's height, arcsec per motor degree."""
         late = self.exponent * math.pow(max(self.turns_limit, 1.0), self.exponent - 1.0)
         return abs(self._half(1.0)) * max(1.0, self.exponent, late) / DEG_PER_TURN
 
 
 def _kiloturns(turns: float, exponent: float) -> float:
-    """Returns the height relative to that of the first thousand turns."""
+    """Returns the loop's height after ``turns``, relative to that after 1000 turns."""
     return math.pow(1e-3, exponent) * (turns if turns < 1.0 else math.pow(turns, exponent))
 
 
 class _Tracker(Tracker):
-    """State: value of the stop operator, distance run (degrees), last angle."""
+    """Tracker whose state is the stop operator's value, the distance run (degrees) and the last angle."""
 
     def __init__(self, effect: Wear, start: Start, fall_arcsec_per_deg: float) -> None:
-        """``fall_arcsec_per_deg`` limits the slope of the crossing."""
+        """``fall_arcsec_per_deg`` limits the slope of a crossing."""
         self._half = effect._half
         self._gain = 2.0 / effect.width_deg
         self._fall = fall_arcsec_per_deg
@@ -133,7 +133,7 @@ class _Tracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """Motor angle of a full crossing at maximum height; the distance run is read from the file."""
+        """Motor travel of a full crossing at maximum height; the distance run does not count as memory."""
         return max(2.0 / self._gain, 2.0 * abs(self._half(self._limit)) / self._fall)
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
@@ -146,7 +146,7 @@ class _Tracker(Tracker):
         return half * self._value
 
     def _at(self, motor_deg: float) -> tuple[float, float, float]:
-        """Returns the distance run, half the height and the stop operator's value at an angle."""
+        """Returns the distance run, half the loop's height and the stop operator's value at an angle."""
         step = 0.0 if self._angle is None else motor_deg - self._angle
         distance = self._distance + abs(step)
         half = self._half(min(self._before + distance / DEG_PER_TURN, self._limit))

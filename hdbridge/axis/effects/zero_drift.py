@@ -1,4 +1,4 @@
-"""Zero shift with temperature, because housing, encoder mount and gear expand differently."""
+"""Shift of the zero with temperature, because housing, encoder mount and gear expand differently."""
 
 from collections.abc import Iterator, Sequence
 from typing import Self
@@ -15,7 +15,7 @@ from hdbridge.axis.effects.warmth import Warmed, WarmthState
 
 
 class ZeroDrift(Linear, Warmed):
-    """drift times the gear's warmth."""
+    """drift w: a zero shift proportional to the gear's warmth w."""
 
     name = "zero_drift"
     about = Cause(
@@ -57,16 +57,16 @@ class ZeroDrift(Linear, Warmed):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields effects driven by temperature if it changes, else by time."""
+        """Yields drifts that depend on temperature if it varies in the record, else on time."""
         for driven_by, tau_s in cls.lags(observations):
             yield cls(drift_arcsec_per_k=1.0, tau_s=tau_s, driven_by=driven_by)
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the time, to show the drift of the zero since the start of the record."""
+        """Returns the time, because a plot over time shows the drift of the zero."""
         return over.time(motion)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the effect of 1 arcsec per kelvin, shape (n, 1)."""
+        """Returns the error due to a drift of 1 arcsec per kelvin, shape (n, 1)."""
         return self.warmth(motion)[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:

@@ -1,4 +1,4 @@
-"""Transmission model: a gear ratio and a sum of effects; its file, its history, its differences."""
+"""Transmission model (a gear ratio and a sum of effects), its file, history and comparison."""
 
 from hdbridge.axis.model.transmission import ModelTracker, TransmissionModel
 

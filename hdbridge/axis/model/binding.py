@@ -25,12 +25,11 @@ def check_binding(
     noun: str,
     instead: str,
 ) -> None:
-    """Raises `InputError` if a model or twin belongs to another drive, axis or gear; ``noun`` names it in
-    messages.
+    """Raises `InputError` if a model or twin belongs to another drive, axis or gear.
 
-    ``identity`` is the identity read from the drive, by default that of the axis file. Values missing from
-    the provenance or the drive are not compared. Neither is the revision, because new firmware does not
-    change a gear.
+    ``identity`` is the identity read from the drive, by default that of the axis file. Values that the
+    provenance or the drive lacks are not compared. The revision is never compared, because new firmware does
+    not change a gear. ``noun`` ("model" or "twin") and ``instead`` (advice) are used in messages.
     """
     bound = Provenance.model_validate(provenance)
 

@@ -1,4 +1,4 @@
-"""Differences between two models, parameter by parameter. Pure."""
+"""Compares two models, parameter by parameter. Pure."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -7,20 +7,20 @@ from hdbridge.axis.model import TransmissionModel
 
 
 class Difference(NamedTuple):
-    """One parameter in two models; None if a model lacks it."""
+    """Values of one parameter in two models; None if a model lacks the parameter."""
 
     effect: str
     """Name of the effect; empty for the ratio."""
     parameter: str
-    """Name with its unit; in a list, with the order or number: ``orders[2].amplitude_arcsec``."""
+    """Name with its unit; list items are identified by order or index: ``orders[2].amplitude_arcsec``."""
     before: Any
     after: Any
     half_width: float | None
-    """Half width of the 95 % interval in the later (else the earlier) model, if known."""
+    """Half width of the 95 % interval, from the later model if it states one, else from the earlier."""
 
     @property
     def changed(self) -> bool:
-        """True if the two differ."""
+        """True if the two values differ."""
         return bool(self.before != self.after)
 
 
@@ -29,7 +29,7 @@ def diff(before: TransmissionModel, after: TransmissionModel) -> list[Difference
     old, new = dict(_parameters(before)), dict(_parameters(after))
     widths = {**dict(_half_widths(before)), **dict(_half_widths(after))}
     keys = list(dict.fromkeys([*old, *new]))
-    # Parameters that only the later model has are placed with the rest of their effect.
+    # Parameters that only the later model has are listed together with the rest of their effect.
     effects = list(dict.fromkeys(effect for effect, _ in keys))
     keys.sort(key=lambda key: effects.index(key[0]))
     return [Difference(*key, old.get(key), new.get(key), widths.get(key)) for key in keys]
@@ -50,7 +50,7 @@ def _half_widths(model: TransmissionModel) -> Iterator[tuple[tuple[str, str], fl
 
 
 def flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields the leaves of nested parameters; list items are named by their ``order``, if any."""
+    """Yields the leaves of nested parameters with their names; list items are named by ``order`` or index."""
     if isinstance(value, dict):
         for key, inner in value.items():
             yield from flat(inner, f"{name}.{key}" if name else key)

@@ -46,7 +46,7 @@ class EffectEntry(BaseModel):
 
 
 class ModelFile(BaseModel):
-    """Content of a model file; each effect checks its own parameters."""
+    """Content of a model file. The parameters of an effect are validated by the effect itself."""
 
     schema_: Literal["hdbridge.model/1"] = Field(
         alias="schema", description="schema and version of this file"
@@ -58,7 +58,8 @@ class ModelFile(BaseModel):
 
 
 def effects_of(document: Document, file: ModelFile) -> tuple[tuple[Effect, ...], dict[str, dict[str, Any]]]:
-    """Returns the effects of a model file and their uncertainties, by name.
+    """Returns the effects of a model file, and their uncertainties by name.
+
 
     Raises `InputError` with file:line:column and the nearest valid name.
     """
@@ -108,7 +109,7 @@ def _effect(document: Document, number: int, entry: EffectEntry, before: list[st
 
 
 def _hexadecimal(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the provenance with the drive's identity in hexadecimal, as in data sheets."""
+    """Returns the provenance with the drive's identity in hexadecimal notation, as in data sheets."""
     data = dict(provenance)
     if isinstance(data.get("drive"), Mapping):
         data["drive"] = {
@@ -118,7 +119,7 @@ def _hexadecimal(provenance: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _in_lines(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the data with each list on one line."""
+    """Returns the data, marked such that each list is written on one line."""
     return {
         name: Line(value)
         if isinstance(value, list)

@@ -1,7 +1,7 @@
-"""Response of an axis to its correction in motion, and the filter that compensates for it.
+"""Response of an axis to a correction in motion, and the filter that compensates for the response.
 
 At rest the load follows a correction fully. In motion, servo, command filter and interpolation change its
-amplitude and phase. `Response` holds the measured points and the filter weights computed from them;
+amplitude and phase. `Response` contains the measured response and the filter weights derived from it;
 `hdbridge.analysis.response` computes both.
 """
 
@@ -14,12 +14,12 @@ from hdbridge.strictness import Strict
 
 
 class LeadFilter(Strict):
-    """Weights of the correction along the path, from the near future to the past, and of earlier outputs.
+    """Filter of the correction along the path: weights of its future and past values, and of earlier outputs.
 
-    Near standstill the filter fades out, because the remains of the move in its memory would make the motor
-    turn back. Weight j applies to the correction of the load target ``lead_cycles - j / per_cycle`` cycles
-    ahead. Feedback i is subtracted for the output i cycles earlier. The weights sum to 1 plus the feedback,
-    so that nothing changes at rest.
+    Weight j applies to the correction of the load target ``lead_cycles - j / per_cycle`` cycles ahead.
+    Feedback i, times the output i cycles earlier, is subtracted. The sum of the weights is 1 plus the sum of
+    the feedback, so that the filter changes nothing at rest. Near standstill the filter is faded out, because
+    its memory of the move would make the motor turn back.
     """
 
     lead_cycles: int = Field(ge=0, le=50, description="lead of the first weight, cycles")
@@ -49,7 +49,7 @@ class LeadFilter(Strict):
 
 
 class Response(Strict):
-    """Measured response of an axis to its correction; valid only for the servo gains of the measurement."""
+    """Measured response of an axis to a correction; valid only for the servo gains of the measurement."""
 
     cycle_ms: float = Field(gt=0, description="SYNC period of the measurement")
     following_lag_ms: float = Field(description="lag of the motor behind its target at constant speed")

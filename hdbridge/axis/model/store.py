@@ -1,4 +1,5 @@
-"""Models of a profile: the active one, a pending one, and all earlier ones.
+"""Storage of the models of a profile: the active one, a pending one, and all earlier ones.
+
 
     profiles/NAME/axis.yaml           written by the user
                   model.yaml          the active model, used by the commands
@@ -6,14 +7,14 @@
                   history/0001.yaml   each version that was ever active, byte for byte
                   history/log.yaml    what was activated when, and why
 
-Twins are stored in the same way under their own file names (`hdbridge.twin.twin`); everything said of models
-here applies to any content of a `Store`.
+Twins are stored in the same way under their own file names (`hdbridge.twin.twin`). All statements about
+models in this module apply to any content of a `Store`.
 
-Each file is replaced atomically, in an order such that a kill at any moment leaves a usable profile: a
-version is in the history before it becomes active, and the log is written last. The number of the active
-version is not stored: it is the version with the same bytes as model.yaml.
+Each file is replaced atomically. The order of writing ensures that a kill at any moment leaves a usable
+profile: a version is in the history before it becomes active, and the log is written last. The number of the
+active version is not stored. It is that of the version with the same bytes as model.yaml.
 
-The date of each step is passed in.
+The caller passes the date of each step.
 """
 
 import fcntl
@@ -40,7 +41,7 @@ Action = Literal["found", "commit", "activate", "rollback"]
 
 
 class Activation(BaseModel):
-    """A line of the log."""
+    """An entry of the log: one change of the active version."""
 
     model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
@@ -62,7 +63,7 @@ class LogFile(BaseModel):
 
 
 class Kept(Protocol):
-    """Content of a store, with a provenance that binds it to an axis and its drive."""
+    """Interface of a store's content, whose provenance binds it to an axis and its drive."""
 
     @property
     def provenance(self) -> Mapping[str, Any]: ...
@@ -84,18 +85,18 @@ class Version(Generic[K]):
     """A stored version."""
 
     number: int | None
-    """None for the pending model, and for an active model that was copied there or edited by hand."""
+    """Number in the history; None for the pending model, and for an active model copied or edited by hand."""
     path: Path
     active: bool
     date: str
-    """Date of creation according to its file."""
+    """Date of creation, as stated in the file."""
     reason: str
     content: K
     activations: tuple[Activation, ...] = ()
 
     @property
     def name(self) -> str:
-        """Name for commands: its number, ``pending`` or ``active``."""
+        """Name of the version in commands: its number, ``pending`` or ``active``."""
         return str(self.number) if self.number else ACTIVE if self.active else PENDING
 
 
@@ -110,18 +111,18 @@ class Store(Generic[K]):
     pending: str
     """File name of the pending version."""
     history: str
-    """Name of the folder with all versions."""
+    """Name of the folder that contains all versions."""
     first: str
     """Advice for an empty store, for messages."""
     command: str
-    """Command that prints the log."""
+    """Command that prints the log, for the log's header."""
     load: Callable[[Path], K]
 
     def log(self, profile: Path) -> list[Version[K]]:
-        """Returns all versions, newest first: pending, an active version outside the history, and the
-        history.
+        """Returns all versions: pending, an active version that is not in the history, then the history.
 
-        Another process, such as the daemon, may commit the pending version meanwhile.
+        The history is sorted from newest to oldest. Another process, such as the daemon, may commit the
+        pending version while this runs.
         """
         activations = self._activations(profile)
         active = _bytes(profile / self.active)
@@ -141,12 +142,13 @@ class Store(Generic[K]):
             except InputError:
                 if pending.exists():
                     raise
-                return self.log(profile)  # it is in the history now, or was discarded
+                return self.log(profile)  # it has been committed or discarded meanwhile
         return versions
 
     def find(self, profile: Path, name: str) -> Version[K]:
-        """Returns the version ``active``, ``pending`` or of a number; raises `InputError` with the existing
-        names.
+        """Returns a version by name: ``active``, ``pending`` or a number.
+
+        If there is none, raises `InputError` with the existing names.
         """
         versions = self.log(profile)
         for version in versions:
@@ -168,9 +170,10 @@ class Store(Generic[K]):
         date: datetime,
         identity: Identity | None = None,
     ) -> Path:
-        """Stores content as pending, bound to the profile's axis and the drive's identity; returns the file.
+        """Stores content as the pending version, bound to the profile's axis and drive; returns the file.
 
-        Replaces a previous pending version. Raises `InputError` if the gear ratio differs.
+        Replaces a previous pending version. Raises `InputError` if the gear ratio differs from the axis
+        file's.
         """
         axis = AxisConfig.load(profile)
         content.check_ratio(axis)
@@ -182,8 +185,8 @@ class Store(Generic[K]):
     def commit(self, profile: Path, date: datetime, identity: Identity | None = None) -> int:
         """Makes the pending version active; returns its number.
 
-        ``identity`` is the present identity of the drive. Raises `InputError` if the identity, the axis or
-        the gear differs.
+        ``identity`` is the identity read from the drive. Raises `InputError` if the pending version belongs
+        to another drive, axis or gear.
         """
         pending = profile / self.pending
         with _locked(profile):
@@ -206,7 +209,7 @@ class Store(Generic[K]):
     def activate(
         self, profile: Path, version: int, reason: str, date: datetime, identity: Identity | None = None
     ) -> int:
-        """Makes a version of the history active; the previous one stays in the history."""
+        """Makes a version of the history active, and returns its number; the previous one stays stored."""
         path = self._history(profile).get(version)
         if path is None:
             numbers = ", ".join(map(str, sorted(self._history(profile)))) or f"none yet, {self.first}"
@@ -231,13 +234,13 @@ class Store(Generic[K]):
             return self._activate(profile, path.read_bytes(), "rollback", reason, date)
 
     def _activate(self, profile: Path, content: bytes, action: Action, reason: str, date: datetime) -> int:
-        """Writes the history first, then the active version, the log last."""
+        """Writes content to the history, then as the active version, the log last; returns its number."""
         activations = self._activations(profile)
         before = _bytes(profile / self.active)
         if before is not None and before != content and self._number(profile, before) is None:
             try:
                 self.load(profile / self.active)
-            except (InputError, UnicodeDecodeError):  # edited by hand and broken: kept, but not a version
+            except (InputError, UnicodeDecodeError):  # damaged by a manual edit: saved, but not as a version
                 write_atomically(self._history_folder(profile) / "unreadable.yaml", before)
             else:
                 reason_found = "was there, but not in the history"
@@ -257,7 +260,7 @@ class Store(Generic[K]):
         return number
 
     def _keep(self, profile: Path, content: bytes) -> int:
-        """Returns the version number of this content, which is added to the history if necessary."""
+        """Adds content to the history, unless it is already there, and returns its version number."""
         number = self._number(profile, content)
         if number is None:
             number = max(self._history(profile), default=0) + 1
@@ -306,10 +309,11 @@ class Store(Generic[K]):
 
 
 def undone(activations: Sequence[Activation], active: int | None) -> int | None:
-    """Returns the version to which a roll-back returns, given the log and the active version.
+    """Returns the version that a roll-back would activate, given the log and the active version.
 
-    Roll-backs undo activations one by one, like the undo of an editor. After a kill the log may lack the last
-    step, which the active version then completes. ``active`` is None for a model outside the history.
+    Roll-backs undo activations one by one, like the undo function of an editor. After a kill the log may lack
+    the last step. The active version then indicates that step. ``active`` is None for a model outside the
+    history.
     """
     stack: list[int] = []
     for each in activations:
@@ -326,7 +330,7 @@ def undone(activations: Sequence[Activation], active: int | None) -> int | None:
 
 
 def _unwind(stack: list[int], version: int) -> None:
-    """Removes the entries above a version from the stack."""
+    """Removes all entries above ``version`` from the stack."""
     while stack[-1] != version:
         stack.pop()
 
@@ -347,10 +351,10 @@ def _iso(date: datetime) -> str:
 
 @contextmanager
 def measuring(axis_file: Path) -> Iterator[None]:
-    """Allows one measurement of a profile at a time, across processes, because a second proposal would
-    replace the first.
+    """Locks a profile for one measurement at a time, because a second proposal would replace the first.
 
-    Raises `InputError` at once if another process holds the lock. The lock ends with its process.
+    The lock applies to all processes. If another process holds it, raises `InputError` at once. The lock is
+    released when its process ends.
     """
     try:
         file = os.open(axis_file, os.O_RDONLY | os.O_CLOEXEC)
@@ -371,7 +375,7 @@ def measuring(axis_file: Path) -> Iterator[None]:
 
 @contextmanager
 def _locked(profile: Path) -> Iterator[None]:
-    """Allows one change at a time, across processes; the lock ends with its process."""
+    """Waits for and holds a lock of the profile, across processes; it is released when its process ends."""
     try:
         folder = os.open(profile, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as problem:

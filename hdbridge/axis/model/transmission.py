@@ -21,39 +21,39 @@ from hdbridge.files.yamlfile import Document, document_from_text, read_yaml, wri
 
 @dataclass(frozen=True)
 class TransmissionModel:
-    """theta_TE = theta_L - theta_M / N as a sum of effects, arcsec at the load.
+    """Transmission error theta_L - theta_M / N as a sum of effects, arcsec at the load.
 
-    The model does not contain the gear's past. The initial state is passed to `predict` and `tracker`
-    (`Start`), because it depends on the move before the record or the run, not on the gear.
+    The model does not contain the elastic state of the gear. The initial state (`Start`) is passed to
+    `predict` and `tracker`, because it depends on the move before the record or the run, not on the gear.
     """
 
     ratio: float
     """N: motor turns per load turn, positive."""
     effects: tuple[Effect, ...] = ()
     uncertainty: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Effect name -> parameter name -> half width of the 95 % interval, in the parameter's unit."""
+    """Half width of the 95 % interval by effect name and parameter name, in the parameter's unit."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Origin of the numbers: recording, date, versions, drive identity (`Provenance`)."""
     response: Response | None = None
     """Response of the axis to the correction in motion; None if it has not been measured."""
     path: Path | None = field(default=None, compare=False)
-    """File from which the model was read."""
+    """File from which the model was read, if any."""
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the transmission error in arcsec for each sample of a motion, shape (n,)."""
+        """Returns the transmission error at each sample of a motion, arcsec, shape (n,)."""
         total = np.zeros(len(motion))
         for effect in self.effects:
             total += effect.predict(motion, start)
         return total
 
     def tracker(self, start: Start = Start.VIRGIN) -> ModelTracker:
-        """Returns a new on-line tracker of the whole sum."""
+        """Returns a new on-line tracker of the sum of all effects."""
         return ModelTracker([effect.tracker(start) for effect in self.effects])
 
     def only(self, names: Iterable[str]) -> Self:
         """Returns the model with only the named effects; unknown names are ignored.
 
-        A law that replaces another is also found by the other's name.
+        A law that replaces another law is also found by the name of the other.
         """
         wanted = set(names)
         kept = (each for each in self.effects if each.name in wanted or each.replaces in wanted)
@@ -66,7 +66,7 @@ class TransmissionModel:
 
     @classmethod
     def from_text(cls, text: str, path: Path | str = "model.yaml") -> Self:
-        """Reads the text of a model file; ``path`` names it in messages."""
+        """Reads a model file from its text; ``path`` is used in messages."""
         return cls._from_document(document_from_text(text, path))
 
     @classmethod
@@ -77,9 +77,9 @@ class TransmissionModel:
 
     @classmethod
     def from_document(cls, data: Mapping[str, Any], path: Path | None = None) -> Self:
-        """Reads the result of `document`, fast enough for the control loop.
+        """Creates a model from the result of `document`, fast enough for the control loop.
 
-        Raises `KeyError` or `ValueError` for anything else.
+        Raises `KeyError` or `ValueError` for any other data.
         """
         entries = data["effects"]
         return cls(
@@ -92,7 +92,7 @@ class TransmissionModel:
         )
 
     def document(self) -> dict[str, Any]:
-        """Returns the content of the model file as plain data, ready for JSON."""
+        """Returns the content of the model file as plain data that can be converted to JSON."""
         entries = [
             {"effect": each.name, "parameters": each.parameters()}
             | ({"uncertainty": dict(known)} if (known := self.uncertainty.get(each.name)) else {})
@@ -118,11 +118,11 @@ class TransmissionModel:
         return replace(self, provenance={**self.provenance, **provenance})
 
     def bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> Self:
-        """Returns the model bound to an axis and the identity of its drive, by default the axis file's."""
+        """Returns the model bound to an axis and a drive identity, by default that of the axis file."""
         return replace(self, provenance={**self.provenance, **binding(axis, identity)})
 
     def check_ratio(self, axis: AxisConfig) -> None:
-        """Raises `InputError` if the model's gear ratio differs from the axis file's."""
+        """Raises `InputError` if the gear ratio of the model differs from that of the axis file."""
         if not math.isclose(self.ratio, axis.gear.ratio, rel_tol=1e-9):
             raise InputError(
                 f"{self._name()}: ratio: this model is of a gear with ratio {self.ratio:g}, but "
@@ -139,25 +139,25 @@ class TransmissionModel:
 
 
 class ModelTracker(Tracker):
-    """Sum of the trackers of all effects."""
+    """Tracker of the sum of all effects."""
 
     def __init__(self, trackers: list[Tracker]) -> None:
         self._trackers = trackers
 
     @property
     def memory_deg(self) -> float:
-        """Longest memory of its effects."""
+        """Longest memory of all effects."""
         return max((each.memory_deg for each in self._trackers), default=0.0)
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
-        """Returns the sum of the effects at ``motor_deg``, arcsec; changes nothing."""
+        """Returns the sum of the effects at ``motor_deg``, arcsec, without changing any state."""
         total = 0.0
         for tracker in self._trackers:
             total += tracker.peek(motor_deg, moment)
         return total
 
     def advance(self, motor_deg: float, moment: Moment) -> float:
-        """Advances every effect and returns the sum, arcsec."""
+        """Advances all effects to ``motor_deg`` and returns their sum, arcsec."""
         total = 0.0
         for tracker in self._trackers:
             total += tracker.advance(motor_deg, moment)
