@@ -1,4 +1,4 @@
-"""Set-points of one axis, period by period: moves, jogs, streams and stops within the limits. Pure."""
+"""Set-points of one axis in each control period: moves, jogs, streams and stops within the limits. Pure."""
 
 from hdbridge.motion.coordinated import CoordinatedPlan, coordinated
 from hdbridge.motion.modes import MotionMode

@@ -1,11 +1,11 @@
-"""Synchronised moves of several axes: common start, common arrival, straight path in between.
+"""Synchronised moves of several axes, with a common start, a common arrival and a straight path.
 
-The result is a set of knots for each axis at the control period, which a stream (`SetPoint.stream`) follows
-exactly. The plan must be computed outside the loop, because it takes milliseconds.
+The result contains one knot per control period for each axis. A stream (`SetPoint.stream`) follows the knots
+exactly. A plan must be computed outside the control loop, because this takes milliseconds.
 
 Ruckig's free version does not plan paths through intermediate points (it would call a server on the
-internet). A path through way points therefore rests at each change of direction; points on a straight line
-are passed in motion. To round a corner without a rest, the caller must choose other points.
+internet). A path through way points therefore comes to rest at each change of direction. It passes points on
+a straight line without stopping. To round a corner without a stop, the caller must choose other points.
 """
 
 import math
@@ -25,9 +25,9 @@ from hdbridge.motion.procedures.moves import MotionLimits
 from hdbridge.motion.stream import ACCELERATION_MARGIN
 
 _STRAIGHT = 1e-9
-"""Maximum difference of two unit direction vectors of the same direction."""
+"""Maximum difference between two unit vectors that count as the same direction."""
 MOST_S = 3600.0
-"""Maximum duration of a plan, whose knots are kept in memory; s."""
+"""Maximum duration of a plan, because its knots are kept in memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,10 +36,10 @@ class CoordinatedPlan:
 
     duration_s: float
     knots: dict[str, FloatArray]
-    """Knots per axis, shape (n, 3): time in s (from 0, at each control period), load angle in degrees,
-    velocity in deg/s.
+    """Knots of each axis, one per control period, shape (n, 3): time from 0, s; load angle, degrees;
+    velocity, deg/s.
 
-    The first knot is the initial position, the last the target; both at rest."""
+    The first knot is the initial position and the last one the target, both at rest."""
 
 
 def coordinated(
@@ -51,10 +51,10 @@ def coordinated(
 ) -> CoordinatedPlan:
     """Plans a synchronised move from rest, through points, to rest at the last point.
 
-    ``starts_deg`` holds the position of each axis. Each point contains load angles of some or all axes; the
-    others stay. ``share``, above 0 and up to 1, scales all velocity and acceleration limits. Raises
-    `InputError` for an unknown axis, an angle that is not finite or outside its limits, and a plan longer
-    than an hour.
+    ``starts_deg`` contains the position of each axis. Each point contains target angles for some or all axes,
+    and the other axes do not move. ``share``, above 0 and up to 1, scales all velocity and acceleration
+    limits. Raises `InputError` for an unknown axis, an angle that is not finite or outside its limits, or a
+    plan longer than an hour.
     """
     if not points_deg:
         raise InputError("a coordinated move without a point; expected at least one")
@@ -100,7 +100,7 @@ def _check_inside(name: str, angle_deg: float, limits: MotionLimits) -> None:
 
 
 class _Eased(NamedTuple):
-    """Reduced limits for the knots, so that the cubics between them stay within the limits of the axis."""
+    """Reduced limits for the knots, with which the cubics between the knots stay within the axis's limits."""
 
     velocity_deg_s: float
     acceleration_deg_s2: float
@@ -110,8 +110,8 @@ class _Eased(NamedTuple):
 def _eased(limits: MotionLimits, period_s: float, share: float) -> _Eased:
     """Returns reduced limits for the knots.
 
-    If the jerk changes within a period T, the cubic exceeds the acceleration by up to 4/27 of jerk T, and the
-    velocity by up to 0.0162 of jerk T^2.
+    If the jerk changes within a period T, the cubic exceeds the planned acceleration by up to 4/27 of jerk T,
+    and the planned velocity by up to 0.0162 of jerk T^2.
     """
     velocity, acceleration = share * limits.velocity_deg_s, share * limits.acceleration_deg_s2
     jerk = min(
@@ -123,9 +123,7 @@ def _eased(limits: MotionLimits, period_s: float, share: float) -> _Eased:
 
 
 def _straight(corners: Sequence[FloatArray]) -> list[tuple[FloatArray, FloatArray]]:
-    """Returns the legs from corner to corner, without points passed in a straight line and without empty
-    legs.
-    """
+    """Returns the legs from corner to corner; merges legs in the same direction, and omits empty legs."""
     legs: list[tuple[FloatArray, FloatArray]] = []
     for begin, end in pairwise(corners):
         way = end - begin
@@ -145,7 +143,7 @@ def _straight(corners: Sequence[FloatArray]) -> list[tuple[FloatArray, FloatArra
 def _leg(
     begin: FloatArray, end: FloatArray, limits: Sequence[_Eased], period_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns positions and velocities at each period from rest to rest, both of shape (n, axes)."""
+    """Returns positions and velocities of a leg from rest to rest in each period, shape (n, axes) each."""
     count = len(begin)
     demand = InputParameter(count)
     demand.synchronization = Synchronization.Phase

@@ -1,8 +1,8 @@
-"""Jerk-limited plans of one axis from any present state, by ruckig on line.
+"""Computes jerk-limited plans of one axis from any present state, on line, by ruckig.
 
 A plan is checked before it is returned: it ends at its target, in finite time, and stays within the bounds
-and the axis's velocity. The result is None if ruckig finds no solution within the bounds; the caller then
-decides on a safe reaction.
+and the axis's velocity limit. The result is None if ruckig finds no solution within the bounds. The caller
+then decides on a safe reaction.
 """
 
 import math
@@ -15,15 +15,15 @@ from hdbridge.motion.procedures.moves import MotionLimits
 
 SOLVED = frozenset({Result.Working, Result.Finished})
 SHARES = (1.0, 1.0 - 1e-6)
-"""Shares of the limits for successive attempts, because ruckig fails if limits and distance coincide
+"""Factors for the limits in successive attempts, because ruckig fails if limits and distance coincide
 exactly."""
 _MISS_DEG = 1e-6
-"""Maximum distance of a plan's end from its target; above it, ruckig has failed numerically."""
+"""Maximum distance of a plan's end from its target; a larger one is a numerical failure of ruckig."""
 _ROUNDING_DEG = 1e-9
 
 
 _NEAR_END = 0.999
-"""Share of a path's duration at which the motion still has its final direction."""
+"""Fraction of a path's duration, just before its end, at which the final direction of motion is evaluated."""
 _HALVINGS = 30
 _At = Callable[[float], tuple[list[float], list[float], list[float]]]
 
@@ -44,16 +44,17 @@ class Bounds(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Path to rest, over the time since its creation."""
+    """Path from the present state to rest, as a function of the time since its start."""
 
     begin_deg: float
     end_deg: float
     duration_s: float
     at: _At
-    """Position (relative to ``begin_deg``), velocity and acceleration of one degree of freedom."""
+    """Function that returns position (relative to ``begin_deg``), velocity and acceleration at a time, as
+    lists of one number each."""
 
     def state(self, time_s: float) -> Kinematics:
-        """Returns the state after this time; after its duration, at rest exactly at its end."""
+        """Returns the state at this time; from the end of the path on, rest exactly at ``end_deg``."""
         if time_s >= self.duration_s:
             return Kinematics(self.end_deg, 0.0, 0.0)
         position, velocity, acceleration = self.at(time_s)
@@ -61,10 +62,10 @@ class Plan(NamedTuple):
 
 
 def _turn(velocity_deg_s: float, at: _At, duration_s: float) -> float:
-    """Returns the position at which a path with this initial velocity turns back, relative to its start;
-    else 0.
+    """Returns the position, relative to the start, at which a path with this initial velocity reverses.
 
-    Ruckig's own extremes omit it if the initial acceleration exceeds the plan's limit.
+    Returns 0 if it does not reverse. Ruckig's own extremes omit this position if the initial acceleration
+    exceeds the plan's limit.
     """
     later = _NEAR_END * duration_s
     if not velocity_deg_s or velocity_deg_s * at(later)[1][0] >= 0.0:
@@ -80,7 +81,7 @@ def _turn(velocity_deg_s: float, at: _At, duration_s: float) -> float:
 
 
 class Generator:
-    """Computes plans within the limits of one axis, or slower."""
+    """Computes plans within the limits of one axis, or within lower limits."""
 
     def __init__(self, limits: MotionLimits) -> None:
         self._limits = limits
@@ -96,12 +97,14 @@ class Generator:
         velocity_deg_s: float = math.inf,
         acceleration_deg_s2: float = math.inf,
     ) -> Plan | None:
-        """Returns the fastest path to rest at a position; never faster than the axis, whatever is requested.
+        """Returns the fastest path to rest at a position, or None.
 
-        Present velocity and acceleration above the requested values are reduced first.
+        The axis's limits apply even if higher values are requested. Present velocity and acceleration above
+        the requested values are reduced first.
         """
         self._demand.control_interface = ControlInterface.Position
-        # Relative to the present position, so that the plan does not depend on the distance from zero.
+        # Positions are relative to the present one, so that rounding does not depend on the distance from
+        # zero.
         self._demand.target_position = [target_deg - now.position_deg]
         plan = self._plan(now, velocity_deg_s, acceleration_deg_s2, bounds)
         if plan is None or abs(plan.end_deg - target_deg) > _MISS_DEG:
@@ -109,7 +112,7 @@ class Generator:
         return plan._replace(end_deg=target_deg)
 
     def to_rest(self, now: Kinematics, bounds: Bounds) -> Plan | None:
-        """Returns the fastest path to rest, at any position within the bounds."""
+        """Returns the fastest path to rest, at any position within the bounds, or None."""
         self._demand.control_interface = ControlInterface.Velocity
         return self._plan(now, math.inf, math.inf, bounds)
 
@@ -118,7 +121,7 @@ class Generator:
     ) -> Plan | None:
         demand, limits = self._demand, self._limits
         begin_deg = now.position_deg
-        # The acceleration must come down first, at the jerk limit; until then the velocity still changes.
+        # The acceleration must first be reduced at the jerk limit, and the velocity changes meanwhile.
         eased = now.acceleration_deg_s2 * abs(now.acceleration_deg_s2) / (2.0 * limits.jerk_deg_s3)
         if abs(now.velocity_deg_s + eased) > limits.velocity_deg_s * (1.0 + 1e-6):
             return None

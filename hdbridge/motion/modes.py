@@ -1,22 +1,24 @@
-"""Modes of motion of a set-point."""
+"""Motion modes of a set-point."""
 
 from enum import IntEnum
 
 
 class MotionMode(IntEnum):
-    """Source of the present motion. The numbers are part of the daemon's shared memory, so they may be added
-    but not changed.
+    """Kind of the present motion.
+
+    The numbers are used in the daemon's shared memory. New ones may be added, but existing ones must not
+    change.
     """
 
     HOLD = 0
     """At rest at the end of the last motion."""
     GOTO = 1
-    """Moving to a target."""
+    """Moving to a target position."""
     JOG = 2
-    """Moving at a velocity while a client requests it."""
+    """Moving at a constant velocity for as long as a client renews the request."""
     STREAM = 3
     """Following knots planned by a client."""
     STOP = 4
     """Braking to rest within the limits."""
     FOLLOW = 5
-    """Following a position supplied by another source in each period."""
+    """Following a position that another source supplies in each period."""

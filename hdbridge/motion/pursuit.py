@@ -1,4 +1,4 @@
-"""Pursuit of a position supplied by another source in each period, within the limits of the axis."""
+"""Pursuit of a position that another source supplies in each period, within the limits of the axis."""
 
 import math
 
@@ -9,12 +9,12 @@ _ROUNDING = 1e-6
 
 
 class Pursuit:
-    """Reaches each goal exactly if the limits permit it; otherwise approaches it at the acceleration limit.
+    """Reaches each goal exactly if the limits permit it, else approaches it at the acceleration limit.
 
-    Goals on straight lines between set-points change their velocity in steps, even on a path within the
-    limits. A goal is therefore reached exactly if its velocity changes by no more than the limit permits from
-    one set-point to the next. A goal outside the bounds is pursued to the bound. Jerk is not limited, as for
-    the knots of a stream.
+    If goals are interpolated linearly between set-points, their velocity changes in steps, even on a path
+    within the limits. A goal is therefore reached exactly if the change of its velocity is no larger than the
+    acceleration limit permits from one set-point to the next. A goal outside the bounds is pursued up to the
+    bound. Jerk is not limited, as in a stream of knots.
     """
 
     def __init__(self, begin_deg: float, limits: MotionLimits, bounds: Bounds, period_s: float) -> None:
@@ -27,13 +27,13 @@ class Pursuit:
 
     @property
     def at_rest(self) -> bool:
-        """True if the set-point stands at its goal."""
+        """True if the set-point is at rest at its goal."""
         return self.state.velocity_deg_s == 0.0 and self.state.position_deg == self._goal_deg
 
     def step(self, goal_deg: float, spacing_s: float = 0.0) -> Kinematics:
-        """Moves towards ``goal_deg`` (finite) for one period; returns the new state.
+        """Moves towards ``goal_deg`` (finite) for one period, and returns the new state.
 
-        ``spacing_s`` is the time between set-points.
+        ``spacing_s`` is the time between the set-points from which the goal was interpolated.
         """
         lower, upper, acceleration, period_s = self._lower, self._upper, self._acceleration, self._period_s
         before_deg = self._goal_deg
@@ -50,7 +50,7 @@ class Pursuit:
         else:
             away, change = goal_deg - position, acceleration * period_s
             wanted = (goal_deg - before_deg) / period_s + math.copysign(self._speed(abs(away)), away)
-            # Whatever the goal does, the axis can still brake before its bounds.
+            # The speed is limited such that the axis can brake before its bounds, wherever the goal moves.
             least = max(-self._fastest, velocity - change, -self._speed(position - lower))
             most = min(self._fastest, velocity + change, self._speed(upper - position))
             wanted = min(max(wanted, least), most)
@@ -59,7 +59,7 @@ class Pursuit:
         return state
 
     def _speed(self, distance_deg: float) -> float:
-        """Returns the highest speed of the next period that still permits braking within a distance."""
+        """Returns the highest speed in the next period from which the axis can brake within this distance."""
         if distance_deg <= 0.0:
             return 0.0
         change = self._acceleration * self._period_s

@@ -1,11 +1,10 @@
-"""Set-point of one axis, period by period, for commands at any time.
+"""Set-point of one axis in each control period, with commands accepted at any time.
 
 Every motion continues from the present position, velocity and acceleration, so a new target does not require
-rest. An impossible command is refused (`InputError`) before anything has changed, and the motion under way
-continues.
+rest. An impossible command is refused (`InputError`) without any change, and the present motion continues.
 
 The set-point always stays within the position limits. A plan is accepted only if its extremes are within
-them, and braking has a fallback that always exists (`SetPoint._brake`). Rounding errors are clipped.
+them, and braking has a fallback that is always possible (`SetPoint._brake`). Rounding errors are clipped.
 """
 
 import math
@@ -18,18 +17,18 @@ from hdbridge.motion.pursuit import Pursuit
 from hdbridge.motion.stream import Cubic, Stream
 
 MOST_TIMEOUT_S = 60.0
-"""Maximum time-out of a dead man's control; s."""
+"""Maximum time-out of a jog or a stream that is no longer renewed."""
 
 
 class SetPoint:
-    """Load target, once per control period.
+    """Computes the load target in each control period.
 
-    Pure: time is counted in calls of `step`. An axis that stands outside its position limits may hold there
-    and move inwards.
+    Pure: time is counted in calls of `step`. An axis that stands outside its position limits may hold its
+    position and move inwards.
     """
 
     def __init__(self, limits: MotionLimits, period_s: float) -> None:
-        """``period_s`` is the time between two calls of `step`. The set-point is at zero until `reset`.
+        """Creates a set-point at zero, until `reset`; ``period_s`` is the time between two calls of `step`.
 
         Raises `InputError` for limits that are not finite or leave no range.
         """
@@ -49,12 +48,12 @@ class SetPoint:
         self._pursuit: Pursuit | None = None
         self._aim = (0.0, 0.0)
         self._path: Plan | Cubic | None = None
-        """Path in progress; None at rest and in a stream."""
+        """Path in progress; None at rest, in a stream and in a pursuit."""
         self._steps = 0
-        """Periods since ``_path`` was set; the path had then run for ``_since_s``."""
+        """Number of periods since ``_path`` was set, ``_since_s`` after the start of the path."""
         self._since_s = 0.0
         self._left = self._stream_timeout = 0
-        """Remaining periods of a jog, or of a stream at rest."""
+        """Remaining periods before a jog or a resting stream times out, and time-out of a stream, periods."""
         self._mode = MotionMode.HOLD
         self._underrun = False
         self._position_deg = self._velocity_deg_s = self._acceleration_deg_s2 = 0.0
@@ -62,7 +61,7 @@ class SetPoint:
 
     @property
     def position_deg(self) -> float:
-        """Load target of the last `step`."""
+        """Load target after the last `step`."""
         return self._position_deg
 
     @property
@@ -79,7 +78,7 @@ class SetPoint:
 
     @property
     def at_rest(self) -> bool:
-        """True if the set-point stands still and would remain so without further input."""
+        """True if the set-point stands still and will do so until it receives further input."""
         if self._stream is not None:
             return self._stream.waiting
         if self._pursuit is not None:
@@ -88,16 +87,16 @@ class SetPoint:
 
     @property
     def underrun(self) -> bool:
-        """True if the last stream ran out of knots in motion and had to be braked."""
+        """True if the last stream ran out of knots in motion, so that the axis was braked."""
         return self._underrun
 
     @property
     def room(self) -> int:
-        """Number of knots that would now be accepted; 0 outside a stream."""
+        """Number of further knots for which there is room now; 0 outside a stream."""
         return 0 if self._stream is None else self._stream.room
 
     def reset(self, load_deg: float) -> None:
-        """Sets a position at rest, discarding all motion, for an axis that is not being driven.
+        """Sets a position at rest and discards all motion; to be used while the drive does not move the axis.
 
         Raises `InputError` for a non-finite angle.
         """
@@ -111,11 +110,11 @@ class SetPoint:
         velocity_deg_s: float | None = None,
         acceleration_deg_s2: float | None = None,
     ) -> None:
-        """Moves to a load angle and rests there; from rest or from any motion.
+        """Moves to a load angle and rests there, starting from rest or from any motion.
 
-        Velocity and acceleration limit this move; the axis's limits apply in any case. Raises `InputError`
-        for a target outside the position limits or an invalid number, and in motion if the path would leave
-        the position limits (stop first).
+        Velocity and acceleration limit this move in addition to the axis's limits. Raises `InputError` for a
+        target outside the position limits and for an invalid number. In motion, also raises it if the path
+        would leave the position limits (stop first).
         """
         limits = self._limits
         _check_finite("target", target_deg)
@@ -129,11 +128,11 @@ class SetPoint:
         self._take(self._planned(target_deg, speed, acceleration), MotionMode.GOTO)
 
     def jog(self, velocity_deg_s: float, timeout_s: float) -> None:
-        """Moves at a velocity (up to the axis's limit) until the time-out; zero brakes.
+        """Moves at a velocity (up to the axis's limit) until the time-out; a velocity of zero brakes.
 
-        Must be called again before the time-out. The axis brakes before a position limit and waits there.
-        Raises `InputError` for invalid numbers, and for a time-out that is not above 0 and up to
-        `MOST_TIMEOUT_S`.
+        Call it again before the time-out to continue the motion. The axis brakes before a position limit and
+        waits there. Raises `InputError` for invalid numbers, including a time-out that is not above 0 and up
+        to `MOST_TIMEOUT_S`.
         """
         _check_finite("velocity", velocity_deg_s)
         timeout = self._timeout(timeout_s)
@@ -142,8 +141,8 @@ class SetPoint:
         if not speed:
             self.stop()
             return
-        # Planned as a move, so that the plan respects the position limit: to the limit, or farther than it
-        # can come before the time-out.
+        # A jog is planned as a move, so that the plan respects the position limits. Its target is the limit,
+        # or a position that the axis cannot reach before the time-out.
         easing_s = speed / limits.acceleration_deg_s2 + limits.acceleration_deg_s2 / limits.jerk_deg_s3
         reach = self._coasting_deg() + speed * (timeout_s + 2.0 * (easing_s + self._period_s))
         bounds = self._bounds_here()
@@ -155,17 +154,18 @@ class SetPoint:
         self._left = timeout
 
     def stop(self) -> None:
-        """Brakes to rest within the limits. Never refused; at rest, ends a stream or a jog."""
+        """Brakes to rest within the limits; at rest, ends a stream or a jog. It is never refused."""
         if self.at_rest:
             self._rest_at(self._position_deg)
         elif self._mode is not MotionMode.STOP:
             self._brake(0.0)
 
     def stream(self, timeout_s: float) -> None:
-        """Follows knots from here (`knot`); their time starts with the first `step` after `begin_stream`.
+        """Starts a stream, which follows knots (`knot`) from the present position.
 
-        A rest without knots for the time-out ends the stream with a hold. Raises `InputError` in motion, and
-        for a time-out that is not above 0 and up to `MOST_TIMEOUT_S`.
+        The time of the knots starts with the first `step` after `begin_stream`. If the axis rests for the
+        time-out without a new knot, the stream ends with a hold. Raises `InputError` in motion, and for a
+        time-out that is not above 0 and up to `MOST_TIMEOUT_S`.
         """
         timeout = self._timeout(timeout_s)
         if not self.at_rest:
@@ -178,7 +178,7 @@ class SetPoint:
         self._mode = MotionMode.STREAM
 
     def follow(self) -> None:
-        """Pursues the positions passed to `aim` until another motion. Raises `InputError` in motion."""
+        """Pursues the positions passed to `aim` until another command; raises `InputError` in motion."""
         if not self.at_rest:
             raise InputError("an axis begins to follow another master at rest: stop the axis first")
         self._rest_at(self._position_deg)
@@ -187,10 +187,9 @@ class SetPoint:
         self._mode = MotionMode.FOLLOW
 
     def aim(self, position_deg: float, spacing_s: float = 0.0) -> None:
-        """Pursues a position with the next `step`, within the limits. Raises `InputError` if it is not
-        finite.
+        """Sets the position to pursue with the next `step`; raises `InputError` if it is not finite.
 
-        ``spacing_s`` is the time between the set-points from which it was interpolated.
+        ``spacing_s`` is the time between the set-points from which the position was interpolated.
         """
         _check_finite("load angle", position_deg)
         self._aim = (position_deg, spacing_s)
@@ -200,17 +199,17 @@ class SetPoint:
         self._streaming().begin()
 
     def knot(self, time_s: float, position_deg: float, velocity_deg_s: float) -> None:
-        """Adds a knot to the stream: time from its start, and load angle and velocity at that time.
+        """Adds a knot to the stream: time since the stream's start, and load angle and velocity at that time.
 
-        Between two knots the set-point follows the cubic with their velocities. Raises `InputError`, leaving
-        the stream unchanged, if the knot is not later than the last one; if position, speed or (by more than
-        5 %) acceleration would exceed the limits, anywhere on the way to it or when braking from it; if the
-        first knot is not at rest at the position of the axis; and if the buffer is full (`room`).
+        Between two knots the set-point follows the cubic with the knots' velocities. Raises `InputError`, and
+        leaves the stream unchanged, in four cases: the knot is not later than the last one; position, speed
+        or (by more than 5 %) acceleration would exceed the limits, on the path to the knot or when braking
+        from it; the first knot is not at rest at the axis's position; the buffer is full (`room`).
         """
         self._streaming().add(time_s, position_deg, velocity_deg_s)
 
     def step(self) -> float:
-        """Advances one period; returns the load target in degrees."""
+        """Advances by one period and returns the load target, degrees."""
         if self._stream is not None:
             return self._step_stream(self._stream)
         if self._pursuit is not None:
@@ -267,7 +266,7 @@ class SetPoint:
         self._bounds = self._bounds_here()
 
     def _bounds_here(self) -> Bounds:
-        """Returns the position limits, extended to the present position if it is outside."""
+        """Returns the position limits, extended to the present position if that is outside."""
         limits, here = self._limits, self._position_deg
         return Bounds(min(limits.position_min_deg, here), max(limits.position_max_deg, here))
 
@@ -282,7 +281,7 @@ class SetPoint:
         """Returns the plan to a target; raises `InputError` if no plan exists."""
         now, bounds = self._state(), self._bounds_here()
         for acceleration in (acceleration_deg_s2, math.inf):
-            # In motion a gentle move may have to brake as hard as the axis can, to stay within its limits.
+            # In motion, a slow move may need the axis's full deceleration to stay within the position limits.
             plan = self._generator.to_position(now, target_deg, bounds, velocity_deg_s, acceleration)
             if plan is not None:
                 return plan
@@ -295,16 +294,17 @@ class SetPoint:
         )
 
     def _brake(self, since_s: float) -> None:
-        """Brakes to rest in the first of three ways that stays within the position limits.
+        """Brakes to rest by the first of three paths that stays within the position limits.
 
-        The first is as fast as the jerk limit permits. The second, if the first would overshoot a limit,
-        returns to the present position, which brakes as hard and releases later. The third has constant
-        acceleration, needs no more travel than any path within the limits, and is always possible. It is
-        needed only in a stream whose knots brake against a limit with more than the axis's jerk.
+        The first path stops as fast as the jerk limit permits. The second returns to the present position; it
+        brakes equally hard but reduces the deceleration later. The third has constant deceleration. It needs
+        no more travel than any path within the limits, and is always possible. It is required only if the
+        knots of a stream brake towards a position limit with more than the axis's jerk.
         """
         now, bounds = self._state(), self._bounds_here()
         if self._stream is not None or self._pursuit is not None:
-            # Their jerk is not limited. At the acceleration of a reversal, a stop would turn the axis round.
+            # Jerk is not limited in these modes. From the acceleration of a reversal, a jerk-limited stop
+            # would reverse the axis.
             most = math.sqrt(2.0 * self._limits.jerk_deg_s3 * abs(now.velocity_deg_s))
             most = min(most, self._limits.acceleration_deg_s2)
             now = now._replace(acceleration_deg_s2=min(max(now.acceleration_deg_s2, -most), most))
@@ -316,7 +316,7 @@ class SetPoint:
         self._take(path, MotionMode.STOP, since_s)
 
     def _steady_stop(self, now: Kinematics, bounds: Bounds) -> Cubic:
-        """Returns a stop with constant deceleration: at the limit, or as the remaining travel requires."""
+        """Returns a stop with constant deceleration, at the limit or as the remaining travel requires."""
         place, speed = now.position_deg, abs(now.velocity_deg_s)
         left_deg = bounds.upper_deg - place if now.velocity_deg_s > 0.0 else place - bounds.lower_deg
         travel_deg = min(speed * speed / (2.0 * self._limits.acceleration_deg_s2), left_deg)
@@ -326,13 +326,13 @@ class SetPoint:
         return Cubic.between(0.0, place, now.velocity_deg_s, 2.0 * travel_deg / speed, end_deg, 0.0)
 
     def _coasting_deg(self) -> float:
-        """Returns an upper bound of the travel before the axis has slowed down."""
+        """Returns an upper bound of the travel within which the axis can slow down to any lower speed."""
         limits, speed = self._limits, abs(self._velocity_deg_s)
         easing_s = (abs(self._acceleration_deg_s2) + limits.acceleration_deg_s2) / limits.jerk_deg_s3
         return limits.velocity_deg_s * (speed / limits.acceleration_deg_s2 + 2.0 * easing_s)
 
     def _timeout(self, timeout_s: float) -> int:
-        """Converts a time-out to periods."""
+        """Converts a time-out to a number of periods; raises `InputError` if it is out of range."""
         if not 0.0 < timeout_s <= MOST_TIMEOUT_S:
             raise InputError(
                 f"a time-out of {timeout_s!r} s; expected more than 0 and at most {MOST_TIMEOUT_S:g}"
@@ -351,7 +351,7 @@ def _check_finite(name: str, value: float) -> None:
 
 
 def _positive(name: str, value: float | None) -> float:
-    """Returns a limit of a move; infinite if not given."""
+    """Returns a validated limit of a move; infinity if none is given."""
     if value is None:
         return math.inf
     if not (math.isfinite(value) and value > 0.0):

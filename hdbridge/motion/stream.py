@@ -1,8 +1,8 @@
 """Knots of position and velocity over time, and the cubics between them.
 
-A knot is checked on arrival, together with the whole path to it: position, speed and acceleration of a cubic
-have their extremes in closed form. Accepted knots can therefore be followed to the end without further
-checks.
+A knot is checked on arrival, together with the whole path to it, because the extremes of a cubic's position,
+speed and acceleration are known in closed form. Accepted knots can therefore be followed to the end without
+further checks.
 """
 
 import math
@@ -14,9 +14,10 @@ from hdbridge.motion.generator import Bounds, Kinematics
 from hdbridge.motion.procedures.moves import MotionLimits
 
 MOST_KNOTS = 8192
-"""Maximum number of waiting knots; more are refused."""
+"""Maximum number of buffered knots; further ones are refused."""
 ACCELERATION_MARGIN = 1.05
-"""Permitted ratio of a cubic's acceleration to the limit, as reached through knots of a path at the limit."""
+"""Permitted ratio of a cubic's acceleration to the limit. Cubics through knots of a path at the limit can
+exceed it by this."""
 BEGIN_DEG = 1e-6
 """Maximum distance of a stream's first knot from the set-point."""
 _ROUNDING = 1e-6
@@ -24,7 +25,7 @@ _REST_DEG_S = 1e-9
 
 
 class Cubic(NamedTuple):
-    """Hermite cubic from one knot to the next, over the share of the time between them."""
+    """Hermite cubic from one knot to the next, as a function of normalised time s, 0 to 1."""
 
     begin_s: float
     end_s: float
@@ -33,7 +34,7 @@ class Cubic(NamedTuple):
     a: float
     b: float
     c: float
-    """Coefficients of begin + s (a + s (b + s c)), degrees."""
+    """Coefficients of the position begin + s (a + s (b + s c)), degrees."""
 
     @classmethod
     def between(
@@ -45,7 +46,7 @@ class Cubic(NamedTuple):
         end_deg: float,
         to_deg_s: float,
     ) -> Self:
-        """Returns the cubic with these ends."""
+        """Returns the cubic with these times, positions and velocities at its ends."""
         period_s = end_s - begin_s
         step = end_deg - begin_deg
         here, there = from_deg_s * period_s, to_deg_s * period_s
@@ -56,11 +57,11 @@ class Cubic(NamedTuple):
 
     @property
     def duration_s(self) -> float:
-        """Time between its ends."""
+        """Time from one end of the cubic to the other."""
         return self.end_s - self.begin_s
 
     def state(self, time_s: float) -> Kinematics:
-        """Returns the state at this time; before and after the cubic, the state at its ends."""
+        """Returns the state at this time; before and after the cubic, that at its nearer end."""
         period_s = self.end_s - self.begin_s
         s = 1.0 if time_s >= self.end_s else max(time_s - self.begin_s, 0.0) / period_s
         return Kinematics(
@@ -70,7 +71,7 @@ class Cubic(NamedTuple):
         )
 
     def fastest_deg_s(self) -> float:
-        """Returns the largest speed."""
+        """Returns the highest speed on the cubic."""
         speed = max(abs(self.a), abs(self.a + 2.0 * self.b + 3.0 * self.c))
         if self.c:
             vertex = -self.b / (3.0 * self.c)
@@ -79,11 +80,11 @@ class Cubic(NamedTuple):
         return speed / self.duration_s
 
     def hardest_deg_s2(self) -> float:
-        """Returns the largest acceleration, which is at one of the ends."""
+        """Returns the highest acceleration on the cubic, which is that at one of its ends."""
         return max(abs(2.0 * self.b), abs(2.0 * self.b + 6.0 * self.c)) / (self.duration_s * self.duration_s)
 
     def extremes_deg(self) -> tuple[float, float]:
-        """Returns the lowest and the highest position."""
+        """Returns the lowest and the highest position on the cubic."""
         places = [self.begin_deg, self.end_deg]
         root = self.b * self.b - 3.0 * self.a * self.c
         if root > 0.0:
@@ -96,11 +97,11 @@ class Cubic(NamedTuple):
 
 
 class Stream:
-    """Knots of one stream, in the stream's own time.
+    """Path through the knots of one stream, in the stream's own time.
 
-    At a knot with zero velocity, the stream rests until the next knot. Its time stops meanwhile, so late
-    knots delay the path instead of causing a jump. If the stream runs out of knots in motion, ``overrun_s``
-    is the time since then.
+    If no further knot is available at a knot with zero velocity, the stream rests until one arrives. Its time
+    is halted meanwhile, so late knots delay the path and cause no jump. If the stream runs out of knots in
+    motion, ``overrun_s`` is the time since then.
     """
 
     def __init__(self, begin_deg: float, limits: MotionLimits, bounds: Bounds, period_s: float) -> None:
@@ -115,20 +116,20 @@ class Stream:
         self._base_s = 0.0
         """Stream time at the last rest."""
         self._steps = 0
-        """Periods since the last rest."""
+        """Number of periods since the last rest."""
         self._released = self._begun = False
         self.overrun_s: float | None = None
-        """Time since the stream ran out of knots in motion; the state is that of the last knot."""
+        """Time since the stream ran out of knots in motion, at the state of the last knot; else None."""
         self._state = Kinematics(begin_deg, 0.0, 0.0)
 
     @property
     def room(self) -> int:
-        """Number of knots that would be accepted."""
+        """Number of further knots for which there is room."""
         return MOST_KNOTS - len(self._cubics)
 
     @property
     def waiting(self) -> bool:
-        """True if the stream rests for lack of knots."""
+        """True if the stream is at rest because it has no further knots."""
         return not self._cubics and self._state.velocity_deg_s == 0.0
 
     @property
@@ -136,7 +137,7 @@ class Stream:
         return self._state
 
     def add(self, time_s: float, position_deg: float, velocity_deg_s: float) -> None:
-        """Adds a knot, or refuses it (`InputError`) and leaves the stream unchanged."""
+        """Adds a knot; if it is not acceptable, raises `InputError` and leaves the stream unchanged."""
         if not (math.isfinite(time_s) and math.isfinite(position_deg) and math.isfinite(velocity_deg_s)):
             raise InputError(
                 f"a knot of {position_deg!r} deg and {velocity_deg_s!r} deg/s at {time_s!r} s; expected "
@@ -177,7 +178,7 @@ class Stream:
         where = f"the way to the knot at {time_s:.6g} s"
         fastest, hardest = cubic.fastest_deg_s(), cubic.hardest_deg_s2()
         lowest, highest = cubic.extremes_deg()
-        # Resolution of differences of rounded positions.
+        # Velocity error due to rounding of the positions.
         grain = 4.0 * math.ulp(max(abs(cubic.begin_deg), abs(position_deg))) / cubic.duration_s
         if not fastest <= limits.velocity_deg_s * (1.0 + _ROUNDING) + grain:
             raise InputError(
@@ -203,11 +204,11 @@ class Stream:
             )
 
     def begin(self) -> None:
-        """Starts time with the next step, or with the first step that has a knot."""
+        """Starts the stream's time with the next step, or with the first step at which there is a knot."""
         self._released = True
 
     def step(self) -> Kinematics:
-        """Advances one period."""
+        """Advances by one period and returns the state."""
         if not self._begun:
             self._begun = self._released and self._last is not None
         elif self._cubics:
@@ -227,7 +228,7 @@ class Stream:
         self._state = cubic.state(time_s)
 
     def _end(self, cubic: Cubic, time_s: float) -> None:
-        """Handles the last knot: at rest, on time for the next, or overrun."""
+        """Handles the last knot: rests if its velocity is zero, else sets ``overrun_s`` once it is passed."""
         if self._last is not None and self._last[2] == 0.0:
             self._cubics.clear()
             self._state = Kinematics(cubic.end_deg, 0.0, 0.0)

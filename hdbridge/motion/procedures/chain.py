@@ -1,4 +1,4 @@
-"""Sequence of procedures as one, optionally with limited acceleration."""
+"""Sequence of procedures that acts as one procedure, optionally with limited acceleration."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,10 +8,10 @@ from hdbridge.motion.procedures.moves import AxisView, Move, MoveTo, Procedure, 
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """Procedures in sequence; the outcome is that of the last.
+    """Runs procedures in sequence; the outcome is that of the last one.
 
-    ``acceleration_deg_s2`` (at the load) limits every move, because acceleration winds up the gear's spring,
-    which a calibration must exclude.
+    ``acceleration_deg_s2`` (at the load) limits every move, because acceleration winds up the gear's spring.
+    A calibration must exclude this wind-up.
     """
 
     parts: tuple[Procedure[object], ...]

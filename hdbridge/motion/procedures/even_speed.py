@@ -1,4 +1,4 @@
-"""Runs at constant speed in both directions: ripple and response of the axis in motion."""
+"""Runs at constant speed in both directions, which measure ripple and response of the axis in motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,22 +9,22 @@ from hdbridge.motion.procedures.moves import AxisView, MoveTo, Sample, Steps
 from hdbridge.units import DEG_PER_TURN
 
 SHARES = (0.95, 0.8, 0.64, 0.5, 0.38, 0.28, 0.18, 0.08)
-"""Speeds of the default test, as shares of the limit. At the limit itself a drive would clip the
+"""Speeds of the default test, relative to the speed limit. At the limit itself a drive would clip the
 correction."""
 WINDOW_S = 1.0
 TURNS = 3.0
-"""Minimum motor turns of a run."""
+"""Minimum travel of a run at constant speed, motor turns."""
 TRANSIENT_S = 0.6
-"""Time at constant speed before the measurement starts."""
+"""Duration of constant speed before the evaluated samples, in which the transient decays."""
 KIND = "even speed"
 
 
 @dataclass(frozen=True, slots=True)
 class EvenRun:
-    """One run: samples at constant speed."""
+    """Samples of one run at constant speed."""
 
     speed_deg_s: float
-    """Load speed; negative backwards."""
+    """Load speed; negative in backward motion."""
     samples: tuple[Sample, ...]
 
 
@@ -37,7 +37,7 @@ class EvenSpeed:
 
     @classmethod
     def spread(cls, axis: AxisView, shares: Sequence[float] = SHARES) -> Self:
-        """Spreads speeds over shares of the fastest run that fits the travel.
+        """Returns a test with speeds that are ``shares`` of the highest speed for which the travel suffices.
 
         Raises `InputError` if the travel is too short for any run.
         """
@@ -54,14 +54,14 @@ class EvenSpeed:
         return cls(tuple(round(share * fastest, 3) for share in shares))
 
     def travel_deg(self, axis: AxisView, speed_deg_s: float) -> float:
-        """Returns the travel of one run including its ramps; load degrees."""
+        """Returns the travel of one run, including its ramps, load degrees."""
         limits = axis.limits
         ramp_s = speed_deg_s / limits.acceleration_deg_s2 + limits.acceleration_deg_s2 / limits.jerk_deg_s3
         even_deg = max(self.window_s * speed_deg_s, TURNS * DEG_PER_TURN / axis.ratio)
         return even_deg + speed_deg_s * (TRANSIENT_S + ramp_s)
 
     def moves(self, axis: AxisView) -> Steps[tuple[EvenRun, ...]]:
-        """Yields each speed forward and back."""
+        """Yields a forward and a backward run at each speed."""
         runs: list[EvenRun] = []
         middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
         for speed in self.speeds_deg_s:
@@ -74,7 +74,7 @@ class EvenSpeed:
 
 
 def _even(samples: Sequence[Sample], speed_deg_s: float) -> tuple[Sample, ...]:
-    """Returns the samples at constant speed, without the transient."""
+    """Returns the samples at constant speed, except those in the initial transient."""
     cycle_s = (samples[-1].time_s - samples[0].time_s) / (len(samples) - 1)
     step = speed_deg_s * cycle_s
     even = [

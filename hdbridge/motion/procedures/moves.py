@@ -1,8 +1,8 @@
-"""Moves of the load target, each a path over time: the vocabulary of all procedures.
+"""Moves of the load target, of which all procedures consist; each is a path over time.
 
-A procedure is a generator that yields moves and receives the samples taken during each. It does not depend on
-buses, drives or clocks, so the same generator runs on a simulated axis, on a real axis, and in a test without
-either.
+A procedure is a generator that yields moves, and receives the samples taken during each move. It does not
+depend on buses, drives or clocks, so the same generator runs on a simulated axis, on a real axis, and in a
+test without either.
 """
 
 import math
@@ -37,7 +37,7 @@ class MotionLimits:
 
 @dataclass(frozen=True, slots=True)
 class AxisView:
-    """Axis properties available to a procedure."""
+    """Properties of the axis that are available to a procedure."""
 
     ratio: float
     limits: MotionLimits
@@ -46,7 +46,7 @@ class AxisView:
 
 
 class Sample(NamedTuple):
-    """One control cycle as seen by a procedure; angles in degrees, multi-turn."""
+    """Data of one control cycle that a procedure receives; angles in degrees, multi-turn."""
 
     time_s: float
     load_target_deg: float
@@ -55,11 +55,11 @@ class Sample(NamedTuple):
     load_position_deg: float
     motor_torque_nm: float
     readings: tuple[float | None, ...] = ()
-    """Last good reading of each channel of the axis file; None without one."""
+    """Last good reading of each channel of the axis file; None for a channel without a good reading."""
 
 
 class Path(NamedTuple):
-    """Load target over the time since the start of the move."""
+    """Load target as a function of the time since the start of the move."""
 
     duration_s: float
     at: Callable[[float], float]
@@ -80,7 +80,7 @@ class Move(Protocol):
         ...
 
     def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
-        """Returns True to end the leg; called in each cycle after the path's duration."""
+        """Returns True if the leg has ended; called in each cycle after the path's duration."""
         ...
 
 
@@ -98,7 +98,7 @@ class Procedure(Protocol[Outcome]):
 
 
 class _Timed:
-    """Leg that ends with its path."""
+    """Base class of legs that end with their path."""
 
     def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
         return True
@@ -106,13 +106,13 @@ class _Timed:
 
 @dataclass(frozen=True, slots=True)
 class MoveTo(_Timed):
-    """Jerk-limited move to a load angle, at the axis's limits or slower."""
+    """Jerk-limited move to a load angle, at the axis's limits or at lower ones."""
 
     load_deg: float
     velocity_deg_s: float | None = None
     kind: str = "move"
     acceleration_deg_s2: float | None = None
-    """Lower limit of the acceleration, which winds up the gear's spring less."""
+    """Maximum acceleration, if less than the axis's limit; a lower one reduces wind-up of the gear."""
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
         """Returns the time-optimal path within the limits (ruckig)."""
@@ -120,7 +120,7 @@ class MoveTo(_Timed):
         if self.load_deg == start_deg:
             return Path(0.0, lambda _: start_deg, start_deg, start_deg)
         # Ruckig fails if limits and distance coincide exactly, as with 200 deg/s2, 4000 deg/s3 and 1 deg plus
-        # a rounding error; slightly slower it succeeds.
+        # a rounding error. With slightly lower limits it succeeds.
         for share in (1.0, 1.0 - 1e-6):
             trajectory, result = self._trajectory(start_deg, limits, share)
             if result in {Result.Working, Result.Finished}:
@@ -168,10 +168,10 @@ class Dwell(_Timed):
 class Settle:
     """Standstill until motor and load have settled, or until the time-out.
 
-    Settled means that over the last ``window_s`` the means of the load's two halves agree within
-    ``drift_arcsec``, and that the mean of the motor is within ``drift_arcsec`` or half a count of its target.
-    Friction can hold a motor off its target until the servo's integrator releases it. Means are used rather
-    than extremes, so that encoder noise does not prevent settling.
+    The axis has settled if, over the last ``window_s``, the mean load angles of the two halves agree within
+    ``drift_arcsec``, and the mean motor angle is within ``drift_arcsec`` or half a count of its target.
+    Friction can hold a motor off its target until the servo's integrator overcomes it. Means are used instead
+    of extremes, so that encoder noise does not prevent settling.
     """
 
     window_s: float = 0.06
@@ -184,7 +184,7 @@ class Settle:
         return Path(max(self.minimum_s, self.window_s), lambda _: start_deg, start_deg, start_deg)
 
     def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
-        """Returns True if the last window is settled, or on time-out."""
+        """Returns True if the axis has settled within the last window, or on time-out."""
         last = samples[-1].time_s
         if last - samples[0].time_s >= self.timeout_s:
             return True
@@ -203,16 +203,16 @@ class Settle:
         return off_deg <= near_deg + 1e-9
 
     def window(self, samples: Sequence[Sample]) -> Sequence[Sample]:
-        """Returns the samples of the last window, measured at rest."""
+        """Returns the samples of the last window, in which the axis is at rest."""
         last = samples[-1].time_s
         return [each for each in samples if each.time_s > last - self.window_s]
 
 
 @dataclass(frozen=True, slots=True)
 class Sine(_Timed):
-    """``amplitude cos(2 pi f t)`` about a centre; starts and ends at the upper extreme, at rest.
+    """``amplitude cos(2 pi f t)`` about a centre; starts at the upper extreme, where the velocity is zero.
 
-    The velocity is zero at the extreme.
+    With a whole number of periods, it also ends there.
     """
 
     centre_deg: float
@@ -222,7 +222,7 @@ class Sine(_Timed):
     kind: str = "sine"
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """Returns the sine; raises `InputError` if it would start with a jump or be too fast."""
+        """Returns the path; raises `InputError` if it would start with a jump or exceed the speed limit."""
         omega = 2.0 * math.pi * self.frequency_hz
         begin = self.centre_deg + self.amplitude_deg
         if abs(start_deg - begin) > 1e-9:

@@ -1,4 +1,4 @@
-"""Path test: moves at the axis's limits, there and back, and a sine, each followed by a rest."""
+"""Path test: moves at the axis's limits in both directions, and a sine, each followed by a rest."""
 
 import math
 from dataclasses import dataclass
@@ -7,23 +7,23 @@ from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Sample, Si
 from hdbridge.units import DEG_PER_TURN
 
 PRECONDITION_TURNS = 2.0
-"""Motor turns before each path, in its direction: more than the width of the gear's hysteresis, so that
-every path begins in the same state of the gear."""
+"""Travel before each path, in its direction, motor turns. It exceeds the width of the gear's hysteresis, so
+that the gear's elastic state at the start is always the same."""
 SHORT_TURNS = 1.5
-"""Motor turns of the short moves."""
+"""Length of the short moves, motor turns."""
 EVEN_S = 0.3
-"""Time at the speed limit in the long moves."""
+"""Duration of motion at the speed limit in the long moves."""
 SINE_HZ = 0.5
 SINE_PERIODS = 3
 SINE_SPEED = 0.4
-"""Highest speed of the sine, as a share of the limit."""
+"""Peak speed of the sine, relative to the speed limit."""
 REST_S = 0.8
 KIND = "path"
 
 
 @dataclass(frozen=True, slots=True)
 class PathRun:
-    """Samples of one path, and of the rest after it."""
+    """Samples of one path and of the rest after it."""
 
     name: str
     samples: tuple[Sample, ...]
@@ -37,7 +37,7 @@ class PathTest:
     """A long and a short move there and back, and a sine, about the middle of the travel."""
 
     def moves(self, axis: AxisView) -> Steps[tuple[PathRun, ...]]:
-        """Yields each path after a run-up in its own direction."""
+        """Yields each path, preceded by a run-up in the path's direction."""
         limits = axis.limits
         travel_deg = limits.position_max_deg - limits.position_min_deg
         middle = limits.position_min_deg + 0.5 * travel_deg
@@ -65,6 +65,6 @@ class PathTest:
         yield Dwell(REST_S, kind="precondition")
         samples = yield Sine(middle, amplitude_deg, SINE_HZ, SINE_PERIODS, kind=KIND)
         rest = yield Dwell(REST_S, kind=KIND)
-        # A sine begins with a step of the acceleration.
+        # The first period is not evaluated, because a sine begins with a step of the acceleration.
         runs.append(PathRun("sine", (*samples,), (*rest,), len(samples) // SINE_PERIODS))
         return tuple(runs)

@@ -3,8 +3,8 @@
 A plan uses units that suit every axis (load turns, motor degrees, motor turns per second). `Plan.tasks`
 adapts it to the ratio, permitted travel and speed of one axis, and reports reductions.
 
-Every task starts at the plan's reference pose, approached by a pre-conditioning move. The elastic state is
-therefore known wherever a recording is interrupted and resumed, and the recurring pose shows drift.
+Every task starts at the plan's reference pose, which is approached by a pre-conditioning move. The elastic
+state is therefore known even if a recording is interrupted and resumed, and the recurring pose shows drift.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from hdbridge.strictness import Strict
 from hdbridge.units import DEG_PER_TURN
 
 SPEED_SHARE = 0.95
-"""Maximum share of the axis's velocity limit that a plan uses."""
+"""Maximum speed of a plan, relative to the axis's velocity limit."""
 SMALLEST_TRAVEL_DEG = 90.0
-"""Minimum travel on either side of the middle, motor degrees; below it, no procedure is useful."""
+"""Minimum travel on either side of the middle, motor degrees. With less, no procedure is useful."""
 
 
 class StandstillEntry(Strict):
-    """Standstill at the reference pose: noise of the encoders."""
+    """Standstill at the reference pose, which shows the noise of the encoders."""
 
     procedure: Literal["standstill"] = Field(description="stand at the reference pose")
     duration_s: float = Field(5.0, ge=0.5, le=36_000, description="duration")
@@ -50,7 +50,7 @@ class StandstillEntry(Strict):
 
 
 class SweepEntry(Strict):
-    """Constant speed in both directions: the synchronous part, load orders, the height of the loop."""
+    """Motion at constant speed in both directions: synchronous part, load orders, height of the loop."""
 
     procedure: Literal["sweep"] = Field(description="both ways at constant speed, about the middle")
     load_turns: float | None = Field(
@@ -85,9 +85,7 @@ class SinesEntry(Strict):
     periods: float = Field(2.0, ge=0.5, le=1000, description="periods per amplitude")
 
     def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
-        """Yields the sines, with amplitudes reduced to the travel and the frequency to the permitted
-        speed.
-        """
+        """Yields the sines, with amplitudes reduced to the travel and frequency to the permitted speed."""
         amplitudes = tuple(
             dict.fromkeys(
                 round(room.half(name, f"the sine of {each:g} deg", each / room.ratio) * room.ratio, 6)
@@ -141,7 +139,7 @@ class _Context(dict[str, Any]):
 
 
 def _named(entry: Any) -> str | None:
-    """Returns the procedure named by an entry; None without one of that name."""
+    """Returns the name of an entry's procedure; None if there is no such procedure."""
     name = entry.get("procedure") if isinstance(entry, dict) else getattr(entry, "procedure", None)
     return name if name in PROCEDURES else None
 
@@ -162,7 +160,7 @@ Entry = Annotated[
 
 
 class ValidationEntry(Strict):
-    """Stepping test that evaluates a new model, with and without it."""
+    """Tests that evaluate a new model: the stepping test, run with and without the model, and others."""
 
     count: int = Field(120, ge=2, le=100_000, description="steps each way")
     step_deg: float = Field(43.56, gt=0, le=36_000, description="step at the motor")
@@ -191,7 +189,7 @@ class ValidationEntry(Strict):
 
 
 class Plan(Strict):
-    """A plan file."""
+    """Content of a plan file."""
 
     schema_: Literal["hdbridge.plan/1"] = Field(alias="schema", description="schema and version of this file")
     name: str = Field(
@@ -219,7 +217,10 @@ class Plan(Strict):
 
     @classmethod
     def load(cls, name: str) -> Self:
-        """Loads a bundled plan by name, else a plan file; raises `InputError` with the bundled names."""
+        """Reads a bundled plan, given its name, or a plan file, given its path.
+
+        If there is neither, raises `InputError` with the bundled names.
+        """
         bundled = bundled_folder("profiles") / "plans"
         known = sorted(each.stem for each in bundled.glob("*.yaml"))
         path = bundled / f"{name}.yaml" if name in known else Path(name)
@@ -232,11 +233,11 @@ class Plan(Strict):
         return read_yaml(path).validate(cls)
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns plain data that passes validation again."""
+        """Returns the plan as plain data, from which it can be validated again."""
         return self.model_dump(by_alias=True, exclude_none=True, mode="json")
 
     def tasks(self, axis: AxisView) -> Tasks:
-        """Returns the tasks for one axis; raises `InputError` if its travel is too short for any task."""
+        """Adapts the plan to one axis; raises `InputError` if the travel is too short for any task."""
         room = Room(axis, self.precondition_deg)
         prelude = (
             Precondition(room.pose_deg, self.precondition_deg / axis.ratio),
@@ -256,7 +257,7 @@ class Plan(Strict):
         return room.stepping("validation", self.validation.count, self.validation.step_deg)
 
     def positioning(self, axis: AxisView) -> Positioning | None:
-        """Returns the positioning test of the validation for one axis; None without one in the plan."""
+        """Returns the positioning test of the validation for one axis; None if the plan has none."""
         if not self.validation.cycles:
             return None
         room = Room(axis, self.precondition_deg)
@@ -267,10 +268,10 @@ class Plan(Strict):
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """Procedure of a plan, adapted to an axis."""
+    """A procedure of a plan, adapted to an axis."""
 
     name: str
-    """Number and procedure, usable as a file name."""
+    """Number and procedure name, usable as a file name."""
     procedure: Procedure[object]
 
 
@@ -280,7 +281,7 @@ class Tasks:
 
     tasks: tuple[Task, ...]
     notes: tuple[str, ...]
-    """Descriptions of the reductions."""
+    """Descriptions of the reductions of travel, speed and number of steps."""
 
 
 class Room:
@@ -293,7 +294,7 @@ class Room:
         self.notes: list[str] = []
         self._axis = axis
         self._back_deg = precondition_deg / axis.ratio
-        # On either side: the extra travel of a pre-conditioning move.
+        # On either side, travel is reserved for the pre-conditioning move.
         self._half_deg = 0.5 * (limits.position_max_deg - limits.position_min_deg) - 1.01 * self._back_deg
         if self._half_deg * axis.ratio < SMALLEST_TRAVEL_DEG:
             least = 2.0 * (SMALLEST_TRAVEL_DEG / axis.ratio + 1.01 * self._back_deg)
@@ -303,7 +304,7 @@ class Room:
             )
 
     def half(self, name: str, what: str, wanted_deg: float) -> float:
-        """Returns half the travel about the middle, load degrees, reduced to the permitted half."""
+        """Returns half a travel about the middle, load degrees, reduced to the permitted one."""
         if wanted_deg <= self._half_deg:
             return wanted_deg
         self.notes.append(
@@ -313,7 +314,7 @@ class Room:
         return self._half_deg
 
     def speed(self, name: str, motor_deg_s: float) -> float:
-        """Returns a speed at the load, deg/s, reduced to the permitted speed."""
+        """Converts a motor speed to load deg/s, reduced to the permitted speed."""
         top = SPEED_SHARE * self._axis.limits.velocity_deg_s
         wanted = motor_deg_s / self.ratio
         if wanted > top:
@@ -321,7 +322,7 @@ class Room:
         return min(wanted, top)
 
     def stepping(self, name: str, count: int, step_deg: float) -> Stepping:
-        """Returns centred upward steps: ``count`` steps, or as many as the travel permits."""
+        """Returns a stepping test about the middle with ``count`` steps, or as many as the travel permits."""
         step = step_deg / self.ratio
         possible = max(int(2.0 * self._half_deg / step), 2)
         if count > possible:

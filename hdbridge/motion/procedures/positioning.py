@@ -1,4 +1,4 @@
-"""Positioning test for machine tools (ISO 230-2): repeated approaches to targets from both sides."""
+"""Positioning test of machine tools (ISO 230-2): repeated approaches to targets from both sides."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,18 +14,18 @@ class Approach:
     target_deg: float
     forward: bool
     error_arcsec: float
-    """Load encoder minus target, mean over the settled window."""
+    """Load encoder reading minus target, mean over the settled window."""
 
 
 @dataclass(frozen=True, slots=True)
 class Positioning:
-    """Standard test cycle: up through all targets, past the last, down through all, past the first."""
+    """Standard test cycle: up to each target, past the last, down to each target, past the first."""
 
     targets_deg: tuple[float, ...]
     """Load angles, ascending."""
     cycles: int = 5
     overrun_deg: float = 2.0
-    """Travel beyond the first and the last target, at the load; more than the width of any hysteresis."""
+    """Travel beyond the first and last target, load degrees; more than the width of any hysteresis."""
     settle: Settle = Settle()
 
     def moves(self, axis: AxisView) -> Steps[tuple[Approach, ...]]:
@@ -48,10 +48,10 @@ class Positioning:
 
 
 def targets(low_deg: float, high_deg: float, axis: AxisView) -> tuple[float, ...]:
-    """Returns as many targets over a travel as ISO 230-2 requires of a rotary axis (at least 3, 5 or 8).
+    """Returns the number of targets over a travel that ISO 230-2 requires of a rotary axis (3, 5 or 8).
 
-    Within their spacing, the targets are distributed over the motor turn by the golden ratio, so that an
-    error that repeats with each motor turn is sampled at different phases.
+    The targets are shifted from even spacing by different fractions of a motor turn (golden ratio), so that
+    an error that repeats with each motor turn is sampled at different phases.
     """
     travel = high_deg - low_deg
     count = 3 if travel <= 90.0 else 5 if travel <= 180.0 else 8

@@ -1,4 +1,4 @@
-"""Rehearsal of a procedure on an ideal axis before any motion: duration, extent, number of legs."""
+"""Rehearses a procedure on an ideal axis before any motion: duration, travel range, number of legs."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from hdbridge.motion.procedures.moves import AxisView, Move, Path, Procedure, Sa
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """Requirements of a procedure."""
+    """Duration, travel range and number of legs of a procedure."""
 
     duration_s: float
     """Duration on an ideal axis; a real axis takes longer to settle."""
@@ -18,9 +18,9 @@ class Rehearsal:
 
 
 def rehearse(procedure: Procedure[object], axis: AxisView, start_deg: float = 0.0) -> Rehearsal:
-    """Rehearses the procedure; raises `InputError` if it would violate the limits.
+    """Rehearses a procedure; raises `InputError` if it would violate the limits.
 
-    Every leg's path is computed as on the bench, so a refused leg never reaches the axis.
+    The path of each leg is computed as on the bench, so a leg that would be refused never reaches the axis.
     """
     duration, legs = 0.0, 0
     lowest = highest = start_deg

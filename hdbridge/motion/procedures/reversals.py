@@ -7,10 +7,11 @@ from hdbridge.motion.procedures.moves import AxisView, MoveTo, Steps
 
 @dataclass(frozen=True, slots=True)
 class Reversals:
-    """For each depth: back by the depth, forward by half of it, back again, then forward until all is
-    forgotten.
+    """Reversal curves: for each depth, back by the depth, forward by half of it, back again, then forward.
 
-    ``depths_deg`` are motor degrees; ``reach_deg`` must exceed the width of the hysteresis.
+    The gear forgets each curve on the approach to the next. ``depths_deg`` and ``reach_deg`` are motor
+    degrees; ``reach_deg``, the travel of the approach, must exceed the width of the hysteresis. With
+    ``beyond``, all depths form a single curve.
     """
 
     centre_deg: float = 0.0
@@ -21,7 +22,7 @@ class Reversals:
     beyond: bool = False
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """Yields the curves, each starting on the forward branch at the centre."""
+        """Yields the curves; each starts at the centre, on the forward branch."""
         depths = [each / axis.ratio for each in self.depths_deg]
         curves: list[tuple[float, ...]] = [(0.0, -each, -0.5 * each, -each, 0.0) for each in depths]
         if self.beyond:

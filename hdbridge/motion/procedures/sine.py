@@ -1,4 +1,4 @@
-"""Slow sines of several amplitudes: Lissajous loops of the hysteresis, some smaller than its width."""
+"""Slow sines of several amplitudes, some smaller than the width of the hysteresis, which trace its loops."""
 
 from dataclasses import dataclass
 

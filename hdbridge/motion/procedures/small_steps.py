@@ -1,6 +1,4 @@
-"""Small steps up and down, shorter than the width of the hysteresis, which keep the gear between its
-branches.
-"""
+"""Small steps in both directions, within the width of the hysteresis, so that the loop does not saturate."""
 
 from dataclasses import dataclass
 
@@ -12,11 +10,11 @@ _GOLDEN = 0.618_033_988_75
 
 @dataclass(frozen=True, slots=True)
 class SmallSteps:
-    """``count`` targets within ``reach_deg`` (motor degrees) on either side of a centre, in mixed order.
+    """Steps to ``count`` targets in mixed order, within ``reach_deg`` (motor degrees) of a centre.
 
-    A stepping test with steps longer than the width of the hysteresis ends saturated each time and cannot
-    show its width, shape or memory; these steps can. Outcomes are classified by the direction of the last
-    move; ``cw`` is upwards.
+    If steps are longer than the width of the hysteresis, the loop is saturated after each. Such a test cannot
+    show the loop's width, shape or memory, but these steps can. Results are divided by the direction of the
+    last move; ``cw`` is upwards.
     """
 
     centre_deg: float = 0.0
@@ -34,7 +32,8 @@ class SmallSteps:
         ways: tuple[list[Standing], list[Standing]] = ([], [])
         last = self.centre_deg
         for index in range(1, self.count + 1):
-            # Steps of all lengths: the differences of n^2 g modulo 1 are distributed as evenly as its values.
+            # Steps have all lengths: the differences of n^2 g modulo 1 are distributed as evenly as the
+            # values.
             share = (index * index * _GOLDEN) % 1.0
             target = self.centre_deg + (2.0 * share - 1.0) * self.reach_deg / axis.ratio
             yield MoveTo(target, kind="step")

@@ -1,4 +1,4 @@
-"""Standstill: encoder readings without motion, which show the noise."""
+"""Standstill: encoder readings without motion, which show the noise and, if repeated, drift."""
 
 from dataclasses import dataclass
 
@@ -7,9 +7,10 @@ from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Steps
 
 @dataclass(frozen=True, slots=True)
 class Precondition:
-    """Back and forth by more than the width of any hysteresis, ending in a forward move at ``load_deg``.
+    """Moves back and forth by more than the width of any hysteresis, ending forward at ``load_deg``.
 
-    The gear's elastic state is then known: saturated forward. Every plan starts with it.
+    The gear's elastic state is then known, because it is saturated in the forward direction. Every task of a
+    plan starts with this move.
     """
 
     load_deg: float = 0.0
@@ -35,7 +36,7 @@ class Standstill:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Standstill at a recurring pose, always approached from the same side, so that changes are drift."""
+    """Standstill at a recurring pose, always approached from the same side, so that changes show drift."""
 
     load_deg: float = 0.0
     duration_s: float = 1.5

@@ -1,4 +1,4 @@
-"""Stepping test: deviation of the load from its target at rest, step by step."""
+"""Stepping test: deviation of the load from its target at rest after each step."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,43 +10,43 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """One step at rest."""
+    """Result of one step, measured at rest."""
 
     target_deg: float
     """Load target, degrees."""
     error_arcsec: float
-    """Load encoder minus target, mean over the settled window, arcsec."""
+    """Load encoder reading minus target, mean over the settled window, arcsec."""
     settle_s: float
     """Time from the end of the move to standstill of the load."""
 
     @property
     def load_deg(self) -> float:
-        """Load position by the load encoder, degrees."""
+        """Load position according to the load encoder, degrees."""
         return self.target_deg + self.error_arcsec / ARCSEC_PER_DEG
 
 
 @dataclass(frozen=True, slots=True)
 class SteppingOutcome:
-    """All steps of both directions."""
+    """Results of all steps in both directions."""
 
     cw: tuple[Standing, ...]
-    """Steps of the first pass, towards positive angles."""
+    """Steps of the first pass, towards positive angles if ``step_deg`` is positive."""
     ccw: tuple[Standing, ...]
-    """Steps of the pass back."""
+    """Steps of the second pass, in the opposite direction."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stepping:
-    """``count`` steps of ``step_deg`` at the motor one way, then back.
+    """Runs ``count`` steps of ``step_deg`` (motor degrees) in one direction, then back.
 
-    It starts with a pre-conditioning move (back by ``precondition_deg`` and forward again), so that the
-    gear's elastic state is that after a forward motion.
+    The test starts with a pre-conditioning move (back by ``precondition_deg`` and forward again), so that the
+    gear's elastic state is that after forward motion.
     """
 
     count: int = 240
     step_deg: float = 43.56
     start_deg: float = 0.0
-    """Load angle of the start."""
+    """Load angle at the start."""
     precondition_deg: float = 2.0
     """Load degrees; more than the width of any hysteresis."""
     settle: Settle = Settle()
@@ -73,7 +73,7 @@ class Stepping:
 
 
 def standing(target_deg: float, samples: Sequence[Sample], settle: Settle) -> Standing:
-    """Returns the result at a target, with means over the settled window."""
+    """Returns the result at a target, from the mean over the settled window."""
     window = settle.window(samples)
     mean = sum(each.load_position_deg - target_deg for each in window) / len(window)
     return Standing(target_deg, mean * ARCSEC_PER_DEG, samples[-1].time_s - samples[0].time_s)

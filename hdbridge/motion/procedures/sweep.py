@@ -1,4 +1,4 @@
-"""Slow sweeps in both directions: the synchronous part, load orders, and the height of the loop."""
+"""Slow sweeps in both directions, which show the synchronous part, load orders and the height of the loop."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from hdbridge.motion.procedures.moves import AxisView, MoveTo, Steps
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """From ``low_deg`` to ``high_deg`` and back at constant speed, ``laps`` times."""
+    """Sweeps from ``low_deg`` to ``high_deg`` and back at constant speed, ``laps`` times."""
 
     low_deg: float
     high_deg: float
@@ -15,7 +15,7 @@ class Sweep:
     laps: int = 1
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """Yields the laps; the elastic state is that after an approach from ``low_deg``."""
+        """Yields the move to ``low_deg`` and the laps."""
         yield MoveTo(self.low_deg)
         for _ in range(self.laps):
             yield MoveTo(self.high_deg, self.velocity_deg_s, kind="sweep")

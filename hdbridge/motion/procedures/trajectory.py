@@ -13,12 +13,12 @@ from hdbridge.motion.procedures.moves import AxisView, MotionLimits, MoveTo, Pat
 from hdbridge.units import ARCSEC_PER_DEG
 
 GRID_S = 0.001
-"""Sampling period of a function; no drive's cycle is much shorter."""
+"""Period at which a function is sampled; the cycle of a drive is rarely shorter."""
 MOST_POINTS = 1_000_000
 UNITS = {"velocity_deg_s": "deg/s", "acceleration_deg_s2": "deg/s2", "jerk_deg_s3": "deg/s3"}
 """Limits of a trajectory with their units, by order of the derivative."""
 ROUNDING = 1e-6
-"""Share of a limit by which finite differences may exceed it."""
+"""Relative amount by which finite differences may exceed a limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,16 +31,16 @@ class Followed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Evenly spaced load angles, followed as one smooth path.
+    """Load angles at equal time intervals, followed as one smooth path.
 
-    The axis makes a jerk-limited move to the first angle, and comes to rest at the last. Speed, acceleration
-    and jerk must be within the axis's limits, including the transitions from and to rest; otherwise
-    `rehearse` rejects the trajectory (`InputError`) before any motion. Between two set-points the path is a
-    cubic whose slopes follow from the neighbours.
+    The axis makes a jerk-limited move to the first angle, and comes to rest at the last one. Speed,
+    acceleration and jerk must be within the axis's limits, including the transitions from and to rest.
+    Otherwise `rehearse` rejects the trajectory (`InputError`) before any motion. Between two set-points the
+    path is a cubic whose slopes are derived from the neighbouring set-points.
     """
 
     load_deg: FloatArray
-    """Shape (n,), n at least 2."""
+    """Load angles, shape (n,) with n of at least 2."""
     period_s: float
     """Time between two angles."""
 
@@ -83,16 +83,17 @@ class Trajectory:
 
 
 class Follow:
-    """Leg that follows set-points; slow computations are done at construction."""
+    """Leg that follows set-points; all slow computations are done on construction."""
 
     kind = "trajectory"
 
     def __init__(self, load_deg: FloatArray, period_s: float) -> None:
         self._points, self._period_s = load_deg, period_s
         self._lowest, self._highest = float(load_deg.min()), float(load_deg.max())
-        # At rest before and after: a path that starts or ends in motion shows as an acceleration there.
+        # Rest is added before and after, so that a path that starts or ends in motion has an acceleration
+        # there.
         padded = np.concatenate([np.full(3, load_deg[0]), load_deg, np.full(3, load_deg[-1])])
-        # Each difference is a mean of the derivative, so it never exceeds the largest one.
+        # Each difference is a mean of the derivative, so it never exceeds the derivative's maximum.
         self._needs: dict[str, tuple[float, float]] = {}
         rounding_deg = np.spacing(max(abs(self._lowest), abs(self._highest), 1.0))
         for number, name in enumerate(UNITS, 1):
@@ -114,7 +115,7 @@ class Follow:
         )
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """Returns the path; raises `InputError` if it starts off the axis's position or violates a limit."""
+        """Returns the path; raises `InputError` if it does not start at the axis or violates a limit."""
         if abs(start_deg - self._points[0]) > 1e-9:
             raise InputError(
                 f"a trajectory begins at {self._points[0]:g} deg, but the axis stands at {start_deg:g}: move "

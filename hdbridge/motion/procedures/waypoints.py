@@ -1,4 +1,4 @@
-"""Moves between load angles, holding the axis at the last."""
+"""Moves through load angles, with a hold at the last one."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -9,14 +9,14 @@ from hdbridge.motion.procedures.stepping import Standing, standing
 
 
 class Hold:
-    """Standstill for a while, or until released; the duration of the leg is not known in advance."""
+    """Standstill for a given time or until released; the duration of the leg is not known in advance."""
 
     kind = "hold"
 
     def __init__(self, duration_s: float = math.inf, released: Callable[[], bool] = lambda: False) -> None:
-        """``released`` is called in each cycle."""
+        """``released`` is called in each cycle, and ends the hold when it returns True."""
         self.begun = False
-        """True once the axis stands at its position."""
+        """True once the axis stands at its final position."""
         self._duration_s, self._released = duration_s, released
         self._since_s = 0.0
 
@@ -24,7 +24,7 @@ class Hold:
         return Path(0.0, lambda _: start_deg, start_deg, start_deg)
 
     def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
-        """Returns True if the time is over or the axis was released."""
+        """Returns True if the time has elapsed or the axis was released."""
         if not self.begun:
             self.begun, self._since_s = True, samples[0].time_s
         return self._released() or samples[-1].time_s - self._since_s >= self._duration_s
@@ -32,13 +32,13 @@ class Hold:
 
 @dataclass(frozen=True, slots=True)
 class WayPoints:
-    """Jerk-limited moves, each followed by a rest; the axis is held at the last."""
+    """Jerk-limited moves, each followed by settling, and a hold at the last target."""
 
     targets_deg: tuple[float, ...]
     """Load angles."""
     hold: Hold = field(default_factory=lambda: Hold(0.0))
     velocity_deg_s: float | None = None
-    """Speed at the load; None for the axis's limit."""
+    """Maximum speed at the load; None for the axis's limit."""
     settle: Settle = Settle()
 
     def moves(self, axis: AxisView) -> Steps[tuple[Standing, ...]]:
