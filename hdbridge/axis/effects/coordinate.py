@@ -50,7 +50,7 @@ class Coordinate:
         return f"{self.name}, {self.unit}" if self.unit else self.name
 
     def at(self, rows: BoolArray | IntArray) -> Self:
-        """Returns the coordinate at some of the samples."""
+        """Returns the coordinate restricted to the samples in ``rows``."""
         return replace(self, values=self.values[rows])
 
     def varies(self) -> bool:
@@ -85,7 +85,7 @@ def load_angle(motion: Motion, ratio: float) -> Coordinate:
 
 
 def position(motion: Motion, ratio: float) -> Coordinate:
-    """Returns the load position over all its turns."""
+    """Returns the multi-turn load position."""
     return Coordinate("position", "deg of the load", motion.motor_deg / ratio, both_ways=True)
 
 
