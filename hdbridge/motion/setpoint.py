@@ -213,7 +213,7 @@ class SetPoint:
         if self._stream is not None:
             return self._step_stream(self._stream)
         if self._pursuit is not None:
-            state = self._pursuit.step(*self._aim)  # within the limits
+            state = self._pursuit.step(*self._aim)  # respects the limits
             self._position_deg, self._velocity_deg_s, self._acceleration_deg_s2 = state
             return self._position_deg
         if self._mode is MotionMode.JOG:

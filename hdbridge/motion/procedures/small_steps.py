@@ -18,11 +18,11 @@ class SmallSteps:
     """
 
     centre_deg: float = 0.0
-    """Centre at the load."""
+    """Centre of the targets, load degrees."""
     reach_deg: float = 20.0
     count: int = 40
     precondition_deg: float = 2.0
-    """Load degrees; more than the width of any hysteresis."""
+    """Travel of the pre-conditioning move, load degrees; more than the width of any hysteresis."""
     settle: Settle = Settle()
 
     def moves(self, axis: AxisView) -> Steps[SteppingOutcome]:
