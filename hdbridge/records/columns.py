@@ -42,7 +42,7 @@ CHANNELS: Final[Mapping[str, str]] = MappingProxyType(
 )
 """Column of a record for each channel name that the options accept."""
 Said = str | Sequence[str] | Mapping[str, object] | None
-"""``channel=value,channel=value``, a sequence of such texts, or a mapping."""
+"""Value of an option: ``channel=value,channel=value``, a sequence of such texts, or a mapping."""
 ROW: Final = "row"
 """Placeholder for a column that contains the row number, for a file without a time column."""
 
@@ -235,7 +235,7 @@ class CsvColumns:
         )
 
     def __bool__(self) -> bool:
-        """True if anything was assigned."""
+        """Returns True if any column, unit or period was assigned."""
         return bool(self.columns or self.units or self.unwrap)
 
     def column(self, channel: str) -> str:
