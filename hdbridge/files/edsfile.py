@@ -146,7 +146,7 @@ class _Reader:
             self._write_object(written, index, objects[index])
         try:
             dictionary = import_eds(io.StringIO("\n".join(written)), node_id)  # type: ignore[no-untyped-call]
-        except Exception as error:  # canopen lets KeyError, ValueError, configparser.Error and others through
+        except Exception as error:  # canopen raises KeyError, ValueError, configparser.Error and others
             reason = " ".join(str(error).split()) or type(error).__name__
             raise InputError(
                 f"{self._path}: cannot be read as an EDS: {reason[:200]}; expected the drive's EDS file"

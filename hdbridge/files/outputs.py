@@ -106,7 +106,7 @@ def _check_file(
                     "standard output"
                 )
     else:
-        return  # a pipe
+        return  # pipes replace nothing
     _check_belongs_to_no_folder(output)
     if found is not None and found.st_size and not re.match(output.kind.value, _head(path)):
         raise InputError(

@@ -64,7 +64,7 @@ class Node:
     value: Any
     """Value as plain Python: dict, list, str, int, float, bool or None."""
     found: str
-    """Value as text, for error messages."""
+    """Text of the value, for error messages."""
     children: dict[str, tuple[Node, Node]] | list[Node] | None = None
     """Items of a list, or nodes of key and value for each key of a mapping; None for a scalar."""
 
