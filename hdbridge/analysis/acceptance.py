@@ -16,8 +16,8 @@ from hdbridge.analysis.linear import Linearised, of_length, sandwich, side_by_si
 from hdbridge.axis.effects import BoolArray, Effect, FloatArray
 
 BLOCKS_S = (1.0, 5.0, 20.0)
-"""Block lengths at which the evidence is tested. Noise and thermal drift must be correlated over less than
-a block."""
+"""Lengths of the blocks over which scores are summed. Noise and thermal drift are correlated over less than a
+block."""
 LEAST_BLOCKS = 30
 """Minimum number of blocks for a reliable variance. In a short record the blocks are shortened to reach
 it."""

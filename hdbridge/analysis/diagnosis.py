@@ -150,7 +150,7 @@ def _search(data: Observed, model: TransmissionModel, scales: Scales, between: N
 
 
 def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:
-    """Returns a remark if the zeros of the recordings disagree."""
+    """Returns a remark if the zeros of the recordings differ by more than their own errors."""
     apart = zeros_apart_arcsec(parts, ratio)
     if apart is None:
         return ()
@@ -462,14 +462,14 @@ class _Judge:
 def _is_in(finding: Finding, changed: Sequence[Effect]) -> bool:
     """Returns True if the finding is among ``changed``, the effects that differ from the given model."""
     effect = finding.effect
-    if effect is None:  # something unexplained
+    if effect is None:  # an unexplained residual
         return True
     part = effect.changes or effect.part
     return any(each.name == effect.name or (part is not None and each.part is part) for each in changed)
 
 
 def _ordinary(finding: Finding) -> bool:
-    """Returns True if the finding is no larger than on any normal axis."""
+    """Returns True if the finding is no larger than on an ordinary axis."""
     return finding.effect is not None and finding.peak_arcsec < finding.effect.ordinary_arcsec
 
 

@@ -137,14 +137,14 @@ class Finding:
     left_alone: bool = False
     """True if the data do not separate a change of a model part from another cause; the part is then kept."""
     within: bool = False
-    """True for a change of a part of the model."""
+    """True if the finding is a change of a part of the given model."""
     lives_in: str = ""
     """Coordinate on which an unexplained residual depends."""
     note: str = ""
     prior: str = ""
     """Description of the fleet's prior, if a fleet was given."""
     effect: Effect | None = field(default=None, repr=False)
-    """Effect to add to the model."""
+    """Fitted effect of the finding; None for an unexplained residual."""
     gate: Gate | None = field(default=None, repr=False)
     """Acceptance tests; None for an unexplained residual."""
     terms: Mapping[str, float] = field(default_factory=dict, repr=False)
@@ -202,7 +202,7 @@ class Traces:
     """Plot data of model and measurement on the same trajectory; arrays of equal length."""
 
     measured_arcsec: FloatArray
-    """Measured error about the zero of the fit."""
+    """Measured transmission error, relative to the zero of the fit."""
     model_arcsec: FloatArray
     """Transmission error predicted by the given model."""
     extended_arcsec: FloatArray

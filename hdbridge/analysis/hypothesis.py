@@ -52,7 +52,7 @@ MOST_TURNS = 100
 """Maximum number of turning points that have individual error columns. With more turning points, their mean
 error is known accurately."""
 SHORT = 10_000
-"""Record length, samples, below which the number of rare samples shrinks in proportion."""
+"""Record length, samples, below which the number of excluded extreme samples is reduced in proportion."""
 MOST_PARTS = 20
 """Maximum number of parts of a record whose initial elastic states are fitted."""
 STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
@@ -69,11 +69,11 @@ class Hypothesis:
     """Columns at the usable points in addition to those of every hypothesis; compared by identity."""
 
     def plus(self, effect: Effect) -> Hypothesis:
-        """Returns the hypothesis with one more effect."""
+        """Returns the hypothesis with an effect appended."""
         return replace(self, effects=(*self.effects, effect))
 
     def without(self, place: int) -> Hypothesis:
-        """Returns the hypothesis without one effect."""
+        """Returns the hypothesis without the effect at ``place``."""
         return replace(self, effects=self.effects[:place] + self.effects[place + 1 :])
 
     def instead(self, place: int, effect: Effect) -> Hypothesis:
@@ -101,7 +101,7 @@ class Fitted:
 
     @cached_property
     def linearised(self) -> Linearised:
-        """Fit linearised at its minimum, in units of the noise."""
+        """Fit linearised at its minimum; rows in standard deviations of the noise."""
         weighted = self._solution.jacobian * self._weight[:, np.newaxis]
         return Linearised(weighted, self.residual, self._solution.known)
 
@@ -150,7 +150,7 @@ class Estimator:
         self._regressors = Regressors([data.full.motion], self.at_points, len(self.index))
         self._noise: dict[object, FloatArray] = {}
         self._free_loops: dict[Start, Nuisances] = {}
-        # The common level is subtracted: an encoder's zero is arbitrary.
+        # The median is subtracted, because an encoder's zero is arbitrary.
         self.level = float(np.median(self.observed))
         self.loop_sign = 1.0
         """Sign of the loop's offset; -1 if the load lags."""
@@ -431,7 +431,7 @@ class Estimator:
         return left[best], best
 
     def with_load_angle(self, load_deg: FloatArray) -> None:
-        """Replaces the load angle (n,) that load-dependent effects use, such as subdivisional error."""
+        """Replaces the predicted load angle (n,), which the effects of the load encoder's lines use."""
         data = self.data
         full = replace(data.full, motion=replace(data.full.motion, load_deg=load_deg))
         points = replace(data.points, motion=replace(data.points.motion, load_deg=data.mean(load_deg)))

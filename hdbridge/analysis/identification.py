@@ -66,13 +66,13 @@ class NoiseFigures:
 
 @dataclass(frozen=True, slots=True)
 class Outliers:
-    """Isolated outliers, whose weight is zero."""
+    """Numbers of isolated outliers, whose weight is zero."""
 
     samples: int
     swinging: int
     """Number of outliers in or just after high acceleration, while the load oscillates on its spring."""
     longest_run: int
-    """Longest run of the other outliers, samples."""
+    """Length of the longest run of consecutive outliers other than swinging ones, samples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +147,7 @@ class Traces:
     error_arcsec: FloatArray
     """Observed transmission error minus its zero."""
     predicted_arcsec: FloatArray
-    """Sum of the model's effects."""
+    """Transmission error predicted by the fit, the sum of its effects."""
     residual_arcsec: FloatArray
     """Observed error minus model, about the best-fitting zeros."""
     orders_arcsec: FloatArray
@@ -193,7 +193,7 @@ LAP_BIN_DEG = 30.0
 WINDOW = 51
 """Window of the running median with which each sample is compared, samples."""
 OUTLYING = 6.0
-"""Outlier threshold, robust standard deviations."""
+"""Minimum deviation of an outlier, robust standard deviations."""
 
 
 def standing_arcsec(samples: Samples) -> float | None:
@@ -372,7 +372,7 @@ class FitOptions:
     family_wise: float = 0.01
     """Probability that noise alone causes the selection of any order."""
     smallest_arcsec: float = 0.1
-    """Minimum amplitude of an order, whatever its significance."""
+    """Minimum amplitude of a selected order, however significant it is."""
     start: Start | None = None
     """Elastic state at the first sample; `Start.FORWARD` after the bench's preconditioning. None fits it."""
     active: TransmissionModel | None = None
@@ -475,7 +475,7 @@ class State(NamedTuple):
         return Separable(Terms(self.design.blocks.error_arcsec, self.design.columns, weighting, columns))
 
     def fitted(self) -> Solution:
-        """Fits the current model."""
+        """Fits the effects of `model` with the current noise model."""
         return self.under(self.precision(), self.columns()).fit(self.model())
 
     def information(self) -> System:

@@ -138,7 +138,7 @@ Columns = Callable[[Effect], FloatArray]
 
 
 class Weighting(Protocol):
-    """The inverse covariance of the noise, K^-1."""
+    """Interface of the inverse covariance of the noise, K^-1."""
 
     def apply(self, columns: FloatArray) -> FloatArray:
         """Returns K^-1 times columns of shape (m,) or (m, p)."""

@@ -44,9 +44,9 @@ class NoiseModel:
     """Standard deviations and correlation lengths of the noise."""
 
     standing_arcsec: float
-    """White noise of one sample at rest."""
+    """Standard deviation of the white noise of one sample at rest."""
     moving_arcsec: float
-    """White noise of one sample in motion."""
+    """Standard deviation of the white noise of one sample in motion."""
     slow_arcsec: float = 0.0
     slow_s: float = 10.0
     """Drift in time: standard deviation and correlation time."""

@@ -38,7 +38,7 @@ class System(NamedTuple):
 
 
 class Family(Enum):
-    """Source of an order."""
+    """Angle to which an order refers; N is the gear ratio, k the order's number."""
 
     MOTOR = "motor"
     """k periods per motor turn: wave generator, motor encoder."""
@@ -95,7 +95,7 @@ class Line:
     standard_error_arcsec: float
     """Standard error of the cosine or sine coefficient, whichever is larger."""
     threshold_arcsec: float
-    """Amplitude that noise exceeds, for any candidate order, with the family-wise probability of error."""
+    """Amplitude that noise alone exceeds, in any candidate order, with the family-wise error probability."""
     aliases: tuple[Order, ...] = ()
     """Orders that are not separable from this order in the record."""
 

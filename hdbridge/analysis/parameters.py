@@ -195,7 +195,7 @@ def parameters_of(
         if shape.moves is Moves.NEVER:
             result = _stepwise(estimator, fitted, effect, result)
     for name, described in type(effect).model_fields.items():
-        if described.annotation is int:  # found by search, and exact
+        if described.annotation is int:  # an integer found by search is exact
             number = float(getattr(effect, name))
             result[name] = Parameter(number, unit_of(name), number, number)
     return result
@@ -219,12 +219,12 @@ def named_parameters(effect: Effect, columns: Sequence[Column], spread: FloatArr
         low, high = value - half, value + half
         is_size = path in names and not name.endswith("phase_deg")
         shape = shapes.get(name)
-        if shape is not None and shape.logarithmic:  # limited to its range
+        if shape is not None and shape.logarithmic:  # the interval is limited to the shape's range
             factor = math.exp(min(half / value, math.log(shape.upper / shape.lower)))
             low = min(value, max(value / factor, shape.lower))
             high = max(value, min(value * factor, shape.upper))
         amplitude = result.get(name.replace("phase_deg", "amplitude_arcsec"))
-        if amplitude is not None and amplitude.low <= 0.0:  # no phase without an amplitude
+        if amplitude is not None and amplitude.low <= 0.0:  # a zero amplitude has no phase
             low, high = value - 180.0, value + 180.0
         if half > 0.0 and name not in result:  # a shape shared by several parts is reported once
             result[name] = Parameter(value, unit_of(name), low, high, is_size)

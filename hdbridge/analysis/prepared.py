@@ -128,7 +128,7 @@ class Chain:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Samples, or means over runs of samples; arrays of shape (n,)."""
+    """Prepared samples, or points that are means over runs of samples; arrays of shape (n,)."""
 
     ratio: float
     motion: Motion

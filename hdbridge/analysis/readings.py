@@ -36,7 +36,7 @@ differences are due to fast motion."""
 _THIRD = np.sqrt(20.0)
 """Amplification of white noise by third differences: the square root of 1 + 9 + 9 + 1."""
 _MAD = 1.4826
-"""Standard deviation of a normal distribution per median absolute deviation."""
+"""Ratio of the standard deviation to the median absolute deviation of a normal distribution."""
 _UNIFORM = np.sqrt(12.0)
 
 

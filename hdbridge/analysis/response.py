@@ -139,7 +139,7 @@ class Harmonics(NamedTuple):
     deviations: FloatArray
     """Standard deviation of the real or imaginary part of each amplitude."""
     mean_arcsec: float
-    """Mean of load minus target."""
+    """Mean load error in the run."""
     ripple_arcsec: float
     """Rms of the load error about a straight line."""
 

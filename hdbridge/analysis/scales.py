@@ -87,7 +87,7 @@ class Scales:
         4.0, "standard deviations of calibration and fit", 0.0, "6 in 100,000 by chance"
     )
 
-    # Look-alikes.
+    # Aliases.
     in_step: float = _scale(
         0.85, "share of a wave's squares", 2.0, "waves a fifth of a period apart explain 0.87 of each other"
     )

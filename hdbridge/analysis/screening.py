@@ -126,7 +126,7 @@ LEAST_LINES = 256
 """Minimum number of lines per turn of an encoder with interpolation."""
 LINE_OVER_MEAN = 12.0
 """Minimum power of a spectral line for a fit, relative to the mean power. Such a line lowers chi square by
-twice this number, less than half of the required gain."""
+twice this number, about half of the required gain."""
 LOWEST_HZ = 0.3
 """Lowest frequency of a tone; slower spectral lines are due to the motion itself."""
 PEAKS = 3

@@ -98,7 +98,7 @@ class Quantity(Strict):
 
     @property
     def scale(self) -> Scale:
-        """Factor from the raw value to the channel's unit."""
+        """Conversion from counts to the channel's unit."""
         return Scale(self.per_count, self.at_zero, self.minimum, self.maximum)
 
 

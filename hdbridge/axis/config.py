@@ -52,7 +52,7 @@ class BusConfig(Strict):
 
 
 class Identity(Strict):
-    """Identity object of the drive, 1018h; omitted values are not compared."""
+    """Identity of the drive (object 1018h); omitted values are not compared."""
 
     vendor_id: Unsigned32 = Field(description="1018h:01")
     product_code: Unsigned32 = Field(description="1018h:02")
@@ -378,7 +378,7 @@ class AxisConfig(OtherChannels):
         return self._document.path if self._document is not None else Path("axis.yaml")
 
     def states(self, key: str) -> bool:
-        """Returns True if the file sets a key (``drive.halt_option``) rather than leaving the default."""
+        """Returns True if the file sets a key such as ``drive.halt_option``; False if it has its default."""
         part: object = self
         for name in key.split("."):
             if not isinstance(part, Strict) or name not in part.model_fields_set:

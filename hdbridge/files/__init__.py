@@ -1,1 +1,1 @@
-"""Files: strict YAML and CSV, atomic writing, bundled files, and error messages about invalid files."""
+"""File handling: strict YAML, CSV, EDS, atomic writing, bundled files, and messages about invalid files."""

@@ -1,7 +1,7 @@
 """Atomic file writing: a file has either its old or its new content, whatever interrupts the write.
 
-Pipes and character devices have no content to preserve, so they are written directly, and never replaced by a
-file.
+Pipes and character devices have no content to preserve. They are written directly, and are never replaced by
+a file.
 """
 
 import errno
@@ -24,24 +24,25 @@ _DESCRIPTOR = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
 
 
 def write_atomically(path: Path | str, content: str | bytes) -> None:
-    """Replaces a file's content (text as UTF-8) by a temporary file, fsync, rename, and fsync of the folder.
+    """Replaces a file's content (text as UTF-8): temporary file, fsync, rename, fsync of the folder.
 
-    A reader, or a power cut, finds the old content or the new one. Pipes and character devices are written
-    directly. Raises `OutputError`, preserving the old file, if the location cannot be written.
+    After an interruption such as a power cut, the file has its old or its new content. Pipes and character
+    devices are written directly. If the location cannot be written, raises `OutputError` and preserves the
+    old file.
     """
     data = content.encode() if isinstance(content, str) else content
     try:
         if is_stream(path):
             _write_through(Path(path), data)
             return
-        target = Path(path).resolve()  # resolves links, or the rename would replace the link
+        target = Path(path).resolve()  # links are resolved, because the rename would replace a link
         with _temporary(target) as descriptor:
             try:
                 os.ftruncate(descriptor, 0)
                 _write_all(descriptor, data)
                 os.fsync(descriptor)
                 _temporary_name(target).rename(target)
-            except OSError:  # a full disk needs its space back
+            except OSError:  # frees the space on a full disk
                 _temporary_name(target).unlink(missing_ok=True)
                 raise
         folder = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY)
@@ -56,9 +57,9 @@ def write_atomically(path: Path | str, content: str | bytes) -> None:
 
 
 def check_writable(path: Path | str) -> None:
-    """Raises `InputError` unless a file can be written here; to be called before a long measurement.
+    """Raises `InputError` if a file cannot be written here; to be called before a long measurement.
 
-    It attempts a write, so that a read-only file system or a name that is too long is detected as well.
+    It creates a temporary file, so a read-only file system or a name that is too long is also detected.
     """
     try:
         if is_stream(path):
@@ -84,7 +85,7 @@ def check_writable(path: Path | str) -> None:
         _try_out(target)
     except OSError as problem:
         raise InputError(f"{path}: cannot be written: {problem.strerror}") from None
-    except RuntimeError:  # Python 3.11 and 3.12 report it this way
+    except RuntimeError:  # Python 3.11 and 3.12 report a loop of symbolic links by this
         raise InputError(f"{path}: cannot be written: its symbolic links form a loop") from None
 
 
@@ -94,7 +95,7 @@ def _try_out(target: Path) -> None:
 
 
 def descriptor_of(path: Path | str) -> int | None:
-    """Returns the descriptor in a path like ``/dev/stdout`` or ``/dev/fd/3``; else None."""
+    """Returns the descriptor that a path such as ``/dev/stdout`` or ``/dev/fd/3`` denotes; else None."""
     if str(path) in _STANDARD:
         return _STANDARD.index(str(path))
     found = _DESCRIPTOR.fullmatch(str(path))
@@ -102,7 +103,7 @@ def descriptor_of(path: Path | str) -> int | None:
 
 
 def is_stream(path: Path | str) -> bool:
-    """Returns True for direct writing: a pipe, a character device, an open file of this process."""
+    """Returns True for a path to write directly: a pipe, a character device, or an open descriptor."""
     if descriptor_of(path) is not None:
         return True
     try:
@@ -114,7 +115,7 @@ def is_stream(path: Path | str) -> bool:
 
 def _write_through(path: Path, data: bytes) -> None:
     number = descriptor_of(path)
-    if number == 1:  # after printed text, not before it
+    if number == 1:  # flushed first, so that printed text precedes the data
         sys.stdout.flush()
         buffer = getattr(sys.stdout, "buffer", None)
         if buffer is not None:
@@ -138,7 +139,7 @@ def _write_all(descriptor: int, data: bytes) -> None:
 
 
 def make_folder(path: Path | str) -> Path:
-    """Creates a folder with its parents and returns it; raises `InputError` if it cannot be written."""
+    """Creates a folder with its parents and returns it; raises `InputError` if it is not writable."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -152,10 +153,11 @@ def make_folder(path: Path | str) -> Path:
 
 
 def write_folder(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
-    """Writes a new folder with these files, all or none of them; returns their paths.
+    """Writes a new folder with all of these files or none; returns the files' paths.
 
-    Raises `InputError` if the folder is not empty or cannot be created, `OutputError` if the files cannot be
-    written, as on a full disk. An error leaves nothing behind, not even new parent folders.
+    Raises `InputError` if the folder is not empty or cannot be created, and `OutputError` if the files cannot
+    be written, for example on a full disk. After an error nothing is left behind, not even new parent
+    folders.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: already exists; expected a new folder, nothing was written")
@@ -178,9 +180,9 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
 
 
 def new_folder(path: Path) -> Path:
-    """Creates a new folder: this one, else the name with the next free number.
+    """Creates a new folder with this name or, if it exists, with the next free number appended.
 
-    Two concurrent processes receive two folders.
+    Concurrent processes always receive different folders.
     """
     make_folder(path.parent)
     for number in itertools.count(1):
@@ -201,10 +203,11 @@ def _temporary_name(target: Path) -> Path:
 
 @contextmanager
 def _temporary(target: Path) -> Iterator[int]:
-    """Yields the descriptor of the single temporary file of a target, locked.
+    """Yields the locked descriptor of a target's temporary file.
 
-    Its name is fixed, so a killed writer leaves only a file that the next writer overwrites. A second writer
-    waits for the lock. The first has then renamed the file, so the second opens the file again.
+    The name is fixed, so a killed writer leaves a single file, which the next writer overwrites. A second
+    writer waits for the lock. When it receives the lock, the first writer has renamed the file, so it opens a
+    new one.
     """
     name = _temporary_name(target)
     while True:
@@ -228,7 +231,7 @@ def _is_still(name: Path, descriptor: int) -> bool:
 def open_regular(path: Path) -> BinaryIO:
     """Opens a file for reading; raises `OSError` for a named pipe, a device or a folder.
 
-    Open files of this process (``/dev/stdin``, and ``/dev/fd/3`` of ``<(command)``) may be of any kind.
+    Descriptors of this process (``/dev/stdin``, or ``/dev/fd/3`` from ``<(command)``) may be of any kind.
     """
     if descriptor_of(path) is None:
         mode = os.stat(path).st_mode  # noqa: PTH116 - follows links such as those in /proc

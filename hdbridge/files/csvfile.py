@@ -1,9 +1,9 @@
-"""Columns of numbers in a CSV file of any program; written numbers read back identically.
+"""Reads columns of numbers from a CSV file of any program; written numbers read back identically.
 
-A header line names the columns, followed by one row per sample. Separators, decimal commas, comments, lines
-before the header, a row of units under it, the encoding and gzip are recognised and reported as remarks. A
-file that numpy's parser accepts takes about two microseconds per row; any other is read row by row, to locate
-its error or to keep a column of text.
+A header line names the columns, and one row per sample follows. Separators, decimal commas, comments, lines
+above the header, a row of units below it, the encoding and gzip are recognised and reported as remarks. A
+file that numpy's parser accepts takes about two microseconds per row. Any other file is read row by row, to
+locate its error or to keep a column of text.
 """
 
 import codecs
@@ -28,7 +28,7 @@ from hdbridge.files.expectation import one_line
 
 FloatArray = NDArray[np.float64]
 Column = NDArray[Any]
-"""A column: float64, or text if it contains anything but numbers."""
+"""A column: float64, or text if not all of its cells are numbers."""
 
 MAXIMUM_BYTES = 2 << 30
 _GZIP_MAGIC = b"\x1f\x8b"
@@ -42,15 +42,15 @@ _OTHER_FILES: Final = {
     b"MDF ": "an MDF file",
     b"\x89MCAP": "an MCAP file",
 }
-"""Kinds of binary files by their first bytes, as in the magic files of file(1)."""
-_GZIP_LEVEL = 4  # beyond it time grows several-fold and the size hardly falls
+"""Kinds of binary files, by their first bytes, as in the magic files of file(1)."""
+_GZIP_LEVEL = 4  # higher levels take several times as long and hardly reduce the size
 _ROWS_AT_ONCE = 50_000
 _PIECE_BYTES = 1 << 20
 
 _SEPARATORS: Final = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 _HEAD_BYTES = 1 << 16
 _HEAD_ROWS = 100
-"""Number of rows searched for the header."""
+"""Number of initial rows that are searched for the header."""
 _SAMPLED = 20
 """Number of data rows examined for decimal commas."""
 _COMMENT = re.compile(rb"(?:^|(?<=[\r\n]))([ \t]*(?:#|%|//)[ \t]*)([^\r\n]*)")
@@ -63,32 +63,32 @@ _DAY_S: Final = 86_400.0
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """Positions of the columns in a file, and the format of its rows."""
+    """Columns of a file, and the format of its rows."""
 
     names: tuple[str, ...]
-    """Names of the columns in order; a column without a name has its number, counted from 1."""
+    """Names of the columns in order; the name of an unnamed column is its number, counted from 1."""
     header_line: int
-    """Line of the header; 0 if the file has none."""
+    """Line number of the header; 0 if the file has no header."""
     first_line: int
-    """Number of lines before the first row of data."""
+    """Number of lines above the first row of data."""
     separator: str
     decimal_comma: bool = False
     units: tuple[str, ...] = ()
-    """Cells of a row of units."""
+    """Cells of the row of units, if any."""
     remarks: tuple[str, ...] = ()
 
 
 class CsvFile:
-    """CSV file with a known layout; `read` returns its columns.
+    """CSV file whose layout is determined on construction; `read` returns its columns.
 
-    ``wanted`` are names of columns that the caller needs, or numbers (1 is the first); the header is the line
-    that contains them. Raises `InputError` with the file and, if known, the line.
+    ``wanted`` contains names or numbers (from 1) of columns that the caller needs. The header is the line
+    that contains the names. Raises `InputError` with the file and, if known, the line.
     """
 
     def __init__(self, path: Path, wanted: Collection[str] = ()) -> None:
         self.path = path
         content, encoding = text_of(path)
-        self._held: bytes | None = content  # kept until it is read, because a stream can be read only once
+        self._held: bytes | None = content  # kept until `read`, because a stream can be read only once
         self._layout = found = _layout(path, content, wanted)
         said = ("comments left out" if _commented(content) else "", encoding)
         self.remarks: tuple[str, ...] = (*found.remarks, *filter(None, said))
@@ -96,23 +96,23 @@ class CsvFile:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the columns, in the order of the file; a column without a name has its number."""
+        """Names of the columns, in the order of the file; the name of an unnamed column is its number."""
         return self._layout.names
 
     @property
     def header_line(self) -> int:
-        """Line of the header; 0 if the first line holds numbers."""
+        """Line number of the header; 0 if the file has no header."""
         return self._layout.header_line
 
     @property
     def units(self) -> dict[str, str]:
-        """Cell of each column in a row of units under the header; empty without one."""
+        """Unit of each column, from a row of units below the header; empty without such a row."""
         return dict(zip(self.names, self._layout.units, strict=False))
 
     def find(self, column: str) -> str | None:
-        """Returns the name of a column given by name or number; None if it does not exist.
+        """Returns the name of a column that is given by name or number; None if there is none.
 
-        Raises `InputError` if two columns have the name.
+        Raises `InputError` if two columns have this name.
         """
         if self.names.count(column) > 1:
             raise _wrong(
@@ -128,9 +128,10 @@ class CsvFile:
     def read(self, finite: Collection[str] = (), times: Collection[str] = ()) -> dict[str, Column]:
         """Returns the columns by name, in the order of the file.
 
-        Columns of ``finite`` must hold only finite numbers; those of ``times`` may hold ISO times or times of
-        day, which become seconds since the first. Other columns are kept, as numbers if possible (an empty
-        cell is NaN), else as text. The first of several columns with the same name is kept.
+        Columns in ``finite`` must contain only finite numbers. Those in ``times`` may contain ISO times or
+        times of day, which are converted to seconds since the first. Other columns are returned as numbers if
+        possible (an empty cell is NaN), else as text. Of several columns with the same name, the first is
+        returned.
         """
         content = self._text()
         self._held = None
@@ -145,11 +146,11 @@ class CsvFile:
         return columns
 
     def line_of_row(self, row: int) -> int:
-        """Returns the file's line (the first is 1) of a row of data (the first is row 0)."""
+        """Returns the line number in the file (from 1) of a row of data (from 0)."""
         return self._line_of(self._text(), row)
 
     def _text(self) -> bytes:
-        """Returns the text with comments blanked and the spaces between two columns replaced by one tab."""
+        """Returns the text without comments, and with spaces between columns replaced by one tab."""
         content = text_of(self.path)[0] if self._held is None else self._held
         if _commented(content):
             content = _COMMENT.sub(b"", content)
@@ -171,7 +172,7 @@ class CsvFile:
         return "\t" if self._layout.separator == " " else self._layout.separator
 
     def _fast(self, content: bytes) -> dict[str, Column] | None:
-        """Reads all columns with numpy's parser; returns None for a non-number or a ragged row."""
+        """Reads all columns with numpy's parser; returns None for a non-numerical cell or a ragged row."""
         layout = self._layout
         if not _lines(content, layout.first_line).readline().strip():
             return None
@@ -229,7 +230,7 @@ class CsvFile:
         return named
 
     def _rows(self, content: bytes) -> Iterator[tuple[list[str], int]]:
-        """Yields the rows of data with their lines, each with a cell for every column."""
+        """Yields each row of data, with one cell per column, and its line number."""
         layout, count = self._layout, len(self.names)
         paired = layout.decimal_comma and layout.separator == ","
         for cells, at in _parsed(self.path, _lines(content, layout.first_line), self._delimiter):
@@ -244,7 +245,7 @@ class CsvFile:
 
 
 def csv_text(columns: Mapping[str, Column]) -> Iterator[str]:
-    """Yields the file's text in pieces; a number has as many digits as it needs to read back identically."""
+    """Yields the text of a CSV file in pieces; numbers have enough digits to read back identically."""
     yield ",".join(map(_cell, columns)) + "\n"
     rows = len(next(iter(columns.values()), ()))
     for first in range(0, rows, _ROWS_AT_ONCE):
@@ -256,7 +257,7 @@ def csv_text(columns: Mapping[str, Column]) -> Iterator[str]:
 
 
 def write_columns(path: Path, columns: Mapping[str, Column]) -> None:
-    """Writes the file atomically, compressed if its name ends in ``.gz``; deterministic."""
+    """Writes a CSV file atomically, compressed if its name ends in ``.gz``; the output is deterministic."""
     content = io.BytesIO()
     if path.suffix == ".gz":
         with gzip.GzipFile("", "wb", _GZIP_LEVEL, content, mtime=0) as file:
@@ -276,7 +277,7 @@ def _wrong(text: str) -> InputError:
 
 
 def text_of(path: Path) -> tuple[bytes, str]:
-    """Returns the file's text, decompressed, as UTF-8 without a mark, and its encoding if different."""
+    """Returns the decompressed text as UTF-8 without byte-order mark, and a remark on any other encoding."""
     try:
         with open_regular(path) as plain:
             content = _bounded(plain)
@@ -317,7 +318,7 @@ def text_of(path: Path) -> tuple[bytes, str]:
 
 
 def _bounded(file: BinaryIO | gzip.GzipFile) -> bytes:
-    """Reads at most one piece more than permitted, because a single `read` could take far more memory."""
+    """Reads at most one piece more than `MAXIMUM_BYTES`; a single `read` could need far more memory."""
     content = io.BytesIO()
     while content.tell() <= MAXIMUM_BYTES and (piece := file.read(_PIECE_BYTES)):
         content.write(piece)
@@ -329,7 +330,7 @@ def _commented(content: bytes) -> bool:
 
 
 def _lines(content: bytes, skipped: int = 0) -> io.TextIOWrapper:
-    """Opens the content as lines, with their line ends, after the first ``skipped`` lines."""
+    """Opens the content for reading by line, after the first ``skipped`` lines; line ends are kept."""
     lines = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8", newline="")
     for _ in range(skipped):
         lines.readline()
@@ -338,7 +339,7 @@ def _lines(content: bytes, skipped: int = 0) -> io.TextIOWrapper:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """Non-blank line near the beginning of the file."""
+    """A non-blank line near the start of the file."""
 
     number: int
     text: str
@@ -366,14 +367,14 @@ def _head(content: bytes) -> list[_Line]:
 
 
 def _layout(path: Path, content: bytes, wanted: Collection[str]) -> _Layout:
-    """Finds separator and header: the line with most ``wanted`` names, else the line above the numbers."""
+    """Determines separator and header: the line with most ``wanted`` names, else that above the numbers."""
     head = _head(content)
     rows = [line for line in head if not line.comment]
     if not rows:
         raise _wrong(f"{path}: the file is empty; expected a header line and one row per sample")
     separator, header = _named_header(head, wanted) or _guessed_header(head)
     data = [line for line in rows if header is None or line.number > header.number]
-    if header is None:  # lines above the numbers belong to no column
+    if header is None:  # lines above the numbers are not data
         data = data[next((at for at, line in enumerate(data) if _holds_numbers(line, separator)), 0) :]
     first = [line.cells(separator) for line in data[:_SAMPLED]]
     cells = header.cells(separator) if header else [""] * len(first[0])
@@ -414,7 +415,7 @@ def _layout(path: Path, content: bytes, wanted: Collection[str]) -> _Layout:
 
 
 def _named_header(head: Sequence[_Line], wanted: Collection[str]) -> tuple[str, _Line] | None:
-    """Returns the separator and the line that contains most of the names; None if no line contains any."""
+    """Returns the separator and the line that contain most of the names; None if no line contains any."""
     found = [
         (len(set(wanted).intersection(line.cells(separator))), not line.comment, -line.number, separator)
         for line in head
@@ -427,7 +428,7 @@ def _named_header(head: Sequence[_Line], wanted: Collection[str]) -> tuple[str, 
 
 
 def _guessed_header(head: Sequence[_Line]) -> tuple[str, _Line | None]:
-    """Returns the separator with most number cells, and the line of names above them, if any."""
+    """Returns the separator that gives most numerical cells, and the line of names above them, if any."""
     best: tuple[int, str, _Line | None] | None = None
     for separator in _SEPARATORS:
         rows = [line for line in head if not line.comment]
@@ -462,7 +463,7 @@ def _numbers(line: _Line, separator: str) -> int:
 
 
 def _is_row_of_units(first: Sequence[str], second: Sequence[str], needed: Sequence[int]) -> bool:
-    """Returns True for words in each needed column above a row of numbers or times."""
+    """Returns True if ``first`` has words in the needed columns, and ``second`` has numbers or times."""
     if max(needed) >= min(len(first), len(second)):
         return False
 
@@ -474,7 +475,7 @@ def _is_row_of_units(first: Sequence[str], second: Sequence[str], needed: Sequen
 
 
 def _is_paired(cells: Sequence[str], count: int) -> bool:
-    """Returns True if each value takes two cells, because its decimal comma looks like a separator."""
+    """Returns True if each value occupies two cells, because its decimal comma was taken for a separator."""
     whole, part = cells[::2], cells[1::2]
     return (
         count > 1
@@ -485,7 +486,7 @@ def _is_paired(cells: Sequence[str], count: int) -> bool:
 
 
 def _parsed(path: Path, lines: io.TextIOWrapper, delimiter: str) -> Iterator[tuple[list[str], int]]:
-    """Yields the non-blank rows, each with the number of its last line."""
+    """Yields each non-blank row with the number of its last line."""
     reader = csv.reader(lines, delimiter=delimiter)
     try:
         for row in reader:
@@ -496,7 +497,7 @@ def _parsed(path: Path, lines: io.TextIOWrapper, delimiter: str) -> Iterator[tup
 
 
 def _column(cells: Sequence[str], *, blanks: bool, comma: bool) -> Column:
-    """Returns numbers if all cells are numbers (blank ones become NaN if allowed), else text."""
+    """Returns a column of numbers if all cells are numbers (or blank, if allowed), else of text."""
     texts = (
         [cell.replace(",", ".") if _DECIMAL_COMMA.match(cell) else cell for cell in cells] if comma else cells
     )
@@ -514,7 +515,7 @@ def _is_number(cell: str, comma: bool = False) -> bool:
 
 
 def _seconds(cells: Sequence[str]) -> FloatArray | None:
-    """Returns the seconds since the first of ISO times or times of day; None for any other cell.
+    """Converts ISO times or times of day to seconds since the first; returns None if any cell is neither.
 
     Times of day without a date continue past midnight.
     """
@@ -530,14 +531,14 @@ def _seconds(cells: Sequence[str]) -> FloatArray | None:
 
 
 class _Moment(NamedTuple):
-    """Time as whole seconds and a fraction."""
+    """Time as whole seconds and a fraction of a second."""
 
     whole: int
     part: float
 
 
 def _moment(cell: str) -> _Moment | None:
-    """Parses an ISO time or a time of day; None for any other text."""
+    """Parses an ISO time or a time of day; returns None for any other text."""
     text = cell.strip()
     if clock := _CLOCK.match(text):
         hours, minutes, seconds = (int(each) for each in clock.groups()[:3])

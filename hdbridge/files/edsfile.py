@@ -1,8 +1,9 @@
-"""EDS and DCF files (CiA 306) as vendors ship them: a front end for canopen's reader.
+"""Reads EDS and DCF files (CiA 306) as vendors ship them: a front end for canopen's reader.
 
-canopen reads a well-formed file in UTF-8. This front end decodes any file and converts its names, numbers and
+canopen reads well-formed files in UTF-8. This front end decodes any file, and converts its names, numbers and
 compact descriptions to the form that canopen accepts. An unreadable value is reported with line, section and
-key: as an `InputError` if an object cannot be described without it, else in `Eds.unread`.
+key. It raises `InputError` if the object cannot be described without the value; otherwise it is listed in
+`Eds.unread`.
 """
 
 import io
@@ -35,7 +36,7 @@ _BITS: Final = {
     datatypes.INTEGER8: 8, datatypes.INTEGER16: 16, datatypes.INTEGER24: 24, datatypes.INTEGER32: 32,
     datatypes.INTEGER40: 40, datatypes.INTEGER48: 48, datatypes.INTEGER56: 56, datatypes.INTEGER64: 64,
 }  # fmt: skip
-"""Signed types, whose values a file may state in two's complement."""
+"""Number of bits of each signed type. A file may state the values of these types in two's complement."""
 _VALUES: Final = ("LowLimit", "HighLimit", "DefaultValue", "ParameterValue")
 _LARGEST_COMPACT: Final = 254
 _PDOS: Final = 512
@@ -52,7 +53,7 @@ class Eds(NamedTuple):
 
     dictionary: ObjectDictionary
     unread: tuple[str, ...]
-    """Unreadable values, which count as missing: one line each, with line, section and key."""
+    """Unreadable values, which count as missing; each text states line, section and key."""
 
 
 def read_eds(path: Path | str, node_id: int) -> Eds:
@@ -71,7 +72,7 @@ def read_eds(path: Path | str, node_id: int) -> Eds:
 
 
 def shared_eds(path: Path | str, node_id: int) -> Eds:
-    """Returns the same as `read_eds`, cached for each state of the file; not to be modified."""
+    """Returns the result of `read_eds`, cached until the file changes; the result must not be modified."""
     path = Path(path)
     try:
         modified_ns = path.stat().st_mtime_ns
@@ -86,7 +87,7 @@ def _read_as_of(_: int, path: Path, node_id: int) -> Eds:
 
 
 def decode(data: bytes) -> str:
-    """Decodes a file in UTF-8, UTF-16 (with or without byte-order mark) or Windows-1252."""
+    """Decodes the bytes of a file in UTF-8, UTF-16 (with or without byte-order mark) or Windows-1252."""
     for mark, encoding in (
         (b"\xef\xbb\xbf", "utf-8"),
         (b"\xff\xfe", "utf-16-le"),
@@ -111,20 +112,20 @@ class _Key(NamedTuple):
 
 
 class _Section:
-    """Section: its name as written, its line, and its keys in capitals."""
+    """A section of the file: its name as written, its line number, and its keys in capitals."""
 
     def __init__(self, name: str, line: int) -> None:
         self.name, self.line = name, line
         self.keys: dict[str, _Key] = {}
 
     def get(self, key: str) -> str:
-        """Returns the value of a key; empty if missing."""
+        """Returns the value of a key; empty if the key is missing."""
         found = self.keys.get(key.upper())
         return found.value if found is not None else ""
 
 
 class _Reader:
-    """Converts one file to the form that canopen reads."""
+    """Converts the text of one file to the form that canopen reads."""
 
     def __init__(self, path: Path, text: str) -> None:
         self._path = path
@@ -145,7 +146,7 @@ class _Reader:
             self._write_object(written, index, objects[index])
         try:
             dictionary = import_eds(io.StringIO("\n".join(written)), node_id)  # type: ignore[no-untyped-call]
-        except Exception as error:  # canopen lets KeyError, ValueError, configparser.Error and others through
+        except Exception as error:  # canopen raises KeyError, ValueError, configparser.Error and others
             reason = " ".join(str(error).split()) or type(error).__name__
             raise InputError(
                 f"{self._path}: cannot be read as an EDS: {reason[:200]}; expected the drive's EDS file"
@@ -155,7 +156,7 @@ class _Reader:
     # -- lines --------------------------------------------------------------------------------------------
 
     def _split(self, text: str) -> None:
-        """Splits the text into sections and keys. The first of two equal keys counts, as in Windows."""
+        """Splits the text into sections and keys. Of two equal keys the first applies, as in Windows."""
         section = None
         end = text.find(_DOS_END)
         for number, raw in enumerate(re.split(r"\r\n|\n|\r", text[:end] if end >= 0 else text), start=1):
@@ -185,7 +186,7 @@ class _Reader:
     # -- values -------------------------------------------------------------------------------------------
 
     def _number(self, section: _Section, key: str, default: int | None = None) -> int:
-        """Returns a number required by an object; ``default`` if the key is missing or empty."""
+        """Returns a number that an object requires; ``default`` if the key is missing or empty."""
         text, line = section.keys.get(key.upper(), _Key("", section.line))
         value = _integer(text)
         if value is None and text == "" and default is not None:
@@ -195,7 +196,7 @@ class _Reader:
         return value
 
     def _value(self, section: _Section, key: str, data_type: int) -> str | None:
-        """Returns a value as read by canopen; None if unreadable."""
+        """Converts a value to the form that canopen reads; returns None if it is missing or unreadable."""
         text = section.get(key)
         if text == "" or data_type not in _INTEGERS:
             return text or None
@@ -220,7 +221,7 @@ class _Reader:
     # -- objects ------------------------------------------------------------------------------------------
 
     def _objects(self) -> dict[int, dict[int | None, _Section]]:
-        """Returns the sections of each object: None is the object itself, all others are its sub-indices."""
+        """Returns the sections of each object by sub-index; the key None denotes the object itself."""
         objects: dict[int, dict[int | None, _Section]] = {}
         for name, section in self._sections.items():
             match = _OBJECT.fullmatch(name)
@@ -257,7 +258,7 @@ class _Reader:
     def _write_object(self, written: list[str], index: int, parts: Mapping[int | None, _Section]) -> None:
         members = {sub: section for sub, section in parts.items() if sub is not None}
         section = parts.get(None)
-        if section is None:  # the sections of its sub-indices describe it
+        if section is None:  # the section of the object may be missing: its sub-objects describe it fully
             section = _Section(f"{index:04X}", next(iter(members.values())).line)
         kind = self._number(section, "ObjectType", _RECORD if members else _VAR)
         if kind not in _OBJECT_TYPES:
@@ -308,13 +309,13 @@ class _Reader:
         return int(value != 0)
 
     def _own_type(self, number: int) -> int:
-        """Returns the base type of a custom type, as written by CANFestival; bytes if unknown."""
+        """Returns the base type of a custom type, as CANFestival writes it; DOMAIN (bytes) if unknown."""
         section = self._sections.get(f"{number:X}SUB1")
         value = _integer(section.get("DefaultValue")) if section is not None else None
         return value if value is not None and 0 < value <= _LAST_STANDARD_TYPE else datatypes.DOMAIN
 
     def _spelt_out(self, index: int, section: _Section, count: int) -> Iterator[tuple[int, _Section]]:
-        """Yields the members of an object that CompactSubObj describes collectively."""
+        """Yields the sub-objects that CompactSubObj describes collectively, by sub-index."""
         if not 0 < count <= _LARGEST_COMPACT:
             line = section.keys["COMPACTSUBOBJ"].line
             found = section.get("CompactSubObj")
@@ -339,7 +340,7 @@ class _Reader:
             yield sub, member
 
     def _add_compact_pdos(self, objects: dict[int, dict[int | None, _Section]]) -> None:
-        """Adds the PDOs that CompactPDO describes: as many as the device has beyond those with sections."""
+        """Adds the PDOs that CompactPDO describes: all PDOs of the device without sections of their own."""
         mask = self._device_number("CompactPDO") or 0
         if not mask & 0x3F:
             return
@@ -386,7 +387,7 @@ def _compact_mapping(device: _Section) -> Iterator[tuple[int, _Section]]:
 
 
 def _made(name: str, of: _Section, keys: Mapping[str, str]) -> _Section:
-    """Creates a section that the file describes within another section."""
+    """Creates a section that the file describes only implicitly, within the section ``of``."""
     section = _Section(of.name, of.line)
     section.keys = {
         key.upper(): _Key(value, of.line) for key, value in (("ParameterName", name), *keys.items())
@@ -395,7 +396,7 @@ def _made(name: str, of: _Section, keys: Mapping[str, str]) -> _Section:
 
 
 def _integer(text: str) -> int | None:
-    """Parses a decimal number (leading zeros allowed) or a hexadecimal number; None for any other text."""
+    """Parses a decimal (leading zeros allowed) or hexadecimal integer; returns None for any other text."""
     match = _NUMBER.fullmatch(text)
     if match is None:
         return None
@@ -404,7 +405,7 @@ def _integer(text: str) -> int | None:
 
 
 def _bounds(low: str | None, high: str | None) -> bool:
-    """Returns False for limits that leave no choice, such as 0 and 0, which denote their absence."""
+    """Returns False for limits without a range, such as 0 and 0, which mean that there are no limits."""
     least, greatest = _integer(low or ""), _integer(high or "")
     return least is None or greatest is None or least < greatest
 

@@ -1,4 +1,4 @@
-"""Expected value of a pydantic model's field, as text for error messages and reference pages."""
+"""Describes the expected value of a pydantic model's field, for error messages and reference pages."""
 
 import difflib
 import types
@@ -15,20 +15,20 @@ _PLAIN: dict[Any, str] = {int: "an integer", float: "a number", str: "text", boo
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """Place in a model: its type, its constraints and its description."""
+    """Field at a location in a model: its type, its constraints and its description."""
 
     annotation: Any
     metadata: tuple[Any, ...] = ()
     description: str = ""
 
     def types(self) -> Iterator[Any]:
-        """Yields the member types of the annotation: unions and aliases resolved, without None."""
+        """Yields the member types of the annotation, with unions and annotations resolved, except None."""
         for member in _members(self.annotation):
             if member is not type(None):
                 yield member
 
     def values(self) -> list[Any]:
-        """Returns the accepted values if the set is closed."""
+        """Returns the accepted values of literals and enums; empty for other types."""
         found: list[Any] = []
         for member in self.types():
             if get_origin(member) is Literal:
@@ -38,35 +38,35 @@ class Field:
         return found
 
     def choices(self) -> list[str]:
-        """Returns the texts among its `values`."""
+        """Returns those of the accepted `values` that are texts."""
         return [each for each in self.values() if isinstance(each, str)]
 
 
 def nearest(word: str, choices: Sequence[str]) -> str | None:
-    """Returns the most probable intended choice for ``word``, or None."""
+    """Returns the choice that ``word`` most probably means, or None."""
     close = difflib.get_close_matches(word.lower(), [each.lower() for each in choices], n=1, cutoff=0.6)
     return next((each for each in choices if close and each.lower() == close[0]), None)
 
 
 def one_line(text: str) -> str:
-    """Returns a text as one line: line breaks and other unprintable characters are escaped."""
+    """Converts a text to one line: escapes line breaks and other unprintable characters."""
     return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
 
 
 def key_of(name: str, field: FieldInfo) -> str:
-    """Returns a field's key in the file."""
+    """Returns the key of a field in the file, its alias or name."""
     return field.alias or name
 
 
 def field_names(model: type[BaseModel], at: Sequence[str | int]) -> list[str]:
-    """Returns the permitted keys of a mapping at a location."""
+    """Returns the permitted keys of the mapping at a location of a model."""
     place = field_at(model, at)
     models = [each for each in place.types() if _is_model(each)] if place else []
     return [key_of(name, field) for each in models for name, field in each.model_fields.items()]
 
 
 def field_at(model: type[BaseModel], at: Sequence[str | int]) -> Field | None:
-    """Returns the field at a location of a model; None if the model leaves it open."""
+    """Returns the field at a location of a model; None if the model does not define it."""
     here: Field | None = Field(model)
     for step in at:
         if here is None:
@@ -76,7 +76,7 @@ def field_at(model: type[BaseModel], at: Sequence[str | int]) -> Field | None:
 
 
 def expected_words(field: Field | None) -> str:
-    """Describes a field, for example "an integer from 1 to 127 (node id of the drive)"."""
+    """Describes a field's expected value, for example "an integer from 1 to 127 (node id of the drive)"."""
     if field is None:
         return "a value"
     words = type_words(field)
@@ -137,7 +137,7 @@ def _members(annotation: Any) -> Iterator[Any]:
 
 
 def _unioned(annotation: Any) -> tuple[Any, ...]:
-    """Returns the members of a union with their annotations; empty for other types."""
+    """Returns the members of a union, including their annotations; empty for other types."""
     return get_args(annotation) if get_origin(annotation) in {Union, types.UnionType} else ()
 
 
@@ -149,7 +149,7 @@ def _member(place: Field, key: str) -> Field | None:
                     return Field(field.annotation, tuple(field.metadata), field.description or "")
         elif get_origin(member) is dict:
             return _annotated(get_args(member)[1])
-    # pydantic includes the name of a union's member in its locations; it is not a step in the file
+    # pydantic includes the name of a union's member in a location, which is not a step in the file.
     return place if len(list(place.types())) > 1 else None
 
 

@@ -1,4 +1,4 @@
-"""Log line of an event: text for people, a JSON object for programs.
+"""Formats of a logged event: text for people, a JSON object for programs.
 
 The library reports events through `logging`, with the event's name as the message and a dictionary of facts
 as its argument.
@@ -11,7 +11,7 @@ from datetime import datetime
 
 
 class ForPeople(logging.Formatter):
-    """Formats text such as ``12:30:01.250 sdo write  node=1 object=6060h:00 value=8``."""
+    """Formats events as text: ``12:30:01.250 sdo write  node=1 object=6060h:00 value=8``."""
 
     def format(self, record: logging.LogRecord) -> str:
         facts = " ".join(f"{name}={value}" for name, value in _facts(record).items())
@@ -19,7 +19,7 @@ class ForPeople(logging.Formatter):
 
 
 class ForMachines(logging.Formatter):
-    """Formats a JSON object: date, level, logger, event, and the event's facts."""
+    """Formats events as JSON objects with date, level, logger, event, and the event's facts."""
 
     def format(self, record: logging.LogRecord) -> str:
         about = {
@@ -32,7 +32,7 @@ class ForMachines(logging.Formatter):
 
 
 class LogFile(logging.FileHandler):
-    """Log file that stops with one message on a full disk, because the axis takes precedence over its log."""
+    """Log file that reports one message and stops on a full disk, because the axis must continue."""
 
     failed = False
 

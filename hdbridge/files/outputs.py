@@ -1,8 +1,8 @@
-"""Permitted locations of results, so that no output overwrites anything of value.
+"""Checks the locations of results, so that no output overwrites anything of value.
 
-A result may replace only a result of the same kind: not an input of the command, another output, or a file
-that makes a folder a profile or a recording. Pipes and character devices are written directly
-(`write_atomically`); sockets, disks and folders are refused. Everything is checked before any motion.
+A result may replace only a result of the same kind. It must not replace an input of the command, another
+output, or a file that belongs to a profile or a recording. Pipes and character devices are written directly
+(`write_atomically`). Sockets, disks and folders are refused. All checks precede any motion.
 """
 
 import os
@@ -23,7 +23,7 @@ _HEAD_BYTES: Final = 4096
 
 
 class Kind(Enum):
-    """Kind of an output, with the pattern for the beginning of such a file."""
+    """Kind of an output; the value is a pattern that matches the beginning of such a file."""
 
     JSON = r'\s*\{\s*"schema": "hdbridge\.'
     PAGE = r"(?s).*<!doctype html>"
@@ -44,10 +44,10 @@ class Kind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """Location written by a command."""
+    """Location that a command will write."""
 
     option: str
-    """Option that names it, for messages: ``--json``."""
+    """Option that states the location, for messages: ``--json``."""
     path: Path
     kind: Kind
 
@@ -63,9 +63,9 @@ _SAMPLES: Final = (".csv", ".csv.gz")
 
 
 def check_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = ()) -> None:
-    """Raises `InputError` unless each output can be written without losing anything.
+    """Raises `InputError` unless each output can be written without overwriting anything of value.
 
-    ``inputs`` are the files and folders that the command reads.
+    ``inputs`` contains the files and folders that the command reads.
     """
     read = [each for each in inputs if _status(each) is not None]
     redirected = _redirected()
@@ -106,7 +106,7 @@ def _check_file(
                     "standard output"
                 )
     else:
-        return  # a pipe
+        return  # pipes replace nothing
     _check_belongs_to_no_folder(output)
     if found is not None and found.st_size and not re.match(output.kind.value, _head(path)):
         raise InputError(
@@ -116,7 +116,10 @@ def _check_file(
 
 
 def _check_belongs_to_no_folder(output: Output) -> None:
-    """Refuses to write a file of a profile or a recording, except a pending model or a first one."""
+    """Refuses to overwrite a file of a profile or a recording.
+
+    A model may be written as the pending model, or as the active model if there is none.
+    """
     path = _resolved(output.path)
     folder, name = path.parent, path.name.casefold()
     profile = folder.parent if folder.name.casefold() in _HISTORIES else folder
@@ -172,7 +175,7 @@ def _check_folder(output: Output, inputs: Sequence[Path]) -> None:
 
 
 def _redirected() -> list[tuple[str, os.stat_result]]:
-    """Returns the regular files that the shell has redirected for this process."""
+    """Returns the regular files to which the standard streams are redirected, with the streams' names."""
     found = []
     for descriptor, name in enumerate(("standard input", "standard output", "standard error")):
         with suppress(OSError):
@@ -183,9 +186,9 @@ def _redirected() -> list[tuple[str, os.stat_result]]:
 
 
 def _same(one: Path, other: Path) -> bool:
-    """Returns True if two paths name one file, also through links, or in another spelling or case.
+    """Returns True if two paths denote the same file, even through links or with different spelling.
 
-    The case of files that do not exist yet is ignored, because some file systems ignore it.
+    For files that do not exist yet, case is ignored, because some file systems ignore it.
     """
     mine, its = descriptor_of(one), descriptor_of(other)
     if mine is not None or its is not None:
@@ -202,13 +205,13 @@ def _same(one: Path, other: Path) -> bool:
 
 
 def _endless(path: Path) -> bool:
-    """Returns True for a character device, which accepts anything and may be shared by several outputs."""
+    """Returns True for a character device, to which several outputs may be written."""
     found = _status(path)
     return found is not None and stat.S_ISCHR(found.st_mode) and descriptor_of(path) is None
 
 
 def _status(path: Path) -> os.stat_result | None:
-    """Returns the status of the file to be written; ``missing/../file`` is the file."""
+    """Returns the status of the file at a path, which is resolved first (``missing/../file`` is ``file``)."""
     try:
         return _resolved(path).stat()
     except OSError:
@@ -235,9 +238,9 @@ _failures: ContextVar[list[OutputError] | None] = ContextVar("failures", default
 
 @contextmanager
 def failures_deferred() -> Iterator[list[OutputError]]:
-    """Defers write failures of results within the block; yields the list of errors.
+    """Defers failures to write results until after the block; yields the list of errors.
 
-    After a measurement, the figures are printed first, so that a full disk does not lose them.
+    The figures of a measurement can thus be printed first, so that a full disk does not lose them.
     """
     failed: list[OutputError] = []
     token = _failures.set(failed)
@@ -249,7 +252,7 @@ def failures_deferred() -> Iterator[list[OutputError]]:
 
 @contextmanager
 def writing() -> Iterator[None]:
-    """Defers an `OutputError` while a result is written, if an outer block defers failures."""
+    """Defers an `OutputError` in the block that writes a result, if an outer block defers failures."""
     try:
         yield
     except OutputError as error:
@@ -257,7 +260,7 @@ def writing() -> Iterator[None]:
 
 
 def defer(error: OutputError) -> None:
-    """Keeps the error for later if an outer block defers failures, else raises it."""
+    """Stores the error if an outer block defers failures (`failures_deferred`), else raises it."""
     failed = _failures.get()
     if failed is None:
         raise error

@@ -1,4 +1,4 @@
-"""Files of one axis, found from user input or a machine file, and the location of bundled files."""
+"""Finds the files of one axis from user input or a machine file, and locates bundled files."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def bundled_folder(kind: Literal["eds", "profiles"], package: Path = _PACKAGE) -> Path:
-    """Returns the folder of bundled EDS files or profiles; it may be missing in a broken installation."""
+    """Returns the folder of bundled EDS files or profiles, which a broken installation may lack."""
     installed = package / "_bundled" / kind
     beside = package.parent / kind
     working_copy = (package.parent / "pyproject.toml").is_file() and beside.is_dir()
@@ -19,7 +19,10 @@ def bundled_folder(kind: Literal["eds", "profiles"], package: Path = _PACKAGE) -
 
 
 def bundled_profile(name: str) -> Path:
-    """Returns the folder of a bundled profile; InputError with the existing profiles and the nearest name."""
+    """Returns the folder of a bundled profile.
+
+    If there is none, raises `InputError` with the existing profiles and the nearest name.
+    """
     folder = bundled_folder("profiles")
     if name and (folder / name / "axis.yaml").is_file():
         return folder / name
@@ -50,7 +53,7 @@ class Profile:
 
     @property
     def twin(self) -> Path:
-        """File of the twin, which may not exist."""
+        """File of the axis's twin, which may not exist."""
         return self.folder / TWIN_NAME
 
     @property
@@ -60,9 +63,9 @@ class Profile:
 
     @classmethod
     def find(cls, text: str, base: Path = Path()) -> Self:
-        """Finds a profile by folder, axis file or bundled name; raises `InputError` if it does not exist.
+        """Finds a profile, given its folder, axis file or bundled name; raises `InputError` if there is none.
 
-        ``base`` is the folder from which a relative path starts.
+        A relative path is relative to ``base``.
         """
         path = base / text
         if not path.exists():

@@ -1,9 +1,9 @@
 """Strict YAML: a file is read exactly, or refused in one line with the location and the reason.
 
-The dialect is the core schema of YAML 1.2 (so `off` and `2025-01-31` are text, `1e-3` is a number and `0x402`
-an integer), one document of plain mappings, lists and scalars: no tags, anchors or aliases, no duplicate
-keys, and limits on size and depth. A pydantic model validates the content in pydantic's strict mode; every
-error becomes ``file:line:column: key.path: what is wrong; expected ...; did you mean 'nearest'?``.
+The dialect is the core schema of YAML 1.2, in which `off` and `2025-01-31` are text, `1e-3` is a number and
+`0x402` an integer. A file contains one document of plain mappings, lists and scalars, without tags, anchors,
+aliases or duplicate keys. Size and depth are limited. A pydantic model validates the content in strict mode.
+Each error has the form ``file:line:column: key.path: what is wrong; expected ...; did you mean 'nearest'?``.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _CONVERSIONS: tuple[tuple[re.Pattern[str], Callable[[str], int | float]], ...] =
 
 
 class FileError(InputError):
-    """A file is invalid. The text is the first error; `details` has all errors, one line each."""
+    """Error of an invalid file. The text is the first error; `details` contains all errors, one line each."""
 
     def __init__(self, *texts: str) -> None:
         lines = tuple(map(one_line, texts))
@@ -57,20 +57,20 @@ class FileError(InputError):
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """Value of the file with its position (line and column count from 1)."""
+    """A value in the file, with its position (line and column, counted from 1)."""
 
     line: int
     column: int
     value: Any
-    """Plain Python: dict, list, str, int, float, bool or None."""
+    """Value as plain Python: dict, list, str, int, float, bool or None."""
     found: str
-    """Value as text, for error messages."""
+    """Text of the value, for error messages."""
     children: dict[str, tuple[Node, Node]] | list[Node] | None = None
-    """Children; for a mapping, key -> (key's node, value's node)."""
+    """Items of a list, or nodes of key and value for each key of a mapping; None for a scalar."""
 
 
 class _Composer:
-    """Builds nodes from parser events, and refuses features that a configuration does not need."""
+    """Builds nodes from parser events, and refuses YAML features that a configuration does not need."""
 
     def __init__(self, text: str, path: Path) -> None:
         self._path = path
@@ -98,7 +98,7 @@ class _Composer:
             raise self._not_yaml(self._in_better_words() or problem) from None
 
     def _in_better_words(self) -> yaml.YAMLError | None:
-        """Returns the error of the pure-Python parser, which is clearer and equal on every computer."""
+        """Returns the error of the pure-Python parser, which is clearer and the same on all computers."""
         try:
             for _ in yaml.parse(self._text, Loader=yaml.SafeLoader):
                 pass
@@ -207,12 +207,12 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def load_yaml(path: Path | str, model: type[M]) -> M:
-    """Loads a file as an instance of ``model``; raises `InputError` with file, line and column."""
+    """Reads a file as an instance of ``model``; raises `InputError` with file, line and column."""
     return read_yaml(path).validate(model)
 
 
 def read_yaml(path: Path | str) -> Document:
-    """Reads a file as plain data with positions, not yet validated."""
+    """Reads a file as plain data with positions, without validation."""
     path = Path(path)
     try:
         with open_regular(path) as file:
@@ -233,7 +233,7 @@ def read_yaml(path: Path | str) -> Document:
 
 
 def document_from_text(text: str, path: Path | str) -> Document:
-    """Parses YAML text as a document; ``path`` only names it in messages."""
+    """Parses YAML text as a document; ``path`` is only used in messages."""
     path = Path(path)
     return Document(path, _Composer(text, path).document())
 
@@ -247,44 +247,44 @@ class Document:
 
     @property
     def data(self) -> Any:
-        """Content as plain dicts, lists and scalars."""
+        """Content of the document as plain dicts, lists and scalars."""
         return self.root.value
 
     def validate(self, model: type[M], at: Location = ()) -> M:
         """Returns the value at a location as an instance of ``model``."""
         value = self._node(at).value
         try:
-            # JSON, because pydantic's strict JSON mode accepts lists and text for tuples and enums, and
-            # strict Python mode would refuse them.
+            # The value is passed as JSON, because pydantic's strict mode accepts lists for tuples and text
+            # for enums in JSON, but not in Python objects.
             return model.model_validate_json(json.dumps(value), strict=True)
         except ValidationError as problem:
             errors = problem.errors(include_url=False, include_input=False)
             raise FileError(*self._complaints(model, at, errors)) from None
 
     def error(self, at: Location, message: str, *, key: bool = False) -> FileError:
-        """Returns an error about the value (or the key) at a location."""
+        """Returns an error that concerns the value (or the key) at a location."""
         return FileError(self._line(at, message, key=key))
 
     def position(self, at: Location) -> tuple[int, int]:
-        """Returns line and column of the key at a location, or of the innermost existing key around it."""
+        """Returns line and column of the key at a location, or of the innermost existing enclosing key."""
         node = self._node(at, key=True)
         return node.line, node.column
 
     def _complaints(self, model: type[BaseModel], at: Location, errors: list[ErrorDetails]) -> list[str]:
         schema = [each for each in errors if each["loc"] == ("schema",)]
-        if schema:  # all other errors follow from the wrong kind of file
+        if schema:  # a file of the wrong kind, which causes all other errors
             errors = schema
         unknown = {each["loc"][:-1]: each["loc"][-1] for each in errors if each["type"] == "extra_forbidden"}
         rows = []
         for error in errors:
             if error["type"] == "too_short" and any(
                 each["loc"][: len(error["loc"])] == error["loc"] != each["loc"] for each in errors
-            ):  # it counts only items without an error of their own
+            ):  # pydantic counts only valid items, so this error follows from those of the items
                 continue
             place, message, key = self._complaint(model, at, error)
             if error["type"] == "missing" and place in unknown:
                 close = nearest(str(unknown[place]), [str(error["loc"][-1])])
-                if close:  # a single typing error, already reported as the unknown key
+                if close:  # a misspelt key, which is already reported as unknown
                     continue
             node = self._node(at + place, key=key)
             line = self._line(at + place, message, key=key)
@@ -294,7 +294,7 @@ class Document:
     def _complaint(
         self, model: type[BaseModel], at: Location, error: ErrorDetails
     ) -> tuple[Location, str, bool]:
-        """Returns location, message, and True if the error is in the key rather than its value."""
+        """Returns location and message of an error, and True if it concerns the key rather than the value."""
         place, kind = error["loc"], error["type"]
         if kind == "extra_forbidden":
             names = field_names(model, place[:-1])
@@ -321,15 +321,15 @@ class Document:
         return f"{where}: {keys}: {message}" if keys else f"{where}: {message}"
 
     def _node(self, at: Location, *, key: bool = False) -> Node:
-        """Returns the value at a location, or its key, or the innermost existing value around it."""
+        """Returns the node of the value (or key) at a location, or of the innermost existing parent."""
         kept, values = self._walk(at)
         around = values[-2].children if key and len(values) > 1 else None
         return around[str(kept[-1])][0] if isinstance(around, dict) else values[-1]
 
     def _walk(self, at: Location) -> tuple[Location, list[Node]]:
-        """Returns the steps that exist in the file, and the values along them, the root first.
+        """Returns the steps of a location that exist in the file, and the nodes along them from the root.
 
-        Other steps are omitted, because pydantic includes the names of a union's members in its locations.
+        Other steps are omitted, because pydantic includes the names of a union's members in a location.
         """
         kept: Location = ()
         values = [self.root]
@@ -346,7 +346,10 @@ class Document:
 
 
 def wrong(message: str, *at: str | int) -> PydanticCustomError:
-    """Creates an error for validators about a part (``at``) of the validated value, without a prefix."""
+    """Creates an error for use in validators, without pydantic's prefix.
+
+    ``at`` is the location of the error within the validated value.
+    """
     return PydanticCustomError("hdbridge", "{message}", {"message": message, "at": at})
 
 
@@ -362,18 +365,18 @@ def _hint(word: str, choices: Sequence[str]) -> str:
 
 
 class Hex(int):
-    """Integer written in hexadecimal: object indices, vendor and product numbers."""
+    """Integer that is written in hexadecimal, such as an object index or a vendor number."""
 
 
 class Line(list[Any]):
-    """List written on one line: a row of a table, an interval."""
+    """List that is written on one line, such as a table row or an interval."""
 
 
 class _Dumper(yaml.SafeDumper):
-    """YAML dumper that quotes any text that either dialect, 1.1 or 1.2, would read as another type."""
+    """YAML dumper that quotes any text that YAML 1.1 or 1.2 would read as another type."""
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Disables aliases, which are refused on reading."""
+        """Disables aliases, which the reader refuses."""
         return True
 
     def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
@@ -396,7 +399,7 @@ _Dumper.add_representer(
 
 
 def _text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
-    """Uses double quotes if other styles would fold the text or lose line breaks and Unicode marks."""
+    """Writes a text, in double quotes if another style would fold it or lose control characters."""
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"' if _BREAKS.search(text) else None)
 
 
@@ -412,7 +415,7 @@ _Dumper.add_multi_representer(object, _plain)
 
 
 def dump_yaml(data: Any) -> str:
-    """Returns plain data as YAML: block style except for `Line`, in order, numbers exact."""
+    """Returns plain data as YAML in block style (except `Line`), with keys in order and exact numbers."""
     text: str = yaml.dump(
         data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=False, width=100000
     )

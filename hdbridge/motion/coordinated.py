@@ -143,9 +143,7 @@ def _straight(corners: Sequence[FloatArray]) -> list[tuple[FloatArray, FloatArra
 def _leg(
     begin: FloatArray, end: FloatArray, limits: Sequence[_Eased], period_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns positions and velocities of a leg from rest to rest, in each period, both of shape (n,
-    axes).
-    """
+    """Returns positions and velocities of a leg from rest to rest in each period, shape (n, axes) each."""
     count = len(begin)
     demand = InputParameter(count)
     demand.synchronization = Synchronization.Phase

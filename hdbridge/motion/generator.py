@@ -23,7 +23,7 @@ _ROUNDING_DEG = 1e-9
 
 
 _NEAR_END = 0.999
-"""Fraction of a path's duration, just before its end, at which its final direction is evaluated."""
+"""Fraction of a path's duration, just before its end, at which the final direction of motion is evaluated."""
 _HALVINGS = 30
 _At = Callable[[float], tuple[list[float], list[float], list[float]]]
 

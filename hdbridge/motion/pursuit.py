@@ -9,8 +9,7 @@ _ROUNDING = 1e-6
 
 
 class Pursuit:
-    """Reaches each goal exactly if the limits permit it, and otherwise approaches it at the acceleration
-    limit.
+    """Reaches each goal exactly if the limits permit it, else approaches it at the acceleration limit.
 
     If goals are interpolated linearly between set-points, their velocity changes in steps, even on a path
     within the limits. A goal is therefore reached exactly if the change of its velocity is no larger than the

@@ -53,8 +53,7 @@ class SetPoint:
         """Number of periods since ``_path`` was set, ``_since_s`` after the start of the path."""
         self._since_s = 0.0
         self._left = self._stream_timeout = 0
-        """Remaining periods until a jog (or a stream at rest) times out, and time-out of the stream in
-        periods."""
+        """Remaining periods before a jog or a resting stream times out, and time-out of a stream, periods."""
         self._mode = MotionMode.HOLD
         self._underrun = False
         self._position_deg = self._velocity_deg_s = self._acceleration_deg_s2 = 0.0
@@ -214,7 +213,7 @@ class SetPoint:
         if self._stream is not None:
             return self._step_stream(self._stream)
         if self._pursuit is not None:
-            state = self._pursuit.step(*self._aim)  # within the limits
+            state = self._pursuit.step(*self._aim)  # respects the limits
             self._position_deg, self._velocity_deg_s, self._acceleration_deg_s2 = state
             return self._position_deg
         if self._mode is MotionMode.JOG:
@@ -317,9 +316,7 @@ class SetPoint:
         self._take(path, MotionMode.STOP, since_s)
 
     def _steady_stop(self, now: Kinematics, bounds: Bounds) -> Cubic:
-        """Returns a stop with constant deceleration: the limit, or more if the remaining travel requires
-        it.
-        """
+        """Returns a stop with constant deceleration, at the limit or as the remaining travel requires."""
         place, speed = now.position_deg, abs(now.velocity_deg_s)
         left_deg = bounds.upper_deg - place if now.velocity_deg_s > 0.0 else place - bounds.lower_deg
         travel_deg = min(speed * speed / (2.0 * self._limits.acceleration_deg_s2), left_deg)

@@ -119,8 +119,7 @@ class Stream:
         """Number of periods since the last rest."""
         self._released = self._begun = False
         self.overrun_s: float | None = None
-        """Time since the stream ran out of knots in motion, else None; the state is then that of the last
-        knot."""
+        """Time since the stream ran out of knots in motion, at the state of the last knot; else None."""
         self._state = Kinematics(begin_deg, 0.0, 0.0)
 
     @property
@@ -229,9 +228,7 @@ class Stream:
         self._state = cubic.state(time_s)
 
     def _end(self, cubic: Cubic, time_s: float) -> None:
-        """Handles the last knot: rests if its velocity is zero, else waits at it and sets ``overrun_s`` if
-        late.
-        """
+        """Handles the last knot: rests if its velocity is zero, else sets ``overrun_s`` once it is passed."""
         if self._last is not None and self._last[2] == 0.0:
             self._cubics.clear()
             self._state = Kinematics(cubic.end_deg, 0.0, 0.0)

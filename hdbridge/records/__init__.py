@@ -1,1 +1,1 @@
-"""Measured time series of one axis: records, recordings with their segments, records of other benches."""
+"""Measured time series of one axis: records, recordings with segments, and records of other programs."""

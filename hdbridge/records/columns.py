@@ -1,7 +1,7 @@
-"""Assignment of CSV columns to channels of a record, with units and wrapping counters.
+"""Assigns CSV columns to the channels of a record, with units and wrapping counters.
 
 A record's own columns are in the units stated in their names. A file of another program is read with
-`CsvColumns`: the options ``--columns``, ``--units`` and ``--unwrap`` of the command line.
+`CsvColumns`, which represents the options ``--columns``, ``--units`` and ``--unwrap`` of the command line.
 """
 
 import math
@@ -40,20 +40,21 @@ CHANNELS: Final[Mapping[str, str]] = MappingProxyType(
         **{without_unit(each.value).removesuffix("_c"): each.value for each in MEASURED},
     }
 )
-"""Column of a record for each channel named in the options."""
+"""Column of a record for each channel name that the options accept."""
 Said = str | Sequence[str] | Mapping[str, object] | None
-"""``channel=value,channel=value``, a sequence of such texts, or a mapping."""
+"""Value of an option: ``channel=value,channel=value``, a sequence of such texts, or a mapping."""
 ROW: Final = "row"
-"""Placeholder for a column: the number of the row, for a file without a time."""
+"""Placeholder for a column that contains the row number, for a file without a time column."""
 
 
 class _Scale(NamedTuple):
-    """Conversion: the value in the record's unit is ``at_zero + factor * value``."""
+    """Conversion of a column's value to ``at_zero + factor * value`` in the record's unit."""
 
     factor: float
     at_zero: float = 0.0
     per: str = ""
-    """Quantity that must follow a colon. It divides the factor or, for a torque, multiplies it."""
+    """Quantity that must follow the unit after a colon, if any. It divides the factor or, for a torque,
+    multiplies it."""
 
 
 _RAD: Final = math.degrees(1.0)
@@ -86,7 +87,7 @@ UNITS: Final[Mapping[str, Mapping[str, _Scale]]] = {
     },
     "c": {"degC": _Scale(1.0), "K": _Scale(1.0, -273.15), "degF": _Scale(5 / 9, -160 / 9)},
 }
-"""Known units by the unit at the end of the record's column."""
+"""Known units, by the unit at the end of the record's column name."""
 _ALIASES: Final[Mapping[str, str]] = {
     alias: unit
     for unit, aliases in {
@@ -116,7 +117,7 @@ _CLOCK_PERIODS: Final = sorted(
     for step in range(4)
     for period in (2**16, 2**24, 2**31, 2**32, 60, 3600, 86400, 1e9)
 )
-"""Values at which clocks wrap, in their own units."""
+"""Values at which clocks wrap, in the clock's own unit."""
 _UNIT = re.compile(r"(-?)(\d*\.?\d*(?:[eE][+-]?\d+)?)\s*([^\d\s:.+-][^:]*?)(?::(.+))?$")
 _IN_NAME = re.compile(r"[\[(]([^\])]+)[\])]\s*$|(?:[_ ./-]|\bin )([^\W\d_]+|[°%\"'‰µμ]\w*)\s*$")
 _HINTS: Final[Mapping[str, frozenset[str]]] = {
@@ -124,28 +125,28 @@ _HINTS: Final[Mapping[str, frozenset[str]]] = {
     "motor": frozenset({"motor", "mot", "input", "drive", "antrieb", "m"}),
     "load": frozenset({"load", "last", "output", "out", "link", "joint", "abtrieb", "l"}),
 }
-"""Words in column names that suggest a column for a missing channel."""
+"""Words in column names that suggest the channel."""
 _OTHERS: Final = frozenset(
     {"torque", "current", "speed", "velocity", "vel", "acceleration", "acc", "error", "temperature", "temp",
      "power", "target", "demand", "command", "cmd", "setpoint", "ref", "soll", "state", "status"}
 )  # fmt: skip
-"""Words in column names that indicate neither a time nor a measured angle."""
+"""Words in column names that rule out a time or a measured angle."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """Unit of a column; `str` formats it as the options do: rad, -counts:65536, 0.1degC."""
+    """Unit of a column; `str` formats it as in the options: rad, -counts:65536, 0.1degC."""
 
     name: str
     scale: _Scale
     per: float | None = None
-    """Counts per turn, or the rated torque in Nm."""
+    """Counts per turn, or rated torque in Nm, if the unit requires it."""
     times: float = 1.0
-    """Number of units per value of the column; negative for the opposite direction."""
+    """Number of units that correspond to 1 in the column; negative for the opposite direction."""
 
     @classmethod
     def parse(cls, text: str, channel: str, where: str = "--units") -> Self:
-        """Parses the text after ``channel=``; raises `InputError` with the possible units."""
+        """Parses a unit, the text after ``channel=``; raises `InputError` with the possible units."""
         known = _units_of(channel)
         found = _UNIT.match(text.strip())
         name = _canonical(found[3], known) if found else None
@@ -171,14 +172,14 @@ class Unit:
 
     @property
     def factor(self) -> float:
-        """Value of one column unit in the record's unit; for a temperature, of a difference of one unit."""
+        """Factor from the column's value to the record's unit; for a temperature, from differences."""
         factor = self.scale.factor * self.times
         if self.per is None:
             return factor
         return factor / self.per if self.scale.per == _PER_TURN else factor * self.per
 
     def convert(self, values: FloatArray) -> FloatArray:
-        """Returns the values in the record's unit; the same array if no conversion is needed."""
+        """Converts values to the record's unit; returns the same array if no conversion is needed."""
         factor, at_zero = self.factor, self.scale.at_zero
         if factor == 1.0 and not at_zero:
             return values
@@ -186,11 +187,11 @@ class Unit:
         return converted
 
     def named(self, name: str, channel: str) -> Self:
-        """Returns the same unit with another name."""
+        """Returns the unit ``name`` with the same counts per turn and factor."""
         return replace(self, name=name, scale=_units_of(channel)[name])
 
     def scaled(self, by: float) -> Self:
-        """Returns the unit of a column whose values are ``by`` times as large as stated here."""
+        """Returns the unit with which a column's values are read ``by`` times as large."""
         return replace(self, times=self.times * by)
 
     def __str__(self) -> str:
@@ -201,13 +202,13 @@ class Unit:
 
 @dataclass(frozen=True, slots=True)
 class CsvColumns:
-    """User's assignment of the channels in CSV files, by the names of `CHANNELS`."""
+    """Assignment of a CSV file's columns by the user; keys are the channels of `CHANNELS`."""
 
     columns: Mapping[str, str] = field(default_factory=dict)
-    """Column name, or its number (1 is the first), or `ROW`; other channels use the record's own column."""
+    """Column name, column number (from 1) or `ROW`; other channels use the record's own column name."""
     units: Mapping[str, Unit] = field(default_factory=dict)
     unwrap: Mapping[str, float] = field(default_factory=dict)
-    """Period of each wrapping counter, in the column's unit."""
+    """Period of each wrapping counter, in the unit of its column."""
 
     @classmethod
     def of(cls, columns: Said = None, units: Said = None, unwrap: Said = None) -> Self:
@@ -234,17 +235,17 @@ class CsvColumns:
         )
 
     def __bool__(self) -> bool:
-        """True if anything was assigned."""
+        """Returns True if any column, unit or period was assigned."""
         return bool(self.columns or self.units or self.unwrap)
 
     def column(self, channel: str) -> str:
-        """Returns the name of the column for a channel."""
+        """Returns the name or number of the column for a channel."""
         return self.columns.get(channel, CHANNELS[channel])
 
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """CSV file of a record and its interpretation, for messages that name lines and options."""
+    """CSV file from which a record was read, and its interpretation, for messages with lines and options."""
 
     file: CsvFile
     columns: Mapping[str, str]
@@ -252,14 +253,14 @@ class Origin:
     units: Mapping[str, Unit]
     """Unit in which each column was read."""
     stated: frozenset[str]
-    """Channels with a unit stated by the user."""
+    """Channels whose unit the user stated."""
     unwrapped: frozenset[str]
     remarks: tuple[str, ...]
-    """Assumptions, as text."""
+    """Assumptions about units and format, as text."""
 
     @property
     def remark(self) -> str:
-        """One line with the assumptions; empty without any."""
+        """One line with all assumptions; empty without assumptions."""
         return one_line(f"{self.file.path}: assumed {'; '.join(self.remarks)}") if self.remarks else ""
 
     def place(self, row: int) -> str:
@@ -267,7 +268,7 @@ class Origin:
         return f"{self.file.path}:{self.file.line_of_row(row)}"
 
     def clock_cure(self, time_s: FloatArray) -> str:
-        """Returns the option for a clock that wraps at a common period, else empty."""
+        """Returns advice with the option for a clock that wraps at a common period; else empty."""
         raw = time_s / self.units["time"].factor
         steps = np.diff(raw)
         ahead = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 0.0
@@ -278,7 +279,7 @@ class Origin:
         return ""
 
     def exchanged(self) -> str:
-        """Returns the option that exchanges motor and load."""
+        """Returns the option that exchanges the columns of motor and load."""
         return option("--columns", {"motor": self.columns["load"], "load": self.columns["motor"]})
 
     def scaled(self, channel: str, by: float) -> str:
@@ -287,14 +288,14 @@ class Origin:
 
 
 def option(name: str, values: Mapping[str, str]) -> str:
-    """Returns an option of the command line, quoted for a shell."""
+    """Returns the text of a command-line option, quoted for a shell."""
     return f"{name} {shlex.quote(','.join(f'{channel}={value}' for channel, value in values.items()))}"
 
 
 def read(file: CsvFile, said: CsvColumns) -> tuple[dict[str, Column], Origin]:
-    """Reads the columns of a record from a CSV file, converted and unwrapped, with their origin.
+    """Reads the columns of a record from a CSV file, converts and unwraps them, and returns their origin too.
 
-    The record's own names come first; all other columns of the file are kept unchanged.
+    The columns of channels come first. All other columns of the file are kept unchanged.
     """
     found = _located(file, said)
     units, remarks = _units(file, said, found)
@@ -308,7 +309,7 @@ def read(file: CsvFile, said: CsvColumns) -> tuple[dict[str, Column], Origin]:
         if channel in said.unwrap:
             values = _unwrapped(values, said.unwrap[channel], ordered=channel == "time")
         if name == time and abs(units[channel].factor) < 1e-3 and rows:
-            values = values - values[0]  # nanoseconds since 1970 exceed the digits of a float
+            values = values - values[0]  # nanoseconds since 1970 exceed the precision of a float
         converted[CHANNELS[channel]] = units[channel].convert(values)
     used = set(found.values())
     kept = {name: each for name, each in columns.items() if name not in used and name not in converted}
@@ -320,7 +321,7 @@ def read(file: CsvFile, said: CsvColumns) -> tuple[dict[str, Column], Origin]:
 
 
 def _located(file: CsvFile, said: CsvColumns) -> dict[str, str]:
-    """Finds the column of each channel; raises `InputError` for missing columns, with the options to pass."""
+    """Finds the column of each channel; for missing columns, raises `InputError` with the options to pass."""
     found: dict[str, str] = {}
     missing: list[str] = []
     for channel, own in CHANNELS.items():
@@ -383,7 +384,7 @@ def _missing(file: CsvFile, said: CsvColumns, missing: Sequence[str], found: Map
 
 
 def _guess(channel: str, names: Sequence[str]) -> str | None:
-    """Returns the column that may hold a channel, or None."""
+    """Returns the column that probably contains a channel, or None."""
     hints = _HINTS.get(channel, frozenset({channel}))
     words = {
         name: set(re.findall(r"[^\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()))
@@ -396,7 +397,10 @@ def _guess(channel: str, names: Sequence[str]) -> str | None:
 
 
 def _units(file: CsvFile, said: CsvColumns, found: Mapping[str, str]) -> tuple[dict[str, Unit], list[str]]:
-    """Determines the unit of each channel: as stated by the user, else by the file, else the record's own."""
+    """Determines the unit of each channel (stated by the user, else by the file, else the default).
+
+    Also returns the assumptions, as text.
+    """
     units: dict[str, Unit] = {}
     remarks: list[str] = []
     for channel, name in found.items():
@@ -439,7 +443,7 @@ def _with_per(units: Mapping[str, str]) -> str:
 
 
 def _unwrapped(values: FloatArray, period: float, *, ordered: bool) -> FloatArray:
-    """Unwraps a counter; a clock (``ordered``) only runs forward."""
+    """Unwraps a counter; ``ordered`` indicates a clock, which only runs forward."""
     if ordered:
         begins = np.diff(values, prepend=values[:1]) < 0.0
         clock: FloatArray = values + period * np.cumsum(begins)

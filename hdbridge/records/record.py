@@ -1,6 +1,6 @@
-"""Record: the motion of one axis, sample by sample, as named columns with units.
+"""Record: the measured motion of one axis, sample by sample, as named columns with units.
 
-A record comes from hdbridge's own bench or from another program's CSV file; both have the same form. Sampling
+Records of hdbridge's own bench and those read from CSV files of other programs have the same form. Sampling
 may be uneven. Angles are multi-turn degrees.
 """
 
@@ -31,11 +31,11 @@ from hdbridge.records.columns import (
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 UNIT_SHARE: Final = 0.006
-"""Maximum relative deviation of a slope from that of another unit: the spacing of common ratios."""
+"""Maximum relative deviation of a slope for attributing it to a wrong unit: the spacing of common ratios."""
 LEAST_COUNTS: Final = 1000.0
-"""Minimum counts per turn of an encoder."""
+"""Minimum plausible number of counts per turn of an encoder."""
 STANDSTILL: Final = 0.01
-"""Share of the expected load travel below which the encoder counts as not being read."""
+"""Minimum load travel, relative to the expected travel; with less, the load encoder was not read."""
 _PLURALS: Final = {
     "deg": "degrees",
     "rad": "radians",
@@ -49,8 +49,8 @@ _PLURALS: Final = {
 def remedy(times: float, ratio: float, exact: float, origin: Origin | None) -> str:
     """Returns advice for a load that travels ``times`` as far as the ratio and the motor imply.
 
-    Names the option if the record is from a CSV file. ``exact`` is the relative accuracy within which a ratio
-    counts as right.
+    If the record is from a CSV file, the advice includes the option to pass. ``exact`` is the relative
+    accuracy within which a ratio counts as right.
     """
     if abs(times) < STANDSTILL:
         column = (
@@ -82,7 +82,7 @@ def remedy(times: float, ratio: float, exact: float, origin: Origin | None) -> s
 
 
 def _other_units(origin: Origin | None) -> list[tuple[float, str, str]]:
-    """Returns factor on the load's relative travel, description and advice for each other angle unit."""
+    """Returns, for each other angle unit: the factor by which it would change the travel, symptom, advice."""
     found = []
     for channel, sense in (("load", 1.0), ("motor", -1.0)):
         unit = origin.units[channel] if origin else None
@@ -111,7 +111,7 @@ def _other_places(ratio: float, origin: Origin | None) -> list[tuple[float, str,
 
 
 def _of_counts(times: float, exact: float, origin: Origin | None) -> str:
-    """Returns the counts per turn that would agree, if the units are counts."""
+    """Returns the options with the counts per turn that would agree with the ratio; empty for other units."""
     if origin is None:
         return ""
     agreeing = []
@@ -123,7 +123,7 @@ def _of_counts(times: float, exact: float, origin: Origin | None) -> str:
 
 
 def _round(counts: float, exact: float) -> int:
-    """Returns the roundest number of counts within the uncertainty of the slope."""
+    """Returns the roundest number of counts, preferably a power of two, within the accuracy ``exact``."""
     power: int = 2 ** round(math.log2(counts))
     if abs(counts / power - 1.0) < exact:
         return power
@@ -139,22 +139,22 @@ __all__ = ["MINIMUM_SAMPLES", "OPTIONAL", "REQUIRED", "Record", "concatenate", "
 MINIMUM_SAMPLES: Final = 2
 
 WRONG_RATIO: Final = 0.003
-"""Relative deviation of a ratio that indicates another gear; the closest common ratios are 0.6 % apart."""
+"""Relative deviation of a ratio that indicates another gear; common ratios are at least 0.6 % apart."""
 WRONG_RATIO_ARCSEC: Final = 900.0
-"""Minimum effect of such a deviation over the travel, several times the error of any gear; arcsec."""
+"""Minimum effect of such a deviation over the travel, arcsec: several times the error of any gear."""
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """Columns of equal length by name; see `REQUIRED` and `OPTIONAL`. Other columns are kept and ignored."""
+    """Columns of equal length, by name (see `REQUIRED` and `OPTIONAL`); others are kept but not used."""
 
     columns: Mapping[str, Column]
     source: str = ""
     """Source of the record, for messages."""
     starts: tuple[int, ...] = field(default=(0,))
-    """First row of each joined record; the motion of the axis between two records is unknown."""
+    """First row of each concatenated record. The motion of the axis between two records is unknown."""
     origin: Origin | None = None
-    """CSV file from which it was read and its interpretation; None for any other record."""
+    """CSV file from which the record was read, and its interpretation; None for any other record."""
 
     def __post_init__(self) -> None:
         missing = [name for name in REQUIRED if name not in self.columns]
@@ -167,7 +167,7 @@ class Record:
         object.__setattr__(self, "columns", MappingProxyType(columns))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Supports pickle, which cannot handle the read-only mapping."""
+        """Supports pickling, which the read-only mapping does not."""
         return type(self), (dict(self.columns), self.source, self.starts)
 
     @classmethod
@@ -182,9 +182,9 @@ class Record:
     ) -> Self:
         """Reads a CSV file of any program, plain or gzip.
 
-        ``columns`` assigns columns to channels, ``units`` their units, ``unwrap`` the period of a wrapping
-        counter, as on the command line: ``columns="motor=theta_m,time=t"`` or a mapping. The assumptions are
-        in ``.origin.remarks``.
+        ``columns`` states the column of each channel, ``units`` its unit and ``unwrap`` the period of a
+        wrapping counter, as on the command line (``columns="motor=theta_m,time=t"``) or as a mapping.
+        ``.origin.remarks`` contains the assumptions.
 
         Raises `InputError`, with file and line, if a required column is missing, a value of a known column is
         not a finite number, a row is ragged, time runs backwards, there are too few samples, or the encoding
@@ -194,7 +194,7 @@ class Record:
 
     @classmethod
     def of_csv(cls, path: Path, said: CsvColumns, minimum_samples: int = MINIMUM_SAMPLES) -> Self:
-        """Reads a CSV file like `read_csv`, with parsed options."""
+        """Reads a CSV file like `read_csv`, but with options that have been parsed."""
         file = CsvFile(path, [said.column(channel) for channel in CHANNELS])
         found, origin = read(file, said)
         record = cls(found, str(path), origin=origin)
@@ -212,18 +212,18 @@ class Record:
         return record
 
     def write_csv(self, path: Path | str) -> None:
-        """Writes the record atomically, gzip if the name ends in ``.gz``.
+        """Writes the record atomically as CSV, compressed if the name ends in ``.gz``.
 
-        Every number reads back exactly, and equal records result in equal bytes.
+        Every number reads back exactly, and equal records produce equal bytes.
         """
         write_columns(Path(path), self.columns)
 
     def __len__(self) -> int:
-        """Number of samples."""
+        """Returns the number of samples."""
         return len(self.time_s)
 
     def __eq__(self, other: object) -> bool:
-        """True for the same columns with exactly the same values."""
+        """Returns True if the records have the same columns with exactly the same values."""
         if not isinstance(other, Record):
             return NotImplemented
         return self.columns.keys() == other.columns.keys() and all(
@@ -258,15 +258,15 @@ class Record:
         return {each: self.columns[each.value] for each in MEASURED if each.value in self.columns}
 
     def transmission_error_arcsec(self, ratio: float) -> FloatArray:
-        """Returns theta_L - theta_M / N in arcsec at the load, shape (n,), from the measured angles.
+        """Returns the measured transmission error theta_L - theta_M / N, arcsec at the load, shape (n,).
 
-        Its mean contains the difference of the two encoders' zeros.
+        Its mean contains the difference between the zeros of the two encoders.
         """
         error: FloatArray = (self.load_position_deg - self.motor_position_deg / ratio) * ARCSEC_PER_DEG
         return error
 
     def motion(self) -> Motion:
-        """Returns the motion for a model, with the commanded motor angle if recorded."""
+        """Returns the motion as a model's input, with the commanded motor angle if it was recorded."""
         target = self.motor_target_deg
         return Motion(
             motor_deg=self.motor_position_deg if target is None else target,
@@ -275,7 +275,7 @@ class Record:
         )
 
     def load_turns_per_motor_turn(self) -> float | None:
-        """Returns the slope of the load angle over the motor angle; None if the motor stood still."""
+        """Returns the slope of the load angle over the motor angle; None if the motor did not move."""
         motor = self.motor_position_deg - np.mean(self.motor_position_deg)
         square = float(motor @ motor)
         return float(motor @ self.load_position_deg) / square if square else None
@@ -283,8 +283,8 @@ class Record:
     def check_ratio(self, ratio: float) -> None:
         """Raises `InputError` if the record's own angles contradict a ratio.
 
-        A small deviation is left to the diagnosis, and so is any deviation that is not distinguishable from
-        the gear's own error because the axis moved too little.
+        Small deviations are left to the diagnosis. So is any deviation that, because of short travel, cannot
+        be distinguished from the gear's own error.
         """
         slope = self.load_turns_per_motor_turn() if len(self) else None
         if slope is None:
@@ -304,7 +304,7 @@ class Record:
         raise InputError(f"{name}{found} ({over}); expected a ratio of {ratio:g}: {cure}")
 
     def rows(self, first: int, end: int) -> Self:
-        """Returns the samples from row ``first`` up to, not including, ``end``."""
+        """Returns the samples from row ``first`` up to but not including row ``end``."""
         columns = {name: column[first:end] for name, column in self.columns.items()}
         inside = (start - first for start in self.starts if first < start < end)
         return type(self)(columns, self.source, (0, *inside), self.origin)
@@ -316,16 +316,16 @@ class Record:
         return self.rows(first, end)
 
     def parts(self) -> tuple[Self, ...]:
-        """Returns the records from which it was concatenated."""
+        """Returns the records from which this record was concatenated."""
         ends = (*self.starts[1:], len(self))
         return tuple(self.rows(start, end) for start, end in zip(self.starts, ends, strict=True))
 
 
 def concatenate(records: Sequence[Record]) -> Record:
-    """Concatenates records in the given order, with one absolute zero.
+    """Concatenates records in the given order.
 
-    A record whose time starts again is shifted to follow the record before. Columns missing from some records
-    are left out.
+    If the time of a record starts again, it is shifted to follow the previous record. Columns that some
+    records lack are omitted.
     """
     if not records:
         raise ValueError("nothing to concatenate")
@@ -347,7 +347,7 @@ def concatenate(records: Sequence[Record]) -> Record:
 
 
 def time_shifts_s(records: Sequence[Record]) -> tuple[float, ...]:
-    """Returns the offsets that make the records' times consecutive, s; zero if they already are."""
+    """Returns the offsets that make the records' times consecutive, s; 0 if they already are."""
     shifts: list[float] = []
     end_s = -np.inf
     for record in records:
@@ -362,7 +362,7 @@ def time_shifts_s(records: Sequence[Record]) -> tuple[float, ...]:
 
 
 def _frozen(column: Any) -> Column:
-    """Returns a read-only view of float64 or of text."""
+    """Returns a column as a read-only view of float64 or of text."""
     array = np.asarray(column)
     if array.dtype.kind != "U":
         array = array.astype(np.float64, copy=False)
@@ -374,6 +374,6 @@ def _frozen(column: Any) -> Column:
 def _same(one: Column, other: Column) -> bool:
     if one.dtype != other.dtype or one.shape != other.shape:
         return False
-    if one.dtype.kind == "f":  # the bits of a NaN have no meaning and are not kept in a file
+    if one.dtype.kind == "f":  # the payload bits of a NaN are meaningless, and a file does not keep them
         one, other = (np.where(np.isnan(each), np.nan, each) for each in (one, other))
     return one.tobytes() == other.tobytes()

@@ -1,8 +1,8 @@
 """Recording: a record, its segments and its provenance, as one folder or as CSV files of another program.
 
 The folder contains ``record.csv.gz`` (several files if the record has several parts) and ``recording.yaml``.
-The latter is written last and contains the checksums, so a folder without it is not a recording, and modified
-raw data are detected.
+``recording.yaml`` is written last and contains the checksums. A folder without it is therefore not a
+recording, and changes of the raw data are detected.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from hdbridge.records.record import Record, concatenate, time_shifts_s
 from hdbridge.strictness import Strict
 
 GAP_CYCLES: Final = 5
-"""Maximum number of missing cycles in which the motor cannot reverse and return unnoticed."""
+"""Maximum length of a gap, cycles, within which the motor cannot reverse and return unnoticed."""
 PART_SAMPLES: Final = 50
-"""Minimum number of samples of a part when a recording is cut at its gaps; shorter parts are left out."""
+"""Minimum number of samples in a part of a recording that is cut at its gaps; shorter parts are omitted."""
 RECORD_NAME = "record.csv.gz"
 ABOUT_NAME = "recording.yaml"
 CSV_NAMES: Final = (".csv", ".csv.gz")
-"""Endings of CSV file names."""
+"""Suffixes of CSV file names."""
 HEADER = "# What was recorded next to this file, by hdbridge. docs/files.md describes its keys.\n"
 """First line of ``recording.yaml``."""
 
@@ -55,7 +55,7 @@ class Segment(Strict):
 
 
 class RecordedFile(Strict):
-    """A file of the recording."""
+    """A CSV file of the recording, with its checksum."""
 
     name: str = Field(pattern=r"^[^/\\]+$", description="name in this folder")
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="checksum")
@@ -63,7 +63,7 @@ class RecordedFile(Strict):
 
     @classmethod
     def of(cls, path: Path, samples: int) -> Self:
-        """Returns the description of a file that was written."""
+        """Returns the description of a recording file on disk."""
         return cls(name=path.name, sha256=sha256_of(path), samples=samples)
 
 
@@ -84,7 +84,7 @@ class RecordingFile(Strict):
 
     @classmethod
     def made(cls, **values: Any) -> RecordingFile:
-        """Creates the content without validation, because a recording begins without files."""
+        """Creates the content without validation, because a new recording has no files yet."""
         return cls.model_construct(schema_="hdbridge.recording/1", **values)
 
     def write(self, folder: Path) -> None:
@@ -98,7 +98,7 @@ class RecordingFile(Strict):
 
 @dataclass(frozen=True)
 class Recording:
-    """Record with its segments and provenance; for a bare CSV file, only the record."""
+    """A record with its segments and provenance; for a plain CSV file, only the record."""
 
     record: Record
     segments: tuple[Segment, ...] = ()
@@ -111,10 +111,11 @@ class Recording:
 
     @classmethod
     def load(cls, *paths: Path | str, columns: Said = None, units: Said = None, unwrap: Said = None) -> Self:
-        """Loads recording folders and CSV files as one recording in the given order.
+        """Reads recording folders and CSV files as one recording, in the given order.
 
-        ``columns``, ``units`` and ``unwrap`` are for CSV files of other programs; see `Record.read_csv`.
-        Raises `InputError` for any error in them, and for files that have changed since they were recorded.
+        ``columns``, ``units`` and ``unwrap`` apply to CSV files of other programs; see `Record.read_csv`.
+        Raises `InputError` for any error in the files, and for files that have changed since they were
+        recorded.
         """
         said = CsvColumns.of(columns, units, unwrap)
         return cls.joined([cls._load_one(Path(path), said) for path in paths])
@@ -158,7 +159,7 @@ class Recording:
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Joins recordings in the given order; attributes on which they differ are left open."""
+        """Joins recordings in the given order; attributes in which they differ are left at their defaults."""
         if len(parts) == 1:
             return parts[0]
         records = [each.record for each in parts]
@@ -176,9 +177,9 @@ class Recording:
         return cls(concatenate(records), tuple(segments), **common)
 
     def save(self, folder: Path | str) -> None:
-        """Writes the folder, with one file per part of the record.
+        """Writes the recording to a folder, with one file per part of the record.
 
-        Raises `InputError` if it already contains a recording, because raw data are never replaced.
+        Raises `InputError` if the folder already contains a recording, because raw data are never replaced.
         """
         folder = Path(folder)
         if (folder / ABOUT_NAME).exists():
@@ -199,17 +200,17 @@ class Recording:
         RecordingFile.made(files=tuple(files), segments=self.segments, **common).write(folder)
 
     def pieces(self, *kinds: str) -> Iterator[tuple[Segment, Record]]:
-        """Yields the segments of these kinds (all by default), each with its samples."""
+        """Yields each segment of these kinds (by default all kinds) with its samples."""
         for segment in self.segments:
             if not kinds or segment.kind in kinds:
                 yield segment, self.record.between(segment.start_s, segment.end_s)
 
 
 def recordings_among(files: Iterable[str]) -> dict[str, list[str]]:
-    """Returns the recordings that `Recording.load` reads among files (paths or URLs), each with its files.
+    """Returns the recordings among files (paths or URLs) that `Recording.load` reads, with their files.
 
     A folder with ``recording.yaml`` is one recording, and each CSV file elsewhere is another. A folder with
-    raw data but without ``recording.yaml``, which is written last, is not complete yet.
+    raw data but without ``recording.yaml``, which is written last, is still incomplete and is omitted.
     """
     folders: dict[str, list[str]] = {}
     for each in files:
@@ -231,7 +232,7 @@ def _is_raw(path: str) -> bool:
 
 
 def versions_here() -> dict[str, str]:
-    """Returns the software versions for a recording or a model made in this process."""
+    """Returns the software versions to be stored in a recording or a model of this process."""
     return dict(_versions())
 
 
@@ -249,11 +250,11 @@ def sha256_of(path: Path) -> str:
 
 
 Given = Record | Recording | Sequence[Record | Recording] | Mapping[Path, Recording]
-"""Recordings in chronological order; the keys of a mapping name them in messages."""
+"""One recording, or several in chronological order; messages name them by the keys of a mapping."""
 
 
 def by_name(given: Given) -> dict[Path, Recording]:
-    """Returns the recordings by their name in messages, file or number; raises `InputError` for none."""
+    """Returns the recordings by their name in messages (file or number); raises `InputError` without any."""
     if isinstance(given, Mapping):
         named = dict(given)
     else:
@@ -276,7 +277,8 @@ def by_name(given: Given) -> dict[Path, Recording]:
 
 
 def agreed_ratio(recordings: Mapping[Path, Recording], said: Iterable[tuple[str, float | None]]) -> float:
-    """Returns the gear ratio on which ``said`` (source and value) and the recordings agree.
+    """Returns the gear ratio on which the recordings and ``said`` (pairs of source and value) agree.
+
 
     Raises `InputError` if they disagree, or if none of them states a ratio.
     """

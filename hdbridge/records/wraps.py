@@ -1,7 +1,7 @@
-"""Angles that jump by a constant: a wrapping counter, or an angle within one turn.
+"""Finds angles that jump by a constant, because a counter wraps or the angle is limited to one turn.
 
-A wrap jumps in one angle only, whereas a concatenated record jumps in both. Its size is constant, whereas a
-misread sample is wrong by any amount and the next sample is right again.
+A wrap is a jump in one angle only. At a join of concatenated records, both angles jump. All wraps have the
+same size, whereas a misread sample is wrong by any amount and the next sample is right again.
 """
 
 import math
@@ -17,41 +17,41 @@ from hdbridge.records.columns import Unit
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 LEAST_JUMP_DEG: Final = 900.0 / ARCSEC_PER_DEG
-"""Minimum jump, larger than any gear error; degrees."""
+"""Minimum size of a jump, larger than any gear error."""
 CONSTANT_SHARE: Final = 0.05
-"""Maximum deviation between the jumps of one counter, as a share of their size."""
+"""Maximum deviation of a jump from the mean jump of a counter, relative to the mean."""
 NOMINAL_SHARE: Final = 0.02
-"""Maximum deviation of a jump from the period of a counter, as a share."""
+"""Maximum uncertainty of a period, relative to the period."""
 LEAST_TIMES: Final = 3.0
-"""Minimum ratio of a jump to any other difference between the steps of the two angles."""
+"""Minimum ratio of a jump to any other difference between the two angles' steps."""
 SAME_SHARE: Final = 0.3
-"""Share of a jump that the other angle may leave unexplained if both have jumped."""
+"""Maximum fraction of a jump that the motion of the other angle may explain; otherwise both have jumped."""
 THERE_AND_BACK: Final = 2
-"""Maximum duration of a misreading, in samples."""
+"""Maximum length of a misreading, samples."""
 WINDOW: Final = 5
-"""Number of steps whose median is the expected step."""
+"""Number of neighbouring steps whose median is the expected step."""
 _PERIODS: Final = (DEG_PER_TURN, math.tau, 1.0, 21_600.0, 1_296_000.0, *(2.0**bits for bits in range(8, 33)))
 """One turn in each unit, and the ranges of binary counters."""
 
 
 class Wraps(NamedTuple):
-    """Jumps of an angle that wraps."""
+    """Jumps of a wrapping angle."""
 
     rows: NDArray[np.intp]
-    """First sample after each jump."""
+    """Index of the first sample after each jump."""
     period_deg: float
-    """Size of the jumps; one turn if they are whole turns."""
+    """Period of the counter: the size of the jumps, or one turn if they are whole turns."""
     jump_deg: float
     """Measured size of the jumps, a whole number of periods."""
     tolerance_deg: float
-    """Uncertainty of the sizes."""
+    """Uncertainty of the period and the jump size."""
 
 
 def find_wraps(angle_deg: FloatArray, other_deg: FloatArray, starts: Sequence[int] = (0,)) -> Wraps | None:
-    """Finds the constant jumps of an angle that the axis's other angle does not make; shapes (n,).
+    """Finds jumps of constant size in an angle (n,) that do not occur in the axis's other angle (n,).
 
-    None without jumps. A single jump counts if it is a whole number of turns or a power of two of counts. A
-    step to the first sample of a record (`starts`) does not count.
+    Returns None without such jumps. A single jump is accepted only if it equals a whole turn or a power of
+    two of counts. Steps to the first sample of a record (``starts``) are ignored.
     """
     if len(angle_deg) < 2 * WINDOW:
         return None
@@ -75,14 +75,15 @@ def find_wraps(angle_deg: FloatArray, other_deg: FloatArray, starts: Sequence[in
     calm = float(np.max(np.abs(np.delete(slip, large)), initial=0.0))
     if np.any(np.abs(sizes - period) > CONSTANT_SHARE * period) or LEAST_TIMES * calm > period:
         return None
-    # An angle wraps at the same place each time, with the same gear error, so no mean reduces it.
+    # An angle wraps at the same position each time. The gear error there is the same, so averaging over the
+    # jumps does not reduce its effect.
     off = float(np.quantile(np.abs(np.delete(slip, large)), 0.99)) + float(np.std(sizes))
     wraps = Wraps(jumps + 1, period, jump, min(off, NOMINAL_SHARE * period))
     return wraps if len(jumps) > 1 or _nominal(wraps, 1.0, count_of(angle_deg)) else None
 
 
 def period_in(unit: Unit, wraps: Wraps, angle_deg: FloatArray) -> float:
-    """Returns the roundest period that jumps and counts permit, in the unit of the angle's column."""
+    """Returns the roundest period consistent with jumps and counts, in the unit of the angle's column."""
     scale = abs(unit.factor)
     count = count_of(angle_deg / unit.factor)
     binary = 2.0 ** round(math.log2(wraps.jump_deg / scale))
@@ -101,12 +102,12 @@ def period_in(unit: Unit, wraps: Wraps, angle_deg: FloatArray) -> float:
 
 
 def unwrapped(angle_deg: FloatArray, period_deg: float) -> FloatArray:
-    """Returns the continuous angle, shape (n,); correct if no step exceeds half the period."""
+    """Unwraps an angle (n,); the result is correct if no step exceeds half the period."""
     return np.asarray(np.unwrap(angle_deg, period=period_deg))
 
 
 def _nominal(wraps: Wraps, scale: float, count: float) -> float:
-    """Returns the period if it is a turn in some unit or the range of a binary counter; else 0."""
+    """Returns the nearest nominal period (a turn in some unit, or a binary counter's range); else 0."""
     period, off = wraps.period_deg / scale, wraps.tolerance_deg / scale
     near = [each for each in _PERIODS if abs(each - period) <= max(off, 1e-6 * each)]
     if count and count != 1.0:
@@ -116,14 +117,14 @@ def _nominal(wraps: Wraps, scale: float, count: float) -> float:
 
 
 def _slope(step: FloatArray, other: FloatArray) -> float:
-    """Returns the travel of the angle per unit of the other angle, from the median of the larger steps."""
+    """Returns the change of an angle per unit of the other angle, as the median over the larger steps."""
     size = np.abs(other)
     large = size > 0.5 * float(np.quantile(size, 0.9))
     return float(np.median(step[large] / other[large])) if np.any(large) else 0.0
 
 
 def _lasting(jumps: NDArray[np.intp], excess: FloatArray) -> NDArray[np.intp]:
-    """Returns the jumps that are not reversed at once."""
+    """Returns the jumps that are not reversed within `THERE_AND_BACK` samples."""
     kept = np.ones(len(jumps), dtype=np.bool_)
     for place in range(len(jumps) - 1):
         out, back = jumps[place], jumps[place + 1]
@@ -134,7 +135,7 @@ def _lasting(jumps: NDArray[np.intp], excess: FloatArray) -> NDArray[np.intp]:
 
 
 def count_of(values: FloatArray) -> float:
-    """Returns the largest decimal number that divides all steps; 0 if that is only the last digit."""
+    """Returns the largest decimal number of which all steps are multiples; 0 if it is just the last digit."""
     for decimals in range(10):
         whole = np.round(values * 10.0**decimals)
         if np.all(np.abs(values * 10.0**decimals - whole) < 1e-4) and np.max(np.abs(whole)) < 2.0**53:

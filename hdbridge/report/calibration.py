@@ -1,4 +1,4 @@
-"""Report page of a calibration: measurements, fitted model, and its reliability."""
+"""Report page of a calibration: measurements, fitted model, and uncertainty of the model."""
 
 import math
 import re
@@ -41,14 +41,14 @@ TURN_LABEL: Final = "motor angle within its turn, deg"
 LOAD_LABEL: Final = "load angle, deg"
 R_LABEL: Final = "residual, arcsec"
 PAUSE_STEPS: Final = 20.0
-"""Gap in time between two runs, in median steps."""
+"""Minimum pause between two runs, in median time steps."""
 HIGHEST_ORDER: Final = 16.0
 """Highest order in the spectrum chart."""
 BINS_PER_TURN: Final = 128
 
 
 def calibration_page(result: Calibration) -> Page:
-    """Returns the page of a calibration, or of a fit of any records: the result, then the evidence."""
+    """Returns the page of a calibration or a fit: the result first, then the evidence."""
     traces = result.fit.traces
     sections = []
     if result.validation is not None:
@@ -122,7 +122,7 @@ def _verdict(result: Calibration) -> str:
 
 
 def _by_angle(traces: Traces, ratio: float) -> Iterator[Chart]:
-    """Yields charts over the motor angle with the model, and over the load angle with means of turns."""
+    """Yields a chart over the motor angle with the model, and one over the load angle with means per turn."""
     sweeps = _of_kind(traces, "sweep")
     chosen = (sweeps if np.any(sweeps) else np.ones_like(sweeps)) & (traces.direction != 0.0)
     if not np.any(chosen):
@@ -144,7 +144,7 @@ def _by_angle(traces: Traces, ratio: float) -> Iterator[Chart]:
 def _over(
     x: FloatArray, y: FloatArray, width: float, middle: Callable[[FloatArray], Any]
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns the median of y over intervals of x of a given width; an interval without samples is a gap."""
+    """Applies ``middle`` (mean or median) to y in intervals of x; intervals without samples become gaps."""
     first = float(np.min(x))
     place = ((x - first) / width).astype(np.intp)
     values: FloatArray = np.full(int(np.max(place)) + 1, np.nan)
@@ -157,7 +157,7 @@ def _over(
 
 
 def _both_ways(traces: Traces, x: FloatArray, y: FloatArray, chosen: BoolArray) -> list[Series]:
-    """Returns the chosen samples by direction, omitting a direction without samples."""
+    """Returns one series of the chosen samples per direction; omits a direction without samples."""
     ways = (("forward", chosen & (traces.direction > 0.0)), ("backward", chosen & (traces.direction < 0.0)))
     return [Series(name, x[rows], y[rows], Mark.POINTS) for name, rows in ways if np.any(rows)]
 
@@ -182,7 +182,7 @@ def _loops(traces: Traces) -> Iterator[Chart]:
 
 
 def _parted(y: FloatArray, time_s: FloatArray) -> FloatArray:
-    """Inserts a gap at the first sample after a pause, so that no line bridges it."""
+    """Inserts a gap after each pause, so that no line is drawn across it."""
     steps = np.diff(time_s, prepend=time_s[0])
     return np.where(steps > PAUSE_STEPS * float(np.median(steps)), np.nan, y)
 
@@ -214,9 +214,9 @@ def _spectrum(result: Calibration) -> Chart:
 
 
 def _alone(traces: Traces) -> tuple[FloatArray, FloatArray]:
-    """Returns orders and amplitudes of the error by FFT over even bins of the motor angle, for display.
+    """Returns orders and amplitudes of the error, by FFT over equal bins of the motor angle, for display.
 
-    Empty bins count as zero; amplitudes are scaled by the share of filled bins.
+    Empty bins count as zero, and the amplitudes are corrected for the fraction of filled bins.
     """
     moving = traces.direction != 0.0
     shown = moving if np.mean(moving) > 0.5 else np.ones_like(moving)
@@ -225,7 +225,7 @@ def _alone(traces: Traces) -> tuple[FloatArray, FloatArray]:
     edges = np.min(motor) + DEG_PER_TURN / BINS_PER_TURN * np.arange(turns * BINS_PER_TURN + 1)
     filled, total = np.histogram(motor, edges)[0], np.histogram(motor, edges, weights=error)[0]
     binned = total / np.maximum(filled, 1)
-    # A bin's mean attenuates high orders; dividing by the sinc of half a bin corrects that.
+    # Averaging over a bin attenuates high orders; division by the sinc function corrects this.
     order = np.fft.rfftfreq(len(binned), 1.0 / BINS_PER_TURN)
     lines = np.abs(np.fft.rfft(binned)) / np.count_nonzero(filled) / np.sinc(order / BINS_PER_TURN)
     below = order <= HIGHEST_ORDER

@@ -29,7 +29,7 @@ from hdbridge.report.stepping import of_offer, stepping_sections
 from hdbridge.units import without_unit
 
 TOLD: Final = 3
-"""Number of findings in the verdict."""
+"""Maximum number of findings in the verdict."""
 PLUS_MINUS: Final = "\N{PLUS-MINUS SIGN} 95 %"
 
 
@@ -44,10 +44,10 @@ def diagnosis_page(
 ) -> Page:
     """Returns the page of a diagnosis.
 
-    ``provenance`` contains names and values about the origin of records and model. ``stepping`` is the
-    stepping test with the old and the extended model, if any; it precedes everything else. ``offer`` is the
-    outcome for the extended model, if it was proposed for commit. ``command`` is the command line of the
-    diagnosis.
+    ``provenance`` contains names and values that describe the origin of records and model. ``stepping`` is
+    the stepping test with the old and the extended model, if there was one; it precedes the findings.
+    ``offer`` is the outcome for the extended model, if it was tested for commit. ``command`` is the command
+    line of the diagnosis.
     """
     seen = diagnosis.views()
     verdict = _verdict(diagnosis, stepping)
@@ -335,7 +335,7 @@ def _name(cause: str) -> str:
 
 
 def _title(cause: str) -> str:
-    """Returns the name of a cause, with its title unless the title contains the name."""
+    """Returns the title of a cause, preceded by its name unless the title contains it."""
     name = _name(cause)
     if cause not in CATALOGUE:
         return name
@@ -350,5 +350,5 @@ def _listed(words: Sequence[str], last: str = "and") -> str:
 
 
 def _two(value: float) -> str:
-    """Formats a value with two or three digits, without an exponent."""
+    """Formats a value with two decimals, or with one decimal from 10 on."""
     return f"{value:.1f}" if value >= 9.95 else f"{value:.2f}"

@@ -29,7 +29,7 @@ def motion_page(axis_name: str, result: MotionTest) -> Page:
 
 
 def motion_sections(result: MotionTest) -> list[Section]:
-    """Returns the ripple over speed, the path errors, and the response if measured."""
+    """Returns the sections: ripple over speed, motor orders, path errors and response, if measured."""
     sections = [
         Section(
             "Ripple over speed", blocks=[Grid([_ripple(result)]), Table(RIPPLE_COLUMNS, ripple_rows(result))]
@@ -78,7 +78,7 @@ def _ripple(result: MotionTest) -> Chart:
 
 
 def ripple_rows(result: MotionTest) -> list[list[str]]:
-    """Returns a row of `RIPPLE_COLUMNS` for each speed."""
+    """Returns a table row with `RIPPLE_COLUMNS` for each speed."""
     return [
         [
             f"{each.speed_deg_s:g}",
@@ -94,7 +94,7 @@ def ripple_rows(result: MotionTest) -> list[list[str]]:
 
 
 def figure(value: float | None) -> str:
-    """Formats two decimals; None is empty."""
+    """Formats a value with two decimals; returns an empty text for None."""
     return "" if value is None else f"{value:.2f}"
 
 
@@ -116,7 +116,7 @@ def _spectrum(ripple: Ripple) -> Chart:
 
 
 def path_rows(result: MotionTest) -> list[list[str]]:
-    """Returns a row of `PATH_COLUMNS` for each path and correction."""
+    """Returns a table row with `PATH_COLUMNS` for each path and correction."""
     return [
         [
             each.name,

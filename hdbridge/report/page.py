@@ -1,8 +1,8 @@
-"""Page of results as plain data, and its rendering as one self-contained HTML file.
+"""Report page as plain data, and its rendering as one self-contained HTML file.
 
-A page opens without a network, because it contains style, script and data. Charts are drawn by uPlot
-(inlined; its licence and checksum are in ``assets``). Pure: `render` returns the text and the caller writes
-it.
+A page opens without a network connection, because it contains style, script and data. Charts are drawn by
+uPlot (inlined; its licence and checksum are in ``assets``). Pure: `render` returns the text, and the caller
+writes it.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from hdbridge.axis.effects import FloatArray
 
 SIGMA: Final = "3\N{GREEK SMALL LETTER SIGMA}"
 SCATTER: Final = (f"pooled {SIGMA}", "mean", f"CW {SIGMA}", "mean", f"CCW {SIGMA}", "mean")
-"""Columns of a stepping test. Pooled comes first as the result, because a mobile phone shows two columns."""
+"""Columns of a stepping test. The pooled result is first, because a mobile phone shows only two columns."""
 
 
 def sentence(text: str) -> str:
-    """Adds a capital letter and exactly one full stop."""
+    """Capitalises the first letter, and ends the text with exactly one full stop."""
     return text[:1].upper() + text[1:].rstrip(".") + "."
 
 
@@ -41,7 +41,7 @@ def figure(value: float, digits: int = 4) -> str:
 
 
 def with_interval(value: float, half_width: float) -> tuple[str, str]:
-    """Formats the half width with two digits, and the value with as many decimals."""
+    """Formats a half width with two significant digits, and the value with the same number of decimals."""
     text, half = units.with_interval(value, half_width)
     return _typeset(text), _typeset(half)
 
@@ -51,45 +51,45 @@ def _typeset(number: str) -> str:
 
 
 POINTS_MAXIMUM: Final = 4000
-"""Maximum number of points of a series in a page; longer series are thinned to keep a page below a
-megabyte."""
+"""Maximum number of points of a series in a page; longer series are thinned to limit a page to a megabyte."""
 _FIGURE: Final = re.compile(r"\(?[-+\N{MINUS SIGN}\N{PLUS-MINUS SIGN}]?\d[\d,.]*(e[-+]\d+)?\)?( ?%)?$")
 DIGITS: Final = 5
-"""Significant digits of a series' span, a hundredth of the screen resolution; more only enlarge the page."""
+"""Number of significant digits relative to a series' span. It resolves a hundredth of a screen pixel; more
+digits would only enlarge the page."""
 
 
 class Mark(Enum):
     """Drawing style of a series."""
 
     LINE = "line"
-    """Points joined in the given order, also for loops, whose x goes back and forth."""
+    """Line through the points in the given order; x may go back and forth, as in loops."""
     DASHED = "dashed"
     POINTS = "points"
     FAINT = "faint"
-    """Small grey points behind everything else: raw data."""
+    """Small grey points behind all other series, for raw data."""
     BARS = "bars"
-    """Bars from zero (or, on a logarithmic axis, from its lower end) to y."""
+    """Bars from zero (on a logarithmic axis, from its lower end) to y."""
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Set of points; x and y of equal length, in the units of the chart's labels. NaN is a gap."""
+    """Points with x and y of equal length, in the units of the chart's labels; NaN is a gap."""
 
     label: str
     x: FloatArray | Sequence[float]
     y: FloatArray | Sequence[float]
     mark: Mark = Mark.LINE
     bar_width: float | None = None
-    """Width for `Mark.BARS`, in units of x; None for an automatic width."""
+    """Width of the bars for `Mark.BARS`, in units of x; None for an automatic width."""
     spread: FloatArray | Sequence[float] | None = None
-    """For `Mark.POINTS`: half the length of a vertical error bar at each point, in units of y."""
+    """Half the length of a vertical error bar at each point, in units of y; for `Mark.POINTS` only."""
     colour: int | None = None
-    """Index in the palette for series that belong together; None for a different colour."""
+    """Palette index, for series that should have the same colour; None for an automatic colour."""
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """Horizontal line at a value of y, for example a threshold."""
+    """Horizontal line at a value of y, such as a threshold."""
 
     label: str
     value: float
@@ -97,7 +97,7 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Series over common axes; the labels include the unit."""
+    """Series in common axes; the axis labels include the units."""
 
     caption: str
     x_label: str
@@ -105,7 +105,7 @@ class Chart:
     series: Sequence[Series]
     height_px: int = 320
     y_range: tuple[float, float] | None = None
-    """Fixed range for comparing several charts; None for the range of the series."""
+    """Fixed range of y, for comparing several charts; None for the range of the series."""
     levels: Sequence[Level] = ()
     y_log: bool = False
     """Logarithmic y axis; non-positive values are gaps."""
@@ -115,7 +115,7 @@ class Chart:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Charts side by side if the window is wide enough."""
+    """Charts that are shown side by side if the window is wide enough."""
 
     charts: Sequence[Chart]
     columns: int = 2
@@ -123,7 +123,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class Heading:
-    """Header of a column of figures: quantity, and its unit on a second line."""
+    """Header of a numerical column: the quantity, and its unit on a second line."""
 
     name: str
     unit: str = "arcsec"
@@ -131,7 +131,7 @@ class Heading:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of cells. Columns of figures are right-aligned; numbers are shown with two decimals."""
+    """Table of cells. Numerical columns are right-aligned, and numbers are shown with two decimals."""
 
     header: Sequence[str | Heading]
     rows: Sequence[Sequence[Cell]]
@@ -140,14 +140,14 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """Names and values."""
+    """List of names and values."""
 
     rows: Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Cell with a link to another page, by its address relative to this one."""
+    """Table cell with a link to another page; the address is relative to this page."""
 
     text: str
     address: str
@@ -159,7 +159,7 @@ Block = Chart | Grid | Table | Facts
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """Heading, text (blank lines separate paragraphs) and blocks."""
+    """Section of a page: heading, text (blank lines separate paragraphs) and blocks."""
 
     title: str
     text: str = ""
@@ -167,14 +167,14 @@ class Section:
 
 
 class Status(Enum):
-    """Outcome reported on the page: the first word of its verdict."""
+    """Outcome that a page reports, shown in front of its verdict."""
 
     OFFERED = "offered"
-    """The model is better; the profile records whether it has been committed since."""
+    """The model is better. The profile shows whether it has been committed since."""
     PENDING = "pending"
     """The model is better and awaits commit."""
     REFUSED = "refused"
-    """The model is not offered; the active one stays."""
+    """The model is not offered, and the active model remains."""
     FOUND = "found"
     NOTHING_FOUND = "nothing found"
     MEASURED = "measured"
@@ -182,7 +182,7 @@ class Status(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A next command, and its purpose."""
+    """A command that the user may run next, and its purpose."""
 
     line: str
     purpose: str
@@ -190,7 +190,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """Content of a page; ``verdict`` is the summary after the word of ``status``."""
+    """Content of a page; ``verdict`` is the summary that follows ``status``."""
 
     title: str
     verdict: str
@@ -201,7 +201,7 @@ class Page:
 
 
 def render(page: Page) -> str:
-    """Returns the page as one HTML document; raises `ValueError` if a series' x and y differ in length."""
+    """Returns the page as one HTML document; raises `ValueError` if x and y of a series differ in length."""
     charts = [chart for section in page.sections for block in section.blocks for chart in _charts_of(block)]
     return _template().render(
         page=page,
@@ -227,9 +227,10 @@ def histogram(
     bins: int | None = None,
     height_px: int = 320,
 ) -> Chart:
-    """Returns a histogram with bins of equal width common to all groups; ignores NaN and infinity.
+    """Returns a histogram of all groups with common bins of equal width; ignores NaN and infinity.
 
-    ``bins`` is the number of bins, by default the square root of the number of values, between 5 and 60.
+    ``bins`` is the number of bins. By default it is the square root of the mean number of values in a group,
+    between 5 and 60.
     """
     finite = {name: np.asarray(each, dtype=np.float64) for name, each in groups.items()}
     finite = {name: each[np.isfinite(each)] for name, each in finite.items()}
@@ -246,18 +247,18 @@ def histogram(
 
 
 def thinned(x: FloatArray, y: FloatArray, most: int = POINTS_MAXIMUM) -> tuple[FloatArray, FloatArray]:
-    """Returns at most ``most`` points of a line in order: those of least and greatest y of each run.
+    """Returns at most ``most`` points of a line, in order: those with minimum and maximum y in each interval.
 
-    The visible shape is preserved: peaks are kept, and points between them are dropped.
+    The visible shape is preserved, because peaks are kept and points between them are dropped.
     """
     keep = _extremes(y, most)
     return (x, y) if keep is None else (x[keep], y[keep])
 
 
 def sampled(x: FloatArray, y: FloatArray, most: int = POINTS_MAXIMUM) -> tuple[FloatArray, FloatArray]:
-    """Returns at most ``most`` points of a cloud in order: three in four evenly spaced, the rest peaks.
+    """Returns at most ``most`` points of a cloud, in order: three quarters evenly spaced, the others peaks.
 
-    Peaks alone, as for a line, would make a cloud look wider.
+    Peaks alone, as for a line, would make a cloud look wider than it is.
     """
     if len(x) <= most:
         return x, y
@@ -268,7 +269,7 @@ def sampled(x: FloatArray, y: FloatArray, most: int = POINTS_MAXIMUM) -> tuple[F
 
 
 def _extremes(y: FloatArray, most: int) -> list[int] | None:
-    """Returns the indices of the extremes of ``most / 2`` runs; None if no thinning is needed."""
+    """Returns the indices of the extremes of y in ``most / 2`` intervals; None if no thinning is needed."""
     if len(y) <= most:
         return None
     low, high = np.where(np.isnan(y), np.inf, y), np.where(np.isnan(y), -np.inf, y)
@@ -328,16 +329,16 @@ def _chart_data(chart: Chart) -> dict[str, Any]:
 
 
 def _rounded(values: FloatArray) -> list[float | None]:
-    """Rounds to a fixed number of decimals: `DIGITS` digits of the span."""
+    """Rounds values to a fixed number of decimals, such that their span has `DIGITS` digits."""
     finite = values[np.isfinite(values)]
     span = float(np.ptp(finite)) or float(np.max(np.abs(finite))) if len(finite) else 1.0
     decimals = DIGITS - 1 - math.floor(math.log10(span)) if span > 0.0 else DIGITS
-    # + 0.0 makes -0.0 a plain zero
+    # Adding 0.0 converts -0.0 to 0.0.
     return [round(value, decimals) + 0.0 if math.isfinite(value) else None for value in values.tolist()]
 
 
 def _significant(values: FloatArray) -> list[float | None]:
-    """Rounds every value to the same relative precision, for logarithmic axes."""
+    """Rounds all values to the same relative precision, for logarithmic axes."""
     return [float(f"{value:.{DIGITS - 1}g}") if math.isfinite(value) else None for value in values.tolist()]
 
 
@@ -351,7 +352,7 @@ def _text_of(cell: Cell) -> str:
 
 
 def _is_words(table: Table, column: int) -> bool:
-    """Returns True for a column of text without figures, which is left-aligned."""
+    """Returns True for the first column and any column without numbers, which are left-aligned."""
     cells = [row[column] for row in table.rows if column < len(row)]
     return column == 0 or not any(
         isinstance(cell, int | float) or (isinstance(cell, str) and _FIGURE.match(cell) is not None)
@@ -360,7 +361,7 @@ def _is_words(table: Table, column: int) -> bool:
 
 
 def _script_safe(data: object) -> str:
-    """Returns JSON that cannot end its surrounding script element."""
+    """Returns JSON that cannot close the script element in which it is embedded."""
     return json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 

@@ -1,4 +1,4 @@
-"""Charts of residuals over every coordinate, and the partial residual of a finding."""
+"""Charts of residuals over all coordinates, and of the partial residual of a finding."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -14,18 +14,18 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.report.page import Chart, Mark, Series, histogram, sampled, thinned
 
 LEAST_IN_BIN: Final = 3
-"""Minimum number of points per bin; bins with fewer are not shown."""
+"""Minimum number of points in a bin; bins with fewer points are not shown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bins:
-    """Means over sufficiently filled bins; arrays of equal length."""
+    """Means over bins of a coordinate that contain enough points; arrays of equal length."""
 
     place: FloatArray
-    """Mean of the coordinate."""
+    """Mean of the coordinate in each bin."""
     mean: FloatArray
     spread: FloatArray
-    """Standard deviation of the points, not of their mean."""
+    """Standard deviation of the points in each bin (not of their mean)."""
     count: IntArray
 
 
@@ -34,7 +34,7 @@ def binned(
 ) -> Bins:
     """Returns the means of y over a coordinate, using only ``rows`` if given.
 
-    Bins with fewer than ``least`` points are left out.
+    Bins with fewer than ``least`` points are omitted.
     """
     number, x = coordinate.numbers(), coordinate.values
     if rows is not None:
@@ -51,37 +51,37 @@ def binned(
 
 
 LEAST_POINTS: Final = 200
-"""Minimum number of points that show a finding alone; with fewer, all points are drawn."""
+"""Minimum number of points that show only the finding. With fewer, all points are drawn."""
 SEEN_BINS: Final = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Strength:
-    """Scale factor of a part of the model, bin by bin; arrays of equal length."""
+    """Change of a model part's scale factor over a coordinate, bin by bin; arrays of equal length."""
 
     of: str
     """Name of the scaled part."""
     place: FloatArray
     measured_percent: FloatArray
     spread_percent: FloatArray
-    """Standard deviation of the measured value, for white noise."""
+    """Standard deviation of the measured value, assuming white noise."""
     finding_percent: FloatArray
     """Change of the scale factor according to the finding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartialResidual:
-    """Finding over its coordinate; arrays of shape (m,), like those of `Traces`."""
+    """Partial residual of a finding over its coordinate; arrays of shape (m,), like those of `Traces`."""
 
     coordinate: Coordinate
     residual_arcsec: FloatArray
-    """Measurement minus the model with everything except this finding."""
+    """Measurement minus the extended model without this finding."""
     own_arcsec: FloatArray | None
-    """Contribution of the finding; None without a law."""
+    """Contribution of the finding; None for an unexplained residual, which has no law."""
     rows: BoolArray
     """Mask of the points that show the finding."""
     forward: BoolArray
-    """True for forward motion, held at rest."""
+    """True if the last motion was forward."""
     strength: Strength | None = None
 
 
@@ -103,7 +103,7 @@ def partial_residual(finding: Finding, diagnosis: Diagnosis) -> PartialResidual:
 
 
 def _in_model(finding: Finding, model: TransmissionModel) -> Effect | None:
-    """Returns the finding's effect as fitted in the extended model, so that chart and model agree."""
+    """Returns the finding's effect as contained in the extended model, so that chart and model agree."""
     effect = finding.effect
     if effect is None or (finding.within and effect.changes is not Part.LOOP):
         return effect
@@ -119,7 +119,7 @@ def _does(effect: Effect, traces: Traces) -> FloatArray:
 
 
 def _home(finding: Finding, traces: Traces, ratio: float) -> Coordinate:
-    """Returns the coordinate of a finding: that of its effect, else the coordinate that it depends on."""
+    """Returns the coordinate of a finding: that of its effect, else that on which the residual depends."""
     if finding.effect is not None:
         own = finding.effect.coordinate(traces.motion, ratio).at(traces.rows)
         return own if own.varies() else time(traces.motion).at(traces.rows)
@@ -142,7 +142,7 @@ def _strength(
     number = coarse.numbers()
     square = np.bincount(number, part**2)
     size = float(np.sqrt(np.mean(part**2)))
-    kept = square > 50.0 * (0.1 * size) ** 2  # bins in which the part is present at all
+    kept = square > 50.0 * (0.1 * size) ** 2  # bins in which the part is large enough
     noise = float(np.std(residual - own))
 
     def percent(y: FloatArray) -> FloatArray:
@@ -157,17 +157,17 @@ def _strength(
 R_LABEL: Final = "residual, arcsec"
 E_LABEL: Final = "error, arcsec"
 CLOUD: Final = 2500
-"""Maximum raw points in a partial residual chart."""
+"""Maximum number of raw points in a partial residual chart."""
 SMALL_CLOUD: Final = 1200
-"""Maximum raw points in a small chart."""
+"""Maximum number of raw points in a small chart."""
 LINE_POINTS: Final = 2000
 FINER: Final = 3
-"""Number of bins of a finding's own curve per bin of the means."""
+"""Number of bins of a finding's curve for each bin of the means."""
 CLOSER_POINTS: Final = 400
 MORE_TURNS_DEG: Final = 540.0
-"""Minimum span of the position for its chart; below it, the chart adds little to that over the load angle."""
+"""Minimum load travel for a chart over position; with less, it adds little to that over the load angle."""
 PAUSE_STEPS: Final = 20.0
-"""Gap in time between two runs, in median steps."""
+"""Minimum pause between two runs, in median time steps."""
 BLUE: Final = 0
 ORANGE: Final = 1
 GREEN: Final = 2
@@ -175,7 +175,7 @@ FORWARD, BACKWARD = "forward", "backward"
 
 
 def partial_residual_chart(partial_residual: PartialResidual) -> Chart:
-    """Returns raw points, means with their spread, and the finding's own contribution."""
+    """Returns a chart of raw points, means with their spread, and the finding's contribution."""
     if partial_residual.strength is not None:
         return _strength_chart(partial_residual.strength, partial_residual.coordinate)
     home, residual, own = (
@@ -224,7 +224,7 @@ def _strength_chart(strength: Strength, home: Coordinate) -> Chart:
 
 
 def residual_charts(seen: ResidualViews) -> Iterator[Chart]:
-    """Yields a chart over each coordinate with the given and the extended model, all to one scale."""
+    """Yields a chart of the residuals of given and extended model over each coordinate, all to one scale."""
     reach = _reach(seen.given_arcsec)
     shares = seen.shares()
     forward = seen.direction > 0.0
@@ -265,7 +265,7 @@ def residual_charts(seen: ResidualViews) -> Iterator[Chart]:
 
 
 def beside_charts(traces: Traces) -> Iterator[Chart]:
-    """Yields charts of model and measurement: the whole record, and the part with the largest gain."""
+    """Yields charts of models and measurement over time: the whole record, and the part with most gain."""
     whole = np.arange(len(traces.time_s))
     given = (traces.measured_arcsec - traces.model_arcsec) ** 2
     left = (traces.measured_arcsec - traces.extended_arcsec) ** 2
@@ -295,7 +295,7 @@ def beside_charts(traces: Traces) -> Iterator[Chart]:
 
 
 def _cloud(label: str, x: FloatArray, y: FloatArray, most: int) -> Series:
-    """Draws ``most`` random (but reproducible) points, a cloud as dense and as wide as the whole."""
+    """Returns at most ``most`` points, chosen at random but reproducibly, to preserve the cloud's shape."""
     if len(x) > most:
         kept = np.sort(np.random.default_rng(0).choice(len(x), most, replace=False))
         label, x, y = f"{label} ({most:,} of {len(x):,})", x[kept], y[kept]
@@ -303,7 +303,7 @@ def _cloud(label: str, x: FloatArray, y: FloatArray, most: int) -> Series:
 
 
 def _ways(forward: BoolArray, rows: BoolArray) -> list[tuple[str, int, BoolArray]]:
-    """Returns name, colour and points of each direction of motion."""
+    """Returns name, colour and mask of the points for each direction of motion that has points."""
     both = ((FORWARD, BLUE, rows & forward), (BACKWARD, ORANGE, rows & ~forward))
     return [each for each in both if np.any(each[2])]
 

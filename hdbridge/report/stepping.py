@@ -1,4 +1,4 @@
-"""Stepping tests: the page of several schemes, and the sections of a test before and after."""
+"""Report of stepping tests: a page that compares schemes, and sections for a test before and after."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -40,7 +40,7 @@ ISO_FIGURES: Final = (
 
 
 def stepping_sections(checked: Validation) -> list[Section]:
-    """Returns the stepping test, and the ISO 230-2 figures of the plan's positioning test, if any."""
+    """Returns sections for the stepping test and, if there was one, the positioning test (ISO 230-2)."""
     return [Section("Stepping test", _stepping_text(checked), [*_stepping(checked)]), *_iso_section(checked)]
 
 
@@ -73,7 +73,7 @@ def _stepping(checked: Validation) -> Iterator[Block]:
 
 
 def _range(tests: Iterable[Stepped]) -> tuple[float, float]:
-    """Returns a range of errors that contains all tests, so that they are drawn to one scale."""
+    """Returns a symmetric error range that covers all tests, so that they are drawn to one scale."""
     errors = [abs(error) for each in tests for way in each.errors_arcsec for error in way]
     reach = 1.08 * max(errors, default=1.0)
     return -reach, reach
@@ -87,7 +87,7 @@ def _ways(test: Stepped) -> list[Series]:
 
 
 def _scatter(test: Stepped) -> list[float]:
-    """Returns the figures of the columns `SCATTER`."""
+    """Returns a test's values for the columns `SCATTER`."""
     parts = (test.pooled, test.cw, test.ccw)
     return [value for each in parts for value in (each.three_sigma_arcsec, each.mean_arcsec)]
 
@@ -115,7 +115,7 @@ def _iso_section(checked: Validation) -> list[Section]:
 
 
 def of_offer(offer: Offer) -> tuple[Status, tuple[Command, ...]]:
-    """Returns status and commands for a model that was measured for commit."""
+    """Returns status and next commands for a model that was tested for commit."""
     if not offer.made:
         return Status.REFUSED, ()
     if offer.pending is None:
@@ -145,7 +145,7 @@ ARTICLE_TABLE_3 = {
     "hysteresis": (55.7, -23.2),
     "both": (30.2, -29.15),
 }
-"""3 sigma and mean, arcsec, as printed in the article's Table 3."""
+"""Three sigma and mean, arcsec, as printed in the article's Table 3."""
 
 
 def stepping_page(
@@ -156,7 +156,7 @@ def stepping_page(
     *,
     with_article: bool = False,
 ) -> Page:
-    """Returns the page; ``with_article`` adds the article's Table 3 to the result."""
+    """Returns the page of a stepping test; ``with_article`` adds the article's Table 3 to the table."""
     best = _best(results)
     range_ = _range(results.values())
     return Page(
@@ -223,7 +223,7 @@ def _remaining(result: Stepped, floor_arcsec: float) -> list[Chart]:
 
 
 def _signed(value: float) -> str:
-    """Formats two decimals with a typographic minus sign, but without a minus before a zero."""
+    """Formats a value with two decimals and a typographic minus sign, which a zero does not have."""
     text = f"{value:.2f}"
     return text.lstrip("-") if float(text) == 0.0 else text.replace("-", "\N{MINUS SIGN}")
 

@@ -1,4 +1,4 @@
-"""Report page of a twin: measured and simulated signals, errors found, fitted values."""
+"""Report page of a twin: measured and simulated signals, errors of the simulation, fitted values."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -31,32 +31,32 @@ from hdbridge.twin.naming import Alike, Finding
 from hdbridge.twin.translate import Row as Translated
 
 WINDOW_S: Final = 1.0
-"""Duration of a detail chart; s."""
+"""Duration shown in a detail chart."""
 MEASURED, SIMULATED, BEFORE, DIFFERENCE = "measured", "simulated", "before", "difference"
 
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """Fitted value of the plant."""
+    """A fitted parameter of the simulated plant."""
 
     name: str
     unit: str
     before: float | None
-    """Value before; None if it was only assumed."""
+    """Value before the fit; None if it was only assumed."""
     after: float
     interval: tuple[float, float] | None
-    """95 % interval; None if the value is not the axis's."""
+    """95 % interval; None if the value only replays the recording and is not that of the axis."""
 
     @property
     def text(self) -> str:
-        """Description as an estimate."""
+        """Description of the value as an estimate, in one line."""
         between = f" ({_figure(self.interval[0])} to {_figure(self.interval[1])})" if self.interval else ""
         return f"estimate: {self.name} {_figure(self.after)}{f' {self.unit}' if self.unit else ''}{between}"
 
 
 @dataclass(frozen=True, eq=False)
 class TwinReport:
-    """Content of the page."""
+    """Content of a twin's report page."""
 
     axis: str
     before: Comparison
@@ -68,22 +68,22 @@ class TwinReport:
     translated: Sequence[Translated] = ()
     facts: Sequence[tuple[str, str]] = ()
     verdict: str = ""
-    """Quality of the values, and the outcome for the twin, in one sentence."""
+    """One sentence on the quality of the values and the outcome for the twin."""
     values: str = ""
     """Origin of the values (`hdbridge.twin.twin.Values`); empty without a fit."""
     left: Sequence[Left] = ()
-    """Residuals of each channel."""
+    """Remaining difference of each channel."""
     commands: Sequence[Command] = ()
     status: Status = Status.MEASURED
 
     @property
     def now(self) -> Comparison:
-        """Comparison after the fit, else before."""
+        """Comparison with the fitted simulation, else with the initial one."""
         return self.after or self.before
 
 
 def twin_page(report: TwinReport) -> Page:
-    """Returns the page."""
+    """Returns the page of a twin."""
     sections = [
         Section(
             "Differences between simulation and axis",
@@ -139,7 +139,7 @@ def twin_page(report: TwinReport) -> Page:
 
 
 def verdict(report: TwinReport) -> str:
-    """Returns one sentence about all signals."""
+    """Returns one sentence on the differences in all signals."""
     parts = []
     for name in report.now.traces:
         now, before = report.now.row(name), report.before.row(name)
@@ -168,7 +168,7 @@ def _title(row: Row) -> str:
 
 
 def figures(report: TwinReport, *, by_kind: bool = False) -> tuple[list[str], list[list[str]]]:
-    """Returns header and rows of each channel's figures, of the whole record or by kind of motion."""
+    """Returns header and rows of a table of all channels, for the whole record or by kind of motion."""
     before = ["difference before"] if report.after is not None else []
     header = ["", "measured", "simulated", *before, "difference", "of the noise", "unit"]
     if not by_kind:
@@ -265,7 +265,7 @@ def _spectrum(name: str, spectrum: Spectrum | None) -> list[Chart]:
 
 
 def _worst(trace: Trace) -> slice:
-    """Returns the rows of the window with the largest difference."""
+    """Returns the rows of the window of `WINDOW_S` with the largest difference."""
     time_s = trace.time_s
     ends = np.searchsorted(time_s, time_s + WINDOW_S)
     power = np.concatenate([[0.0], np.cumsum(trace.difference**2)])

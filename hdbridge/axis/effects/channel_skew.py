@@ -49,7 +49,7 @@ class ChannelSkew(Angleless, Linear):
     ordinary_arcsec = 1.0
     """Error due to ordinary skew, because no two encoders are sampled at exactly the same instant."""
     incidental = frozenset({"second_order_ms2"})
-    """The second-order coefficient is not evidence, because it includes the load's inertial wind-up."""
+    """The second-order coefficient is no evidence, because it includes the load's inertial wind-up."""
     linear = ("delay_ms", "second_order_ms2")
     typical = {"delay_ms": 0.5, "second_order_ms2": 0.25}
 

@@ -50,7 +50,7 @@ class Coordinate:
         return f"{self.name}, {self.unit}" if self.unit else self.name
 
     def at(self, rows: BoolArray | IntArray) -> Self:
-        """Returns the coordinate at some of the samples."""
+        """Returns the coordinate restricted to the samples in ``rows``."""
         return replace(self, values=self.values[rows])
 
     def varies(self) -> bool:
@@ -85,7 +85,7 @@ def load_angle(motion: Motion, ratio: float) -> Coordinate:
 
 
 def position(motion: Motion, ratio: float) -> Coordinate:
-    """Returns the load position over all its turns."""
+    """Returns the multi-turn load position."""
     return Coordinate("position", "deg of the load", motion.motor_deg / ratio, both_ways=True)
 
 
@@ -108,7 +108,7 @@ def acceleration(motion: Motion) -> Coordinate:
 
 
 def time(motion: Motion) -> Coordinate:
-    """Returns the time on the record's clock; the sample number without a clock."""
+    """Returns the time on the record's clock, or the sample number of a motion without time."""
     values = motion.time_s
     if values is None:
         return Coordinate("sample", "", np.arange(len(motion), dtype=np.float64), bins=100)
@@ -116,7 +116,7 @@ def time(motion: Motion) -> Coordinate:
 
 
 def measured(motion: Motion, channel: Channel) -> Coordinate:
-    """Returns a measured channel; the time if the channel was not recorded."""
+    """Returns a measured channel; falls back to `time` if the channel was not measured."""
     values = motion.measured.get(channel)
     if values is None:
         return time(motion)

@@ -59,7 +59,7 @@ class CountLoss(Angleless):
     usual = 2
     sought = Sought.STEP
     inexact = 0.03
-    """Slow effects can produce small apparent steps next to a large one."""
+    """Slow effects can leave apparent smaller steps next to a large one."""
     typical = {"steps": (Step(time_s=0.0, size_arcsec=10.0),)}
 
     steps: tuple[Step, ...] = Field(

@@ -68,7 +68,7 @@ class Creep(Effect):
     """``tau_s`` is the time constant of the first exponential; the others keep their ratio to it."""
 
     usual = 8
-    """A real relaxation is a sum of several exponentials."""
+    """Maximum number of exponentials, because a real relaxation is a sum of several."""
     typical = {
         "parts": tuple(Relaxation(amplitude_arcsec=2.0, tau_s=tau_s) for tau_s in (2.0, 20.0)),
         "build_up": 0.1,
@@ -89,7 +89,7 @@ class Creep(Effect):
                 yield cls(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=tau_s),), build_up=build_up)
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Requires a time constant comparable to a rest; a slower relaxation cannot be told from a drift."""
+        """Requires a time constant comparable to a rest; a slower relaxation is not separable from drift."""
         if min(each.tau_s for each in self.parts) <= RESTS * longest_rest_s(observations.motion):
             return ""
         return "no rest is long enough to see it bend"

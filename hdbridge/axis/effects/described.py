@@ -11,7 +11,7 @@ from hdbridge.axis.effects.motion import BoolArray, Moment, Motion
 
 
 class Part(Enum):
-    """Part of a model that other effects may scale, and therefore copy."""
+    """Part of a model that other effects may scale, and of which they therefore contain a copy."""
 
     ORDERS = "ripple"
     """Motor orders of the model."""

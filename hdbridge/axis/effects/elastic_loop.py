@@ -63,7 +63,7 @@ class ElasticLoop(Effect):
     """Loop of a published gear with ratio 50."""
     part = Part.LOOP
     drifting = ("offset_arcsec",)
-    """Only the offset, because settling of the preload and friction change it, but not width and exponent."""
+    """Only the offset drifts, because preload settles and friction changes."""
 
     offset_arcsec: float = Field(
         ge=-3600,

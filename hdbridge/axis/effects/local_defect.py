@@ -55,7 +55,7 @@ class LocalDefect(Momentary, Linear):
     usual = 2
     sought = Sought.BUMP
     inexact = 0.15
-    """The bump of a damaged tooth never has exactly this shape."""
+    """A damaged tooth's bump never has exactly this shape, so its misfit can appear as a smaller bump."""
     linear = ("height_arcsec",)
     typical = {"height_arcsec": 5.0, "centre_deg": 0.0, "half_width_deg": 3.6}
 

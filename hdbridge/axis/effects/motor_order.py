@@ -35,9 +35,9 @@ class MotorOrders(OrderSeries):
     part = Part.ORDERS
     searched = range(1, HIGHEST_MOTOR_ORDER + 1)
     usual = 4
-    """A worn wave-generator bearing causes several orders."""
+    """Maximum number of similar orders, because a worn wave-generator bearing causes several."""
     drifting = ("orders",)
-    """All orders, because wear of teeth and bearing changes them."""
+    """All orders drift, because wear of teeth and bearing changes them."""
 
     @classmethod
     def of_change(cls, before: Effect, now: Effect) -> Self | None:

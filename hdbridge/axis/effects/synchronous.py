@@ -33,4 +33,4 @@ class Synchronous(OrderSeries):
     """Orders of the published gear."""
     part = Part.ORDERS
     drifting = ("orders",)
-    """All orders, because the teeth and the wave generator's bearing wear."""
+    """All orders drift, because the teeth and the wave generator's bearing wear."""

@@ -49,8 +49,8 @@ class Vibration(Angleless):
     usual = 2
     sought = Sought.TONE
     inexact = 0.03
-    """No source has an exactly constant frequency and amplitude, and the gear's loop responds at other
-    frequencies."""
+    """A vibration can appear as further, smaller ones, because its frequency and amplitude are not exactly
+    constant and the gear's loop responds at other frequencies."""
     typical = {"frequency_hz": 50.0, "amplitude_arcsec": 1.0, "phase_deg": 0.0}
     """The frequency is an example; that of a real vibration is found by a search."""
 

@@ -40,6 +40,7 @@ def differences(
     Parameters that only the later file has are placed with the rest of their effect.
     """
     keys = list(dict.fromkeys([*old, *new]))
+    # Parameters that only the later model has are listed together with the rest of their effect.
     effects = list(dict.fromkeys(effect for effect, _ in keys))
     keys.sort(key=lambda key: effects.index(key[0]))
     return [Difference(*key, old.get(key), new.get(key), half_widths.get(key)) for key in keys]

@@ -109,7 +109,7 @@ def _effect(document: Document, number: int, entry: EffectEntry, before: list[st
 
 
 def hexadecimal(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the provenance with the drive's identity in hexadecimal, as in data sheets."""
+    """Returns the provenance with the drive's identity in hexadecimal notation, as in data sheets."""
     data = dict(provenance)
     if isinstance(data.get("drive"), Mapping):
         data["drive"] = {

@@ -82,7 +82,7 @@ K = TypeVar("K", bound=Kept)
 
 @dataclass(frozen=True, slots=True)
 class Version(Generic[K]):
-    """A stored version."""
+    """A version in a store: its content, its place and its activations."""
 
     number: int | None
     """Number in the history; None for the pending model, and for an active model copied or edited by hand."""
@@ -219,7 +219,7 @@ class Store(Generic[K]):
             return self._activate(profile, path.read_bytes(), "activate", reason, date)
 
     def rollback(self, profile: Path, reason: str, date: datetime, identity: Identity | None = None) -> int:
-        """Undoes the last activation that has not been undone; returns the number of the active version."""
+        """Undoes the last activation that is not yet undone; returns the number of the active version."""
         with _locked(profile):
             active = _bytes(profile / self.active)
             earlier = undone(

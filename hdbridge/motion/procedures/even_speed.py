@@ -30,7 +30,7 @@ class EvenRun:
 
 @dataclass(frozen=True, slots=True)
 class EvenSpeed:
-    """Runs at constant speed in the middle of the travel."""
+    """Runs an axis at several constant speeds about the middle of the travel, in both directions."""
 
     speeds_deg_s: tuple[float, ...]
     window_s: float = WINDOW_S

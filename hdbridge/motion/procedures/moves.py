@@ -112,8 +112,7 @@ class MoveTo(_Timed):
     velocity_deg_s: float | None = None
     kind: str = "move"
     acceleration_deg_s2: float | None = None
-    """Maximum acceleration of this move, if less than the axis's; a lower one winds up the gear's spring
-    less."""
+    """Maximum acceleration, if less than the axis's limit; a lower one reduces wind-up of the gear."""
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
         """Returns the time-optimal path within the limits (ruckig)."""
@@ -223,9 +222,7 @@ class Sine(_Timed):
     kind: str = "sine"
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """Returns the path; raises `InputError` if it would start with a jump or exceed the velocity
-        limit.
-        """
+        """Returns the path; raises `InputError` if it would start with a jump or exceed the speed limit."""
         omega = 2.0 * math.pi * self.frequency_hz
         begin = self.centre_deg + self.amplitude_deg
         if abs(start_deg - begin) > 1e-9:

@@ -34,7 +34,7 @@ class PathRun:
 
 @dataclass(frozen=True, slots=True)
 class PathTest:
-    """A long and a short move there and back, and a sine, about the middle of the travel."""
+    """Runs a long and a short move, each forward and back, and a sine, about the middle of the travel."""
 
     def moves(self, axis: AxisView) -> Steps[tuple[PathRun, ...]]:
         """Yields each path, preceded by a run-up in the path's direction."""

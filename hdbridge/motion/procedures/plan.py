@@ -50,9 +50,7 @@ class StandstillEntry(Strict):
 
 
 class SweepEntry(Strict):
-    """Motion at constant speed in both directions, which shows synchronous part, load orders and loop
-    height.
-    """
+    """Motion at constant speed in both directions: synchronous part, load orders, height of the loop."""
 
     procedure: Literal["sweep"] = Field(description="both ways at constant speed, about the middle")
     load_turns: float | None = Field(
@@ -306,9 +304,7 @@ class Room:
             )
 
     def half(self, name: str, what: str, wanted_deg: float) -> float:
-        """Returns ``wanted_deg``, half a travel about the middle in load degrees, reduced to the permitted
-        one.
-        """
+        """Returns half a travel about the middle, load degrees, reduced to the permitted one."""
         if wanted_deg <= self._half_deg:
             return wanted_deg
         self.notes.append(

@@ -7,7 +7,7 @@ from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Sine, Step
 
 @dataclass(frozen=True, slots=True)
 class Sines:
-    """Sines of ``amplitudes_deg`` (at the motor) about ``centre_deg`` (at the load), in sequence."""
+    """Runs sines of ``amplitudes_deg`` (motor degrees) about ``centre_deg`` (load degrees), in sequence."""
 
     centre_deg: float = 0.0
     amplitudes_deg: tuple[float, ...] = (180.0, 45.0, 5.0)

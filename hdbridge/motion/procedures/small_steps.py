@@ -10,8 +10,7 @@ _GOLDEN = 0.618_033_988_75
 
 @dataclass(frozen=True, slots=True)
 class SmallSteps:
-    """Steps to ``count`` targets within ``reach_deg`` (motor degrees) on either side of a centre, in mixed
-    order.
+    """Steps to ``count`` targets in mixed order, within ``reach_deg`` (motor degrees) of a centre.
 
     If steps are longer than the width of the hysteresis, the loop is saturated after each. Such a test cannot
     show the loop's width, shape or memory, but these steps can. Results are divided by the direction of the
@@ -19,11 +18,11 @@ class SmallSteps:
     """
 
     centre_deg: float = 0.0
-    """Centre at the load."""
+    """Centre of the targets, load degrees."""
     reach_deg: float = 20.0
     count: int = 40
     precondition_deg: float = 2.0
-    """Load degrees; more than the width of any hysteresis."""
+    """Travel of the pre-conditioning move, load degrees; more than the width of any hysteresis."""
     settle: Settle = Settle()
 
     def moves(self, axis: AxisView) -> Steps[SteppingOutcome]:

@@ -7,8 +7,7 @@ from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Steps
 
 @dataclass(frozen=True, slots=True)
 class Precondition:
-    """Moves back and forth by more than the width of any hysteresis, and ends at ``load_deg`` in forward
-    motion.
+    """Moves back and forth by more than the width of any hysteresis, ending forward at ``load_deg``.
 
     The gear's elastic state is then known, because it is saturated in the forward direction. Every task of a
     plan starts with this move.

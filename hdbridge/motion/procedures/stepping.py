@@ -17,7 +17,7 @@ class Standing:
     error_arcsec: float
     """Load encoder reading minus target, mean over the settled window, arcsec."""
     settle_s: float
-    """Time from the end of the move to standstill of the load."""
+    """Time from the end of the move to the standstill of the load."""
 
     @property
     def load_deg(self) -> float:
@@ -48,7 +48,7 @@ class Stepping:
     start_deg: float = 0.0
     """Load angle at the start."""
     precondition_deg: float = 2.0
-    """Load degrees; more than the width of any hysteresis."""
+    """Travel of the pre-conditioning move, load degrees; more than the width of any hysteresis."""
     settle: Settle = Settle()
 
     def __post_init__(self) -> None:

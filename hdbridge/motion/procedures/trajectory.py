@@ -23,7 +23,7 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Followed:
-    """Tracking error of the load, load encoder minus load target, arcsec."""
+    """Tracking error of the load (load encoder minus load target): rms and maximum."""
 
     rms_arcsec: float
     largest_arcsec: float
@@ -42,7 +42,7 @@ class Trajectory:
     load_deg: FloatArray
     """Load angles, shape (n,) with n of at least 2."""
     period_s: float
-    """Time between two angles."""
+    """Time between two successive angles."""
 
     def __post_init__(self) -> None:
         """Raises `InputError` for too few points, a non-finite value, or a period that is not positive."""
