@@ -52,6 +52,7 @@ def identifiability(
     """
     best, reasons = _examples(estimator, fitted, base)
     scales, spans = estimator.scales, {name: orthonormal(each.rest) for name, each in best.items()}
+    usual = _usual_changes_arcsec(estimator, base, fitted.hypothesis.start)
     result: dict[str, Identifiability] = {}
     for cause in causes():
         if cause not in best:
@@ -68,7 +69,7 @@ def identifiability(
             (math.sqrt(scales.penalty * example.rest.shape[1] + scales.enter) + POWER) / strength,
             estimator.floor_arcsec + POWER / strength,
             _named_from(_injected(estimator, fitted, example, base), context, scales),
-            _usual_arcsec(estimator, cause, base, fitted.hypothesis.start),
+            usual.get(cause, 0.0),
         )
         own = [*type(example.effect).proposals(estimator.data, ())]  # each is a possible instance
         waves = set(waves_alike(estimator, own, fitted.hypothesis.start))
@@ -187,18 +188,18 @@ def _named_from(injected: Gate, context: Context, scales: Scales) -> float:
     return math.inf
 
 
-def _usual_arcsec(estimator: Estimator, cause: str, base: Sequence[Effect], start: Start) -> float:
-    """Returns the smallest change of a loop's parameters that counts as more than a usual deviation.
-
-    It is 0 for other causes.
-    """
+def _usual_changes_arcsec(estimator: Estimator, base: Sequence[Effect], start: Start) -> dict[str, float]:
+    """Returns, by cause, the smallest change of a loop that exceeds the usual deviation, arcsec."""
     scales = estimator.scales
-    for given in base:
-        larger = given.fitted(2.0 * given.coefficients())
-        if given.part is Part.LOOP and cause in [each.name for each in causes_of(given, larger)]:
-            peak_arcsec = 0.5 * float(np.ptp(estimator.does(given, start)))
-            return scales.calibrations * scales.calibrated * peak_arcsec
-    return 0.0
+    return {
+        cause.name: 0.5
+        * float(np.ptp(estimator.does(given, start)))
+        * scales.calibrations
+        * scales.calibrated
+        for given in reversed(base)  # of several loops, the first one counts
+        if given.part is Part.LOOP
+        for cause in causes_of(given, given.fitted(2.0 * given.coefficients()))
+    }
 
 
 class _Background:

@@ -488,8 +488,8 @@ class State(NamedTuple):
         right = found.jacobian.T @ precision.apply(self.design.blocks.error_arcsec)
         mean, known = np.array(nuisances.prior).T
         right[: len(mean)] += known * mean
-        zeros = [at for at, name in enumerate(nuisances.names) if name.startswith("zero ")]
-        return System(found.information, right, np.flatnonzero(known > 0.0), np.array(zeros))
+        zeros = 2 * len(self.candidates) + np.arange(self.design.samples.zeros)
+        return System(found.information, right, np.flatnonzero(known > 0.0), zeros)
 
     def selected(self, system: System | None = None) -> State:
         """Returns the state with the orders that are significant at the current noise.

@@ -148,14 +148,14 @@ class _Candidates:
     """Candidate orders, after elimination of all other columns of the fit."""
 
     def __init__(self, number: int, system: System) -> None:
-        information, right, limited, _ = system
+        information, right, limited, zeros = system
         own, rest = np.arange(2 * number), np.arange(2 * number, len(right))
 
         self._information, explained = _eliminated(information, own, rest)
         self._right = right[own] - explained.T @ right[rest]
         self._if_limited_known, _ = _eliminated(information, own, np.setdiff1d(rest, limited))
         # About the zeros, because a long standstill at one angle does not determine any order.
-        centred, _ = _eliminated(information, own, system.zeros)
+        centred, _ = _eliminated(information, own, zeros)
         self._alone = np.maximum(np.diag(centred), 1e-9 * np.diag(information)[own])
         self.number = number
 

@@ -440,19 +440,20 @@ def with_measured(search: Search, fitted: Fitted) -> Fitted:
         for kind, piece in lookalikes(effect, estimator.data.ratio):
             others = [each for each in effect.pieces() if each != piece]
             without = hypothesis.instead(place, together(others)) if others else hypothesis.without(place)
-            tried = [without]
+            bare = estimator.fit(without)
+            tried = [bare]
             if not any(type(each) is kind for each in without.effects[base:]):
                 # All proposals are tried, because a non-linear spring differs from a linear one.
                 own = proposed(kind, estimator.data, hypothesis.effects[:base])
-                tried = [without.plus(each) for each in own]
-            for trial in sorted((estimator.fit(each) for each in tried), key=search.cost):
+                tried = [estimator.fit(without.plus(each)) for each in own]
+            for trial in sorted(tried, key=search.cost):
                 driven = [each for each in trial.hypothesis.effects if type(each) is kind]
                 if any(each.violations() for each in driven):
                     continue
                 start = trial.hypothesis.start
                 lost = sum(estimator.channel_noise(each, start) @ each.coefficients() ** 2 for each in driven)
-                margin = search.margin(fitted, estimator.fit(without))
-                if search.cost(trial) - search.cost(fitted) < margin + scales.noisy * float(lost):
+                most = search.cost(fitted) + search.margin(fitted, bare) + scales.noisy * float(lost)
+                if search.cost(trial) < most:
                     return trial
                 break
     return fitted
@@ -547,7 +548,7 @@ def _share_in(effect: Effect, orders: Container[float]) -> float:
 def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:
     """Chooses, among equivalent parametrisations (`Effect.retold`), the one that keeps the ``given`` model.
 
-    Returns ``fitted`` if there is none.
+    Returns ``fitted`` unchanged without an equivalent one.
     """
     effects = fitted.hypothesis.effects
     for place in range(len(given), len(effects)):

@@ -160,7 +160,7 @@ class LatencyReport:
 
     @property
     def carried_s(self) -> float | None:
-        """Shortest measured period that the computer sustains with all longer ones; None if there is none."""
+        """Shortest measured period that the computer sustains with all longer ones; None without one."""
         best = None
         for each in reversed(self.measurements):
             if not each.carried:

@@ -54,7 +54,7 @@ class NodeStatus:
         return self.boot_ups, self.heartbeats, self.emergency_count
 
     def heard_since(self, counts: tuple[int, int, int]) -> str:
-        """Describes the messages of the node since these counts; empty if there are none."""
+        """Describes the messages of the node since these counts; empty if nothing was received."""
         boot_ups, heartbeats, emergencies = counts
         said = []
         if self.boot_ups > boot_ups:

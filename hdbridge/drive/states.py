@@ -139,7 +139,7 @@ def decode(statusword: int | None) -> State:
 
 
 def row_for(state: State, command: Command) -> Transition:
-    """Returns the row of ``command`` in ``state``; raises `TransitionError` if there is none."""
+    """Returns the row of ``command`` in ``state``; raises `TransitionError` for an illegal command."""
     for row in TRANSITIONS:
         if row.source is state and row.command is command:
             return row

@@ -110,7 +110,7 @@ class CsvFile:
         return dict(zip(self.names, self._layout.units, strict=False))
 
     def find(self, column: str) -> str | None:
-        """Returns the name of a column that is given by name or number; None if there is none.
+        """Returns the name of a column that is given by name or number; None for an unknown column.
 
         Raises `InputError` if two columns have this name.
         """

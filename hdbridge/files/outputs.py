@@ -118,7 +118,7 @@ def _check_file(
 def _check_belongs_to_no_folder(output: Output) -> None:
     """Refuses to overwrite a file of a profile or a recording.
 
-    A model may be written as the pending model, or as the active model if there is none.
+    A model may be written as the pending model, or as the active model of a profile that has no model.
     """
     path = _resolved(output.path)
     folder, name = path.parent, path.name.casefold()

@@ -21,7 +21,7 @@ def bundled_folder(kind: Literal["eds", "profiles"], package: Path = _PACKAGE) -
 def bundled_profile(name: str) -> Path:
     """Returns the folder of a bundled profile.
 
-    If there is none, raises `InputError` with the existing profiles and the nearest name.
+    Raises `InputError` with the existing profiles and the nearest name for an unknown one.
     """
     folder = bundled_folder("profiles")
     if name and (folder / name / "axis.yaml").is_file():
@@ -63,7 +63,7 @@ class Profile:
 
     @classmethod
     def find(cls, text: str, base: Path = Path()) -> Self:
-        """Finds a profile, given its folder, axis file or bundled name; raises `InputError` if there is none.
+        """Finds a profile by its folder, axis file or bundled name; raises `InputError` for an unknown one.
 
         A relative path is relative to ``base``.
         """

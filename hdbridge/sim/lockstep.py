@@ -164,7 +164,7 @@ class LockstepBus(can.BusABC):
             node.poll(now_s)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Returns the next frame; if there is none, advances the time by up to ``timeout`` virtual seconds.
+        """Returns the next frame; waits up to ``timeout`` virtual seconds for it.
 
         Raises CanOperationError after ``LONGEST_WAIT_S`` without a frame if no time-out is given.
         """

@@ -127,7 +127,7 @@ class Page:
 
 @contextmanager
 def browser() -> Iterator[Page]:
-    """Provides a page of a new Chromium; skips the test with a reason if there is none."""
+    """Provides a page of a new Chromium; skips the test with a reason if Chromium is not installed."""
     found = subprocess.run([FINDER], capture_output=True, text=True, check=False)
     if found.returncode:
         pytest.skip(found.stderr.strip())

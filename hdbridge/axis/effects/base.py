@@ -172,7 +172,7 @@ class Effect(Law):
         """Yields candidates of this kind for a record and the model ``base``, over their shape parameters.
 
         Their coefficients are arbitrary. By default, they are `candidate` with shape parameters on a grid
-        over their ranges. There are none if the model lacks a part that the effect would scale.
+        over their ranges. A model that lacks a part which the effect would scale has no candidate.
         """
         if not set(cls.carries) <= {each.part for each in base} | {Part.GROWTH}:
             return
@@ -288,7 +288,7 @@ class Effect(Law):
         return None
 
     def found_in(self, effects: Sequence[Effect]) -> Effect:
-        """Returns the instance of this kind among ``effects``; the effect itself if there is none."""
+        """Returns the effect of this kind among ``effects``; this effect if no other is of its kind."""
         return next((each for each in effects if type(each) is type(self)), self)
 
     def tidied(self, ratio: float) -> Self:

@@ -148,7 +148,7 @@ class Store(Generic[K]):
     def find(self, profile: Path, name: str) -> Version[K]:
         """Returns a version by name: ``active``, ``pending`` or a number.
 
-        If there is none, raises `InputError` with the existing names.
+        Raises `InputError` with the existing names for an unknown one.
         """
         versions = self.log(profile)
         for version in versions:
@@ -199,7 +199,7 @@ class Store(Generic[K]):
         return number
 
     def discard(self, profile: Path) -> None:
-        """Deletes the pending version; raises `InputError` if there is none."""
+        """Deletes the pending version; raises `InputError` without one."""
         with _locked(profile):
             try:
                 (profile / self.pending).unlink()

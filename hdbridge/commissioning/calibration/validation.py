@@ -80,8 +80,9 @@ class Validation:
     @property
     def improves(self) -> bool:
         """True if positioning is not significantly worse with the new model."""
-        worse = _chance(sum(map(len, self.after.errors_arcsec)))
-        return self.after.pooled.three_sigma_arcsec <= worse * self.before.pooled.three_sigma_arcsec
+        return not _exceeds(
+            self.after.pooled.three_sigma_arcsec, self.before.pooled.three_sigma_arcsec, self.after
+        )
 
     @property
     def worse(self) -> tuple[str, ...]:
@@ -199,12 +200,14 @@ def validate(
         ("after", "the new model"),
     ):
         bench, run = stepped(name, model)
-        if name == "after" and _arrives_otherwise(Stepped.of(words, run.outcome)):
+        test = Stepped.of(words, run.outcome)
+        if name == "after" and _arrives_otherwise(test):
             model = at_rest(model, run)
             bench, run = stepped(name, model)
-        results.append(Stepped.of(words, run.outcome))
+            test = Stepped.of(words, run.outcome)
+        results.append(test)
         notes += lines([(f"stepping {name}", run.survived)])
-        if name == "after" and _exceeds(_within_directions(results[1]), floor.three_sigma_arcsec, results[1]):
+        if name == "after" and _exceeds(_within_directions(test), floor.three_sigma_arcsec, test):
             notes += _turning_back(run, axis)
         if positioning:
             pace.begin(f"positioning {name}")

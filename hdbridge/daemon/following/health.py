@@ -172,17 +172,17 @@ class Jump(NamedTuple):
     allowed_arcsec: float
 
 
-def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float, swing_s2: float) -> Jump | None:
+def find_jump(
+    found: Residuals, steps_arcsec: FloatArray, noise_arcsec: float, count_arcsec: float, swing_s2: float
+) -> Jump | None:
     """Returns the first step of the residual that neither noise nor motion nor model can cause.
 
     ``noise_arcsec`` is the standard deviation of one reading, ``count_arcsec`` a motor encoder count at the
     load, ``swing_s2`` the largest step per acceleration.
     """
-    span = 2 * SIDE
-    if len(found) < span:
+    if not len(steps_arcsec):
         return None
-    middle = _median(found["residual_arcsec"])
-    step = middle[SIDE:] - middle[:-SIDE]
+    span = 2 * SIDE
     turned = _ranges(span, found["motor_deg"])
     allowed = (
         SIGMAS * noise_arcsec * MEDIAN_ERROR * np.sqrt(2.0 / SIDE)
@@ -190,32 +190,36 @@ def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float, swing_
         + _motion_arcsec(found, span, swing_s2)
         + UNMODELLED_ARCSEC * np.minimum(turned / UNMODELLED_DEG, 1.0)
     )
-    rows = np.flatnonzero(_together(found, span) & (np.abs(step) > allowed))
+    rows = np.flatnonzero(np.abs(steps_arcsec) > allowed)
     if not len(rows):
         return None
     # Several windows contain the step; the one centred on it shows it best.
     near = rows[rows < rows[0] + span]
-    row = int(near[np.argmax(np.abs(step[near]))])
-    return Jump(row + SIDE, float(step[row]), float(allowed[row]))
+    row = int(near[np.argmax(np.abs(steps_arcsec[near]))])
+    return Jump(row + SIDE, float(steps_arcsec[row]), float(allowed[row]))
 
 
-def swing_s2(found: Residuals) -> float:
-    """Returns the largest step of the residual per acceleration; 0 without acceleration."""
+def seen_swing_s2(found: Residuals, steps_arcsec: FloatArray) -> float:
+    """Returns the largest of the `steps` per acceleration; 0 without acceleration."""
+    if not len(steps_arcsec):
+        return 0.0
+    shaken = _windows(found["shaken_deg_s2"], 2 * SIDE).max(axis=0)
+    rows = shaken > 0.5 * np.max(shaken)
+    return float(np.max(np.abs(steps_arcsec[rows]) / shaken[rows], initial=0.0)) / ARCSEC_PER_DEG
+
+
+def steps(found: Residuals) -> FloatArray:
+    """Returns the step of the residual in the middle of each window of 2 `SIDE` samples, arcsec.
+
+    It is 0 for windows with a gap or an unusable sample.
+    """
     span = 2 * SIDE
     if len(found) < span:
-        return 0.0
+        return np.zeros(0)
     middle = _median(found["residual_arcsec"])
-    step = np.abs(middle[SIDE:] - middle[:-SIDE]) / ARCSEC_PER_DEG
-    shaken = _windows(found["shaken_deg_s2"], span).max(axis=0)
-    rows = _together(found, span) & (shaken > 0.5 * np.max(shaken, initial=0.0))
-    return float(np.max(step[rows] / shaken[rows], initial=0.0))
-
-
-def _together(found: Residuals, span: int) -> BoolArray:
-    """Returns a mask of the windows of usable samples without a gap."""
-    usable = np.all(_windows(found["usable"], span), axis=0)
-    usable &= found["cycle"][span - 1 :] - found["cycle"][: len(usable)] < 2 * span
-    return np.asarray(usable)
+    together = np.all(_windows(found["usable"], span), axis=0)
+    together &= found["cycle"][span - 1 :] - found["cycle"][: len(together)] < 2 * span
+    return np.where(together, middle[SIDE:] - middle[:-SIDE], 0.0)
 
 
 def misread(found: Residuals, noise_arcsec: float, count_arcsec: float, swing_s2: float) -> int:
@@ -383,12 +387,13 @@ class EncoderHealth:
     def _judge_steps(self, found: Residuals) -> None:
         noise = self._usual(standing=bool(np.all(_standing(found))))
         if len(found) > 1:
-            steps = np.abs(np.diff(found["residual_arcsec"]))
-            noise = max(noise, MEDIAN_DIFFERENCE * float(np.median(steps)))
+            differences = np.abs(np.diff(found["residual_arcsec"]))
+            noise = max(noise, MEDIAN_DIFFERENCE * float(np.median(differences)))
         swing = SWING * SOFTEST_S2
         if len(self._swings_s2) >= LEARNING_BLOCKS:
             swing = SWING * float(np.clip(np.quantile(self._swings_s2, 0.9), STIFFEST_S2, SOFTEST_S2))
-        jump = find_jump(found, noise, self._count_arcsec, swing)
+        steps_arcsec = steps(found)
+        jump = find_jump(found, steps_arcsec, noise, self._count_arcsec, swing)
         # A frozen reading ends with a jump.
         if jump is not None and self.status.fault is not EncoderFault.FROZEN:
             moved = float(np.ptp(found["motor_deg"][jump.row - SIDE : jump.row + SIDE])) / self._ratio
@@ -399,7 +404,7 @@ class EncoderHealth:
                 f"at most {jump.allowed_arcsec:.1f})",
             )
         if jump is None and len(self._swings_s2) < MAX_LEARNING_BLOCKS:
-            usual = swing_s2(found)
+            usual = seen_swing_s2(found, steps_arcsec)
             if usual:
                 self._swings_s2.append(usual)
         # Excludes the samples that the next batch repeats.
@@ -419,10 +424,8 @@ class EncoderHealth:
         """
         standing = _standing(found)
         before, since_s = self._since
-        begins = np.flatnonzero(standing != np.append(before, standing[:-1]))
-        since = np.full(len(found), since_s)
-        for first in begins.tolist():
-            since[first:] = found["time_s"][first]
+        changed = standing != np.append(before, standing[:-1])
+        since = np.maximum.accumulate(np.where(changed, found["time_s"], since_s))
         self._since = (bool(standing[-1]), float(since[-1]))
         taken = found["usable"] & (found["time_s"] - since >= SETTLE_S)
         for kind, pending in self._pending.items():

@@ -283,7 +283,7 @@ class ServiceAxis:
             await self._use(await self._work(self.models.moved, model))
 
     def followed(self, holder: str) -> Following:
-        """Returns the adaptation for a change; InputError if there is none."""
+        """Returns the adaptation, to change it; InputError for an axis without adaptation."""
         self.core.lease.check(holder)
         if self.following is None:
             raise InputError(
