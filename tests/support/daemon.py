@@ -1,7 +1,7 @@
 """Control loop of the daemon with simulated drives, in one thread on virtual time: `SteppedDaemon`.
 
-Waiting on the service's side turns the loop: `SteppedClock.sleep_until` and `SteppedRelay.recv` run as many
-turns as fit. So the service runs here unchanged, as fast as the processor allows.
+Waiting on the service's side runs the loop: `SteppedClock.sleep_until` and `SteppedRelay.recv` run as many
+cycles as the waiting time allows. The service is therefore unchanged, and as fast as the processor permits.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ EVENTS_KEPT = 1000
 
 
 class SteppedClock:
-    """Clock of the service; waiting on it turns the loop."""
+    """Clock of the service; waiting on it runs cycles of the loop."""
 
     def __init__(self, daemon: SteppedDaemon) -> None:
         self._daemon = daemon
@@ -53,7 +53,7 @@ class SteppedClock:
 
 
 class SteppedRelay(can.BusABC):
-    """Service's end of the relay: the loop sends its frames, and turns while it waits."""
+    """Service's end of the relay: the loop sends its frames, and runs while the service waits."""
 
     def __init__(self, daemon: SteppedDaemon) -> None:
         super().__init__(channel=None)
@@ -84,7 +84,7 @@ class SteppedRelay(can.BusABC):
 
 
 class SteppedDaemon:
-    """Control loop with its simulated drives, and the actions of a service."""
+    """Control loop with its simulated drives, and the actions that a service performs."""
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class SteppedDaemon:
     def turn(self, turns: int = 1) -> None:
         for _ in range(turns):
             self.controller.turn()
-        self.intruder.queue.queue.clear()  # never read, so it would grow
+        self.intruder.queue.queue.clear()  # nobody reads this queue, so it would grow
         events, lost = self._events.read()
         assert lost == 0
         self.events.extend(events)
@@ -144,7 +144,7 @@ class SteppedDaemon:
         return self.memory.commands.post(kind, axis, **fields)  # type: ignore[arg-type]
 
     def order(self, kind: CommandKind, axis: int = 0, timeout_s: float = 5.0, **fields: float) -> Event:
-        """Posts a command and turns until it is answered."""
+        """Posts a command and runs cycles until it is answered; returns the answer."""
         id_ = self.post(kind, axis, **fields)
         answers = (EventKind.DONE, EventKind.REFUSED)
         found: list[Event] = []
@@ -171,7 +171,7 @@ class SteppedDaemon:
         return CompensationSetting(model, scheme, load_loop=load_loop)
 
     def use(self, setting: CompensationSetting, axis: int = 0) -> None:
-        """Makes the loop compensate by a setting."""
+        """Makes the loop use a compensation setting."""
         self.done(CommandKind.CHANGE, axis, i=self.memory.settings[axis].put(setting.to_json()))
 
     def drive(self, axis: int) -> Drive:
@@ -213,7 +213,7 @@ class SteppedDaemon:
         return any(each.kind is EventKind.MOTION_ENDED and each.id == id_ for each in self.events)
 
     def stream(self, knots: dict[int, Sequence[tuple[float, float, float]]], timeout_s: float = 0.5) -> Event:
-        """Begins a stream of one or several axes, with knots (time, position, velocity) queued before."""
+        """Queues knots (time, position, velocity) of one or several axes and begins their stream."""
         self._streams += 1
         for axis, points in knots.items():
             wanted = [Knot(self._streams, *point) for point in points]
@@ -224,7 +224,7 @@ class SteppedDaemon:
     # ---------------------------------------------------------------- what goes wrong
 
     def interfere(self, can_id: int, data: bytes = b"", **kind: bool) -> None:
-        """Sends a frame from another node, before the next turn."""
+        """Sends a frame from another node, before the next cycle."""
         kind = {"is_extended_id": False, **kind}
         self.intruder.send(can.Message(arbitration_id=can_id, data=data, **kind))
 
@@ -239,7 +239,7 @@ class SteppedDaemon:
 
 
 def article_axes(count: int = 1, profile: Path = PROFILE) -> list[AxisConfig]:
-    """Returns ``count`` axes of one kind on one bus: nodes 1, 2, ..."""
+    """Returns ``count`` equal axes on one bus: nodes 1, 2, ..."""
     first = AxisConfig.load(profile)
     return [
         first.model_copy(

@@ -1,4 +1,5 @@
-"""Examples of every effect, and motions with every channel, sampled unevenly."""
+"""Strategies for random examples of every effect, and for motions with every channel, also unevenly
+sampled."""
 
 import numpy as np
 from hypothesis import strategies as st
@@ -155,7 +156,7 @@ EXAMPLES = {name: st.just(kind.candidate(50.0, BASE)) for name, kind in CATALOGU
         ratio=ratios, height_arcsec=signed, centre_deg=st.floats(0, 360), half_width_deg=st.floats(0.1, 20),
     ),
 }  # fmt: skip
-"""Strategies for effects of each kind, usually of typical size, by effect name."""
+"""Hypothesis strategies for effects, usually of typical size, by effect name."""
 
 angle_steps = st.lists(
     st.one_of(st.sampled_from([0.0, 1e-6, -1e-6]), st.floats(-30, 30, allow_subnormal=False)),
@@ -166,7 +167,7 @@ starts = st.sampled_from(list(Start))
 
 
 def _motion(first, steps, seed, even):
-    """Makes a path with all other channels drawn at random."""
+    """Returns a path with all other channels drawn at random."""
     angle = np.cumsum(np.array([first, *steps]))
     draw = np.random.default_rng(seed)
     count = len(angle)

@@ -1,7 +1,7 @@
-"""Machine without drives behind the API: it records requests and moves nothing.
+"""Machine without drives, for tests of the API: it records requests and moves nothing.
 
-The lease is the real one, so permission to move is decided as in the daemon; targets are checked against the
-axis's limits.
+The lease is the real one, so that permission to move is decided as in the daemon; targets are checked against
+the limits of the axis.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ STATUSWORD = Object(0x6041, 0, "Statusword", 6, IntegerType("uint16"))
 
 
 class FakeAxis:
-    """Axis that is always at its last target."""
+    """Axis that is always at its latest target."""
 
     def __init__(self, bridge: FakeBridge, name: str) -> None:
         self._bridge = bridge
@@ -45,7 +45,7 @@ class FakeAxis:
         self.outer: messages.OuterState | None = None
         self.queued: list[messages.QueueItem] = []
         self.moving_s = 0.0
-        """Duration of a move."""
+        """Duration of a move, s."""
 
     def state(self) -> messages.AxisState:
         fault = None
@@ -194,11 +194,11 @@ class FakeStream:
 
 
 class FakeBridge:
-    """Machine with some axes; ``moved`` lists requests that needed the lease, ``stopped`` all others."""
+    """Machine with several axes; ``moved`` lists the requests for motion, ``stopped`` the stops."""
 
     def __init__(self, *names: str, lease_s: float = 10.0) -> None:
         self.now_s: float | None = None
-        """Time of the lease if the test sets it; None for the computer's clock."""
+        """Time for the lease if the test sets it; None for the computer's clock."""
         self.lease = Lease(lease_s, lambda: time.monotonic() if self.now_s is None else self.now_s)
         self.axes = {name: FakeAxis(self, name) for name in names or ("joint-1", "joint-2")}
         self.moved: list[tuple[Any, ...]] = []
@@ -209,7 +209,7 @@ class FakeBridge:
         self.batch_s = 0.005
         self.rows = 5
         self.sent_cycles = 0
-        """Number of cycles that were offered to subscribers."""
+        """Number of cycles offered to subscribers so far."""
 
     def state(self) -> messages.MachineState:
         holder = self.lease.holder
@@ -251,7 +251,7 @@ class FakeBridge:
             await self.axes[name].move(holder, target_deg, wait=wait)
 
     async def subscribe(self, most: int = 512) -> AsyncIterator[Batch]:
-        """Yields batches without end; of rows not fetched in time only the newest ``most`` are kept."""
+        """Yields batches endlessly; of the rows not fetched in time, only the newest ``most`` are kept."""
         queue: asyncio.Queue[None] = asyncio.Queue(1)
         waiting: list[int] = []
         cycle = lost = 0

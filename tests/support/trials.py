@@ -1,4 +1,4 @@
-"""Trials of the diagnosis: random causes hidden in records from formulas, and the verdict on its result.
+"""Trials of the diagnosis: random causes in records computed from formulas, and a verdict on the result.
 
 The plant (plant.py) shares no code with the effects.
 """
@@ -17,11 +17,11 @@ SHORT = plant.Plan(rate_hz=16.0, scale=0.2, load_turns=1.05, steps=16)
 """Plan of about 15,000 samples."""
 SYNONYMS = {"motor_encoder_eccentricity": {"motor_order"}, "motor_order": {"motor_encoder_eccentricity"}}
 FORMS = frozenset({"at", "width", "tau", "hz", "lines", "reference", "shear", "t1", "build"})
-"""Parameters of an effect that are not a size."""
+"""Parameters of an effect that do not scale with its size."""
 
 
 def drawn(cause: str, rng: np.random.Generator) -> tuple[dict[str, dict[str, object]], dict[str, object]]:
-    """Draws an effect of about three arcsec or more; returns it and the axis properties that it needs."""
+    """Draws an effect of about three arcsec or more; returns the effect and the axis properties it needs."""
     size = float(3.0 * (1 + rng.random()) * rng.choice([-1, 1]))
     phase = float(rng.uniform(0, 360))
     big = abs(size)
@@ -111,7 +111,7 @@ LOOPS = {"hysteresis_memory", "hysteresis_parameters"}
 def planted(
     name: str, seed: int, plan: plant.Plan | None = None
 ) -> tuple[set[str], Record, TransmissionModel]:
-    """Returns the causes present, the record, and the model to be tested."""
+    """Returns the causes present, a record with these causes, and the model to be diagnosed."""
     rng = np.random.default_rng(1000 * seed + 17)
     effects: dict[str, dict[str, object]] = {}
     axis: dict[str, object] = {}
@@ -140,10 +140,10 @@ def planted(
 
 @dataclass(frozen=True)
 class Verdict:
-    """Agreement of the reported causes with those present."""
+    """Agreement of the reported causes with the causes present."""
 
     all_right: bool
-    """True if each hidden cause is reported, or an alias of a reported one."""
+    """True if each cause present is reported, or is an alias of a reported cause."""
     first_right: bool
     wrong: tuple[str, ...]
     """Reported causes that are not present."""
@@ -151,7 +151,7 @@ class Verdict:
 
 
 def verdict(name: str, there: Set[str], found: Mapping[str, Set[str]]) -> Verdict:
-    """Judges the reported names (most important first, with aliases) in the record ``name`` of `planted`."""
+    """Judges the reported causes (most important first, with their aliases) for the record ``name``."""
     right = [
         any(
             each == cause or each in aliases or cause in SYNONYMS.get(each, ())
