@@ -18,11 +18,9 @@ if TYPE_CHECKING:
 
 
 TOOTH_SHARE: Final = 0.35
-"""Maximum error of a ratio, as a fraction of the distance to the neighbouring ratio (N and N + 1 differ by
-1/N)."""
+"""Maximum error of a ratio, relative to the distance to its neighbour (N and N + 1 differ by 1/N)."""
 CLOSE_SHARE: Final = 0.001
-"""Relative error of a sound gear's ratio when measured over one motor turn: 26 arcsec at the load for N =
-50."""
+"""Relative error of a sound gear's ratio over one motor turn: 26 arcsec at the load for N = 50."""
 DEAD_SHARE: Final = 0.02
 """Fraction of the expected travel below which a load encoder counts as not moving."""
 USUAL_RATIOS: Final = frozenset(

@@ -322,8 +322,7 @@ class ServoCheck:
     stored_lag_ms: float
     lag_ms: float
     difference: float
-    """Rms difference between measured and stored response, as a fraction of the ripple
-    (`Answers.difference`)."""
+    """Rms difference of the measured from the stored response, relative to the ripple (`Answers`)."""
 
     @property
     def agrees(self) -> bool:
@@ -383,9 +382,7 @@ class _Runner:
         return self._harmonics(self._run(name, model, self.procedure))
 
     def check(self, model: TransmissionModel) -> tuple[tuple[Harmonics, ...], ServoCheck]:
-        """Runs the axis at all speeds with a model that has a response, and compares the motor's response
-        with the stored one.
-        """
+        """Runs the axis at all speeds with a model; compares the motor's response with the model's."""
         stored, runs = model.response, self._run("filtered correction", model, self.procedure)
         assert stored is not None
         answers = Answers(stored, self.motor_orders, self.ratio)

@@ -45,8 +45,7 @@ class PathError:
     settle_s: float
     """Time from the end of the path until the load has settled."""
     delayed_arcsec: float
-    """Rms error over the path relative to the delayed target, with wind-up and the servo's acceleration
-    error."""
+    """Rms error over the path relative to the delayed target, wind-up and servo error included."""
 
 
 def path_errors(variants: Sequence[Sequence[PathRun]], ratio: float, lag_s: float) -> list[list[PathError]]:

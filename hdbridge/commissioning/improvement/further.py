@@ -137,8 +137,7 @@ def choose(
     view: AxisView,
     done: Collection[str] = (),
 ) -> Choice | None:
-    """Returns the shortest experiment, not yet ``done``, that separates the most causes from their
-    ``rivals``.
+    """Returns the shortest experiment not ``done`` that separates the most causes from their ``rivals``.
 
     If none separates any, returns the experiment for the coordinate of an unexplained residual, or None if no
     experiment of the axis is of use.
