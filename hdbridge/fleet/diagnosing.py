@@ -191,9 +191,7 @@ def _of_samples(recording: Recording) -> Row:
 
 
 def _key(row: Mapping[str, Any]) -> str:
-    """Returns the hash of samples, model and version; without a diagnosis, of samples, joint, reason,
-    version.
-    """
+    """Hashes samples, model and version; without a diagnosis, samples, joint, reason and version."""
     if row.get("reason"):
         parts = [row.get("samples_sha256", ""), row["joint"], row["reason"], row["version"]]
     else:

@@ -130,8 +130,7 @@ def watch(
     report: Callable[[str], None] = lambda _: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Passes sources and ``retried`` to ``diagnose`` whenever some are new, until interrupted or ``once``
-    only.
+    """Passes sources and ``retried`` to ``diagnose`` whenever some are new, until interrupted, or ``once``.
 
     A recording is ready once two listings, ``interval_s`` apart, agree on it, so a recording that is still
     being written waits for a later round. The first call receives all ready recordings, because models may

@@ -35,8 +35,7 @@ EVERYDAY_SHARE: Final = 0.05
 """Normal relative difference of an order's amplitude between two recordings of one joint."""
 AGREE: Final = 1e-4
 DISAGREE: Final = 1e-12
-"""Chi-square tail probabilities below which orders do not agree (`AGREE`) or certainly differ
-(`DISAGREE`)."""
+"""Chi-square tail probabilities below which orders do not agree, or certainly differ."""
 
 
 @dataclass(frozen=True, slots=True)
