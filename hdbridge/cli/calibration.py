@@ -115,8 +115,7 @@ class Measurement:
 
     @contextmanager
     def booted(self) -> Iterator[tuple[Drive, Callable[[str, float, float], None], Callable[[], bool]]]:
-        """Yields the booted drive, a function that shows progress, and one that returns True once an end is
-        requested.
+        """Yields the booted drive, and functions that show progress and return True once an end is requested.
 
         Locks the axis against other measurements. If the measurement fails, prints the location of its
         record; removes an empty folder.
@@ -141,9 +140,7 @@ class Measurement:
 
 @contextmanager
 def phases() -> Iterator[Callable[[str, float, float], None]]:
-    """Yields a progress function that shows one bar per phase; a phase is identified by its total duration,
-    s.
-    """
+    """Yields a progress function that shows one bar per phase; the total duration, s, identifies a phase."""
     with progress_bar() as bar:
         bars: dict[float, int] = {}
 
