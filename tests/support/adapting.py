@@ -214,9 +214,7 @@ class Work:
         return self._drive.link.clock.now()
 
     def step(self, count: int = 16, step_deg: float = 43.56) -> None:
-        """Runs a stepping test; each starts at another angle, because equal angles do not separate the
-        orders.
-        """
+        """Runs a stepping test at new angles, because repeated angles do not separate the orders."""
         start_deg = SPAN_DEG * math.fmod(GOLDEN * len(self.errors_arcsec), 1.0)
         self._loads_deg.clear()
         run = self._bench.run(Stepping(count=count, step_deg=step_deg, start_deg=start_deg))

@@ -1,5 +1,4 @@
-"""Drives that conform to CiA 402 but behave differently where the standard leaves a choice to the
-firmware."""
+"""Drives that conform to CiA 402 but differ in behaviour that the standard leaves to the firmware."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

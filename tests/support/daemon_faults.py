@@ -67,9 +67,7 @@ def _bus_off(bench: DaemonBench) -> tuple[str, int, int]:
 
 
 def _stops(bench: DaemonBench, fault: str, end: str, *how: str) -> tuple[str, int, int]:
-    """Disturbs the frames that leave an end of the cable, checks that the axis stops, and ends the
-    disturbance.
-    """
+    """Disturbs the frames that leave an end of the cable until the axis has stopped."""
     with ExitStack() as spoilt:
         made = bench.made(lambda: spoilt.enter_context(bench.cable.spoilt(end, *how)))
         cycles = bench.reported(made, "fault", NOTICED, Fault[fault].value, "quick stop")

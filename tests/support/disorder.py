@@ -57,14 +57,13 @@ class Laws:
         self.word = 0
         self.following = False
         self.mapped = self.operational = True
-        """True while the master's PDO mapping is in force, so that an RPDO takes effect at SYNC, not at
+        """True while the master's PDO mapping is in force: an RPDO then takes effect at SYNC, else at
         once."""
         self.unasked = ""
         """Reason why the present following is unrequested, if it moves; empty if it was requested."""
         self.lowest = self.highest = self.began_deg = 0.0
         self.periods = self.moved = self.enabled = 0
-        """Numbers of cycles checked, of cycles with a moving set-point, and of times the master enabled
-        it."""
+        """Number of cycles checked, of cycles with a moving set-point, and of enablings by the master."""
         self.before: tuple[int, float] | None = None
 
     def sent(self, word: int) -> None:

@@ -1,5 +1,4 @@
-"""Strategies for random examples of every effect, and for motions with every channel, also unevenly
-sampled."""
+"""Strategies for random effects of every kind, and for motions with every channel, also sampled unevenly."""
 
 import numpy as np
 from hypothesis import strategies as st

@@ -1,5 +1,4 @@
-"""Linear filter, and test of a claimed rate, without the second that loading scipy.signal and scipy.stats
-takes."""
+"""Linear filter and test of a claimed rate, without scipy.signal and scipy.stats, which load slowly."""
 
 from collections.abc import Sequence
 

@@ -1,7 +1,7 @@
-"""Faults on the outer master's bus, and of the processes between this bus and the axis, with the time to
-stop.
+"""Faults on the outer master's bus and of the processes between it and the axis, with the time to stop.
 
-Each happens while the axis follows the master at half its maximum speed. The true load is observed."""
+Each happens while the axis follows the master at half its maximum speed. The true load is observed.
+"""
 
 import errno
 import math
@@ -14,8 +14,7 @@ from support.service import play
 
 SPEED_DEG_S = 10.0
 STANDING_DEG = 0.005
-"""Maximum movement of a load that counts as at rest; it rings, and at 10 deg/s it moves 0.04 deg per
-cycle."""
+"""Maximum movement of a load at rest, degrees; it rings, and at 10 deg/s it moves 0.04 deg per cycle."""
 OBSERVED_S = 0.7
 STANDS_S = 0.3
 

@@ -1,5 +1,4 @@
-"""Article's axis with raised limits, at which its servo attenuates the correction, and its measured
-response."""
+"""Article's axis with raised limits, at which the servo attenuates the correction; measured response."""
 
 import re
 import shutil

@@ -1,5 +1,4 @@
-"""Load torque and temperature channels: lines for an axis file, and functions that stop and resume their
-TPDO."""
+"""Load torque and temperature channels: lines for an axis file; functions that stop and resume the TPDO."""
 
 CHANNELS = """
 load_torque:

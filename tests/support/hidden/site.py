@@ -98,9 +98,7 @@ class Site:
         return self.rng.uniform(low + 0.1 * (high - low), high - 0.1 * (high - low))
 
     def tooth_peak_arcsec(self, shift_deg: float | None = None) -> float:
-        """Returns the peak of the tooth error over the motor angle, or of its change under a shift of the
-        angle.
-        """
+        """Returns the peak of the tooth error over the motor angle, or of its change by a shift, arcsec."""
         orders = Orders(self.truth.gear.motor_orders)
         if not self.truth.gear.motor_orders:
             raise ValueError("this axis has no tooth error by motor angle")
