@@ -1,12 +1,12 @@
-"""Computes all figures of docs/method.md, which show why the article's Tables 1 and 2 cannot give its Table
-3.
+"""Computes all figures of docs/method.md: why the article's Tables 1 and 2 cannot give its Table 3.
 
     python tools/article_table3.py [--json FILE] [--simulate] [--as-data]
 
 The axis is ideal except for the article's own error model and the resolution of its two encoders: no
 dynamics, no noise. The hysteresis law is that of the project's effects; the inverse and the statistics are
 computed here independently, so that they also check the compensation. ``--simulate`` runs the same test on
-the simulated drive (half a minute) and compares the errors step by step."""
+the simulated drive (half a minute) and compares the errors step by step.
+"""
 
 from __future__ import annotations
 
@@ -73,9 +73,7 @@ def step_errors(
     motor_counts: int = MOTOR_COUNTS,
     target: Target = exact,
 ) -> tuple[list[float], list[float]]:
-    """Returns the load error at rest after each step, arcsec, outward (240) and back (240), with quantised
-    encoders.
-    """
+    """Returns the load errors at rest, arcsec, outward (240) and back (240), with quantised encoders."""
     told, real = compensated.tracker(Start.FORWARD), gear.tracker(Start.FORWARD)
     told.advance(0.0, NOW)
     real.advance(0.0, NOW)
@@ -256,7 +254,7 @@ def as_data(result: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def simulated() -> dict[str, Any]:
-    """Runs the test on the simulated drive; returns its figures, and the deviations from the computed steps."""
+    """Runs the test on the simulated drive; returns its figures and deviations from the computed steps."""
     profile = bundled_profile("article")
     axis = AxisConfig.load(profile / "axis.yaml")
     model = TransmissionModel.load(profile / "model.yaml")

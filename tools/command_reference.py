@@ -113,7 +113,7 @@ class Command:
 
 
 def commands() -> Iterator[Command]:
-    """Yields all commands in the order of the overview; a command of a group has the group's name in front."""
+    """Yields all commands in the order of the overview; those of a group have its name as a prefix."""
     for panel in PANELS.values():
         for name in panel:
             loaded = load(name)
@@ -171,9 +171,7 @@ def _section(command: Command, common: Container[Parameter], general: Container[
 
 
 def _common_item(parameter: Parameter, names: list[str], meanings: Mapping[str, int]) -> str:
-    """Returns the list item of a shared option, with its commands if the option has another meaning
-    elsewhere.
-    """
+    """Returns the item of a shared option, with its commands if it has another meaning elsewhere."""
     groups = {name.split()[0] for name in names}
     if meanings[parameter.names[0]] == 1:
         owner = ""

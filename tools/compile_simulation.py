@@ -1,5 +1,4 @@
-"""Compiles the loops of the simulated axis and caches them on disk, for tests that run in several
-processes."""
+"""Compiles the loops of the simulated axis and caches them on disk, for tests in several processes."""
 
 from __future__ import annotations
 

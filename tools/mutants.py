@@ -1,5 +1,4 @@
-"""Mutation testing of the pure modules: changes one operator or number at a time and runs the package's
-tests.
+"""Mutation testing of the pure modules: changes one operator or number at a time and runs the tests.
 
     make mutants
     .venv/bin/python tools/mutants.py --seed 1 --sample 60 --minutes 30 --only motion axis.effects
@@ -8,7 +7,8 @@ The modules are those of the import contract on the pure core (pyproject.toml). 
 is drawn by seed. Each mutant replaces its module in a separate process, in which the tests run until one
 fails; no file is changed. A mutant that takes three times the CPU time of the unchanged module counts as
 killed. Prints each mutant when it is done, and finally, by package, the fraction killed with its 95 %
-interval, and the survivors. `--minutes` limits the CPU time; the rest of the sample is then not run."""
+interval, and the survivors. `--minutes` limits the CPU time; the rest of the sample is then not run.
+"""
 
 from __future__ import annotations
 

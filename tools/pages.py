@@ -5,7 +5,7 @@ python tools/pages.py docs/tutorial.md --write     also write the new outputs in
 
 A page is a shell session in a new folder:
 
-* ```` ```sh ```` contains commands, ```` ```console ```` commands after `$ ` with their output. `...` replaces
+* ```` ```sh ```` contains commands, ```` ```console ```` commands after `$ ` with their output. `...` marks
   omitted lines; lines before the first and after the last shown line may be omitted, too.
 * ```` ```python ```` contains a program, which runs after the commands above it.
 * ```` ```text ```` after `<!-- output -->` is the output of the command above it.
@@ -16,7 +16,8 @@ Comments, which readers do not see, give further instructions:
 * `<!-- run first: COMMANDS -->` runs commands that prepare what the page presupposes.
 * `<!-- not run: REASON -->` in front of a block, or of the first heading for the whole page.
 * `<!-- exit status: N -->` in front of a block whose last command fails with this status.
-* `<!-- figures vary: REASON -->` in front of a block, or of the first heading: only the text is compared."""
+* `<!-- figures vary: REASON -->` in front of a block, or of the first heading: only the text is compared.
+"""
 
 from __future__ import annotations
 

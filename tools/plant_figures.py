@@ -23,7 +23,7 @@ DEG_PER_COUNT = 360.0 / 8000.0
 
 
 def trajectory() -> list[int]:
-    """Returns the set-points of a step of 43.56 motor deg, one per cycle, in counts, within the axis limits."""
+    """Returns the set-points of a step of 43.56 motor deg, in counts per cycle, within the axis limits."""
     otg = ruckig.Ruckig(1, CYCLE_S)
     way, out = ruckig.InputParameter(1), ruckig.OutputParameter(1)
     way.current_position = way.current_velocity = way.current_acceleration = [0.0]

@@ -60,7 +60,7 @@ def recorded(drive: Drive, plan: Plan) -> Recording:
 def calibrated(
     axis: AxisConfig, truth: Truth, plan: str, seed: int, folder: Path
 ) -> tuple[Calibration, float]:
-    """Calibrates an axis that has no model, stepping test included; returns the result and the axis time, s."""
+    """Calibrates an axis without a model, stepping test included; returns the result and the axis time, s."""
     content = axis.model_dump(mode="json", by_alias=True, exclude_none=True)
     (folder / "axis.yaml").write_text(yaml.safe_dump(content))
     with simulated(axis, truth, seed) as (drive, clock):

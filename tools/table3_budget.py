@@ -52,7 +52,7 @@ def budget(table: Mapping[str, Row], wave: float, offset: float, floor: float) -
 
 
 def _means(table: Mapping[str, Row]) -> dict[str, float]:
-    """Returns by how much the means of the corrections are not additive, as for one error they must be."""
+    """Returns the deviation of the corrections' means from additivity, which one common error requires."""
     mean = {name: each[1] for name, each in table.items()}
     apart = mean["both"] - mean["synchronous"] - mean["hysteresis"] + mean["none"]
     return {
@@ -75,7 +75,7 @@ def _between(variance: Mapping[str, float]) -> float:
 
 
 def _two_values(table: Mapping[str, Row], wave: float) -> dict[str, Any]:
-    """Returns the scatter of the hysteresis correction, and its size if it has only one value per direction."""
+    """Returns the scatter of the hysteresis correction, and its size if it has one value per direction."""
     variance = {name: (each[0] / 3.0) ** 2 for name, each in table.items()}
     shift = 0.5 * (table["none"][1] - table["hysteresis"][1] + table["synchronous"][1] - table["both"][1])
     possible = possible_variances(variance, wave)

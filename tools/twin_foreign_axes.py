@@ -6,7 +6,8 @@ Each axis is recorded on the plan ``dynamics`` and on another motion. The fit of
 values with the gear's true transmission error, as if from a calibration. Prints for each axis the errors of
 the twin's following error and torque on the other motion, per cent of the measured signal; how many of the
 intervals contain the truth; the remarks on the twin; and the CPU time of the fit. With ``--checks``, each
-axis is changed, recorded again and compared with its twin."""
+axis is changed, recorded again and compared with its twin.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +75,7 @@ def start(axis: AxisConfig, foreign: Foreign) -> Truth:
 
 
 def shares(other: Recording, axis: AxisConfig, truth: Truth, seed: int) -> str:
-    """Returns the twin's errors and the noise of following error and torque, per cent of the measured signal."""
+    """Returns errors and noise of following error and torque on the other motion, per cent of the signal."""
     again = replay(other, axis, without_noise(truth), seed)
     told = compare(other.record, again, other.segments, axis.gear.ratio)
     return ", ".join(

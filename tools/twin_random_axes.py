@@ -2,15 +2,16 @@
 
     .venv/bin/python tools/twin_random_axes.py --axes 8 --checks
 
-Each axis has its own inertias, friction, loops and feed-forward (half to double the usual), dead time (0 to 3
-ms), resonance (15 to 80 Hz), ratio (30 to 160), law of hysteresis, tooth orders and noise. Its axis file
-allows the following error that such a drive needs; gains near instability are drawn again. It is benched over
-frames on the plan ``dynamics``, twinned from the usual values (`hdbridge.twin.parameters`), and judged on
-another motion that the fit has not seen. Prints for each axis the differences on that motion, the number of
-95 % intervals that contain the truth, and the result of the check after one, two or no changes of the plant.
+Each axis has its own inertias, friction, control loops and feed-forward (half to double the usual values),
+dead time (0 to 3 ms), resonance (15 to 80 Hz), ratio (30 to 160), hysteresis law, tooth orders and noise. Its
+axis file allows the following error that such a drive needs; gains near instability are drawn again. The axis
+is recorded over CAN frames on the plan ``dynamics``, its twin is fitted from the usual values
+(`hdbridge.twin.parameters`), and the twin is judged on another motion that the fit has not used. Prints for
+each axis the differences on that motion, the number of 95 % intervals that contain the truth, and the result
+of the check after no change, one change or two changes of the plant.
 
-The gear's own transmission error is given, as from a calibration (tools/calibrate_random_axes.py measures
-that): this tool measures the rest.
+The gear's transmission error is given, as if from a calibration (tools/calibrate_random_axes.py measures
+that); this tool measures the rest.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ PAIRS = 3
 """Number of pairs of changes drawn for each axis."""
 WINDOWS = 3.0
 """Ratio of the allowed following error to the one that the delay causes at the highest speed; `hdbridge
-bringup` sets three times the observed one."""
+doctor` suggests three times the observed one."""
 GAIN_MARGIN = 2.0
 """Minimum gain margin: 6 dB, the usual textbook minimum for loop tuning."""
 
@@ -152,8 +153,7 @@ def draw(seed: int, *, sticking: bool = False) -> tuple[AxisConfig, Truth]:
 
 
 def _gain_margin(truth: dict[str, Any]) -> float:
-    """Returns the factor by which the velocity gain may fall or rise before the control loops become
-    unstable.
+    """Returns the factor by which the velocity gain may fall or rise before the loops become unstable.
 
     The lower limit is the stability limit of a rigid axis (Routh), the upper one that of the motor alone: the
     loop uses the mean speed of the previous substep, which limits the gain to two inertias per substep.

@@ -6,7 +6,8 @@ Each axis has its own ambient temperature (14 to 32 deg C), thermal resistance (
 (240 to 1500 s) and copper loss (0 to 30 W). It moves for three quarters of the time: slow moves, moves at
 high acceleration and rests, in periods of 20 to 180 s; then it rests. The temperature is measured in steps of
 0.1 K. The twin begins at usual values. Its mechanics are those of the axis, except for friction, which has a
-random error with the uncertainty of a fit: 0.5 % (Coulomb) and 3 % (viscous)."""
+random error with the uncertainty of a fit: 0.5 % (Coulomb) and 3 % (viscous).
+"""
 
 from __future__ import annotations
 
