@@ -38,7 +38,7 @@ class Outcome(NamedTuple):
     counts: int
     noise: float
     offset: tuple[float, float, bool]
-    """True value, error, and whether the interval contains it."""
+    """True value, error of the fit, and True if the interval contains the true value."""
     width: tuple[float, float, bool]
     exponent: tuple[float, float, bool]
     amplitude: float

@@ -1,7 +1,7 @@
 """Writes the tables of docs/reliability.md: the results of every fault of the suite at every place.
 
-python tools/reliability_page.py            run the suite (minutes; vcan by tools/socketcan.sh), write the
-page python tools/reliability_page.py --check    only check that the page has the rows of the suite
+python tools/reliability_page.py            run all (minutes; vcan by tools/socketcan.sh), write the page
+python tools/reliability_page.py --check    only check that the page has the rows of the suite
 """
 
 from __future__ import annotations

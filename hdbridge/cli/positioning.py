@@ -246,7 +246,7 @@ def run_comparison(
     if Scheme.EXTENDED in wanted and Scheme.EXTENDED not in offered:
         raise InputError("--scheme extended: the model has no effect beyond its two parts; leave it out")
     if record is not None:
-        make_folder(record)  # before the axis moves, not after
+        make_folder(record)  # an error is reported before the axis moves
 
     for each in wanted:
         compensation_for(axis, each.of(model))  # refused before anything is connected

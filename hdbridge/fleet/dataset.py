@@ -97,7 +97,7 @@ STORED: Final = [
     *("key", "path", "joint", "axis", "date", "ratio"),
     *("model_sha256", "version", "reason", "stamp", "axes"),
 ]
-"""Columns from which a run decides whether to read a recording."""
+"""Columns that a run needs to decide if a recording must be read."""
 
 
 def schema(name: str) -> pa.Schema:

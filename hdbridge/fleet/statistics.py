@@ -139,7 +139,7 @@ def repeats(named: Sequence[Sequence[bool]]) -> Repeats:
 
 
 def within_false_discoveries(probability: FloatArray, rate: float) -> FloatArray:
-    """Selects the largest set of claims of which an expected fraction of at most ``rate`` is wrong."""
+    """Selects the largest set of claims whose expected fraction of wrong claims is at most ``rate``."""
     order = np.argsort(-probability, kind="stable")
     wrong = np.cumsum(1.0 - probability[order]) / np.arange(1, len(order) + 1)
     chosen = np.zeros(len(probability), dtype=bool)

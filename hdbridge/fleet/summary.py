@@ -254,7 +254,7 @@ def _size(rows: Sequence[Row], cause: str) -> Series:
         peak, floor = _peak(row, cause), _floor(row, cause)
         if peak is not None:
             points.append((row, peak, max(PEAK_ERROR * floor, 0.02 * peak)))
-        else:  # 0.29: standard deviation of a uniform distribution
+        else:  # 0.29: standard deviation of a uniform distribution of width 1
             points.append((row, 0.5 * floor, 0.29 * floor))
     return _series(points)
 

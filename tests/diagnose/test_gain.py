@@ -82,9 +82,7 @@ def test_a_gain_is_that_of_the_written_model_on_a_fresh_record(
         before = diagnose(fresh, replace(model, effects=(*model.effects, *others))).baseline.rms_arcsec
         assert each.gain is not None
         stated = np.sqrt(each.gain.before_arcsec**2 - each.gain.after_arcsec**2)
-        assert stated == pytest.approx(
-            np.sqrt(before**2 - after**2), rel=0.1
-        )  # the speeds of the fresh record differ by 5 %
+        assert stated == pytest.approx(np.sqrt(before**2 - after**2), rel=0.1)  # speeds differ by 5 %
 
 
 @pytest.mark.parametrize("gain", [WORSE, None], ids=["worse", "none made"])

@@ -102,7 +102,7 @@ def greased() -> Truth:
 
 
 def bouc_wen() -> Truth:
-    """Sweep over all load angles, both ways: shows dependence on the angle or on the torque of a mass."""
+    """Returns an axis with a loop of about the size of the model's, but of a law outside the catalogue."""
     data = bare_truth().model_dump(by_alias=True)
     data["gear"]["hysteresis"] = {
         "law": "bouc_wen",

@@ -57,8 +57,7 @@ class Laws:
         self.word = 0
         self.following = False
         self.mapped = self.operational = True
-        """True while the master's PDO mapping is in force: an RPDO then takes effect at SYNC, else at
-        once."""
+        """True while the master's PDO mapping is in force, so that RPDOs take effect at SYNC, not at once."""
         self.unasked = ""
         """Reason why the present following is unrequested, if it moves; empty if it was requested."""
         self.lowest = self.highest = self.began_deg = 0.0

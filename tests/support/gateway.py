@@ -26,8 +26,8 @@ COUNTS_PER_DEG = 12_960_000 / 360.0
 class Plc:
     """PLC-like master, written from CiA 301 and CiA 402 alone; it has its own clock.
 
-    ``plan`` gives controlword and target for each of its cycles; both go out by one synchronous RPDO before
-    SYNC. What came by the TPDO of that SYNC is in ``seen``: time, statusword, position.
+    ``plan`` returns the target of each cycle, or None to keep the last one. Controlword and target are sent
+    in one synchronous RPDO before SYNC.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ class GatewayBench:
         self.plc = plcs[0]
         """Master of the axis on which the methods act."""
         self.bus, self._made = bus, gateway
-        self.daemon.clock.nodes += reversed(plcs)  # before the gateway: a frame arrives when it is sent
+        self.daemon.clock.nodes += reversed(plcs)  # before the gateway, so that frames arrive at once
         self.start_gateway()
 
     def start_gateway(self) -> None:

@@ -26,7 +26,7 @@ class OuterFault:
     name: str
     happens: Callable[[GatewayBench], Awaitable[None] | None]
     codes: tuple[int, ...] = ()
-    """Codes of which the master must receive one as an EMCY; empty if it must receive none."""
+    """EMCY codes, one of which the master must receive; empty if it must receive none."""
     within_s: float | None = None
     """Maximum time until the load is at rest, s."""
     prepares: Callable[[GatewayBench], Awaitable[None]] | None = None

@@ -110,7 +110,7 @@ def ripple_arcsec(samples: np.ndarray, speed_deg_s: float) -> float:
     ``samples`` are those of one axis from the daemon's ring.
     """
     even = np.flatnonzero(abs(samples["velocity_deg_s"] - speed_deg_s) < 1e-3 * abs(speed_deg_s))
-    even = even[len(even) // 3 :]  # the transient of the ramp
+    even = even[len(even) // 3 :]  # without the transient of the ramp
     assert len(even) > 100
     error = 3600.0 * (samples["load_position_deg"] - samples["load_target_deg"])[even]
     line = np.linspace(-1.0, 1.0, len(error))

@@ -135,7 +135,7 @@ class Story:
         """Records an EMCY or a boot-up message as a loss, unless 6007h = 0 makes the drive ignore it."""
         while (message := self.bus.recv(0)) is not None:
             code = struct.unpack_from("<H", message.data)[0] if message.arbitration_id == 0x081 else 0
-            known = code in (0x0000, 0x8210, 0x8220, *self.errors)  # an RPDO of another length loses nothing
+            known = code in (0x0000, 0x8210, 0x8220, *self.errors)  # a wrong RPDO length is no loss
             emergency = message.arbitration_id == 0x081 and not known
             self.errors = set() if message.arbitration_id == 0x081 and not code else self.errors | {code}
             ignored = code >> 8 in (0x81, 0x87) and self.node.dictionary.value(0x6007) == 0

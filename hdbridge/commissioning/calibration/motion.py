@@ -76,9 +76,7 @@ class OrderRipple:
 
 @dataclass(frozen=True, slots=True)
 class PathResult:
-    """Errors on one path without correction, with the static and the filtered correction, and with
-    compensated wind-up in addition.
-    """
+    """Errors on one path: without correction, static, filtered, and filtered with wind-up compensation."""
 
     name: str
     none: PathError
@@ -322,7 +320,7 @@ class ServoCheck:
     stored_lag_ms: float
     lag_ms: float
     difference: float
-    """Rms difference of the measured from the stored response, relative to the ripple (`Answers`)."""
+    """Rms difference of measured and stored response, relative to the ripple (`Answers.difference`)."""
 
     @property
     def agrees(self) -> bool:

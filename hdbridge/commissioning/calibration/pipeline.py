@@ -1,4 +1,4 @@
-"""Complete calibration, from a booted drive to a pending model; restores its result from its folder."""
+"""Runs a complete calibration, from a booted drive to a pending model, and restores results from folders."""
 
 import json
 import math
@@ -32,7 +32,7 @@ from hdbridge.units import unit_of
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """Decision whether a model is offered for commit, with the reason."""
+    """Decision to offer a model for commit, or not, with the reason."""
 
     made: bool
     reason: str

@@ -87,7 +87,7 @@ class Stepped:
 
     @property
     def ccw(self) -> Scatter:
-        """Scatter of the steps back."""
+        """Scatter of the return steps."""
         return Scatter.of(self.errors_arcsec[1])
 
     @property

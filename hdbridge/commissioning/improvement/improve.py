@@ -1,4 +1,4 @@
-"""Complete improvement, from a booted drive to a pending model that positions better, and its result."""
+"""Runs a complete improvement, from a booted drive to a pending model that positions better."""
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
