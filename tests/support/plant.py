@@ -135,7 +135,7 @@ def rise(xi: np.ndarray | float, n: float) -> Any:
 
 
 def kept(direction: np.ndarray) -> np.ndarray:
-    """Fills zeros with the direction of the last motion; forward before the first."""
+    """Replaces zeros with the direction of the last motion, or with forward before the first motion."""
     last = np.maximum.accumulate(np.where(direction != 0, np.arange(len(direction)), -1))
     return np.where(last < 0, 1.0, direction[last])
 
@@ -199,7 +199,7 @@ def loop(motor: np.ndarray, law: str, offset: float, width: float, n: float) -> 
 
 
 def stop(motor: np.ndarray, width: float) -> np.ndarray:
-    """Returns the stop operator of full crossing ``width``, from a saturated forward start."""
+    """Returns the output of a stop operator that crosses from -1 to 1 over ``width``, initially 1."""
     turning = [0, *(np.flatnonzero(np.diff(np.sign(np.diff(motor))) != 0) + 1).tolist(), len(motor) - 1]
     value, out = 1.0, np.empty(len(motor))
     out[0] = 1.0
@@ -210,7 +210,7 @@ def stop(motor: np.ndarray, width: float) -> np.ndarray:
 
 
 def crept(going: np.ndarray, dt: float, tau: float, build: float = 0.1, **_: float) -> np.ndarray:
-    """Returns creep that builds up with the direction of motion, faster than it relaxes at rest."""
+    """Returns creep that builds up in the direction of motion, faster than it relaxes at rest."""
     up, down = math.exp(-dt / (build * tau)), math.exp(-dt / tau)
     y, out = 0.0, np.empty(len(going))
     for i, sense in enumerate(going.tolist()):

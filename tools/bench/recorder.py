@@ -82,7 +82,7 @@ def as_recorded(samples: Any, rate: int, folder: Path) -> tuple[float, int]:
 
 
 def measured(axes: int, seconds: int, rate: int) -> dict[str, float]:
-    """Returns all figures for ``axes`` axes."""
+    """Returns all figures for a machine with this number of axes."""
     samples = at_work(seconds, rate, axes)
     messages = len(samples) * (1 + axes)
     with tempfile.TemporaryDirectory() as folder:
@@ -102,7 +102,7 @@ def measured(axes: int, seconds: int, rate: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measures and prints."""
+    """Measures the recorder for each number of axes and prints the figures."""
     given = parser(__doc__)
     given.add_argument("--axes", type=int, nargs="+", default=[1, 6])
     given.add_argument("--seconds", type=int, default=120)
