@@ -6,7 +6,8 @@ First an empty loop with the same number of periods is timed; the periods that i
 the bus nor to the drive. Then `hdbridge simulate` is started, the drive is booted and enabled over the bus,
 and the axis moves to and fro, compensated by the article's model in every cycle. Prints the periods missed
 (begun more than half a period late), the cycles in which a TPDO was missing, and the lateness of the cycles.
-Exit status 0 if nothing was missed, 1 otherwise."""
+Exit status 0 if nothing was missed, 1 otherwise.
+"""
 
 from __future__ import annotations
 
