@@ -1,11 +1,11 @@
-"""Shows why the article's Tables 1 and 2 cannot give its Table 3: all figures of docs/method.md.
+"""Computes all figures of docs/method.md: why the article's Tables 1 and 2 cannot give its Table 3.
 
     python tools/article_table3.py [--json FILE] [--simulate] [--as-data]
 
-The axis is ideal except for the article's own error model and its two encoders: no dynamics, no noise. The
-law comes from the project's effects; the inverse and the statistics are computed here independently, so that
-they also check the compensation. ``--simulate`` runs the same test on the simulated drive (half a minute)
-and compares it step by step.
+The axis is ideal except for the article's own error model and the resolution of its two encoders: no
+dynamics, no noise. The hysteresis law is that of the project's effects; the inverse and the statistics are
+computed here independently, so that they also check the compensation. ``--simulate`` runs the same test on
+the simulated drive (half a minute) and compares the errors step by step.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def exact(model: Tracker, load_deg: float) -> float:
 
 
 def as_printed(model: Tracker, load_deg: float) -> float:
-    """Returns the angle by the article's own formula, with the error at the angle before compensation."""
+    """Returns the motor angle by the article's own formula, with the error at the uncompensated angle."""
     return load_deg * RATIO - RATIO * model.advance(load_deg * RATIO, NOW) / 3600.0
 
 
@@ -73,7 +73,7 @@ def step_errors(
     motor_counts: int = MOTOR_COUNTS,
     target: Target = exact,
 ) -> tuple[list[float], list[float]]:
-    """Returns each load error at rest, arcsec, outward (240) and back (240), with quantised encoders."""
+    """Returns the load errors at rest, arcsec, outward (240) and back (240), with quantised encoders."""
     told, real = compensated.tracker(Start.FORWARD), gear.tracker(Start.FORWARD)
     told.advance(0.0, NOW)
     real.advance(0.0, NOW)
@@ -90,7 +90,7 @@ def step_errors(
 
 
 def quantised(angle_deg: float, counts_per_turn: int) -> float:
-    """Returns the nearest whole count, in degrees."""
+    """Rounds an angle to whole counts; degrees."""
     return round(angle_deg / 360.0 * counts_per_turn) * 360.0 / counts_per_turn
 
 
@@ -133,12 +133,12 @@ def figures() -> dict[str, Any]:
 
 
 def _about_table_3(computed: Mapping[str, Parts]) -> dict[str, Any]:
-    """Returns the figures of Table 3 alone, and against its possible means and scatters."""
+    """Returns figures derived from Table 3, and compared with the possible means and scatters."""
     three_sigma = {name: each[0] for name, each in TABLE_3.items()}
     mean = {name: each[1] for name, each in TABLE_3.items()}
     wave = computed["none"]["cw"][0]
     offset = computed["synchronous"]["cw"][1]
-    # A share p of forward steps adds (2 offset)^2 p (1 - p) to the variance; solve for the scatter of "none".
+    # A fraction p of forward steps adds (2 offset)^2 p (1 - p) to the variance; solved for that of "none".
     both_ways = (three_sigma["none"] ** 2 - wave**2) / (3.0 * 2.0 * offset) ** 2
     forward = 0.5 + math.sqrt(0.25 - both_ways)
     return {
@@ -166,7 +166,7 @@ def _about_table_3(computed: Mapping[str, Parts]) -> dict[str, Any]:
 
 
 def _about_the_test(model: TransmissionModel, law: Hysteresis) -> dict[str, Any]:
-    """Returns the angles that the stepping test samples and misses."""
+    """Returns figures on the angles that the stepping test samples and on those that it misses."""
     turn = np.linspace(0.0, 360.0, 100_001)
     stops = np.concatenate([np.arange(COUNT + 1), np.arange(COUNT - 1, -1, -1)]) * STEP_DEG
     reached = law.predict(Motion(stops), Start.FORWARD)[1:]
@@ -223,10 +223,10 @@ def _about_the_law(law: Hysteresis) -> dict[str, Any]:
 
 
 def memory_gaps(law: Hysteresis) -> tuple[float, float]:
-    """Returns the largest differences to the same branch with return-point memory (Masing's rules), arcsec.
+    """Returns the maximum differences from the same law with return-point memory (Masing's rules), arcsec.
 
-    On two rising paths after a saturated start: a rise with one 2 deg step back, over all positions of the
-    step, and a staircase of 1 deg up and 0.5 deg down.
+    There are two rising paths after a saturated start: one with a single 2 deg step back, at the worst
+    position, and a staircase of 1 deg up and 0.5 deg down.
     """
     memory = HysteresisMemory.model_validate(law.parameters())
 
@@ -244,7 +244,7 @@ def memory_gaps(law: Hysteresis) -> tuple[float, float]:
 
 
 def as_data(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the figures of Table 3 taken as a measurement."""
+    """Returns the error budget of Table 3, which is treated as a measurement."""
     from table3_budget import budget  # noqa: PLC0415 - found only where this file is run as a script
 
     computed = result["computed"]
@@ -254,7 +254,7 @@ def as_data(result: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def simulated() -> dict[str, Any]:
-    """Runs the test on the simulated drive; returns its figures and the differences of its steps."""
+    """Runs the test on the simulated drive; returns its figures and deviations from the computed steps."""
     profile = bundled_profile("article")
     axis = AxisConfig.load(profile / "axis.yaml")
     model = TransmissionModel.load(profile / "model.yaml")

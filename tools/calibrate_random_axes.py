@@ -4,8 +4,8 @@
 
 Each axis has its own orders and phases, offset (15-80 arcsec), width (5-40 deg), exponent (1.2-2.8), ratio
 (30-160), encoder resolutions and directions, and noise (0.5-3 arcsec). The calibration is that of the
-command: a plan on the bench, the fit, the stepping test before and after. Prints for each axis the errors of
-the parameters, the share of the 95 % intervals that contain the truth, the stepping test relative to the
+command: a plan on the bench, the fit, the stepping test before and after. Prints for each axis the parameter
+errors, the number of 95 % intervals that contain the truth, the result of the stepping test relative to the
 best possible with the axis's counts and noise, and the speed relative to real time.
 """
 
@@ -19,7 +19,7 @@ from multiprocessing import Pool
 from pathlib import Path
 from typing import Any, NamedTuple
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, so threads only cost time
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads slow down operations on such small matrices
 
 import numpy as np
 import yaml
@@ -38,7 +38,7 @@ class Outcome(NamedTuple):
     counts: int
     noise: float
     offset: tuple[float, float, bool]
-    """True value, error, and whether the interval contains it."""
+    """True value, error of the fit, and True if the interval contains the true value."""
     width: tuple[float, float, bool]
     exponent: tuple[float, float, bool]
     amplitude: float
@@ -57,9 +57,9 @@ class Outcome(NamedTuple):
 
 
 def draw(seed: int, presliding_arcsec: float = 0.0) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Draws axis file and truth file of a random axis; motor, servo and frequencies are the demo's.
+    """Draws axis file and truth file of a random axis; motor, servo and frequencies are those of the demo.
 
-    With ``presliding_arcsec``, most of the loop is friction at the load that yields before it slips.
+    With ``presliding_arcsec``, most of the hysteresis loop is due to friction at the load with presliding.
     """
     rng = np.random.default_rng(seed)
     axis, truth = (yaml.safe_load((DEMO / name).read_text()) for name in ("axis.yaml", "truth.yaml"))

@@ -90,7 +90,7 @@ def _needs(kind: type[Effect]) -> str:
 
 
 def _once(kind: type[Effect]) -> Iterator[str]:
-    """Yields the parameters of an effect; those that another effect describes as names only."""
+    """Yields the parameters of an effect; of those that an earlier effect describes, only the names."""
     earlier = list(CATALOGUE.values())[: list(CATALOGUE).index(kind.name)]
     first = {each: other.name for other in reversed(earlier) for each in _parameters(other, other)}
     same: dict[str, list[str]] = {}

@@ -57,10 +57,10 @@ third one ends the program at once.
 """
 
 _COMMON = 2
-"""Number of commands from which an option is described once, for all of them."""
+"""Minimum number of commands with an option for which it is described only once."""
 
 _MANY = 4
-"""Number of commands from which the commands with an option are not listed."""
+"""Minimum number of commands with an option for which these commands are not listed."""
 
 _SETS = {
     "*axis*": ("--interface", "--channel", "--force", "--borrow", "--simulate", "--truth", "--seed"),
@@ -73,7 +73,7 @@ _SETS = {
         *("--pages", "--timeout"),
     ),
 }
-"""Options that stand together in many commands, by the name of the set."""
+"""Sets of options that many commands share, by the name of the set."""
 
 _VALUES = {int: "INTEGER", float: "NUMBER", str: "TEXT", Path: "FILE"}
 
@@ -83,9 +83,9 @@ class Parameter:
     """Argument or option of a command."""
 
     names: tuple[str, ...]
-    """Names of an option with dashes; placeholder of an argument."""
+    """Names of an option, with dashes; for an argument, its placeholder."""
     value: str
-    """Placeholder of its value; empty for a switch."""
+    """Placeholder of the option's value; empty for a switch."""
     help: str
     default: str
     is_option: bool
@@ -95,7 +95,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Command:
-    """Command as typed by a user."""
+    """Command with its name as typed by a user, its help text and its parameters."""
 
     name: str
     text: str
@@ -103,7 +103,7 @@ class Command:
 
     @property
     def usage(self) -> str:
-        """First line of its section."""
+        """Heading of the command's section: name and arguments."""
         words = ["hdbridge", self.name]
         for each in self.parameters:
             if not each.is_option:
@@ -113,7 +113,7 @@ class Command:
 
 
 def commands() -> Iterator[Command]:
-    """Yields all commands in the order of the overview, with a group's name before those of the group."""
+    """Yields all commands in the order of the overview; those of a group have its name as a prefix."""
     for panel in PANELS.values():
         for name in panel:
             loaded = load(name)
@@ -171,7 +171,7 @@ def _section(command: Command, common: Container[Parameter], general: Container[
 
 
 def _common_item(parameter: Parameter, names: list[str], meanings: Mapping[str, int]) -> str:
-    """Returns an item for all its commands; they are named if the option has another meaning elsewhere."""
+    """Returns the item of a shared option, with its commands if it has another meaning elsewhere."""
     groups = {name.split()[0] for name in names}
     if meanings[parameter.names[0]] == 1:
         owner = ""
@@ -213,7 +213,7 @@ def _parameter(name: str, hint: Any, default: Any) -> Parameter:
         label = (info.metavar or name.upper()).removesuffix("...")
         return Parameter((label,), "", info.help or "", shown, False, required, many)
     assert isinstance(info, OptionInfo)
-    # An Annotated hint has the first name in the place of a default.
+    # In an Annotated hint the first name is stored in place of the default.
     declared = (*((info.default,) if isinstance(info.default, str) else ()), *(info.param_decls or ()))
     names = tuple(part for each in declared for part in each.split("/"))
     if not names:
@@ -227,7 +227,7 @@ def _parameter(name: str, hint: Any, default: Any) -> Parameter:
 
 
 def _plain(kind: Any) -> tuple[Any, bool]:
-    """Returns the type without None and without the list around it, and whether it may be repeated."""
+    """Returns the type without None and without an enclosing list, and True if there was a list."""
     if isinstance(kind, UnionType) or typing.get_origin(kind) is typing.Union:
         (kind,) = (each for each in typing.get_args(kind) if each is not NoneType)
     if typing.get_origin(kind) is list:
@@ -248,9 +248,9 @@ def _text(default: Any) -> str:
 
 
 def refused(line: str) -> str | None:
-    """Returns the reason why a command line in the docs is not valid; None if it is.
+    """Returns the reason why a command line in the docs is invalid; None if it is valid.
 
-    Values may be placeholders; options are checked only for existence and for taking a value.
+    Values may be placeholders; of an option, only its existence and the presence of a value are checked.
     """
     words = shlex.split(re.sub(r"\s+(#|>|&|\|).*$", "", line.strip()))[1:]
     known = {each.name: each for each in commands()}

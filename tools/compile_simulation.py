@@ -1,4 +1,4 @@
-"""Compiles the loops of the simulated axis once and keeps them on disk, for tests in several processes."""
+"""Compiles the loops of the simulated axis and caches them on disk, for tests in several processes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SUBSTEPS = 8
 
 
 def compile_all() -> None:
-    """Compiles each method of the loops, for both kinds of plant."""
+    """Compiles each method that contains a loop, for both kinds of plant, by calling it."""
     fast.waiting.left = 0
     for loaded in (False, True):
         machine = Machine(Truth.load(bundled_profile("article")), 0, may_compile=True, loaded=loaded)

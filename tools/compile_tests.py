@@ -1,9 +1,9 @@
-"""Rewrites the assertions of all tests once and caches them; otherwise each worker of pytest-xdist does.
+"""Rewrites the assertions of all tests and caches the result, so that the workers of pytest-xdist need not.
 
     python tools/compile_tests.py [FOLDER]
 
-It does what pytest does when it imports a test, without importing it. Pytest has no interface for that; if
-another version lacks these parts, nothing is done here, and the workers rewrite the tests.
+It does what pytest does when it imports a test, but without importing it. Pytest has no public interface for
+this; if another version lacks the private one, nothing is done here, and the workers rewrite the tests.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ TESTS = Path(__file__).resolve().parents[1] / "tests"
 
 
 def main(tests: Path) -> None:
-    """Writes the files that pytest would write into the folders ``__pycache__``."""
+    """Writes the cache files that pytest would write into the ``__pycache__`` folders."""
     config = get_config()
     config.parse(["--disable-plugin-autoload"])
     for path in sorted((*tests.rglob("test_*.py"), *tests.rglob("conftest.py"))):

@@ -1,7 +1,7 @@
-"""Hooks of the `make docs` site, called by MkDocs (mkdocs.yml): pages in addition to those in docs/.
+"""Hooks for the site of `make docs`, called by MkDocs (mkdocs.yml), which add pages to those in docs/.
 
-The API reference is made from the docstrings of the public names of `import hdbridge`. CONTRIBUTING.md and
-CHANGELOG.md are at the top of the project, where readers look for them; the site includes them.
+The API reference is generated from the docstrings of the public names of `import hdbridge`. CONTRIBUTING.md
+and CHANGELOG.md are in the project's root folder, where readers look for them; the site includes them.
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ together, with examples: [library](api.md).
 
 
 def reference() -> str:
-    """Returns the page of the API: every public name, the errors last."""
+    """Returns the page of the API reference: every public name, the errors last."""
     public = {name: getattr(hdbridge, name) for name in getattr(hdbridge, "__all__", ())}
     errors = {name for name, each in public.items() if isinstance(each, type) and issubclass(each, Exception)}
     groups: tuple[tuple[str, list[str]], ...] = (
@@ -37,7 +37,7 @@ def reference() -> str:
 
 
 def generated() -> dict[str, str]:
-    """Returns the generated pages as Markdown, by their path in the site."""
+    """Returns the additional pages as Markdown, by their path in the site."""
     pages = {
         page: (ROOT / source).read_text(encoding="utf-8").replace("](docs/", "](")
         for page, source in FROM_THE_TOP.items()
@@ -46,7 +46,7 @@ def generated() -> dict[str, str]:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Adds the generated pages."""
+    """Adds the additional pages to the site."""
     from mkdocs.structure.files import File  # noqa: PLC0415  the tests of this file need no MkDocs
 
     for path, text in generated().items():
@@ -55,7 +55,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Redirects links to files at the top of the project to their pages in the site."""
+    """Redirects links to files in the project's root folder to their pages in the site."""
     for page, source in FROM_THE_TOP.items():
         markdown = markdown.replace(f"](../{source})", f"]({page})")
     return markdown
@@ -67,5 +67,5 @@ def on_post_template(output_content: str, **_: Any) -> str:
 
 
 def on_post_page(output: str, **_: Any) -> str:
-    """Redirects the theme's only external script, which makes the search work from files, to a local copy."""
+    """Redirects the theme's only external script (which enables search in local files) to a local copy."""
     return output.replace("https://unpkg.com/iframe-worker/shim", "assets/iframe-worker.js")

@@ -1,5 +1,5 @@
-"""Writes the tables of docs/files.md and of plans (docs/calibration.md) from the models that read the files,
-those of faults (docs/reliability.md, docs/ci.md) from the fault tables.
+"""Writes the generated parts of the docs: keys of files and plans from the pydantic models that read them,
+and faults from the fault tables.
 
 python tools/file_reference.py           rewrite the tables
 python tools/file_reference.py --check   report if they are up to date (exit status 1 if not)
@@ -121,7 +121,7 @@ SEEN_BY: Mapping[Fault, str] = {
 
 
 def fault_list() -> str:
-    """Returns the reactions to each fault."""
+    """Returns the list of faults with the reactions to each."""
     lines = []
     for row in TABLE:
         later = f"; {REACTION_WORDS[row.then]}" if row.then is not row.first else ""
@@ -145,13 +145,13 @@ def manifest_list() -> str:
 
 
 def _grouped(rows: Iterable[tuple[str, str, str]]) -> str:
-    """Returns rows as a list; neighbours of one kind and meaning share a line."""
+    """Returns rows as a list; adjacent rows with the same kind and meaning share a line."""
     groups = groupby(rows, key=lambda row: row[1:])
     return "".join(_item(", ".join(f"`{name}`" for name, *_ in same), *of) for of, same in groups)
 
 
 def fault_names() -> str:
-    """Returns the list of the faults that a simulated drive can be given."""
+    """Returns the list of faults that can be injected into a simulated drive."""
     rows = [f"- `{name}({arguments})`: {what}" for name, arguments, what in sentences()]
     return "\n" + "\n".join(rows) + "\n\n"
 
@@ -175,7 +175,7 @@ BLOCKS: Mapping[str, Any] = {
 
 
 def updated(page: str) -> str:
-    """Returns the page with up-to-date tables."""
+    """Returns the page with up-to-date generated blocks."""
     return _BLOCK.sub(lambda match: match[1] + BLOCKS[match["name"]]() + match[3], page)
 
 
@@ -195,15 +195,15 @@ _SHORTER = (
     (r" or '", ", '"),
     (r"'([^']*)'", r"`\1`"),
 )
-"""Words of an error message in the style of a table."""
+"""Replacements that shorten the wording of error messages for the tables, as patterns and texts."""
 
 
 def _rows(
     model: type[BaseModel], prefix: str = "", shown: dict[type[BaseModel], str] | None = None
 ) -> Iterator[tuple[int, str, str, str]]:
-    """Yields depth, key (bold if required), expected value with default, and meaning.
+    """Yields depth, key (bold if required), expected value with default, and meaning of each key.
 
-    A mapping that was ``shown`` before is a reference to it.
+    A mapping that is already ``shown`` becomes a reference to its first place.
     """
     shown = ({} if model is AxisConfig else dict(_of_the_axis_file())) if shown is None else shown
     for name, info in model.model_fields.items():
@@ -232,7 +232,7 @@ def _of_the_axis_file() -> dict[type[BaseModel], str]:
 
 
 def _inner(place: Field) -> tuple[type[BaseModel] | None, bool]:
-    """Returns the model of a nested mapping, or of the items of a list, and whether it is a list."""
+    """Returns the model of a nested mapping or of the items of a list, and True for a list."""
     for member in place.types():
         if isinstance(member, type) and issubclass(member, BaseModel):
             return member, False

@@ -1,11 +1,11 @@
-"""Fits the formula of the probabilities: `python tools/fit_probabilities.py [--suite FOLDER]... [--trials N]
+"""Fits the probability formula: `python tools/fit_probabilities.py [--suite FOLDER]... [--trials N]
 [--keep TABLE.json]`.
 
 Diagnoses records whose causes are known: blind suites (tools/blind/generate.py) and short records from the
 formulas of tests/support/plant.py, N seeds of each cause. Each finding gives the terms of the formula
-(hdbridge/analysis/probability.py) and whether the name was right. A logistic formula with a ridge is fitted,
-every term with its required sign, and tested by cross-validation that leaves whole records out. An existing
-table of `--keep` is read instead of made again. Prints the coefficients for `Scales`.
+(hdbridge/analysis/probability.py) and tells if the named cause was right. A logistic regression with a ridge
+penalty is fitted, every term with its required sign, and tested by cross-validation that leaves out whole
+records. An existing table of `--keep` is read instead. Prints the coefficients for `Scales`.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ FOLDS = 10
 FREE = frozenset({"constant"})
 AGAINST = frozenset({"excess", "unexplained"})
 PRIOR = {"unexplained": -1.0}
-"""Coefficients to which the ridge shrinks where these records are uninformative; 0 for all others."""
+"""Coefficients to which the ridge penalty shrinks if the records are uninformative; 0 for all others."""
 Row = dict[str, Any]
 
 
 def fitted(terms: np.ndarray, right: np.ndarray, names: list[str]) -> np.ndarray:
-    """Returns the coefficients of the logistic formula, shape (terms,)."""
+    """Returns the fitted coefficients of the logistic formula, shape (terms,)."""
     bounds = [
         (None, None) if each in FREE else ((None, 0) if each in AGAINST else (0, None)) for each in names
     ]
@@ -67,7 +67,7 @@ def probabilities(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
 def judged(
     source: str, name: str, result: Diagnosis, there: set[str], also: set[str], loop: bool
 ) -> Iterator[Row]:
-    """Yields one row for each reported cause; those in ``also`` count neither right nor wrong."""
+    """Yields one row for each reported cause; those in ``also`` count neither as right nor as wrong."""
     met: set[str] = set()
     for each in result.findings:
         names = {each.cause, *each.aliases}
@@ -83,7 +83,7 @@ def judged(
 
 
 def from_suite(folder: Path) -> Iterator[Row]:
-    """Yields the findings in the cases of a blind suite."""
+    """Yields the judged findings in the cases of a blind suite."""
     for case in sorted(each.parent for each in folder.glob("[!.]*/sealed.json")):
         hidden = unsealed(case)
         recording = Recording.load(*record_of(case))
@@ -95,7 +95,7 @@ def from_suite(folder: Path) -> Iterator[Row]:
 
 
 def from_trials(seeds: int, first: int) -> Iterator[Row]:
-    """Yields the findings in short records from formulas."""
+    """Yields the judged findings in short records computed from formulas."""
     for seed in range(first, first + seeds):
         for name in (*CAUSES, *SPECIAL, *NONE, *UNKNOWN, *PAIRS):
             there, record, model = planted(name, seed)
@@ -105,7 +105,7 @@ def from_trials(seeds: int, first: int) -> Iterator[Row]:
 
 
 def kept(rows: Iterable[Row], file: Path | None) -> list[Row]:
-    """Collects the findings, and writes them as they come."""
+    """Collects the findings, and writes them to the file after each one."""
     found: list[Row] = []
     for row in rows:
         found.append(row)
@@ -115,7 +115,7 @@ def kept(rows: Iterable[Row], file: Path | None) -> list[Row]:
 
 
 def report(title: str, pairs: Sequence[Pair]) -> None:
-    """Prints probabilities by bin, with the share that was right, and the Brier score."""
+    """Prints, by bin of probability, the fraction of findings that were right, and the Brier score."""
     print(f"{title}\n\n{table(CALIBRATION, calibration(pairs))}\n\n{': '.join(brier(pairs))}\n")
 
 

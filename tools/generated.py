@@ -1,4 +1,4 @@
-"""Harness of the tools that write pages and modules from the code; with `--check` they only compare."""
+"""Harness of the tools that generate pages from the code; with `--check` they only compare."""
 
 from __future__ import annotations
 

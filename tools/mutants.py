@@ -1,13 +1,13 @@
-"""Mutation run over the pure modules: changes one operator or number at a time and runs the package's tests.
+"""Mutation testing of the pure modules: changes one operator or number at a time and runs the tests.
 
     make mutants
     .venv/bin/python tools/mutants.py --seed 1 --sample 60 --minutes 30 --only motion axis.effects
 
-The modules are those of the import contract on the pure core (pyproject.toml). A sample of all mutants is
-drawn by the seed. Each is loaded in place of its module in a process of its own, where the tests run until
-one fails; no file is changed. A mutant that takes three times the processor time of the unchanged module
-counts as killed. Prints each mutant as it comes, and in the end the share killed with its 95 % interval, by
-package, and the survivors. The limit of time is that of the processor; the rest of the sample is not run.
+The modules are those of the import contract on the pure core (pyproject.toml). A random sample of all mutants
+is drawn by seed. Each mutant replaces its module in a separate process, in which the tests run until one
+fails; no file is changed. A mutant that takes three times the CPU time of the unchanged module counts as
+killed. Prints each mutant when it is done, and finally, by package, the fraction killed with its 95 %
+interval, and the survivors. `--minutes` limits the CPU time; the rest of the sample is then not run.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ TESTS = {
     "drive": ("drive",),
     "daemon.following": ("daemon/following",),
 }
-"""Folders of tests, the cheapest first, by the package of the mutant."""
+"""Folders of tests, the fastest first, by the package of the mutant."""
 BINARY = (("Add", "Sub"), ("Sub", "Add"), ("Mul", "Div"), ("Div", "Mul"), ("FloorDiv", "Div"), ("Pow", "Mul"))
 COMPARED = (
     ("Lt", "LtE"), ("LtE", "Lt"), ("Gt", "GtE"), ("GtE", "Gt"), ("Lt", "GtE"), ("Gt", "LtE"), ("Eq", "NotEq"),
@@ -60,17 +60,17 @@ OPERATORS = (
     "core/ReplaceBreakWithContinue", "core/ReplaceContinueWithBreak", "core/NumberReplacer",
 )  # fmt: skip
 SLOWER = 3.0
-"""Processor time of a mutant over that of the unchanged module, beyond which it counts as killed."""
+"""Ratio of a mutant's CPU time to that of the unchanged module, above which the mutant counts as killed."""
 START_S = 10.0
-"""Processor time allowed in addition, for imports."""
+"""Additional CPU time allowed for imports, s."""
 EQUIVALENT = re.compile(r"\s*@|\s+[A-Z_]+ = \d+$")
-"""Lines without mutants: options of a decorator, and members of an enumeration, whose values mean nothing."""
+"""Lines that are not mutated: decorators, and members of enumerations, whose values are arbitrary."""
 PLUGINS = ("pytest_timeout", "_hypothesis_pytestplugin", "hdbridge.pytest_plugin")
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """Place of one change."""
+    """One change of a module, given by its place and its operator."""
 
     path: str
     operator: str
@@ -79,12 +79,12 @@ class Mutant:
 
     @property
     def package(self) -> str:
-        """Key of `TESTS`."""
+        """Package of the mutant, a key of `TESTS`."""
         module = self.path.removeprefix("hdbridge/").removesuffix(".py").replace("/", ".")
         return next(each for each in TESTS if f"{module}.".startswith(f"{each}."))
 
     def source(self) -> str:
-        """Returns the changed module."""
+        """Returns the source of the changed module."""
         changed = mutate_code((ROOT / self.path).read_text(), get_operator(self.operator)(), self.occurrence)
         assert changed is not None
         return changed
@@ -107,7 +107,7 @@ def modules() -> Iterator[str]:
 
 
 def mutants(path: str) -> Iterator[Mutant]:
-    """Yields every mutant of a file, without those that change nothing."""
+    """Yields every mutant of a file, except in lines that match `EQUIVALENT`."""
     text = (ROOT / path).read_text()
     lines, nodes = text.splitlines(), list(ast_nodes(get_ast(text)))
     for name in OPERATORS:
@@ -119,7 +119,7 @@ def mutants(path: str) -> Iterator[Mutant]:
 
 
 def tests_of(mutant: Mutant) -> list[str]:
-    """Returns the files of tests: of the package, those first that name the module."""
+    """Returns the test files of the mutant's package; those that mention its module come first."""
     stem = Path(mutant.path).stem
     folders = [ROOT / "tests" / each for each in TESTS[mutant.package]]
     files = [each for folder in folders for each in sorted(folder.glob("test_*.py"))]
@@ -127,7 +127,7 @@ def tests_of(mutant: Mutant) -> list[str]:
 
 
 def fails(path: str, source: str, tests: list[str], limit_s: float | None = None) -> tuple[bool, float]:
-    """Runs tests with another source of a module; returns True if one failed, and CPU seconds."""
+    """Runs tests with another source of a module; returns True if one failed, and the CPU time, s."""
     assert "hdbridge" not in sys.modules, "the new process must load the package itself"
     before_s = _children_s()
     if not (child := os.fork()):
@@ -142,7 +142,7 @@ def _children_s() -> float:
 
 
 def _run(path: str, source: str, tests: list[str], limit_s: float | None) -> None:
-    """Ends the process with the exit status of the tests."""
+    """Runs the tests in this child process, and ends it with their exit status."""
     plain = SourceFileLoader.get_code
 
     def get_code(self: SourceFileLoader, fullname: str) -> object:

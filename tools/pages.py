@@ -1,21 +1,21 @@
-"""Runs the commands of a page of the documentation in order, as printed, and compares what they print.
+"""Runs the commands of a page of the documentation in order, as printed, and compares their output.
 
 python tools/pages.py docs/tutorial.md             run a page; print the deviations
-python tools/pages.py docs/tutorial.md --write     and write today's outputs into the page
+python tools/pages.py docs/tutorial.md --write     also write the new outputs into the page
 
 A page is a shell session in a new folder:
 
-* ```` ```sh ```` holds commands, ```` ```console ```` commands after `$ ` with their output. `...` stands for
-  lines that are left out; lines may also be left out before the first and after the last shown one.
-* ```` ```python ```` holds a program, which runs after the commands above it.
-* ```` ```text ```` after `<!-- output -->` is what the command above it printed.
-* A server (`SERVERS`) starts in the background, as in a terminal of its own.
+* ```` ```sh ```` contains commands, ```` ```console ```` commands after `$ ` with their output. `...` marks
+  omitted lines; lines before the first and after the last shown line may be omitted, too.
+* ```` ```python ```` contains a program, which runs after the commands above it.
+* ```` ```text ```` after `<!-- output -->` is the output of the command above it.
+* A server (`SERVERS`) starts in the background, as if in its own terminal.
 
-Comments that a reader does not see say more:
+Comments, which readers do not see, give further instructions:
 
-* `<!-- run first: COMMANDS -->` prepares what the page takes as given.
+* `<!-- run first: COMMANDS -->` runs commands that prepare what the page presupposes.
 * `<!-- not run: REASON -->` in front of a block, or of the first heading for the whole page.
-* `<!-- exit status: N -->` in front of a block whose last command is refused.
+* `<!-- exit status: N -->` in front of a block whose last command fails with this status.
 * `<!-- figures vary: REASON -->` in front of a block, or of the first heading: only the text is compared.
 """
 
@@ -42,11 +42,12 @@ SERVERS = {
     "hdbridge simulate ": "Ctrl-C ends it",
     "hdbridge ctl watch": "",
 }
-"""Commands that run until Ctrl-C, with the output of each when it is ready."""
+"""Beginnings of commands that run until Ctrl-C, each with the output that shows that it is ready."""
 LONGEST_S = 900.0
-"""Time after which a command is stopped and reported."""
+"""Time-out of a command, s; a command that takes longer is stopped and reported."""
 ABSOLUTE = 0.3
-"""Tolerance of a figure, arcsec: ten times the scatter of a 3 sigma of 240 steps at the best possible."""
+"""Tolerance of a figure, arcsec: ten times the random variation of three sigma over 240 steps on a perfectly
+compensated axis."""
 RELATIVE = 0.02
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 DATE = re.compile(r"\d{8}T\d{6}Z|\d{8}-\d{6}|\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\dZ?")
@@ -62,7 +63,7 @@ NOTE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Command of a page, with the lines of its output that the page shows."""
+    """Command of a page, with those lines of its output that the page shows."""
 
     line: int
     shell: str
@@ -122,7 +123,7 @@ def _number(text: str, at: int) -> int:
 
 
 def _joined(number: int, lines: Sequence[str]) -> Iterator[tuple[int, str]]:
-    """Yields each command with the number of its first line; backslashes and here-documents continue it."""
+    """Yields each command with its first line number; backslashes and here-documents continue a command."""
     first, held, until = number, "", None
     for line in lines:
         held = f"{held}\n{line}" if held else line
@@ -138,7 +139,7 @@ def _joined(number: int, lines: Sequence[str]) -> Iterator[tuple[int, str]]:
 
 
 def _session(number: int, lines: Sequence[str], exact: bool) -> list[Command]:
-    """Returns the commands of a console block with the output of each."""
+    """Returns the commands of a console block, each with its output."""
     starts = [at for at, line in enumerate(lines) if line.startswith("$ ")]
     commands = []
     for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
@@ -217,7 +218,7 @@ class Shell:
         os.close(self.writer)
 
     def __call__(self, shell: str) -> tuple[int | None, str]:
-        """Runs a command. Returns its exit status, None for a server, and what it printed to both outputs."""
+        """Runs a command. Returns its exit status (None for a server) and its output, errors included."""
         self.run += 1
         out = self.outputs / f"{self.run}.txt"
         ready = next((word for start, word in SERVERS.items() if shell.startswith(start)), None)
@@ -247,12 +248,12 @@ class Shell:
 
 
 def words(line: str) -> str:
-    """Returns a line without the parts that vary from run to run: figures, dates, widths of tables."""
+    """Returns a line without figures, dates and table widths, which vary from run to run."""
     return re.sub(r"[\s━─]+", " ", NUMBER.sub("#", DATE.sub("@", line))).strip()
 
 
 def compared(command: Command, printed: str) -> tuple[list[str], dict[int, str]]:
-    """Returns the shown lines that were not printed, and the printed line for each shown one."""
+    """Returns the deviations of the output from the page, and the printed line for each shown line."""
     lines = [line.rstrip() for line in printed.splitlines() if line.strip()]
     wrong: list[str] = []
     found: dict[int, str] = {}
@@ -310,7 +311,7 @@ def run(path: Path, folder: Path) -> tuple[list[str], dict[int, str]]:
 
 
 def rewritten(text: str, found: dict[int, str]) -> str:
-    """Returns the page with the printed lines in place of the shown ones; dates stay."""
+    """Replaces the shown lines of the page with the printed ones; dates remain."""
     lines = text.split("\n")
     for number, printed in found.items():
         old = lines[number - 1]
@@ -322,7 +323,7 @@ def rewritten(text: str, found: dict[int, str]) -> str:
 
 
 def main() -> int:
-    """Runs pages; returns 1 if a page differs from its output."""
+    """Runs the pages; returns 1 if the output of one deviates from the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

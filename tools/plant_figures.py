@@ -23,7 +23,7 @@ DEG_PER_COUNT = 360.0 / 8000.0
 
 
 def trajectory() -> list[int]:
-    """Returns a step of 43.56 motor degrees, in counts per cycle, within the limits of the axis files."""
+    """Returns the set-points of a step of 43.56 motor deg, in counts per cycle, within the axis limits."""
     otg = ruckig.Ruckig(1, CYCLE_S)
     way, out = ruckig.InputParameter(1), ruckig.OutputParameter(1)
     way.current_position = way.current_velocity = way.current_acceleration = [0.0]
@@ -40,7 +40,7 @@ def trajectory() -> list[int]:
 
 
 def static_arcsec(truth: Truth, motor_deg: float, direction: int) -> float:
-    """Returns tooth error plus saturated hysteresis, the limit of infinitely slow motion."""
+    """Returns tooth error plus saturated hysteresis, the transmission error in the limit of slow motion."""
     assert isinstance(truth.gear.hysteresis, RollingFriction)
     tooth = (
         each.amplitude_arcsec * math.cos(math.radians(each.order * motor_deg + each.phase_deg))
@@ -50,7 +50,7 @@ def static_arcsec(truth: Truth, motor_deg: float, direction: int) -> float:
 
 
 def step_test(truth: Truth, steps: int) -> str:
-    """Runs a stepping test in both directions with 0.3 s to settle; returns one line of figures."""
+    """Runs a stepping test in both directions with 0.3 s of settling; returns one row of the table."""
     machine = Machine(truth, 1)
     substeps = round(CYCLE_S / machine.dt_s)
     move = trajectory()

@@ -1,4 +1,4 @@
-"""Shares of counts with their intervals."""
+"""Proportions with their confidence intervals."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ Z95 = 1.959964
 
 
 def proportion(hits: int, number: int) -> str:
-    """Formats ``hits / all (per cent; Wilson's 95 % interval)``; a dash for none."""
+    """Formats ``hits / number (per cent; Wilson's 95 % interval)``; a dash if ``number`` is 0."""
     if not number:
         return "-"
     share, square = hits / number, Z95**2 / number

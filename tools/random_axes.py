@@ -1,4 +1,4 @@
-"""Harness of the measurements on random axes: command line, benches, calibrations."""
+"""Harness of the tools that measure random axes: command line, benches, calibrations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DATE = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 def parser(text: str, axes: int, first: int = 1, workers: int | None = None) -> argparse.ArgumentParser:
-    """Returns the options of every measurement: number of axes, first seed, and processes if it has any."""
+    """Returns a parser with the common options: number of axes, first seed, and optionally processes."""
     made = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--axes", type=int, default=axes)
     made.add_argument("--first", type=int, default=first, help="seed of the first axis")
@@ -51,7 +51,7 @@ def simulated(axis: AxisConfig, truth: Truth, seed: int) -> Iterator[tuple[Drive
 
 
 def recorded(drive: Drive, plan: Plan) -> Recording:
-    """Runs a plan on the bench, task by task."""
+    """Runs a plan on the bench, task by task, and joins the recordings."""
     bench = Bench(drive)
     runs = [bench.run(task.procedure) for task in plan.tasks(bench.view).tasks]
     return Recording.joined([Recording(run.record, run.segments, run.axis, run.ratio) for run in runs])
@@ -60,7 +60,7 @@ def recorded(drive: Drive, plan: Plan) -> Recording:
 def calibrated(
     axis: AxisConfig, truth: Truth, plan: str, seed: int, folder: Path
 ) -> tuple[Calibration, float]:
-    """Calibrates an axis without a model, with its stepping test; returns that and the axis time, seconds."""
+    """Calibrates an axis without a model, stepping test included; returns the result and the axis time, s."""
     content = axis.model_dump(mode="json", by_alias=True, exclude_none=True)
     (folder / "axis.yaml").write_text(yaml.safe_dump(content))
     with simulated(axis, truth, seed) as (drive, clock):

@@ -1,10 +1,10 @@
-"""Prints the figures of docs/how-well.md, from measured records (which are not part of the project).
+"""Prints those figures of docs/how-well.md that come from measured records (not part of the project).
 
-    HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py          # ten minutes of CPU
-    HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py twins    # only those
+    HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py          # ten minutes of CPU time
+    HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py twins    # only the figures of twins
 
-The folder holds `cobot/jointJ-R.csv`, the same with the command in `cobot-command`, `damper/sine.csv` and
-`damper/earthquake.csv`.
+The folder contains `cobot/jointJ-R.csv`, the same with the commanded angle in `cobot-command`,
+`damper/sine.csv` and `damper/earthquake.csv`.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ gear: {ratio: 100}
 limits: {position_min_deg: -400, position_max_deg: 400, velocity_deg_s: 60,
          acceleration_deg_s2: 300, jerk_deg_s3: 6000, torque_percent: 300}
 """
-"""Axis file for the robot's joints: encoder resolutions from the records, the rest assumed."""
+"""Axis file for the robot's joints; the encoder resolutions come from the records, the rest is assumed."""
 
 
 def main() -> None:
@@ -92,14 +92,15 @@ def joint_axis() -> AxisConfig:
 
 
 def joint_recordings(folder: Path, joint: int) -> list[Recording]:
-    """Returns a joint's four recordings with their commands, with the output torque as the motor's.
+    """Returns a joint's four recordings with their commands, and with torques in hdbridge's convention.
 
-    The robot reports the load torque as delivered by the gear: at rest against its weight, it has the sign
-    of the motor's torque. Here it is the torque that pushes the load forward.
+    The recorded motor torque is divided by the ratio. The robot reports the load torque as delivered by the
+    gear: at rest against the weight, it has the sign of the motor torque. In hdbridge, it is the external
+    torque that pushes the load forward, so its sign is reversed.
 
-    The joint's zero is some thirty motor turns away. Whole turns are subtracted, because a replay begins at
-    the zero of the simulated drive. The replay's approach then goes backwards, as do the recordings, so
-    friction holds the axis in the same direction before them.
+    The joint's zero is about thirty motor turns away. Whole turns are subtracted, because a replay begins at
+    the zero of the simulated drive. The approach of the replay is then backwards, as in the recordings, so
+    that friction acts in the same direction before them.
     """
     recordings = []
     for path in sorted(folder.glob(f"cobot-command/joint{joint}-*.csv")):
@@ -119,7 +120,7 @@ def joint_recordings(folder: Path, joint: int) -> list[Recording]:
 
 
 def twin_of_others(recordings: Sequence[Recording], out: int) -> tuple[Twin, dict[str, Comparison]]:
-    """Fits a twin to all recordings but one; compares usual values, model and twin with that one."""
+    """Fits a twin to all recordings but one; compares usual values, model and twin with the one left out."""
     axis = joint_axis()
     others = [each for number, each in enumerate(recordings) if number != out]
     found = diagnose(others, NOTHING, independent_zeros=True)
@@ -130,13 +131,13 @@ def twin_of_others(recordings: Sequence[Recording], out: int) -> tuple[Twin, dic
 
 
 def held_against(recording: Recording, truth: Truth) -> Comparison:
-    """Compares a recording with its replay."""
+    """Compares a recording with its replay on the simulated axis."""
     simulated = replay(recording, joint_axis(), truth)
     return compare(recording.record, simulated, (), NOTHING.ratio)
 
 
 def _twins(folder: Path) -> None:
-    """Prints the errors of a twin, fitted to three recordings, on the fourth."""
+    """Prints the errors, on each recording, of a twin that is fitted to the other three."""
     for joint in (4, 5):
         recordings = joint_recordings(folder, joint)
         left: dict[tuple[str, str], list[float]] = {}
@@ -182,7 +183,7 @@ def _leave_one_out(records: list[Record]) -> None:
 
 
 def left_out(records: Sequence[Record]) -> list[float]:
-    """Returns the error of each record that a diagnosis of the others leaves, about its mean; rms, arcsec."""
+    """Returns the rms error, about its mean, of each record with the model from the others; arcsec."""
     left = []
     for out in records:
         others = concatenate([each for each in records if each is not out])
@@ -193,7 +194,10 @@ def left_out(records: Sequence[Record]) -> list[float]:
 
 
 def regressed(records: Sequence[Record]) -> list[float]:
-    """Returns the error left by a least-squares fit of motor orders 1 and 2, motor speed and load torque."""
+    """Returns the rms error of each record with a linear regression on the others, arcsec.
+
+    The regressors are motor orders 1 and 2, motor speed and load torque.
+    """
     columns, errors = [], []
     for record in records:
         motor = record.motor_position_deg
@@ -224,7 +228,7 @@ def _damper(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _laws(folder: Path) -> None:
-    """Fits both laws to the sine and predicts the earthquake; widths in mm."""
+    """Fits both hysteresis laws to the sine motion and predicts the earthquake; widths in mm."""
     _, angle, force = _damper(folder, "sine")
     _, other, measured = _damper(folder, "earthquake")
     bands = (CHATTER_COUNTS * reading_of(each).unaided_deg for each in (angle, other))

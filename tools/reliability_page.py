@@ -1,7 +1,7 @@
-"""Writes the tables of docs/reliability.md: results of every fault of the suite, at every place.
+"""Writes the tables of docs/reliability.md: the results of every fault of the suite at every place.
 
-python tools/reliability_page.py            try them (minutes; vcan by tools/socketcan.sh), write the page
-python tools/reliability_page.py --check    only report if the page has the suite's rows
+python tools/reliability_page.py            run all (minutes; vcan by tools/socketcan.sh), write the page
+python tools/reliability_page.py --check    only check that the page has the rows of the suite
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ SOCKETCAN_TESTS = ("tests/socketcan/test_reliability.py", "tests/socketcan/test_
 _BLOCK = re.compile(r"(<!-- tried: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _BETWEEN = "; "
 PLACES = {VIRTUAL: "bench", VCAN: "vcan", DAEMON: "daemon"}
-"""Places of the suite in the order of the page, as the page names them."""
+"""Names of the suite's places on the page, in the order of the page."""
 
 
 class Result(NamedTuple):
-    """Row of the suite with its required reaction, the allowed cycles and the measured ones."""
+    """Row of the suite with the required reaction, the allowed and the measured number of cycles."""
 
     fault: str
     expected: str
@@ -118,7 +118,7 @@ def page(seen: list[Seen]) -> str:
 
 
 def together(cells: dict[str, str]) -> str:
-    """Returns the results of a row at all places as one cell; a single result if they agree."""
+    """Joins the results of a row at all places; a single result if they agree."""
     if len({*cells.values()}) == 1:
         return next(iter(cells.values()))
     return ", ".join(f"{place} {taken}" for place, taken in cells.items() if taken != "–")
@@ -133,7 +133,7 @@ def _whole(row: DaemonRow, seen: Seen) -> Result:
 
 
 def _behaviour(character: Character) -> str:
-    """Returns the keys of the truth file in which a drive differs from the default."""
+    """Returns the keys of the truth file that differ from the default for a drive of this character."""
     keys = character.behaviour.model_dump(mode="json", exclude_defaults=True)
     chosen = [f"`{name}: {str(value).lower()}`" for name, value in keys.items()]
     return ", ".join([*chosen, f"605Ah = {character.quick_stop_option}"])

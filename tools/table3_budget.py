@@ -1,12 +1,12 @@
-"""Error budget of the article's Table 3, taken as a measurement: `article_table3.py --as-data`.
+"""Error budget of the article's Table 3, treated as a measurement: `article_table3.py --as-data`.
 
-Four runs of one test give four scatters and four means. If the four share one uncompensated error e, from
+Four runs of one test give four scatters and four means. If all four have the same uncompensated error e, from
 which the runs removed a synchronous correction w, a hysteresis correction h, or both, then
 
     var(e - w) = var e + var w - 2 cov(e, w)                               and likewise for h and w + h,
 
 so the four scatters give cov(e, w), cov(w, h) and, for each var h, cov(e, h). A covariance matrix has no
-negative eigenvalue. That bounds var h, and with the means the size of h and the share of the steps in one
+negative eigenvalue. This bounds var h and, with the means, the size of h and the fraction of the steps in one
 direction. No assumption is made about the shape of any part.
 """
 
@@ -23,9 +23,10 @@ Row = tuple[float, float]
 
 
 def budget(table: Mapping[str, Row], wave: float, offset: float, floor: float) -> dict[str, Any]:
-    """Returns everything that follows from four rows; arcsec.
+    """Returns all figures that follow from the four rows of the table; arcsec.
 
-    ``wave`` and ``floor`` are 3 sigma of Table 1's wave and of one motor count, ``offset`` is Table 2's.
+    ``wave`` and ``floor`` are 3 sigma of Table 1's synchronous error and of one motor count; ``offset`` is
+    that of Table 2.
     """
     three = {name: each[0] for name, each in table.items()}
     least = min(three.values())
@@ -51,7 +52,7 @@ def budget(table: Mapping[str, Row], wave: float, offset: float, floor: float) -
 
 
 def _means(table: Mapping[str, Row]) -> dict[str, float]:
-    """Returns the means of the corrections; corrections of one error must be additive in them."""
+    """Returns the deviation of the corrections' means from additivity, which one common error requires."""
     mean = {name: each[1] for name, each in table.items()}
     apart = mean["both"] - mean["synchronous"] - mean["hysteresis"] + mean["none"]
     return {
@@ -104,7 +105,7 @@ def possible_variances(variance: Mapping[str, float], wave: float, most: float =
 
 
 def _covariances(variance: Mapping[str, float], wave: float, correction: float) -> list[list[float]]:
-    """Returns the covariances of the error, the synchronous and the hysteresis correction."""
+    """Returns the covariance matrix of the error, the synchronous and the hysteresis correction."""
     error = variance["none"]
     along_wave = (error + wave - variance["synchronous"]) / 2.0
     along = (error + correction - variance["hysteresis"]) / 2.0
@@ -113,11 +114,11 @@ def _covariances(variance: Mapping[str, float], wave: float, correction: float) 
 
 
 def _neither(variance: Mapping[str, float], wave: float, correction: float) -> float:
-    """Returns the variance of the error that remains for any sizes of the two corrections."""
+    """Returns the variance of the error that no scaling of the two corrections removes."""
     whole = np.array(_covariances(variance, wave, correction))
     return float(whole[0, 0] - whole[0, 1:] @ np.linalg.pinv(whole[1:, 1:]) @ whole[1:, 0])
 
 
 def _share(deviation: float, mean: float) -> float:
-    """Returns the share, per cent, of the more frequent of two opposite values, by scatter and mean."""
+    """Returns the percentage of the more frequent of two opposite values, given their scatter and mean."""
     return 50.0 * (1.0 + abs(mean) / math.hypot(deviation, mean))

@@ -1,11 +1,12 @@
-"""Calibrates and steps random axes and their twins, and compares the two.
+"""Calibrates and steps random axes and their twins, and compares the results.
 
     .venv/bin/python tools/twin_agreement.py --first 500 --axes 2
 
 The axes are those of tools/twin_random_axes.py. Each is treated as an axis on a bench: calibrated with the
-stepping test, recorded on the plan ``dynamics``, twinned from usual values, with the error of its model. Then
-the twin is calibrated and stepped in the same way. Prints for each axis 3 sigma of the stepping test without
-compensation, the offset of the loop, and the differences of the orders.
+stepping test, and recorded on the plan ``dynamics``. Its twin is fitted from usual values with the
+transmission error of the calibrated model, and then calibrated and stepped in the same way. Prints for each
+axis 3 sigma of the stepping test without compensation, the hysteresis offset, and the largest difference of
+an order.
 """
 
 from __future__ import annotations
@@ -30,29 +31,29 @@ from hdbridge.twin.translate import translate
 from hdbridge.twin.twin import fit_twin
 
 STEPPING, ORDERS_ARCSEC, OFFSET = 0.05, 0.3, 0.02
-"""Tolerances of a twin: a share of 3 sigma, each order's phasor, a share of the offset."""
+"""Tolerances of a twin: relative error of 3 sigma, phasor of each order, relative error of the offset."""
 
 
 def calibration(axis: AxisConfig, truth: Truth, plan: str, seed: int) -> Calibration:
-    """Calibrates an axis without a model, with its stepping test."""
+    """Calibrates an axis that has no model, stepping test included."""
     with tempfile.TemporaryDirectory() as folder:
         return calibrated(axis, truth, plan, seed, Path(folder))[0]
 
 
 def three_sigma_arcsec(found: Calibration) -> float:
-    """Returns 3 sigma of the stepping test without compensation."""
+    """Returns 3 sigma of the stepping test without compensation, arcsec."""
     return found.validation.before.pooled.three_sigma_arcsec if found.validation else float("nan")
 
 
 def offset_arcsec(model: TransmissionModel) -> float:
-    """Returns the offset of the loop; 0 without one."""
+    """Returns the hysteresis offset of a model; 0 without hysteresis."""
     return sum(
         each.offset_arcsec for each in model.effects if isinstance(each, Hysteresis | HysteresisMemory)
     )
 
 
 def phasors(model: TransmissionModel) -> dict[int, complex]:
-    """Returns the phasor of each motor order."""
+    """Returns the complex amplitude of each motor order, arcsec."""
     return {
         each.order: each.amplitude_arcsec * np.exp(1j * np.radians(each.phase_deg))
         for effect in model.effects
@@ -62,7 +63,7 @@ def phasors(model: TransmissionModel) -> dict[int, complex]:
 
 
 def one(seed: int, plan: str, workers: int) -> str:
-    """Runs one axis; returns one line."""
+    """Measures one axis and its twin; returns one line of the table."""
     began_s = time.perf_counter()
     axis, truth = draw(seed)
     own = calibration(axis, truth, plan, seed)

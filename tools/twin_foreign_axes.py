@@ -2,11 +2,11 @@
 
     PYTHONPATH=tests .venv/bin/python tools/twin_foreign_axes.py --structures piv observed --first 20 --axes 2
 
-Each axis is recorded on the plan ``dynamics`` and on another motion. Its twin starts at usual values with the
-gear's true transmission error, as from a calibration. Prints for each axis the twin's errors of following
-error and torque on the other motion, per cent of the measured signal; the number of intervals, and of those
-that contain the truth; the remarks on the twin; and the CPU time of the fit. With ``--checks``
-each axis is changed, recorded again and compared with its twin.
+Each axis is recorded on the plan ``dynamics`` and on another motion. The fit of its twin starts at usual
+values with the gear's true transmission error, as if from a calibration. Prints for each axis the errors of
+the twin's following error and torque on the other motion, per cent of the measured signal; how many of the
+intervals contain the truth; the remarks on the twin; and the CPU time of the fit. With ``--checks``, each
+axis is changed, recorded again and compared with its twin.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, so threads only cost time
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads slow down operations on such small matrices
 
 import yaml
 from foreign.bench import bench_of
@@ -43,7 +43,7 @@ from hdbridge.twin.twin import fit_twin, judge
 
 
 def bench(foreign: Foreign, plan: Plan) -> Recording:
-    """Runs a plan on the foreign axis, over frames, task by task."""
+    """Runs a plan on the foreign axis, over CAN frames, task by task."""
     with (
         tempfile.TemporaryDirectory() as folder,
         bench_of(foreign, Path(folder)) as axis,
@@ -60,7 +60,7 @@ def axis_of(foreign: Foreign) -> AxisConfig:
 
 
 def start(axis: AxisConfig, foreign: Foreign) -> Truth:
-    """Returns usual values with the gear's own transmission error."""
+    """Returns the start of the fit: usual values with the gear's true transmission error."""
     law, truth = foreign.mechanics.hysteresis, default_truth(axis).model_dump(by_alias=True)
     truth["gear"]["motor_orders"] = [each._asdict() for each in foreign.mechanics.motor_orders]
     truth["gear"]["hysteresis"] = (
@@ -90,7 +90,7 @@ def _mechanics(foreign: Foreign, **changes: float) -> Foreign:
 
 
 def _detuned(foreign: Foreign) -> Foreign:
-    """Returns the axis with a softer position loop, by the parameter that its structure has for it."""
+    """Returns the axis with a lower position loop gain, by the corresponding parameter of its structure."""
     law = foreign.servo.law
     name = "feedback_hz" if hasattr(law, "feedback_hz") else "position_gain_per_s"
     return replace(
@@ -115,11 +115,11 @@ CHANGES = {
         lambda f: replace(f, servo=replace(f.servo, dead_time_ms=f.servo.dead_time_ms + 1.0)),
     ),
 }
-"""Cause that should be reported, and the changed axis, by name."""
+"""Cause that should be reported, and function that changes the axis, by name of the change."""
 
 
 def print_checks(foreign: Foreign, axis: AxisConfig, twin: Truth, seed: int, workers: int) -> None:
-    """Changes the axis, records it again with other noise, and prints the result of a check."""
+    """Makes each change of the axis, records it with other noise, and prints the result of the check."""
     for name, (cause, change) in CHANGES.items():
         try:
             recording = bench(replace(change(foreign), seed=seed + 3000), Plan.load("dynamics"))

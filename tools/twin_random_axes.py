@@ -2,15 +2,16 @@
 
     .venv/bin/python tools/twin_random_axes.py --axes 8 --checks
 
-Each axis has its own inertias, friction, loops and feed-forward (half to double the usual), dead time (0 to 3
-ms), resonance (15 to 80 Hz), ratio (30 to 160), law of hysteresis, tooth orders and noise. Its axis file
-allows the following error that such a drive needs; gains near instability are drawn again. It is benched over
-frames on the plan ``dynamics``, twinned from the usual values (`hdbridge.twin.parameters`), and judged on
-another motion that the fit has not seen. Prints for each axis the differences on that motion, the number of
-95 % intervals that contain the truth, and the result of the check after one, two or no changes of the plant.
+Each axis has its own inertias, friction, control loops and feed-forward (half to double the usual values),
+dead time (0 to 3 ms), resonance (15 to 80 Hz), ratio (30 to 160), hysteresis law, tooth orders and noise. Its
+axis file allows the following error that such a drive needs; gains near instability are drawn again. The axis
+is recorded over CAN frames on the plan ``dynamics``, its twin is fitted from the usual values
+(`hdbridge.twin.parameters`), and the twin is judged on another motion that the fit has not used. Prints for
+each axis the differences on that motion, the number of 95 % intervals that contain the truth, and the result
+of the check after no change, one change or two changes of the plant.
 
-The gear's own transmission error is given, as from a calibration (tools/calibrate_random_axes.py measures
-that): this tool measures the rest.
+The gear's transmission error is given, as if from a calibration (tools/calibrate_random_axes.py measures
+that); this tool measures the rest.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, so threads only cost time
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads slow down operations on such small matrices
 
 import numpy as np
 import random_axes
@@ -66,14 +67,14 @@ CHANGES: dict[str, tuple[str, Callable[[Truth], dict[str, float]]]] = {
     ),
     "warmer gear": ("warmth", lambda t: {"temperature": t.temperature.ambient_c + 15.0}),
 }
-"""Cause that should be reported, and the change of the plant, by name."""
+"""Cause that should be reported, and changed values of the plant, by name of the change."""
 PAIRS = 3
 """Number of pairs of changes drawn for each axis."""
 WINDOWS = 3.0
-"""Ratio of the allowed following error to that of the delay at the highest speed; `hdbridge bringup` sets
-three times the observed one."""
+"""Ratio of the allowed following error to the one that the delay causes at the highest speed; `hdbridge
+doctor` suggests three times the observed one."""
 GAIN_MARGIN = 2.0
-"""Minimum gain margin: 6 dB, the minimum of textbooks for tuning a loop."""
+"""Minimum gain margin: 6 dB, the usual textbook minimum for loop tuning."""
 
 
 @dataclass
@@ -81,22 +82,21 @@ class Outcome:
     seed: int
     about: str
     channels: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Differences on the other motion as a share of the measured signal and in units of its noise, by
-    channel."""
+    """Differences on the other motion, relative to the measured signal and to its noise, by channel."""
     held: int = 0
     intervals: int = 0
     missed: list[str] = field(default_factory=list)
     fit_s: float = 0.0
     checks: list[tuple[str, set[str], set[str]]] = field(default_factory=list)
-    """Change of the plant, causes that should be reported, and reported causes."""
+    """Change of the plant, causes that should be reported, and reported causes of each check."""
 
 
 def draw(seed: int, *, sticking: bool = False) -> tuple[AxisConfig, Truth]:
-    """Draws a random axis; with ``sticking`` it also has higher friction near rest."""
+    """Draws a random axis; with ``sticking``, its friction is higher near rest (Stribeck effect)."""
     rng = np.random.default_rng(seed)
 
     def some() -> float:
-        """Returns a factor from one half to two."""
+        """Draws a factor from one half to two."""
         return float(np.exp(rng.uniform(math.log(0.5), math.log(2.0))))
 
     ratio = float(rng.integers(60, 321)) / 2.0
@@ -153,9 +153,9 @@ def draw(seed: int, *, sticking: bool = False) -> tuple[AxisConfig, Truth]:
 
 
 def _gain_margin(truth: dict[str, Any]) -> float:
-    """Returns the factor by which the velocity gain may fall or rise before the loops are unstable.
+    """Returns the factor by which the velocity gain may fall or rise before the loops become unstable.
 
-    It may fall until the loops of a rigid axis are unstable (Routh), and rise until the motor alone is: the
+    The lower limit is the stability limit of a rigid axis (Routh), the upper one that of the motor alone: the
     loop uses the mean speed of the previous substep, which limits the gain to two inertias per substep.
     """
     servo, motor, ratio = truth["servo"], truth["motor"], truth["gear"]["ratio"]
@@ -199,7 +199,7 @@ def usual(axis: AxisConfig, truth: Truth) -> Truth:
 
 
 def without_noise(truth: Truth) -> Truth:
-    """Removes the noise, so that differences do not come from two noise samples."""
+    """Removes the encoder noise, so that a comparison contains only the noise of the measurement."""
     encoder = truth.load_.encoder.model_copy(update={"noise_arcsec": 0.0})
     return truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": encoder})})
 
@@ -230,7 +230,7 @@ def one(
     checks: bool,
     workers: int,
 ) -> Outcome:
-    """Fits a twin and judges it."""
+    """Fits a twin and judges it on the other motion, by its intervals and, with ``checks``, by changes."""
     began_s = time.perf_counter()
     twin = fit_twin([recording], axis, usual(axis, truth), workers=workers)
     law = truth.gear.hysteresis.law if truth.gear.hysteresis else "none"
@@ -267,7 +267,7 @@ def one(
 
 
 def _saturated(recording: Recording, axis: AxisConfig) -> str:
-    """Returns a remark if the drive is at its torque limit, where loops and load oscillate."""
+    """Returns a remark if the drive reaches its torque limit, at which control loops and load oscillate."""
     most_nm = 0.01 * axis.limits.torque_percent * axis.drive.rated_torque_nm
     share = float(np.mean(np.abs(recording.record.columns["motor_torque_nm"]) > 0.99 * most_nm))
     return f" {share:.1%} at the torque limit" if share else ""
@@ -290,7 +290,7 @@ def changed_plants(truth: Truth, seed: int) -> Iterator[tuple[str, set[str], Tru
 
 
 def line(each: Outcome) -> str:
-    """Returns the line of one axis."""
+    """Returns the output line of one axis."""
     parts = [
         f"{name.split('_')[0]} {share:.3f} {noise:.2f}" for name, (share, noise) in each.channels.items()
     ]

@@ -1,12 +1,12 @@
-"""Draws thermal constants of the demo's axis at random and measures the coverage of a twin's intervals.
+"""Draws random thermal constants for the demo's axis and measures the coverage of a twin's intervals.
 
     python tools/twin_warmth.py --first 100 --axes 30 --minutes 30
 
 Each axis has its own ambient temperature (14 to 32 deg C), thermal resistance (0.8 to 5 K/W), time constant
-(240 to 1500 s) and copper loss (0 to 30 W). It works for three quarters of the time: slow moves, moves at
-high acceleration and rests, in spells of 20 to 180 s; then it rests. Its temperature is read in steps of 0.1
-K. The twin begins at usual values. Its mechanics are the axis's own except for friction, which is wrong at
-random by the uncertainty of a fit: half a per cent (Coulomb) and three per cent (viscous).
+(240 to 1500 s) and copper loss (0 to 30 W). It moves for three quarters of the time: slow moves, moves at
+high acceleration and rests, in periods of 20 to 180 s; then it rests. The temperature is measured in steps of
+0.1 K. The twin begins at usual values. Its mechanics are those of the axis, except for friction, which has a
+random error with the uncertainty of a fit: 0.5 % (Coulomb) and 3 % (viscous).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FRICTION = {"Coulomb friction": 0.005, "viscous friction": 0.03}
 
 
 def draw(rng: np.random.Generator) -> Truth:
-    """Returns the demo's axis with random thermal constants and surroundings."""
+    """Returns the demo's axis with random thermal constants and ambient temperature."""
 
     def some() -> float:
         return float(np.exp(rng.uniform(-1.0, 1.0) * math.log(2.5)))
@@ -51,7 +51,7 @@ def draw(rng: np.random.Generator) -> Truth:
 
 
 def recorded(truth: Truth, rng: np.random.Generator, minutes: float) -> Recording:
-    """Records work of several kinds, and a rest."""
+    """Records motion of several kinds, and a final rest."""
     machine = Machine(truth, 0, may_compile=True)
     machine.torque_limit_permille = 10.0 * AXIS.limits.torque_percent
     bench = Exercise(machine)
@@ -80,7 +80,7 @@ def recorded(truth: Truth, rng: np.random.Generator, minutes: float) -> Recordin
 
 
 def fitted(rng: np.random.Generator) -> Fitted:
-    """Returns the axis's mechanics with the errors of a fit."""
+    """Returns the axis's mechanics with the random errors of a fit."""
     parameters, spread = tuple(BY_NAME[name] for name in FRICTION), np.array(list(FRICTION.values()))
     place = np.array(coordinates(TRUTH, parameters)) + spread * rng.standard_normal(len(spread))
     truth = at_coordinates(TRUTH, parameters, place.tolist())

@@ -93,9 +93,9 @@ _MODULES: Final = {
     "positioning": ("demo", "move", "step", "motion"),
     "recordings": ("record",),
 }
-"""Modules with several commands; every other command is in the module of the same name.
+"""Modules that define several commands; any other command is in the module of the same name.
 
-``COMMANDS`` of a module contains the function of a command, or the functions of a group of commands."""
+A module's ``COMMANDS`` contains the function of each command, or the functions of a group of commands."""
 SIGNED: Final = {"move", "sdo set", "ctl move", "ctl jog", "ctl queue", "ctl set"}
 """Commands with a number that may be negative and would otherwise be parsed as an option."""
 
@@ -123,7 +123,7 @@ def load(name: str) -> typer.Typer:
 
 
 class _LoadedToRun(TyperGroup):
-    """Command group that replaces the placeholders of the overview by the real commands."""
+    """Command group that replaces the placeholders of the overview with the real commands."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         name, _, rest = super().resolve_command(ctx, args)
@@ -133,7 +133,7 @@ class _LoadedToRun(TyperGroup):
 
 @cache
 def _built(name: str) -> Any:
-    """Returns the command with its options; cached, because a process may run it several times."""
+    """Builds a command with its options; cached, because a process may run the command several times."""
     return usage.strict(get_group(load(name)).commands[name])
 
 
@@ -195,7 +195,7 @@ def _hdbridge(
 
 
 _HANDLER: Final = "hdbridge.plain"
-"""Name of the error handler of a text stream that replaces characters outside its encoding."""
+"""Name of the codec error handler that replaces characters outside the encoding of the output."""
 _PLAIN: Final = str.maketrans(
     {"σ": "s", "±": "~", "→": ">", "°": " ", "²": "2", "µ": "u", "–": "-", "…": "~"}
 )
@@ -248,7 +248,7 @@ def main() -> None:
 
 
 def _close_output() -> None:
-    """Discards the output buffer, which cannot be written and must not fail again at exit."""
+    """Discards the output buffer, which cannot be written, so that exit does not fail again."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -156,7 +156,7 @@ def check(profile: CheckedArgument, model: opt.Model = None, json_file: opt.Json
 
 
 def _check_channel(bus: BusConfig, where: str) -> None:
-    """Notes a channel that this computer lacks; the file may be for another computer."""
+    """Prints a note if this computer lacks the channel; the file may be meant for another computer."""
     from hdbridge.drive.link import absent_interface
 
     if absent := absent_interface(bus):
@@ -192,7 +192,7 @@ def _print_facts(facts: dict[str, str]) -> None:
 
 
 class _Report:
-    """Content of one axis's files, for reports."""
+    """Report on the files of one axis."""
 
     def __init__(self, axis: AxisConfig, model: Path | None) -> None:
         from hdbridge.axis.model import TransmissionModel
@@ -506,7 +506,7 @@ def _print_row(row: Row[BringUpContext]) -> None:
 
 
 def _stored_response(context: BringUpContext) -> Verdict:
-    """Checks, before any motion, that the model's response belongs to this drive, axis and cycle."""
+    """Checks, before any motion, that the model's response is valid for this drive, axis and cycle time."""
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.control.bench import compensation_for
 
@@ -520,10 +520,7 @@ def _stored_response(context: BringUpContext) -> Verdict:
 
 
 def _servo_as_measured(context: BringUpContext) -> Verdict:
-    """Runs the axis at constant speeds without and with its correction, and compares the response.
-
-    The response in motion is that of the model.
-    """
+    """Runs the axis at constant speeds with its correction, and compares the response with the model's."""
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.commissioning.calibration.motion import servo_check
 

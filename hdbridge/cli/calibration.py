@@ -67,7 +67,7 @@ class Measured:
         axis, date = session.axis, datetime.now().astimezone()
         if self.resume is None:
             plan = Plan.load(self.plan)
-            outlook(plan, axis)  # refused before a folder is made
+            outlook(plan, axis)  # an impossible plan is refused before the folder is created
             default = Path("recordings") / f"{axis.name}-{date:%Y%m%d-%H%M%S}"
             folder = make_folder(self.out) if self.out else new_folder(default)
             return Measurement(session, plan, folder, date, None)
@@ -87,10 +87,10 @@ class Measurement:
     folder: Path
     date: datetime
     journal: Journal | None
-    """Journal of the recording to continue; None for a new one."""
+    """Journal of the recording to continue; None for a new recording."""
 
     def announce(self, after: str = "") -> None:
-        """Prints the remaining part of the plan and its duration; ``after`` describes the next step."""
+        """Prints the remaining part of the plan and its duration; ``after`` describes the step after it."""
         from hdbridge.commissioning.calibration.measure import outlook
 
         done = self.journal.done if self.journal else ()
@@ -104,7 +104,7 @@ class Measurement:
         )
 
     def begun(self, drive: Drive) -> Journal:
-        """Returns the journal to continue, else a new journal for this booted drive."""
+        """Returns the journal to continue, or starts a new one for this booted drive."""
         from hdbridge.commissioning.calibration import start_journal
 
         if self.journal is not None:
@@ -115,7 +115,7 @@ class Measurement:
 
     @contextmanager
     def booted(self) -> Iterator[tuple[Drive, Callable[[str, float, float], None], Callable[[], bool]]]:
-        """Yields the booted drive, and functions that show progress and report a request to end.
+        """Yields the booted drive, and functions that show progress and return True once an end is requested.
 
         Locks the axis against other measurements. If the measurement fails, prints the location of its
         record; removes an empty folder.
@@ -140,7 +140,7 @@ class Measurement:
 
 @contextmanager
 def phases() -> Iterator[Callable[[str, float, float], None]]:
-    """Yields a progress function with one bar per phase, identified by its total duration, s."""
+    """Yields a progress function that shows one bar per phase; the total duration, s, identifies a phase."""
     with progress_bar() as bar:
         bars: dict[float, int] = {}
 
@@ -297,8 +297,7 @@ def report(
 
 
 TAKEN_OFF = 0.95
-"""Maximum remaining share of the residual with the terms fitted in addition to the model, for reporting
-them."""
+"""Maximum ratio of the residual with the additional terms to that without, for these terms to be reported."""
 
 
 def print_calibration(result: Calibration) -> None:
@@ -317,7 +316,7 @@ def print_calibration(result: Calibration) -> None:
         was = before.get((each.effect, each.parameter))
         value, half_width = with_interval(each.value, each.half_width)
         known = (value, half_width) if each.identifiable else (f"({figure(each.value)})", "not known")
-        # With a previous model there is no space for the unit column; the names contain the units.
+        # With a previous model there is no room for the unit column; the names contain the units.
         last = "-" if was is None else with_interval(was, each.half_width)[0]
         rows.append((each.effect, each.parameter, *known, last if before else unit_of(each.parameter)))
     axis = f"axis '{result.axis}'" if result.axis else ", ".join(result.recordings)
@@ -357,7 +356,7 @@ def write_calibration_page(path: Path, result: Calibration) -> None:
 
 
 def print_next(offer: Offer | None, session: Session) -> None:
-    """Prints the commands for a pending model. A daemon that lent its bus commits and uses the model."""
+    """Prints the next commands for a pending model; a daemon that lent its bus commits and uses it itself."""
     if offer is not None and offer.made:
         folder = session.files.axis.parent
         daemon = f"hdbridge ctl model {session.axis.name} pending"
@@ -366,7 +365,7 @@ def print_next(offer: Offer | None, session: Session) -> None:
 
 
 def print_stepping(checked: Validation) -> None:
-    """Prints the stepping test with the previous and the new model, and the floor of the axis."""
+    """Prints the stepping test with the previous and the new model, and the best possible on this axis."""
     print_steps("Stepping test: load error at rest, arcsec", (checked.before, checked.after))
     print_worse("stepping", checked.worse)
     _print_accuracy(checked)
@@ -380,7 +379,7 @@ def print_stepping(checked: Validation) -> None:
 
 
 def print_steps(title: str, tests: Iterable[Stepped], first: str = "with") -> None:
-    """Prints scatter and mean of stepping tests, one line each; ``first`` heads the column of their names."""
+    """Prints scatter and mean of each stepping test; ``first`` is the heading of the column of test names."""
     columns = (first, "CW 3σ", "mean", "CCW 3σ", "mean", "pooled 3σ", "mean")
     rows = []
     for test in tests:
@@ -391,7 +390,7 @@ def print_steps(title: str, tests: Iterable[Stepped], first: str = "with") -> No
 
 
 def print_worse(test: str, ways: Iterable[str]) -> None:
-    """Prints the deterioration in one direction."""
+    """Prints each direction of a test in which the axis became worse."""
     for each in ways:
         say(f"{test}: {each}", style="bold")
 

@@ -54,7 +54,7 @@ AxesArgument = Annotated[list[str] | None, Argument(metavar="AXIS...", help="Nam
 
 @dataclass(frozen=True)
 class Daemon:
-    """Options of a command that needs the right to move."""
+    """Options of a command that needs the lease, the right to move."""
 
     at: AtOption = None
     force: Annotated[
@@ -119,14 +119,12 @@ def stopping(at: str | None) -> Iterator[Client]:
             yield client
     except DaemonError as problem:
         if type(problem) is not DaemonError:
-            raise  # the daemon answers
+            raise  # the daemon answered with a refusal
         raise DaemonError(f"{problem}; {_who_holds(at)}") from None
 
 
 def _who_holds(at: str | None) -> str:
-    """Describes the processes that hold an interface or listen at the daemon's socket, and how to end
-    them.
-    """
+    """Describes the processes that hold an interface or the daemon's socket, and how to end them."""
     from hdbridge.client.address import find
     from hdbridge.daemon.api.sockets import daemon_of
     from hdbridge.drive.interfacelock import holders, process_words
@@ -145,7 +143,7 @@ def _who_holds(at: str | None) -> str:
 
 @contextmanager
 def stopped_by_signals(client: Client, name: str) -> Iterator[None]:
-    """Brakes an axis to rest if the block is interrupted; the interruption propagates."""
+    """Brakes an axis to rest if the block is interrupted, and then lets the interruption propagate."""
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
@@ -328,7 +326,7 @@ def mark(text: Annotated[str, Argument(metavar="TEXT", help="One line.")], at: A
 
 
 def _looks(count: int | None, every_s: float) -> Iterator[int]:
-    """Yields ``count`` numbers, with a pause between two."""
+    """Yields 0, 1, 2, ..., pausing before each further number; ``count`` None is endless."""
     for number in itertools.count() if count is None else range(count):
         if number:
             time.sleep(every_s)

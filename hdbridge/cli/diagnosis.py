@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 WORTH_PRINTING = 0.01
-"""Minimum share of the difference for printing a coordinate."""
+"""Minimum fraction of the difference that a coordinate must explain to be printed."""
 
 
 @taking(Part, opt.CsvFormat)
@@ -139,7 +139,7 @@ def diagnose(
     single = {"--model": model, **chosen, "--prior": prior}
     said += [word for name, text in single.items() if text for word in (name, str(text))]
     document = result.as_dict()
-    # Files first, because the reader of the tables may close the pipe (`| head`).
+    # Files are written first, because the reader of the tables may close the pipe (`| head`).
     write_json(json_file, document)
     if html_file is not None:
         page = diagnosis_page(
@@ -157,7 +157,7 @@ def diagnose(
 
 
 def _prior(path: Path | None, groups: Sequence[str]) -> Prior | None:
-    """Reads the prior for a joint of these groups."""
+    """Reads the prior for a joint of these groups; None without a file."""
     if path is None:
         if groups:
             raise InputError("--group needs --prior with the fleet of these groups")
@@ -200,7 +200,7 @@ def print_diagnosis(result: Diagnosis) -> None:
 
 
 def _details(finding: Finding) -> Iterator[str]:
-    """Yields the details of a finding that are not in its table row."""
+    """Yields the details of a finding that its table row does not show."""
     said = [f"{name} {_number(each)}" for name, each in finding.parameters.items()]
     if finding.aliases:
         said.insert(0, f"it may also be: {', '.join(finding.aliases)}")
@@ -274,7 +274,7 @@ def _print_plan(report: dict[str, Any]) -> None:
 
 
 LEFT_OF_FLOOR = 1.5
-"""Ratio of a stepping test to its floor above which a further cause is suspected."""
+"""Ratio of the stepping test's three sigma to the best possible, above which a further cause is suspected."""
 
 
 @taking(Session, Measured, opt.CsvFormat)

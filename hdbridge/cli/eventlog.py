@@ -15,7 +15,7 @@ _ROOT = logging.getLogger("hdbridge")
 
 
 _given: tuple[int, Path | None] = (0, None)
-"""Requested settings: verbosity on standard error, and the file."""
+"""Requested settings: verbosity on standard error, and path of the log file."""
 
 
 def begin(verbose: int, path: Path | None) -> None:
@@ -45,7 +45,7 @@ def write(event: str, **facts: object) -> None:
 
 
 def handed_over() -> tuple[int, Path | None]:
-    """Returns the settings to a command with its own logging, and stops logging here."""
+    """Returns the settings, for a command with its own logging, and stops logging here."""
     for each in tuple(_ROOT.handlers):
         _ROOT.removeHandler(each)
         each.close()

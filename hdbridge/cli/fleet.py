@@ -120,7 +120,7 @@ class Fleet:
         return Dataset(self.out)
 
     def find(self, stored: Stored, *, may_be_empty: bool = False) -> Sequence[Source]:
-        """Returns the available recordings; raises `InputError` for a wrong source or manifest."""
+        """Returns the available recordings; raises `InputError` for an invalid source or manifest."""
         from hdbridge.fleet.sources import find_sources
 
         return find_sources(
@@ -135,7 +135,7 @@ class Fleet:
     def diagnose(
         self, found: Sequence[Source], interrupted: Callable[[], bool], retried: Collection[str] | None = None
     ) -> None:
-        """Processes the recordings with a progress bar."""
+        """Diagnoses the recordings, showing a progress bar."""
         from hdbridge.fleet.engine import RETRIED, Cluster, Progress
         from hdbridge.fleet.engine import run as run_fleet
 
@@ -275,7 +275,7 @@ def _summarise(
     pages: bool = False,
     joints: Sequence[str] = (),
 ) -> Summary:
-    """Prints, writes and returns the summary; writes the pages of these joints and of all listed ones."""
+    """Prints, writes and returns the summary; writes the pages of ``joints``, and all with ``pages``."""
     from hdbridge.fleet.prior import write_prior
     from hdbridge.fleet.report import ROWS, fleet_page, hours_words, shown
     from hdbridge.fleet.summary import summarise
@@ -322,7 +322,7 @@ def _summarise(
 
 
 def _with_pages(folder: Path, latest: Mapping[str, Row], wanted: Collection[str]) -> dict[str, str]:
-    """Writes missing pages of the wanted joints; returns the addresses of all existing pages."""
+    """Writes the missing pages of the wanted joints; returns the addresses of all pages, by joint."""
     from hdbridge.fleet.report import links, write_page
 
     there = links(folder, latest)

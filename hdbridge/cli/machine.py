@@ -286,7 +286,7 @@ def eds_of(axis: AxisConfig, settings: GatewaySettings, model: TransmissionModel
 
 
 def _heard(settings: GatewaySettings, duration_s: float) -> Iterator[Frame]:
-    """Yields the frames on the outer bus."""
+    """Yields the frames on the bus of the gateway for ``duration_s``."""
     from hdbridge.cli.session import deferred_interrupt
     from hdbridge.clock import MonotonicClock
     from hdbridge.drive.link import Link, open_bus
@@ -301,7 +301,7 @@ def _heard(settings: GatewaySettings, duration_s: float) -> Iterator[Frame]:
 
 
 def _begun(frames: Iterator[Frame]) -> Iterator[Frame]:
-    """Returns the same frames after reading the first, so that a wrong file is refused early."""
+    """Returns the same frames after reading the first one, so that an unreadable file is refused early."""
     return chain(list(islice(frames, 1)), frames)
 
 
@@ -318,9 +318,9 @@ def _logged(path: Path) -> Iterator[Frame]:
 
 
 def gateway_axis(machine: str, name: str | None) -> tuple[AxisConfig, GatewaySettings, TransmissionModel]:
-    """Returns an axis of a machine's gateway, the gateway, and the axis's model.
+    """Returns an axis of a machine's gateway, the gateway's settings, and the axis's model.
 
-    InputError if the machine has no gateway, or if the name is required.
+    InputError if the machine has no gateway, or if ``name`` is needed to select one of several axes.
     """
     from hdbridge.daemon.machine import Machine
 
@@ -398,7 +398,7 @@ def _refuse_another(bus: can.BusABC, clock: Clock, node_id: int) -> None:
     from hdbridge.drive.objects import COB_SDO_REQUEST
 
     link = Link(bus, clock)
-    # SDO upload of 1000h, which every node has
+    # SDO upload of 1000h, which every node must have
     link.send(COB_SDO_REQUEST + node_id, b"\x40\x00\x10\x00\0\0\0\0")
     end_s = clock.now() + listening_s()
     while (frame := link.recv(end_s)) is not None:

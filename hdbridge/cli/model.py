@@ -170,7 +170,7 @@ def _cells(row: Difference) -> tuple[str, str, str, str]:
 
 
 def _cell(value: Any, half_width: float | None) -> tuple[str, str]:
-    """Formats a value and the half width of its interval, with the digits of the interval or else four."""
+    """Formats a value and the half width of its interval, which determines the digits; else four digits."""
     if isinstance(value, float):
         return (figure(value), "-") if half_width is None else with_interval(value, half_width)
     return "-" if value is None else str(value), "-" if half_width is None else figure(half_width, 2)

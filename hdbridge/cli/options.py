@@ -184,7 +184,7 @@ def taking(*groups: type[Any]) -> Callable[[Callable[..., None]], Callable[..., 
     """Adds the fields of dataclasses to a command as options; the command receives these as its first
     arguments.
 
-    Arguments of the groups come first, their options after those of the command.
+    The arguments of the groups come first; their options follow those of the command.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -213,7 +213,7 @@ def taking(*groups: type[Any]) -> Callable[[Callable[..., None]], Callable[..., 
 
 
 def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
-    """Returns the parameters with their annotations evaluated."""
+    """Returns the parameters of a function, with evaluated annotations."""
     hints = get_type_hints(function, include_extras=True)
     given = inspect.signature(function).parameters.values()
     return [each.replace(annotation=hints[each.name]) for each in given]
@@ -246,8 +246,8 @@ STANDARD_OUTPUT = Path("/dev/stdout")
 def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
     """Wraps a command so that it is refused if an output would destroy something; ``-`` is standard output.
 
-    If a result goes to standard output, text for people goes to standard error. If a result cannot be written
-    after all (a full disk), the command fails after everything has been printed.
+    If a result goes to standard output, text for people goes to standard error. If writing a result fails
+    nevertheless (full disk), the command fails after everything has been printed.
     """
     options = dict(_options_of(command))
     declared = {name: (option, kind) for name, (option, kind) in options.items() if kind is not None}
@@ -297,7 +297,7 @@ def _check_truths(given: Path | list[Path] | None) -> None:
 
 @contextmanager
 def _naming(options: Mapping[str, tuple[str, Kind | None]]) -> Iterator[None]:
-    """Replaces the parameter name in an error of the library by the option on the command line."""
+    """Replaces the parameter name in an error of the library with the option of the command line."""
     try:
         yield
     except InputError as problem:
@@ -308,7 +308,7 @@ def _naming(options: Mapping[str, tuple[str, Kind | None]]) -> Iterator[None]:
 
 
 def _options_of(command: Callable[..., Any]) -> Iterator[tuple[str, tuple[str, Kind | None]]]:
-    """Yields for each parameter its option and the kind of its output; None without an output."""
+    """Yields each parameter with its option and the kind of its output, or None if it is no output."""
     for parameter in _parameters(command):
         metadata = getattr(parameter.annotation, "__metadata__", ())
         kinds = (each for each in metadata if isinstance(each, Kind))

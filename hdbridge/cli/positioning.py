@@ -77,7 +77,7 @@ def move(
     note_clamped(axis.limits, velocity_deg_s=velocity_deg_s)
     with session.booted() as (drive, interrupted):
         if session.simulate and hold_s is None:
-            hold_s = 0.0  # a simulated axis need not hold
+            hold_s = 0.0  # a simulated axis need not hold its position
         hold = Hold(math.inf if hold_s is None else hold_s, released=interrupted)
         stands_deg = drive.read_positions().motor_deg / axis.gear.ratio
         targets_deg = _absolute(angles_deg, stands_deg) if relative else angles_deg
@@ -105,7 +105,7 @@ def move(
 
 
 def _print_position(drive: Drive) -> None:
-    """Prints the position after a stop on the way; nothing if the drive no longer answers."""
+    """Prints the position after an interrupted move; nothing if the drive no longer answers."""
     with suppress(HdbridgeError):
         stands_deg = drive.read_positions().motor_deg / drive.axis.gear.ratio
         note(f"stopped on the way, at {stands_deg:.4f} deg by the motor encoder; power is off")
@@ -114,7 +114,7 @@ def _print_position(drive: Drive) -> None:
 def _compensating(
     files: Profile, given: Path | None, ratio: float, *, compensated: bool
 ) -> TransmissionModel:
-    """Returns the compensating model; without a model or ``compensated``, one without effects."""
+    """Returns the model for the compensation; one without effects if there is none or not ``compensated``."""
     from hdbridge.axis.model import TransmissionModel
 
     if not compensated:
@@ -232,7 +232,7 @@ def run_comparison(
     record: Path | None = None,
     notify: Callable[[Comparison], None],
 ) -> None:
-    """Connects, boots and compares; keeps each scheme's record as soon as it is complete.
+    """Connects and boots the drive, and compares the schemes; keeps each record as soon as it is complete.
 
     ``notify`` receives the result. For an interrupted test, this is the result of the completed schemes.
     """
@@ -246,7 +246,7 @@ def run_comparison(
     if Scheme.EXTENDED in wanted and Scheme.EXTENDED not in offered:
         raise InputError("--scheme extended: the model has no effect beyond its two parts; leave it out")
     if record is not None:
-        make_folder(record)  # before the axis moves, not after
+        make_folder(record)  # an error is reported before the axis moves
 
     for each in wanted:
         compensation_for(axis, each.of(model))  # refused before anything is connected
@@ -282,7 +282,7 @@ def run_comparison(
         def show(scheme: Scheme, share: float) -> None:
             if scheme not in begun:
                 begun.add(scheme)
-                bar.reset(bars[scheme])  # the progress time starts here
+                bar.reset(bars[scheme])  # the bar's elapsed time starts here
                 for each in bars.values():  # no progress bar for a refused test
                     bar.update(each, visible=True)
             bar.update(bars[scheme], completed=share)

@@ -1,4 +1,4 @@
-"""Printing of all commands: lines and tables of the result, remarks, progress, result files."""
+"""Output of all commands: lines and tables of the result, remarks, progress, and result files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hdbridge.files.outputs import writing
 
 Cell = str | Text
 _FIGURE: Final = re.compile(r"\(?[-+~<]?\d[\d,.]*(e[-+]?\d+)?\)?( (s|%))?|not known|-|")
-"""Cell of a column of figures, which is right-aligned."""
+"""Pattern of a cell with a figure; a column that has only such cells is right-aligned."""
 
 
 class _Console(Console):
@@ -31,9 +31,9 @@ class _Console(Console):
 
 
 console = _Console(highlight=False)
-"""Tables, on standard output."""
+"""Console for results, on standard output."""
 notes = _Console(stderr=True, highlight=False)
-"""Progress and remarks, on standard error, so that they stay out of a pipe."""
+"""Console for progress and remarks, on standard error, to keep them out of a pipe."""
 
 
 def say(line: str, style: str | None = None) -> None:
@@ -47,7 +47,7 @@ def note(line: str) -> None:
 
 
 def progress_bar() -> Progress:
-    """Returns a progress bar with the time left, on standard error; plain lines without a terminal."""
+    """Returns a progress bar with the remaining time, on standard error; plain lines without a terminal."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -59,7 +59,7 @@ def progress_bar() -> Progress:
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str = "") -> None:
-    """Prints a table uncropped, always as one table into a pipe or a file. An empty row ends a section."""
+    """Prints a table uncropped; in a pipe or a file always as one table. An empty row ends a section."""
     for each in tables(columns, rows, title):
         console.print(each, crop=False)
 
@@ -87,7 +87,7 @@ def tables(columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str = 
 
 
 def _table(columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str, shown: Sequence[int]) -> Table:
-    """Returns a table of some of the columns."""
+    """Returns a table with the columns ``shown``."""
     table = Table(title=title or None, title_justify="left")
     for place in shown:
         cells = [str(row[place]) for row in rows if place < len(row)]
@@ -103,14 +103,14 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str, s
 
 
 def print_object(name: str, value: object, type_name: str) -> None:
-    """Prints an object of a drive: a natural number also in hexadecimal."""
+    """Prints the value of an object of a drive; a non-negative integer also in hexadecimal."""
     whole = isinstance(value, int) and not isinstance(value, bool) and value >= 0
     also = f" ({value:#x})" if whole else ""
     say(f"{name}: {value}{also}  {type_name}")
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:
-    """Writes the JSON result if requested."""
+    """Writes the result as JSON, unless ``path`` is None."""
     if path is not None:
         write_result(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
 

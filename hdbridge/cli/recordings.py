@@ -48,7 +48,7 @@ class Part:
     ] = None
 
     def read(self, paths: Sequence[Path], *, all_states: bool = False) -> tuple[Recording, ModelUsed | None]:
-        """Reads MCAP files and folders of them, and the model in use at the end, or None.
+        """Reads MCAP files and folders of them; returns the recording and the model last used, or None.
 
         Raises `InputError` if the axis or the period is not in the recordings.
         """
@@ -77,7 +77,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Export:
-    """Options for the record created by a command."""
+    """Options of a command that creates a record."""
 
     out: Annotated[
         Path | None,
@@ -113,7 +113,7 @@ def is_flight(path: Path) -> bool:
 
 
 def remarks(recording: Recording) -> Iterator[str]:
-    """Yields remarks on a recording from flights or a bus log."""
+    """Yields remarks on a recording made of flight recordings or a bus log."""
     about = recording.notes
     if count := about.get("cycles_missing_within_parts"):
         yield f"{count} cycles are missing within parts, and the times allow for them"
@@ -127,7 +127,7 @@ def remarks(recording: Recording) -> Iterator[str]:
 
 
 def need_reader() -> None:
-    """Raises `InputError` if a package that reads flight recordings is not installed."""
+    """Raises `InputError` if a package for reading flight recordings is not installed."""
     need_extra("flight recordings need", _EXTRA, "daemon")
 
 

@@ -1,4 +1,4 @@
-"""Axis of a command: its profile, its options, and its real or simulated drive."""
+"""Axis on which a command acts: its profile, its options, and its real or simulated drive."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BusOptions:
-    """Options of every command for a real or simulated node."""
+    """Options of every command that uses a real or simulated node."""
 
     simulate: opt.Simulate = False
     truth: opt.Truth = None
@@ -61,7 +61,7 @@ class BusOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Session(BusOptions):
-    """Axis named by the user of one command. Nothing is connected before it is needed.
+    """Axis on which one command acts. Nothing is connected before it is needed.
 
     The fields are the options of every command for an axis; see `on_axis`.
     """
@@ -75,7 +75,7 @@ class Session(BusOptions):
 
     @cached_property
     def axis(self) -> AxisConfig:
-        """Axis file, with the bus replaced by the options."""
+        """Axis file, with the bus given by the options if they name one."""
         from hdbridge.axis import AxisConfig
         from hdbridge.drive.link import check_interface
 
@@ -134,7 +134,7 @@ class Session(BusOptions):
 
     @contextmanager
     def booted(self) -> Iterator[tuple[Drive, Callable[[], bool]]]:
-        """Yields the booted drive, and a function that reports a request to end. Ctrl-C stops the axis."""
+        """Yields the booted drive, and a function that returns True once an end is requested (Ctrl-C)."""
         with deferred_interrupt() as interrupted, self.drive() as drive:
             report = drive.boot()
             note(f"booted node {self.axis.drive.node_id} over {drive.link.name}")
@@ -144,7 +144,7 @@ class Session(BusOptions):
 
 
 on_axis = taking(Session)
-"""Gives a command the options of a `Session`, which it receives as its first argument."""
+"""Decorator that adds the options of a `Session` to a command, which receives the session first."""
 
 
 @contextmanager
@@ -159,7 +159,7 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
     def note(_number: int, _frame: FrameType | None) -> None:
         nonlocal wishes
         wishes += 1
-        if wishes >= 3:  # the user insists: end even if something hangs
+        if wishes >= 3:  # the user insists: end even if the program hangs
             raise KeyboardInterrupt
 
     before = {
@@ -175,7 +175,7 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
 
 
 def check_bus_options(interface: str | None, channel: str | None, *, simulate: bool) -> None:
-    """Refuses a bus option for a simulated drive, which does not use it."""
+    """Raises `InputError` for a bus option together with a simulated drive, which does not use it."""
     if simulate and (interface is not None or channel is not None):
         raise InputError(
             "--simulate has a bus of its own in this process: leave out --interface and --channel; a "
@@ -186,7 +186,7 @@ def check_bus_options(interface: str | None, channel: str | None, *, simulate: b
 def _borrow(bus: BusConfig) -> None:
     """Makes the daemon that holds a bus release it; does nothing for a free bus.
 
-    Raises `BusInUseError` if the holder is not a daemon that this user may ask.
+    Raises `BusInUseError` if the holder is not a daemon that is accessible to this user.
     """
     from hdbridge.client import Client
     from hdbridge.client.address import running
@@ -211,7 +211,7 @@ def _borrow(bus: BusConfig) -> None:
 
 
 def simulated_by(files: Profile, truth: Path | None) -> Path:
-    """Returns the file that describes the simulated axis; prints a note if this is the axis's twin."""
+    """Returns the truth file of the simulated axis; prints a note if it is the axis's twin."""
     plant = truth or files.simulated
     if plant == files.twin:
         note(f"simulated by the axis's twin, {plant}")
@@ -258,9 +258,9 @@ def compensating_model(files: Profile, profile: str, model: Path | None, otherwi
 
 
 def note_clamped(limits: Any, **wanted: float | None) -> None:
-    """Reports each velocity or acceleration above the axis's limit, which is used instead.
+    """Prints a note for each wanted velocity or acceleration that is replaced by the lower limit of the axis.
 
-    ``limits`` must have the named attributes: ``velocity_deg_s``, ``acceleration_deg_s2``.
+    ``limits`` must have the attributes named in ``wanted``: ``velocity_deg_s``, ``acceleration_deg_s2``.
     """
     for name, value in wanted.items():
         limit = getattr(limits, name)

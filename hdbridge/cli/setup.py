@@ -82,7 +82,7 @@ def setup(
 
 @dataclass
 class _State:
-    """Completed steps, each with the digest of the axis file used."""
+    """Saved state of a set-up: completed steps, each with the digest of the axis file used."""
 
     simulated: bool = False
     seed: int = 0
@@ -144,7 +144,7 @@ class _Setup:
         self._finish("facts")
 
     def examine(self) -> None:
-        """Checks the files, then the drive, until the doctor finds no fault."""
+        """Checks the files and then the drive, repeatedly until `doctor` finds no fault."""
         while True:
             self._run("check", self._folder)
             if self._is_done("doctor"):
@@ -163,7 +163,7 @@ class _Setup:
             return
 
     def measure_latency(self) -> None:
-        """Checks that this computer sustains the cycle; skipped for a simulated drive."""
+        """Checks that this computer sustains the cycle time; skipped for a simulated drive."""
         if self._state.simulated or self._is_done("latency"):
             return
         from hdbridge.axis import AxisConfig
@@ -174,7 +174,7 @@ class _Setup:
         self._finish("latency")
 
     def calibrate(self, plan: str) -> None:
-        """Measures, fits, and tests the model on the axis."""
+        """Measures the axis, fits its model, and tests the model on the axis."""
         if self._is_done("calibrate"):
             return
         self._confirm("The calibration moves the axis within its limits for some minutes. Move now?")
@@ -248,7 +248,7 @@ class _Setup:
         return str(typer.prompt(question[:1].upper() + question[1:], default=default, err=True))
 
     def _confirm(self, question: str) -> None:
-        """Continues only after a yes. Raises `typer.Exit` with status 130 after a no."""
+        """Asks the user to confirm. Raises `typer.Exit` with status 130 if the user declines."""
         if self._yes:
             return
         if not sys.stdin.isatty():
@@ -257,7 +257,7 @@ class _Setup:
             raise typer.Exit(130)
 
     def _mended(self) -> bool:
-        """Changes the key most suspected by the doctor, if the user agrees."""
+        """Changes the first key that `doctor` suspects if the user agrees; returns True if so."""
         checks = json.loads((self._folder / DOCTOR).read_text(encoding="utf-8"))["checks"]
         remedies = [remedy for check in checks for remedy in check.get("remedies", ())]
         match = next(filter(None, map(_REMEDY.search, remedies)), None)
@@ -305,7 +305,7 @@ def _check_interface(interface: str, channel: str, bitrate_bps: int | None) -> N
 
 
 def value_of(text: str, key: str) -> tuple[str, bool] | None:
-    """Returns the value of ``section.key`` in an axis file's text, and True if it is yet to be filled in."""
+    """Returns the value of ``section.key`` in an axis file's text, and True if it is marked as to fill in."""
     match = _line(key).search(text)
     if match is None:
         return None
@@ -313,7 +313,7 @@ def value_of(text: str, key: str) -> tuple[str, bool] | None:
 
 
 def with_value(text: str, key: str, value: str) -> str:
-    """Returns the text with another value of ``section.key``; keeps comments and order, removes the mark."""
+    """Replaces the value of ``section.key``; keeps comments and order, but removes the fill-in mark."""
 
     def replaced(match: re.Match[str]) -> str:
         comment = "" if _FILL_IN in match["comment"] else match["comment"]

@@ -1,4 +1,4 @@
-"""``hdbridge twin``: errors of the simulated drive about an axis, and the fit that corrects them."""
+"""``hdbridge twin``: differences between the simulated drive and an axis, and the fit that reduces them."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def _learned(
     begun: Translation,
     facts: list[tuple[str, str]],
 ) -> TwinReport:
-    """Fits, and keeps the twin as pending if it is better on held-out legs."""
+    """Fits a twin, and keeps it as pending if it is better on held-out legs."""
     from datetime import datetime
 
     from hdbridge.axis.model.store import measuring
@@ -123,7 +123,7 @@ def _learned(
         twin.before,
         twin.after,
         learned=_values(begun.truth, twin.truth) if verdict.kept else (),
-        # The residual is all there is to report about a twin that is no better.
+        # If the twin is no better, only its unexplained residual is reported.
         named=[*twin.findings, *twin.alike, *twin.unexplained] if verdict.kept else twin.unexplained,
         translated=begun.rows,
         facts=facts,
@@ -136,7 +136,7 @@ def _learned(
 
 
 def _values(before: Truth, after: Truth) -> list[Learned]:
-    """Returns the fitted values with their intervals, and the values before unless only assumed."""
+    """Returns the fitted values with their intervals, and the previous values unless only assumed."""
     from hdbridge.report.twin import Learned
     from hdbridge.twin.misfit import Values
     from hdbridge.twin.parameters import PARAMETERS, value_in
@@ -188,7 +188,7 @@ def _check(
 
 
 def _joined(axis: AxisConfig, recordings: dict[Path, Recording]) -> Recording:
-    """Returns all recordings as one; raises `InputError` if one is of another axis or without a command."""
+    """Joins the recordings; raises `InputError` if one is of another axis or has no commanded position."""
     from hdbridge.analysis.checks import check_records
     from hdbridge.records.recording import Recording
 

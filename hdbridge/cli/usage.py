@@ -14,10 +14,10 @@ import typer
 from hdbridge.errors import InputError
 
 UsageError: Any = typer.BadParameter.__mro__[1]
-"""Error of a wrong command line. typer takes it from click or defines its own, and exports only a
+"""Error class of an invalid command line. typer takes it from click or defines its own, and exports only a
 subclass."""
 _PLACES = ("PROFILE", "MACHINE")
-"""Metavars of parameters with a path or the name of a bundled profile."""
+"""Metavars of the parameters that take a path or the name of a bundled profile."""
 _KINDS = {"int": "an integer", "float": "a number", "bool": "true or false"}
 
 
@@ -34,8 +34,8 @@ def refusal(error: Any) -> str:
 def strict(command: Any) -> Any:
     """Makes a command refuse values that typer accepts: empty texts, NaN and infinity, impossible paths.
 
-    They are checked before the command runs and before its outputs are checked; raises a one-line
-    `InputError`.
+    The values are checked before the command runs and before its outputs are checked. An invalid one raises
+    a one-line `InputError`.
     """
     for each in getattr(command, "commands", {}).values():
         strict(each)
@@ -77,7 +77,7 @@ def asks_for_help(error: Any) -> bool:
 
 
 def _about_value(error: Any) -> str | None:
-    """Describes a wrong option value, found and expected, as for a file; None for other errors."""
+    """Describes an invalid option value with the expected one, as for a file; None for other errors."""
     param, cause = getattr(error, "param", None), error.__cause__
     if param is None or not hasattr(cause, "errors"):
         return None
@@ -96,7 +96,7 @@ def _about_value(error: Any) -> str | None:
 
 
 def _about_line(error: Any) -> str:
-    """Describes a line with too many or too few arguments."""
+    """Describes an invalid command line, for example with an unknown option or a missing argument."""
     from hdbridge.files.expectation import nearest
 
     message = str(error.format_message()).strip().rstrip(".")
@@ -120,7 +120,7 @@ def _about_line(error: Any) -> str:
 
 
 def _name(param: Any) -> str:
-    """Returns the parameter as it is typed: --count, PROFILE."""
+    """Returns the name of a parameter as the user types it: --count, PROFILE."""
     if param.param_type_name == "option":
         return str(max(param.opts, key=len))
     return str(param.metavar or param.name.upper()).removesuffix("...").strip("[]{}")

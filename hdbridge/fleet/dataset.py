@@ -97,7 +97,7 @@ STORED: Final = [
     *("key", "path", "joint", "axis", "date", "ratio"),
     *("model_sha256", "version", "reason", "stamp", "axes"),
 ]
-"""Columns from which a run decides whether to read a recording."""
+"""Columns that a run needs to decide if a recording must be read."""
 
 
 def schema(name: str) -> pa.Schema:
@@ -163,11 +163,11 @@ class Dataset:
             os.close(folder)
 
     def stored(self) -> Stored:
-        """Returns the columns that a run needs, without figures and findings."""
+        """Returns the rows of all recordings with only the columns that a run needs."""
         return Stored(self._rows(RECORDINGS, STORED))
 
     def renew(self, changes: Mapping[tuple[str, str], Mapping[str, Any]]) -> None:
-        """Replaces columns of rows, by key and path, without changing their findings."""
+        """Replaces columns of rows, given by key and path; the findings of the rows remain."""
         if changes:
             self.add(
                 [
@@ -197,8 +197,8 @@ class Dataset:
     def compact(self, present: Collection[tuple[str, str]] = ()) -> None:
         """Merges the increments into the parts, marks duplicates and sorts the rows.
 
-        ``present`` contains key and path of each recording of the last run. Other rows of the same paths
-        belong to an older file, model or version, and are dropped.
+        ``present`` contains key and path of each recording of the last run. Rows with the same path but
+        another key belong to an older file, model or version, and are dropped.
         """
         current: dict[str, set[str]] = defaultdict(set)
         for key, path in present:

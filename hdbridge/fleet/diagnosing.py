@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 ORDERS: Final = (1, 2, 3, 4, 5, 6, 7, 8)
 """Motor orders that identify a joint."""
 SETTLED_DEG: Final = 90.0
-"""Motor travel after a reversal that is excluded from the orders, because the loop has not been crossed
-yet."""
+"""Motor travel after each reversal that is excluded from the estimation of orders, because the hysteresis
+loop is not saturated yet."""
 TURNS: Final = 2.0
 """Minimum travel for estimating orders; motor turns."""
 NO_MEMORY: Final = "more memory was needed than a worker has; raise --memory"
@@ -52,7 +52,7 @@ class Model:
 
 @cache
 def model_in(text: str, where: str) -> Model:
-    """Checks the text of a model file; the `Model` of an invalid file contains the reason."""
+    """Returns the `Model` of a model file's text; that of an invalid file contains the reason."""
     from hdbridge.axis.model import TransmissionModel
 
     try:
@@ -66,7 +66,7 @@ def model_in(text: str, where: str) -> Model:
 def fitted(sources: Sequence[Source], where: str) -> Model:
     """Fits the model of a joint to the first usable one of its recordings.
 
-    The reason for a failure is preferably that of a readable recording.
+    If none is usable, the reason given is that of a readable recording if possible.
     """
     from hdbridge.commissioning.calibration import fit
 
@@ -119,7 +119,7 @@ def read(source: Source) -> Recording:
 
 
 def diagnosed(source: Source, model: Model, known: str = "") -> Row:
-    """Diagnoses a recording and returns its row, without ``findings`` if its key is the ``known`` key."""
+    """Diagnoses a recording and returns its row; stops early, without ``findings``, at the ``known`` key."""
     row = _described(source) | {"model": model.where or None, "model_sha256": model.sha256}
     try:
         recording = read(source)
@@ -244,7 +244,7 @@ def _of_diagnosis(diagnosis: Diagnosis) -> Row:
 
 
 def _orders(record: Record, ratio: float) -> Row:
-    """Fits cosine and sine of each motor order by least squares to the samples clear of reversals."""
+    """Fits cosine and sine of each motor order by least squares to the samples away from reversals."""
     rows, designs, kept = [], [], 0.0
     for number, part in enumerate(record.parts()):
         clear = _clear(part.motor_position_deg)

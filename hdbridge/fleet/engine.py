@@ -32,7 +32,7 @@ INCREMENT_S: Final = 1.0
 """Minimum time between two increments; `kill -9` loses at most the recordings finished in this time."""
 POLL_S: Final = 0.25
 AHEAD: Final = 2000
-"""Maximum number of tasks submitted to the scheduler at a time."""
+"""Maximum number of unfinished tasks submitted to the scheduler."""
 KILLED: Final = (
     "it kills its worker each time, most likely for memory; raise --memory, or shorten the recording"
 )
@@ -49,7 +49,7 @@ class Progress:
     failed: int
     known: int
     memory_mb: float
-    """Highest memory use of a worker so far."""
+    """Maximum memory use of a worker so far, MB."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ class Cluster:
             with client:
                 yield client
             return
-        # Threads and processes inherit the mask: Ctrl-C reaches this process only, not the workers. The start
-        # of the resource tracker would lift it.
+        # Threads and processes inherit the mask, so that Ctrl-C reaches only this process, not the workers.
+        # Starting the resource tracker would reset the mask, so it is started before.
         ensure_running()
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
@@ -113,7 +113,7 @@ def run(
 
     ``model`` is the model of every joint, ``models`` a folder of JOINT.yaml; a joint without one gets a model
     fitted to its earliest usable recording, kept in OUT/models. Raises KeyboardInterrupt when interrupted;
-    the rows made until then are kept.
+    the rows completed by then are kept.
     """
     with dataset.locked(), ExitStack() as stack:
         clients = cache(lambda: stack.enter_context(cluster.client()))
@@ -130,7 +130,7 @@ def watch(
     report: Callable[[str], None] = lambda _: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Passes sources and ``retried`` to ``diagnose`` whenever some are new, until interrupted; or ``once``.
+    """Passes sources and ``retried`` to ``diagnose`` whenever some are new, until interrupted, or ``once``.
 
     A recording is ready once two listings, ``interval_s`` apart, agree on it, so a recording that is still
     being written waits for a later round. The first call receives all ready recordings, because models may
@@ -174,7 +174,7 @@ def _name(source: Source) -> tuple[str, str | None]:
 
 
 def _is_new(file: Sequence[Source], stored: Stored) -> bool:
-    """Returns True for a file that must be read, except a file that is missing as before."""
+    """Returns True for a file that must be read; False for a file that was already missing."""
     if any(each.stamp is None for each in file):
         return any(stored.row(each) is None for each in file)
     return not stored.unchanged(file)
@@ -190,7 +190,7 @@ class _Run:
         retried: Collection[str],
     ) -> None:
         self._clients = clients
-        """Returns the client of the cluster; the first call starts the cluster."""
+        """Function that returns the cluster's client; its first call starts the cluster."""
         self._dataset = dataset
         self._stored = dataset.stored()
         self._notify = progress
@@ -204,7 +204,7 @@ class _Run:
         self._memory = 0.0
 
     def of(self, sources: Sequence[Source], model: Path | None, models: Path | None) -> Progress:
-        """Performs the run. However it ends, the rows so far are kept."""
+        """Performs the run. However it ends, the completed rows are kept."""
         try:
             sources = self._split_flights(sources)
             self._total = len(sources) + len(self._present)
@@ -225,7 +225,7 @@ class _Run:
                     again.append(tasks[place])
                 else:
                     self._take(row)
-            for task in again:  # one at a time, so that the failing recording is known
+            for task in again:  # one at a time, to identify the recording that kills its worker
                 for _, row in self._results([task]):
                     self._take(row if row is not None else lost(task[1][0], KILLED))
         finally:
@@ -236,7 +236,7 @@ class _Run:
         return self._state()
 
     def _unchanged(self, source: Source) -> Mapping[str, Any] | None:
-        """Returns the stored row of an unchanged recording; None for a new or a changed one."""
+        """Returns the stored row of an unchanged recording, reusable if its model is the same; or None."""
         row = self._stored.row(source)
         if row is None or source.stamp is None or row["reason"] in self._retried:
             return None
@@ -360,7 +360,7 @@ class _Run:
         self._measure(client)
 
     def _measure(self, client: Client) -> None:
-        """Updates the highest memory use of a worker."""
+        """Updates the maximum memory use of a worker, MB."""
         with suppress(OSError):
             workers: Collection[Mapping[str, Any]] = client.scheduler_info(n_workers=-1)["workers"].values()
             self._memory = max(

@@ -1,7 +1,7 @@
 """Fleet as the prior for the diagnosis of a single joint: `fleet.parquet` next to the page of a run.
 
-It contains, for each cause, its frequency in joints of each group, the rates of findings in joints with and
-without it, and the distribution of its parameters between joints. All of these are estimated from the fleet.
+For each cause, it contains the prevalence in each group of joints, the rates of findings in joints with and
+without the cause, and the distribution of its parameters over the joints, all estimated from the fleet.
 """
 
 import math
@@ -53,7 +53,7 @@ def prior_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
             cases = {group: (len(sick.intersection(own)), len(own)) for group, own in sorted(groups.items())}
             pooled = prevalence({"all": (len(sick), len(joints))})["all"].value if cases else 0.0
             for group, share in prevalence(cases).items():
-                # The overall share comes from all recordings; the group shifts its odds.
+                # The overall prevalence comes from all recordings; the group shifts its odds.
                 shifted = float(expit(logit(found.share) + logit(share.value) - logit(pooled)))
                 counts = {"cases": cases[group][0], "joints": cases[group][1], "share": shifted}
                 result.append({**common, **counts, "attribute": attribute, "group": group, "parameters": []})
@@ -61,7 +61,7 @@ def prior_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def _ranges(cause: str, joints: Mapping[str, Sequence[Row]]) -> list[dict[str, Any]]:
-    """Returns median and standard deviation between joints of each parameter of a cause."""
+    """Returns the median and the standard deviation over the joints of each parameter of a cause."""
     values: dict[str, list[float]] = defaultdict(list)
     for own in joints.values():
         last = next(found for row in reversed(own) if (found := named_by(row, cause)))
@@ -89,7 +89,7 @@ def write_prior(path: Path, rows: Sequence[Row]) -> None:
 
 
 def read_prior(path: Path, of: Mapping[str, str]) -> Prior:
-    """Reads the prior of a joint ``of`` these groups, by attribute. InputError for a bad file or group."""
+    """Reads the prior of a joint in the groups ``of``, by attribute. InputError for a bad file or group."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -112,7 +112,7 @@ def read_prior(path: Path, of: Mapping[str, str]) -> Prior:
 
 
 def joint_prior(rows: Sequence[Mapping[str, Any]], of: Mapping[str, str]) -> Prior:
-    """Returns the prior of a joint ``of`` these groups, by attribute, from `prior_rows`."""
+    """Returns the prior of a joint in the groups ``of``, by attribute, from the rows of `prior_rows`."""
     right: dict[str, float] = {}
     words: dict[str, str] = {}
     ranges: dict[tuple[str, str], tuple[float, float]] = {}

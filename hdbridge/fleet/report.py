@@ -25,14 +25,14 @@ ROWS: Final = 200
 NOT_KNOWN: Final = "not known yet"
 NO_PAGES: Final[Mapping[str, str]] = MappingProxyType({})
 Joint = Callable[[str], Cell]
-"""Returns the name of a joint, with a link to its page if it exists."""
+"""Function that returns a joint's name, as a link to its page if the page exists."""
 _FAILURES: Final = 40
-"""Length of the prefix by which failure reasons are grouped, characters."""
+"""Number of characters of a failure reason by which failures are grouped."""
 _KINDS: Final = {"swapped": "another joint", "turned": "another encoder or zero", "changed": "changed orders"}
 
 
 def hours_words(remaining: Interval | None) -> str:
-    """Formats the hours to a limit with their interval, or reports that they are unknown."""
+    """Formats the hours until a limit is reached, with their interval, or states that they are unknown."""
     if remaining is None:
         return NOT_KNOWN
     if remaining.high == 0.0:
@@ -204,7 +204,7 @@ def _words(name: str) -> str:
 
 
 def _two(value: float) -> str:
-    """Formats a value with two significant digits, without an exponent."""
+    """Formats a value to two significant digits, without an exponent."""
     return f"{float(f'{value:.2g}'):,.0f}"
 
 
@@ -213,9 +213,9 @@ KEY_DIGITS = 12
 
 
 def shown(rows: Sequence[Row]) -> dict[str, Row]:
-    """Returns the recording for the page of each joint: the last that is the joint's own.
+    """Returns the recording shown on each joint's page: the last one made of the joint itself.
 
-    Its ``mistaken`` are the joint's recordings of another joint or encoder, or with other orders.
+    Its key ``mistaken`` lists the joint's recordings of another joint or encoder, or with different orders.
     """
     own, mistaken = own_recordings(rows)
     return {
@@ -235,7 +235,7 @@ def links(folder: Path, latest: Mapping[str, Row]) -> dict[str, str]:
 
 
 def write_page(folder: Path, row: Row) -> None:
-    """Diagnoses the displayed recording again and writes the page; removes the joint's older pages.
+    """Diagnoses the recording again and writes its joint's page; removes the joint's older pages.
 
     InputError if recording or model no longer exist.
     """

@@ -31,11 +31,11 @@ LUBRICANTS: Final = ("grease A", "grease B")
 CELLS: Final = ("cell 1", "cell 2", "cell 3")
 BATCHES: Final = ("2025-07", "2025-08", "2025-09")
 SICK: Final = 0.2
-"""Share of joints with a growing cause, three times as large in the last batch."""
+"""Fraction of joints with a growing cause; three times as large in the last batch."""
 ODD: Final = 0.1
-"""Share of joints with unusually large orders from the beginning."""
+"""Fraction of joints with unusually large motor orders from the beginning."""
 EVERYDAY: Final = 0.015
-"""Relative standard deviation of orders and loop between recordings of a healthy joint."""
+"""Relative standard deviation of order amplitudes and hysteresis offset between recordings of one joint."""
 FRICTION_NM: Final = 0.3
 """Load friction of a joint with backlash."""
 STIFFNESS_NM_PER_RAD: Final = 45_000.0
@@ -53,7 +53,7 @@ class Joint:
     offset_arcsec: float
     cause: str | None = None
     arcsec_per_1000_hours: float = 0.0
-    """Growth rate of the cause's peak, which is zero at 0 hours."""
+    """Growth rate of the cause's peak, which is zero at 0 operating hours."""
     odd: bool = False
     swapped_with: str | None = None
     """Joint under whose name its recordings are filed from number ``swapped_at`` on."""
@@ -92,10 +92,11 @@ def _loop(data: dict[str, Any], size: float) -> None:
 
 
 def peak_at_0_hours_arcsec(cause: str, arcsec_per_1000_hours: float, first_hours: float) -> float:
-    """Returns the peak at 0 hours of the straight line seen by a diagnosis.
+    """Returns the cause's peak that a diagnosis sees, extrapolated along its straight line to 0 hours.
 
-    A model fitted to the first recording contains that recording's motor orders and loop, so they count from
-    there. The friction of a load with backlash winds the gear up, which looks like the gap.
+    A model fitted to the first recording contains the motor orders and the loop of that recording, so only
+    their later growth is seen. The load friction of a joint with backlash winds up the gear, which looks like
+    additional backlash.
     """
     if cause in {"motor_order", "hysteresis_parameters"}:
         return -arcsec_per_1000_hours * first_hours / 1000.0
@@ -109,7 +110,7 @@ CAUSES: Final[Mapping[str, Callable[[dict[str, Any], float], None]]] = {
     "motor_order": _motor_order,
     "hysteresis_parameters": _loop,
 }
-"""Causes of ageing, as functions that add a peak of a given size, in arcsec, to the data of a truth."""
+"""Causes of ageing, as functions that add a cause with a given peak, in arcsec, to the data of a truth."""
 
 
 def simulate(
@@ -213,7 +214,7 @@ def _truth(joint: Joint, number: int, base: Mapping[str, Any], rng: Random) -> T
 
 
 def _recorded(joint: Joint, number: int, base: Mapping[str, Any], rng: Random) -> Record:
-    """Records a minute of motion: a load turn there and back, and sine motions of several amplitudes."""
+    """Records a minute of motion: a load turn in each direction, and sine motions of several amplitudes."""
     exercise = Exercise(
         Machine(_truth(joint, number, base, rng), rng.randrange(2**31), may_compile=True), cycles_per_sample=4
     )
@@ -257,7 +258,7 @@ def _spoiled(folder: Path, paths: list[Path], rows: list[dict[str, str]], rng: R
     for place in bad:
         path = paths[place]
         how = rng.randrange(3)
-        if how == 0:  # the transfer broke off
+        if how == 0:  # an interrupted transfer
             path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
         elif how == 1:
             path.write_bytes(b"")

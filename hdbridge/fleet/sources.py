@@ -48,13 +48,13 @@ MANIFEST: Final[Mapping[str, str]] = {
 """Columns of a manifest. Only ``path`` is required."""
 NUMBERS: Final = ("ratio", "hours")
 MANIFEST_NAMES: Final = ("manifest.csv", "manifest.parquet")
-"""File names that are not recordings."""
+"""Names of files that are manifests, not recordings."""
 MARKS: Final = ("size", "ETag", "mtime", "LastModified", "created")
-"""Attributes of a remote file that change with its content, by their names in fsspec's file systems."""
+"""Attributes of a remote file that change with its content, as named by fsspec's file systems."""
 
 
 TIMEOUT_S: Final = 20.0
-"""Default time-out of the first answer of a server."""
+"""Default time-out for a server's first response."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Source:
     units: str | None = None
     unwrap: str | None = None
     stamp: str | None = None
-    """Fingerprint of files and manifest row; equal to that in the data set if neither has changed."""
+    """Fingerprint of files and manifest row; equal to the data set's stamp if neither has changed."""
     axes: int | None = None
     """Number of axes in a flight recording."""
 
@@ -92,7 +92,7 @@ class Source:
 
 
 class Stored:
-    """Rows of a data set without their figures, for finding the recordings that need not be read again."""
+    """Rows of a data set without their figures, used to find the recordings that need not be read again."""
 
     def __init__(self, rows: Iterable[Mapping[str, Any]] = ()) -> None:
         self._rows: dict[str, dict[str | None, Mapping[str, Any]]] = defaultdict(dict)
@@ -100,11 +100,11 @@ class Stored:
             self._rows[row["path"]][row["axis"]] = row
 
     def row(self, source: Source) -> Mapping[str, Any] | None:
-        """Returns the row of a source, regardless of changes."""
+        """Returns the stored row of a source, even if the recording has changed since; None without one."""
         return self._rows[source.path].get(source.axis) if source.path in self._rows else None
 
     def unchanged(self, sources: Sequence[Source]) -> list[Mapping[str, Any]]:
-        """Returns all rows of one file; none if it, its rows in the manifest or hdbridge have changed."""
+        """Returns one file's stored rows; none if the file, its manifest rows or hdbridge have changed."""
         stamps = {each.stamp for each in sources} - {None}
         rows = [
             row
@@ -130,12 +130,12 @@ def find_sources(
     timeout_s: float = TIMEOUT_S,
     report: Callable[[str], None] = lambda _: None,
 ) -> list[Source]:
-    """Returns all recordings at the given places and in the manifest, each once, sorted by path.
+    """Returns all recordings at the given places and in the manifest, without repetition, sorted by path.
 
     InputError for a place that does not exist or has no recording (unless it ``may_be_empty``), for an
-    invalid manifest, and for a manifest that is given as a place. A recording that is ``stored`` unchanged is
-    not opened. ``timeout_s`` is the time-out of the first answer of a server. Ignored parts of the manifest
-    are passed to ``report``.
+    invalid manifest, and for a manifest that is given as a place. Recordings unchanged since they were
+    ``stored`` are not opened. ``timeout_s`` limits the wait for a server's first response. Ignored parts of
+    the manifest are passed to ``report``.
     """
     found = read_manifest(manifest, report) if manifest else {}
     if not found and not given and not may_be_empty:
@@ -172,7 +172,7 @@ def find_sources(
 
 
 def _advice(manifest: str) -> str:
-    """Returns the option for a manifest that was found among recordings; ``--manifest`` is a local file."""
+    """Returns how to pass a manifest that was found among recordings; ``--manifest`` takes a local file."""
     if "://" not in manifest:
         return f"pass it as well: --manifest {manifest}"
     name = posixpath.basename(manifest)
@@ -180,14 +180,14 @@ def _advice(manifest: str) -> str:
 
 
 def _recordings(files: Mapping[str, str], described: Collection[str]) -> dict[str, str]:
-    """Returns the recordings among files, each with the joined marks of its files (`_listing`)."""
+    """Returns the recordings among files, each with the marks (size and times) of its files joined."""
     found = recordings_among(files)
     found |= {each: [each] for each in files if each.endswith(FLIGHT) or each in described}
     return {path: "\n".join(f"{each} {files[each]}" for each in own) for path, own in found.items()}
 
 
 def _marks_of(paths: Collection[str], timeout_s: float) -> dict[str, str]:
-    """Returns the marks of the recordings in a manifest; a missing recording has none."""
+    """Returns the marks (size and times) of the recordings in a manifest, without those that are missing."""
     files: dict[str, str] = {}
     for place in {posixpath.dirname(path) if "://" in path else path for path in paths}:
         with suppress(InputError):  # the worker that reads the recording reports the error
@@ -209,28 +209,28 @@ def _listing(place: str, timeout_s: float) -> dict[str, str]:
 
     try:
         system, root = fsspec.core.url_to_fs(place)
-        host = place.rstrip("/").removesuffix(root)  # protocol and host, which the paths of `system` lack
+        host = place.rstrip("/").removesuffix(root)  # protocol and host; paths from `system` lack them
         system.invalidate_cache()
-        if system.async_impl:  # the others have time-outs of their own, of 15 s for SFTP
+        if system.async_impl:  # the other file systems have their own time-outs (SFTP: 15 s)
             try:
                 system.info(root.partition("*")[0], timeout=timeout_s)
             except FSTimeoutError:
                 raise TimeoutError(
                     f"no answer in {timeout_s:g} s; is it the right server? see --timeout"
                 ) from None
-            except Exception:  # the listing reports it
+            except Exception:  # the listing below reports the error
                 pass
         files: dict[str, Any] = {}
         for each in system.glob(root) if glob.has_magic(root) else [root]:
             found = system.find(each, detail=True)
-            if not found:  # `find` hides that a server is away; `ls` raises it
+            if not found:  # `find` hides an unreachable server; `ls` raises an error
                 with suppress(FileNotFoundError):
                     system.ls(each)
             files |= found
         return {
             host + file: " ".join(str(about.get(each)) for each in MARKS) for file, about in files.items()
         }
-    except Exception as problem:  # each file system raises exceptions of its own
+    except Exception as problem:  # each file system raises its own exception types
         raise InputError(one_line(f"{place}: cannot be listed: {problem}")) from None
 
 
@@ -249,7 +249,7 @@ def _stamp(source: Source, mark: str | None) -> str | None:
     if mark is None:
         return None
     if source.axis and source.path.endswith(BUS_LOGS):
-        with suppress(InputError, OSError):  # the worker reports it
+        with suppress(InputError, OSError):  # the worker that reads the recording reports the error
             mark += Profile.find(source.axis).axis.read_text(encoding="utf-8")
     return hashlib.sha256("\n".join([mark, repr(source)]).encode()).hexdigest()
 
@@ -329,7 +329,7 @@ def _table(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
         separator = max(",;\t", key=head.count)
         reader = csv.DictReader(lines, strict=True, delimiter=separator)
         rows = list(reader)
-        if separator != ",":  # written where the decimal sign is a comma
+        if separator != ",":  # such files use the comma as decimal separator
             rows = [row | {name: (row.get(name) or "").replace(",", ".") for name in NUMBERS} for row in rows]
         return list(reader.fieldnames or ()), rows
     except InputError:
@@ -364,7 +364,7 @@ def _described(row: Mapping[str, Any], manifest: Path, number: int) -> Source:
 
 
 def with_axes(path: str, axes: Iterable[str | None], described: Iterable[Source]) -> list[Source]:
-    """Returns one source for each axis of a flight recording, with the manifest rows that describe it."""
+    """Returns one source for each axis of a flight recording, with the data of its manifest rows."""
     rows = {each.axis: each for each in described}
     common = rows.get(None) or Source(path, stamp=next(iter(rows.values())).stamp)
     found = [rows.get(name) or replace(common, axis=name, joint=common.joint or name) for name in axes]
@@ -387,6 +387,6 @@ def fetched(path: str) -> Iterator[Path]:
         try:
             system, place = fsspec.core.url_to_fs(path)
             system.get(place, str(target), recursive=system.isdir(place))
-        except Exception as problem:  # each file system raises exceptions of its own
+        except Exception as problem:  # each file system raises its own exception types
             raise NotFetchedError(f"{path}: cannot be fetched: {problem}") from None
         yield target

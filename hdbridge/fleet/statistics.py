@@ -1,7 +1,7 @@
 """Statistics over many joints: pure functions of arrays, without files or randomness.
 
-Every rate, scatter and prior is estimated from the fleet itself, so a joint is compared with the same
-diagnosis of the other joints on everyday records. If the data do not decide, the answer is None.
+Every rate, scatter and prior is estimated from the fleet itself, so that a joint is compared with the same
+diagnosis of other joints on everyday records. If the data do not determine a result, it is None.
 """
 
 import math
@@ -27,15 +27,15 @@ GOLDEN: Final = 0.6180339887498949
 INTERVAL: Final = (0.05, 0.95)
 """Quantiles of the 90 % intervals of hours and prevalences."""
 SCATTER_SERIES: Final = 200
-"""Number of series for estimating the common scatter; its error is then 5 % or less."""
+"""Maximum number of series used to estimate the common scatter; its error is then 5 % or less."""
 OWN_SCATTER: Final = 1e-3
-"""Share of joints whose figure does not follow a line, for example because of a repair."""
+"""Prior fraction of joints whose figure does not follow a line, for example because of a repair."""
 PHASE_STEP_DEG: Final = 0.25
 EVERYDAY_SHARE: Final = 0.05
-"""Relative difference of an order's amplitude that is normal between two recordings of one joint."""
+"""Normal relative difference of an order's amplitude between two recordings of one joint."""
 AGREE: Final = 1e-4
 DISAGREE: Final = 1e-12
-"""Chi-square tail probabilities below which orders do not agree (`AGREE`), or certainly differ."""
+"""Chi-square tail probabilities below which orders do not agree, or certainly differ."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class Interval:
 
 
 def prevalence(cases: Mapping[str, tuple[int, int]]) -> dict[str, Interval]:
-    """Estimates the share of joints with a cause in each group from (cases, joints), partially pooled.
+    """Estimates the fraction of joints with a cause in each group from (cases, joints), partially pooled.
 
     The model is beta-binomial with mean and concentration integrated out over a grid, so a group of three
     joints is drawn towards the others, unlike a group of three hundred.
@@ -91,7 +91,7 @@ class Repeats:
     probability: FloatArray
     """Probability that each joint has the cause, shape (joints,)."""
     share: float
-    """Share of joints that have the cause."""
+    """Fraction of joints that have the cause."""
     named: float
     """Rate of findings in recordings of a joint with the cause."""
     wrongly: float
@@ -139,7 +139,7 @@ def repeats(named: Sequence[Sequence[bool]]) -> Repeats:
 
 
 def within_false_discoveries(probability: FloatArray, rate: float) -> FloatArray:
-    """Selects the largest set of claims with an expected share of wrong claims of at most ``rate``."""
+    """Selects the largest set of claims whose expected fraction of wrong claims is at most ``rate``."""
     order = np.argsort(-probability, kind="stable")
     wrong = np.cumsum(1.0 - probability[order]) / np.arange(1, len(order) + 1)
     chosen = np.zeros(len(probability), dtype=bool)
@@ -151,7 +151,7 @@ def within_false_discoveries(probability: FloatArray, rate: float) -> FloatArray
 
 
 def normal_range(values: FloatArray) -> Interval:
-    """Returns the median and the range of 95 % of normal values, by the median absolute deviation."""
+    """Returns the median and the 95 % range of normal values, estimated by the median absolute deviation."""
     middle = float(np.median(values))
     half = NORMAL_95 * median_deviation(values - middle)
     return Interval(middle - half, middle, middle + half)
@@ -204,7 +204,7 @@ class Trend:
 
     @cached_property
     def _slopes(self) -> list[tuple[float, float, float]]:
-        """Weight, mean and standard deviation of the slope if the joint does not change, and if it does."""
+        """Weight, mean and standard deviation of the slope for an unchanging and for a changing joint."""
         slope, own = float(self.line[1]), float(self.covariance[1, 1])
         result = []
         for weight, centre, deviation in (
@@ -217,7 +217,7 @@ class Trend:
 
     @cached_property
     def _draws(self) -> tuple[FloatArray, FloatArray]:
-        """Posterior levels and slopes, drawn by quantiles so that equal data give equal intervals."""
+        """Posterior levels and slopes, drawn at fixed quantiles so that equal data give equal intervals."""
         slope, cov, changing = float(self.line[1]), self.covariance, round(self.changing * DRAWS)
         drawn = np.concatenate(
             [
@@ -227,14 +227,14 @@ class Trend:
                 )
             ]
         )
-        # Level given the slope; its own variance takes the quantiles in another order than the slope's.
+        # Level conditional on the slope; its residual variance uses quantiles in a different order.
         level = self.line[0] + cov[0, 1] / cov[1, 1] * (drawn - slope)
         rest = math.sqrt(max(float(cov[0, 0] - cov[0, 1] ** 2 / cov[1, 1]), 0.0))
         return level + rest * ndtri((np.arange(1, DRAWS + 1) * GOLDEN) % 1.0), drawn
 
     @property
     def per_1000_hours(self) -> Interval:
-        """Slope with its interval."""
+        """Slope per 1000 hours with its interval."""
         low, middle, high = np.quantile(self._draws[1], (INTERVAL[0], 0.5, INTERVAL[1])).tolist()
         return Interval(low, middle, high)
 
@@ -245,7 +245,7 @@ class Trend:
     def hours_to(self, limit: float) -> Interval | None:
         """Returns the hours from the last recording until the line reaches a limit, or None if unknown.
 
-        They are unknown if the line may never reach the limit (upper bound of the interval infinite).
+        They are unknown if the line may never reach the limit (infinite upper bound of the interval).
         """
         level, slope = self._draws
         hours = np.full(DRAWS, np.inf)
@@ -258,11 +258,11 @@ class Trend:
 
 
 def trends(series: Sequence[Series]) -> list[Trend | None]:
-    """Fits the trend of one figure in every joint; None for a joint without two different hours.
+    """Fits the trend of one figure in every joint; None for a joint without two different operating hours.
 
-    The trends are straight lines; errors are the figure's own plus a scatter between recordings that is
-    common to all joints. The prior of the slopes is a normal mixture of joints that change and joints that do
-    not, fitted to the fleet, so the slope of three noisy recordings is drawn to zero, unlike a steep slope.
+    The trends are straight lines; the errors are those of the values plus a scatter between recordings that
+    is common to all joints. The prior of the slopes is a normal mixture of joints that change and joints that
+    do not, fitted to the fleet; it draws the slope of three noisy recordings to zero, unlike a steep slope.
     """
     usable = [place for place, each in enumerate(series) if len(np.unique(each.hours)) > 1]
     if not usable:
@@ -296,7 +296,7 @@ def _design(each: Series) -> FloatArray:
 
 
 def _line(each: Series, scatter: float) -> tuple[FloatArray, FloatArray]:
-    """Fits a line. If the values do not follow it, as after a step, its covariance grows with the misfit."""
+    """Fits a line; returns it with its covariance, which is enlarged if the values do not follow the line."""
     design = _design(each)
     weight = 1.0 / (each.sd**2 + scatter**2)
     cov = np.linalg.pinv(design.T @ (weight[:, np.newaxis] * design))
@@ -310,7 +310,7 @@ def _line(each: Series, scatter: float) -> tuple[FloatArray, FloatArray]:
 def _scatter(series: Sequence[Series]) -> float:
     """Estimates the common scatter between recordings by restricted maximum likelihood (REML).
 
-    A share `OWN_SCATTER` of the series has a scatter of its own, so one step does not blur all other series.
+    A fraction `OWN_SCATTER` of the series has its own scatter, so that one step does not affect the others.
     """
     chosen = [each for each in series if len(each.hours) > _design(each).shape[1]]
     chosen = chosen[:: max(1, math.ceil(len(chosen) / SCATTER_SERIES))]
@@ -335,7 +335,9 @@ def _scatter(series: Sequence[Series]) -> float:
 
 
 def _two_kinds(slopes: FloatArray, errors: FloatArray) -> tuple[float, tuple[float, float], float]:
-    """Fits the mixture of slopes: deviation without change, mean and deviation with change, its share."""
+    """Fits the mixture of slopes; returns the deviation of unchanging joints, and of changing joints the mean
+    with the deviation, and the fraction.
+    """
     middle = float(np.median(np.abs(slopes)))
     stay = 0.3 * max(middle, float(np.median(errors)))
     mean, deviation, share = 0.0, max(3.0 * float(np.std(slopes)), 3.0 * stay, 1e-12), 0.1
@@ -374,13 +376,13 @@ class Identity:
     """``swapped``: the orders are another joint's; ``turned``: the motor encoder was exchanged or its zero
     set; ``changed``: the orders match no joint."""
     other: int | None = None
-    """Joint that the orders match, if ``swapped``."""
+    """Number of the joint whose orders match, if ``swapped``."""
     angle_deg: float | None = None
     """Offset of the motor angle, if ``turned``."""
 
 
 def identities(orders: Complexes, joint: Sequence[int], time: Sequence[Any]) -> list[Identity | None]:
-    """Checks by the motor orders that each recording belongs to its joint; None if it does.
+    """Checks by the motor orders that each recording belongs to its joint; returns None for each that does.
 
     ``orders``, shape (recordings, orders), are amplitude times exp(i phase) of the orders 1, 2, ...; rows
     with NaN are missing. Each recording is compared with the first recording of its joint.

@@ -29,16 +29,16 @@ from hdbridge.fleet.statistics import (
 
 SCHEMA: Final = "hdbridge.fleet-summary/1"
 FALSE_DISCOVERIES: Final = 0.01
-"""Maximum expected share of wrong joints in the list."""
+"""Maximum expected fraction of wrong entries in the list of joints to inspect."""
 COMMON: Final = 0.4
-"""Share of a gear type's joints above which a cause belongs to the type and counts only if it grows."""
+"""Fraction of a gear type's joints above which a cause is typical of the gear and listed only if it grows."""
 SURE: Final = 0.95
 REPEATED: Final = 2
 """Minimum number of recordings with a finding of the cause."""
 PEAK_ERROR: Final = 0.25
-"""Standard deviation of a small peak, in detection limits."""
+"""Standard deviation of a small peak, as a fraction of its detection limit."""
 SILENT: Final = 3.0
-"""Time without a recording after which a joint is silent; multiples of its median interval."""
+"""Time without a recording after which a joint is silent, as a multiple of its median recording interval."""
 ATTRIBUTES: Final = ("batch", "cell", "lubricant")
 Row = Mapping[str, Any]
 
@@ -57,7 +57,7 @@ class Candidate:
     named: int
     recordings: int
     growth: Interval | None
-    """Arcsec per 1000 hours; None without hours."""
+    """Growth of the peak, arcsec per 1000 hours; None without operating hours."""
     growing: bool
     remaining: Interval | None
     """Hours until the peak reaches the limit; None if unknown."""
@@ -98,17 +98,17 @@ class Summary:
     limit_arcsec: float
     first: tuple[Candidate, ...]
     prevalence: Mapping[str, Mapping[str, Mapping[str, tuple[int, int, Interval]]]]
-    """Joints with the cause, joints, and share, by attribute, cause and group."""
+    """Number of joints with the cause, number of joints, and prevalence, by attribute, cause and group."""
     rates: Mapping[str, tuple[float, float, float]]
-    """Share of joints, and rates of findings in joints with and without the cause, by cause."""
+    """Fraction of joints with the cause, and rates of findings in joints with and without it, by cause."""
     odd: tuple[Odd, ...]
     mistaken: tuple[Mistaken, ...]
     duplicates: tuple[tuple[str, str, str], ...]
-    """Joint, path and path of the original."""
+    """Joint and path of each duplicate, and path of the original."""
     silent: tuple[tuple[str, str], ...]
-    """Joint and reason."""
+    """Joints without current information, each with the reason."""
     failed: tuple[tuple[str, str, str], ...]
-    """Joint, path and reason."""
+    """Joint and path of each recording without a diagnosis, and the reason."""
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the summary for JSON, schema hdbridge.fleet-summary/1."""
@@ -127,7 +127,7 @@ class Summary:
 
 
 def counted(mistaken: Sequence[Mistaken]) -> Iterator[str]:
-    """Yields the number of recordings of each kind, in words."""
+    """Yields the number of mistaken recordings of each kind, as text."""
     for kind, count in Counter(each.kind for each in mistaken).items():
         yield f"recordings {_KINDS[kind]}: {count}"
 
@@ -165,7 +165,7 @@ def summarise(rows: Sequence[Row], limit_arcsec: float) -> Summary:
 
 
 def own_recordings(rows: Sequence[Row]) -> tuple[dict[str, list[Row]], tuple[Mistaken, ...]]:
-    """Returns the diagnosed recordings of each joint in time, without copies; and the mistaken ones."""
+    """Returns each joint's own diagnosed recordings in time order, without copies; and the mistaken ones."""
     good = [row for row in rows if row["reason"] is None and row["duplicate_of"] is None]
     good.sort(key=_when)
     mistaken, foreign = _mistaken(good)
@@ -181,7 +181,7 @@ def _when(row: Row) -> tuple[float, str, str]:
 
 
 def _mistaken(good: Sequence[Row]) -> tuple[tuple[Mistaken, ...], set[tuple[str, str]]]:
-    """Returns the mistaken recordings, and key and path of those excluded from the other results."""
+    """Returns the mistaken recordings, and key and path of those that no other result uses."""
     result: list[Mistaken] = []
     foreign: set[tuple[str, str]] = set()
     gears: dict[str, list[Row]] = defaultdict(list)
@@ -217,7 +217,7 @@ def _causes(
 ) -> tuple[
     dict[str, dict[str, float]], dict[str, tuple[float, float, float]], dict[str, dict[str, Trend | None]]
 ]:
-    """Returns, by cause, the probability that each joint has it, the fleet's rates and its peak's trend."""
+    """Returns, by cause, the probability that each joint has it, the fleet's rates, and the peak's trends."""
     causes = sorted({each["cause"] for rows in joints.values() for row in rows for each in row["findings"]})
     names = list(joints)
     has: dict[str, dict[str, float]] = {}
@@ -242,19 +242,19 @@ def _peak(row: Row, cause: str) -> float | None:
 
 
 def _floor(row: Row, cause: str) -> float:
-    """Returns the smallest peak that a recording would report, arcsec."""
+    """Returns the smallest peak of a cause that the diagnosis of a recording would report, arcsec."""
     limit = next((each["arcsec"] for each in row["limits"] or () if each["cause"] == cause), None)
     return limit if limit is not None else max(row["rms_arcsec"] or 0.0, 1.0)
 
 
 def _size(rows: Sequence[Row], cause: str) -> Series:
-    """Returns the peak of a cause over the hours; without a finding, between 0 and the detection limit."""
+    """Returns the peak of a cause over the hours; without a finding, half the detection limit."""
     points = []
     for row in rows:
         peak, floor = _peak(row, cause), _floor(row, cause)
         if peak is not None:
             points.append((row, peak, max(PEAK_ERROR * floor, 0.02 * peak)))
-        else:  # 0.29: standard deviation of a uniform distribution
+        else:  # 0.29: standard deviation of a uniform distribution of width 1
             points.append((row, 0.5 * floor, 0.29 * floor))
     return _series(points)
 
@@ -268,7 +268,7 @@ def _series(points: Sequence[tuple[Row, float, float]]) -> Series:
 
 
 def _figures(joints: Mapping[str, Sequence[Row]]) -> dict[str, list[tuple[float, str]]]:
-    """Returns, by joint, strength and text of each significant trend of the model's figures."""
+    """Returns, by joint, the strength of each significant trend of a model parameter, and its text."""
     table: dict[str, dict[str, list[tuple[Row, float, float]]]] = defaultdict(lambda: defaultdict(list))
     for name, rows in joints.items():
         for row in rows:
@@ -310,7 +310,7 @@ def _first(
             trend = sizes[cause][name]
             growing = trend is not None and trend.growing() >= SURE and trend.changing >= SURE
             last = next(each for each in named[-1]["findings"] if each["cause"] == cause)
-            # The first recording would have shown it.
+            # A cause of this size would have been found in the first recording.
             seen = last["peak_arcsec"] > (1.0 + 2.0 * PEAK_ERROR) * _floor(rows[0], cause)
             appeared = _peak(rows[0], cause) is None and seen and not common[rows[-1]["gear"]]
             if not growing and not appeared:
@@ -390,7 +390,7 @@ def _prevalence(
 
 
 def _odd(joints: Mapping[str, Sequence[Row]]) -> tuple[Odd, ...]:
-    """Returns the figures outside the normal range of their gear type, from each joint's median."""
+    """Returns the figures whose median over a joint's recordings is outside the gear type's normal range."""
     table: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for name, rows in joints.items():
         for row in rows:
@@ -416,7 +416,7 @@ def _odd(joints: Mapping[str, Sequence[Row]]) -> tuple[Odd, ...]:
 
 
 def _silent(rows: Sequence[Row]) -> tuple[tuple[str, str], ...]:
-    """Returns the joints without a usable recording, or without one for a long time."""
+    """Returns the joints without a usable recording, or without one for a long time, with the reason."""
     usable: dict[str, list[datetime]] = {row["joint"]: [] for row in rows if row["joint"]}
     diagnosed = {row["joint"] for row in rows if row["reason"] is None}
     for row in rows:

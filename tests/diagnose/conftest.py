@@ -1,4 +1,4 @@
-"""The plant of this folder, and records of it that are short enough for a test."""
+"""Fixtures of this folder: the plant, and records of it that are short enough for a test."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def plant() -> ModuleType:
 
 @pytest.fixture(scope="session")
 def columns(plant: ModuleType) -> Callable[..., dict[str, Any]]:
-    """Columns of a short bench plan on an axis with these effects."""
+    """Returns a function that records an axis with given effects on a short bench plan, as columns."""
 
     def make(
         effects: dict[str, Any] | None = None,
@@ -39,7 +39,7 @@ def columns(plant: ModuleType) -> Callable[..., dict[str, Any]]:
 
 @pytest.fixture(scope="session")
 def model(plant: ModuleType) -> TransmissionModel:
-    """The gear's model, some per cent off."""
+    """Returns a model of the gear whose parameters are a few per cent off."""
     return TransmissionModel.from_text(plant.model_text(5))
 
 

@@ -1,4 +1,4 @@
-"""A known part of the model stays within its calibration, unless the data show that it has changed."""
+"""Tests that a calibrated part of the model stays within its intervals unless the data show a change."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ SEEDS = range(401, 407)
 def run_out(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> Callable[[int], tuple[float, Diagnosis]]:
-    """Run-out of a load encoder next to a known spring under the same mass; returns the modelled spring and
-    the findings.
+    """Returns a function that diagnoses run-out of the load encoder together with a known compliance under an
+    eccentric mass; it returns the modelled compliance, arcsec/Nm, and the diagnosis.
     """
 
     def run(seed: int) -> tuple[float, Diagnosis]:
@@ -43,7 +43,7 @@ def run_out(
 
 
 def holds(known: float, result: Diagnosis) -> bool:
-    """Returns True if only the order is named, with its size, and the spring is unchanged."""
+    """Returns True if only the load order is named, with the right size, and the compliance is unchanged."""
     (spring,) = (each for each in result.model.effects if each.name == "compliance")
     if [each.cause for each in result.findings] != ["load_order"]:
         return False
@@ -60,12 +60,12 @@ def test_a_known_spring_is_not_replaced_by_load_encoder_eccentricity(
 
 @pytest.mark.slow
 def test_eccentricity_next_to_known_springs(run_out: Callable[[int], tuple[float, Diagnosis]]) -> None:
-    """Without a prior the spring was lost in 8 of 8; five of six right is then less likely than 1e-6."""
+    """Without a prior, 8 of 8 compliances were wrong; 5 of 6 right is then less likely than 1e-6."""
     assert sum(holds(*run_out(seed)) for seed in SEEDS) >= 5
 
 
 def test_parts_are_as_wide_as_the_model_file_says(model: TransmissionModel) -> None:
-    """The loop has its 95 % half widths; the orders, which have none, get 4 %, at least 0.1 arcsec each."""
+    """The loop gets the 95 % half widths of the file; orders without any get 4 %, at least 0.1 arcsec."""
     loop = next(place for place, each in enumerate(model.effects) if each.name == "hysteresis")
     parts = calibrated(
         model.effects,
@@ -88,7 +88,7 @@ def test_parts_are_as_wide_as_the_model_file_says(model: TransmissionModel) -> N
 def test_a_changed_loop_is_named_if_another_law_fits_as_well(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel, seed: int
 ) -> None:
-    """Sweeps alone do not show the memory of a loop."""
+    """Sweeps alone do not show whether the hysteresis has return-point memory."""
     whole = columns(seed=seed, offset=25.0)
     sweeps = Record({name: each[whole["time_s"] < 90.0] for name, each in whole.items()})
     (found,) = diagnose(sweeps, model).findings

@@ -1,4 +1,4 @@
-"""Changed springs are found, or reported with their aliases."""
+"""Tests that a changed compliance is found, or reported with its aliases."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from hdbridge.records.record import Record
 
 Columns = Callable[..., dict[str, Any]]
 KNOWN, NOW = 1.5, 2.4
-"""Arcsec per Nm."""
+"""Compliance in the model, and true compliance, arcsec/Nm."""
 
 
 @pytest.fixture
 def known(model: TransmissionModel) -> TransmissionModel:
-    """The model with a straight spring."""
+    """Returns the model with a linear compliance."""
     return with_spring(model, KNOWN)
 
 
@@ -32,7 +32,7 @@ def spring_of(model: TransmissionModel) -> float:
 def test_a_changed_spring_is_found_and_written_to_the_model(
     columns: Columns, known: TransmissionModel
 ) -> None:
-    """The torque is uncorrelated with everything else."""
+    """The load torque is uncorrelated with all other coordinates."""
     record = columns()
     torque_nm = 6.0 * np.sin(2.0 * np.pi * record["time_s"] / 37.0)
     record["load_torque_nm"] = torque_nm + 0.01 * np.random.default_rng(1).normal(size=len(torque_nm))
@@ -49,7 +49,7 @@ def test_a_changed_spring_is_found_and_written_to_the_model(
 def test_a_change_explained_by_eccentricity_is_not_reported(
     columns: Columns, known: TransmissionModel
 ) -> None:
-    """The torque of an off-centre mass repeats once per turn, as a run-out does."""
+    """The torque of an eccentric mass repeats once per load turn, like run-out of the load encoder."""
     record = columns({"compliance": {"c1": NOW, "c2": NOW, "t1": 1e3}}, torque_nm=9.0)
     result = diagnose(Record(record), known)
     assert len(result.findings) == 1

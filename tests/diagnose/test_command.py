@@ -1,4 +1,4 @@
-"""`hdbridge diagnose` from files to files."""
+"""Tests of `hdbridge diagnose`, from input files to output files."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_writes_findings_and_an_extended_model(files: tuple[Path, Path], tmp_pat
     assert max(shares, key=lambda name: shares[name]) == "motor angle"
     assert "motor angle" in result.output
     assert "Diagnosis of record.csv.gz" in page.read_text()
-    # As in a terminal of 80 columns, output to a pipe is complete and tables do not wrap.
+    # Output to a pipe is complete, and its tables fit 80 columns.
     tables = [line for line in result.output.splitlines() if line[:1] in "│┃┏└┡"]
     assert max(map(len, tables)) <= 80
     assert "…" not in result.output
@@ -79,5 +79,5 @@ def test_a_plan_is_judged_before_anything_moves(files: tuple[Path, Path], tmp_pa
     assert result.stdout.startswith("This plan has no torque at the load: ")
     found = json.loads(out.read_text())["identifiability"]
     assert found["motor_order"]["detectable"]
-    # Six motor turns are an eighth of a load turn: these are not separable.
+    # Six motor turns are an eighth of a load turn, over which these causes are not separable.
     assert set(found["load_order"]["aliases"]) & {"ratio_error", "compliance"}

@@ -1,4 +1,4 @@
-"""Hidden effects are named, and a healthy axis yields no finding."""
+"""Tests that hidden effects are named, and that a healthy axis yields no finding."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_the_same_record_gives_the_same_answer(
 
 
 def test_a_short_record_yields_no_confident_wrong_cause(model: TransmissionModel) -> None:
-    """One direction, no command, no standstill, coarse counts and noise permit hardly any conclusion."""
+    """One direction, no command, no standstill, coarse counts and noise permit few conclusions."""
     rng = np.random.default_rng(3)
     time = np.arange(150) * 0.02
     motor = np.round(400.0 * time / 0.045) * 0.045
@@ -129,9 +129,9 @@ def test_a_short_record_yields_no_confident_wrong_cause(model: TransmissionModel
 def test_rounded_digits_yield_no_cause(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel, counts: int, digits: int
 ) -> None:
-    """Without a command the reading drives the loop, and rounding hides its count."""
+    """Without a command, the hysteresis depends on the measured angle, whose count rounding hides."""
     values = columns()
-    lag_s = 2e-4  # of the plant's motor behind its command
+    lag_s = 2e-4  # lag of the plant's motor behind its command
     motor = values["motor_target_deg"]
     motor = motor - lag_s * np.gradient(motor, values["time_s"])
     read = np.round(motor * counts / 360.0) * 360.0 / counts + 36_000.0

@@ -1,4 +1,4 @@
-"""Fast effects are separated from noise: floor, frequency, and decay after a stop."""
+"""Tests that fast effects are separated from noise: noise floor, frequency, and decay after a stop."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record, concatenate
 
 NOISE_ARCSEC = 0.35
-"""Noise of the plant: white noise, and the rounding of its load encoder."""
+"""Noise of the plant: white noise, and rounding of the load encoder."""
 
 
 def diagnosed(plant: ModuleType, effects: dict[str, Any], seed: int, rate_hz: float = 16.0) -> Diagnosis:
@@ -32,7 +32,7 @@ def names(found: Diagnosis) -> list[str]:
 
 
 def often_enough(right: int, of: int, rate: float) -> bool:
-    """Returns True if this number of correct findings does not contradict a rate, at 1 %."""
+    """Returns True if this number of correct findings does not contradict the rate at the 1 % level."""
     return float(bdtr(right, of, rate)) > 0.01
 
 
@@ -90,7 +90,7 @@ def test_a_damaged_tooth_is_named_next_to_a_load_order(plant: ModuleType) -> Non
 
 
 def test_an_unattributed_arcsec_is_unexplained(plant: ModuleType) -> None:
-    """The error drifts in motion by 1.7 arcsec; a count of the motor adds 0.9 arcsec rms."""
+    """The error varies slowly in motion, by 1.7 arcsec rms; the motor encoder's count adds 0.9 arcsec rms."""
     record = plant.record(plant.Truth(), plant.Plan(rate_hz=16.0, scale=0.1, load_turns=1.05, steps=8), 71)
     time_s = record["time_s"]
     decay = float(np.exp(time_s[0] - time_s[1]))
@@ -103,7 +103,7 @@ def test_an_unattributed_arcsec_is_unexplained(plant: ModuleType) -> None:
 
 
 def one_way(seed: int) -> Record:
-    """Four equal moves of a second, with ripple of two orders, a speed term and a slow error."""
+    """Returns four equal one-second moves with a motor order, a speed term, and slow and white noise."""
     rng = np.random.default_rng(seed)
     part = np.arange(100) / 100.0
     turns, phase, drag = rng.uniform(1.2, 2.5), rng.uniform(0.0, 6.0), rng.uniform(0.01, 0.03)

@@ -1,4 +1,4 @@
-"""Gains are validated on held-out data; findings without a gain are not offered."""
+"""Tests that gains are validated on held-out data, and that findings without a gain are not offered."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WORSE = Gain("stretches of time", 8, np.ones(8), np.full(8, 4.0), np.full(8, 4.1
 
 @pytest.fixture(scope="module")
 def wider(diagnosed: Diagnosed) -> Diagnosis:
-    """A loop 1.5 times as wide as the model's."""
+    """Returns the diagnosis of a hysteresis loop 1.5 times as wide as in the model."""
     found = diagnosed(width=30.0)
     assert [each.cause for each in found.findings] == ["hysteresis_parameters"]
     return found
@@ -36,7 +36,7 @@ def wider(diagnosed: Diagnosed) -> Diagnosis:
 def test_a_spurious_change_worsens_held_out_data(
     columns: Callable[..., dict[str, Any]],
 ) -> None:
-    """Orders fitted to noise alone always improve the fitted data."""
+    """Orders fitted to pure noise always improve the fit to the same data."""
     record = Record(columns(orders=(), offset=0.0))
     estimator = Estimator(gather(record, 50.0))
     nothing = Synchronous(orders=orders_from(range(3, 24), 0.0))
@@ -72,7 +72,7 @@ def test_a_gain_is_that_of_the_written_model_on_a_fresh_record(
     model: TransmissionModel,
     effects: dict[str, Any],
 ) -> None:
-    """Refitting the given model would hide a part of the gain."""
+    """Refitting the given model would hide part of the gain."""
     found = diagnosed(effects)
     assert {each.cause for each in found.findings} == set(effects)
     fresh = Record(columns(effects, seed=2))
@@ -82,7 +82,7 @@ def test_a_gain_is_that_of_the_written_model_on_a_fresh_record(
         before = diagnose(fresh, replace(model, effects=(*model.effects, *others))).baseline.rms_arcsec
         assert each.gain is not None
         stated = np.sqrt(each.gain.before_arcsec**2 - each.gain.after_arcsec**2)
-        assert stated == pytest.approx(np.sqrt(before**2 - after**2), rel=0.1)  # its speeds differ by 5 %
+        assert stated == pytest.approx(np.sqrt(before**2 - after**2), rel=0.1)  # speeds differ by 5 %
 
 
 @pytest.mark.parametrize("gain", [WORSE, None], ids=["worse", "none made"])
@@ -109,7 +109,7 @@ def test_a_cause_without_a_gain_is_not_more_likely_than_not(wider: Diagnosis, ga
 def test_a_finding_that_cannot_be_written_is_dropped(
     diagnosed: Diagnosed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The finding's parameters are out of bounds once everything is fitted together."""
+    """The parameters of the finding are out of bounds after the joint fit of all effects."""
     monkeypatch.setattr(
         VelocityWindup, "tidied", lambda self, _: self.model_copy(update={"shear_deg_s": -1.0})
     )
@@ -141,11 +141,11 @@ def test_unexplained_findings_have_no_hold_out(diagnosed: Diagnosed) -> None:
 def test_unnamed_findings_are_not_written(
     diagnosed: Diagnosed, columns: Callable[..., dict[str, Any]]
 ) -> None:
-    """Several near-equal orders of the flexspline are one unknown cause, and none is added to the model."""
+    """Several flexspline orders of equal size count as one unknown cause, and none is added to the model."""
     orders = {"orders": [(2, 4.0, 30.0), (3, 4.0, 70.0), (5, 4.0, 10.0)]}
     found = diagnosed({"flexspline_order": orders})
     assert [each.cause for each in found.findings] == ["unexplained"]
     assert {each.name for each in found.model.effects} == {"synchronous", "hysteresis"}
-    # The stated residual of the extended model is its actual one.
+    # The reported residual of the extended model is that of the written model.
     again = diagnose(Record(columns({"flexspline_order": orders})), found.model)
     assert found.extended.rms_arcsec == pytest.approx(again.baseline.rms_arcsec, rel=0.01)

@@ -1,4 +1,4 @@
-"""Physically impossible or inseparable causes are not named, however well they fit."""
+"""Tests that physically impossible or inseparable causes are not named, however well they fit."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MODEL = TransmissionModel(
 
 
 def sweeps(error_arcsec: Callable[[Any], Any], *legs: tuple[float, float]) -> Record:
-    """Legs of this many load turns at this many motor turns per second, and an error over the load angle."""
+    """Returns a record of sweeps (load turns, motor turns per second) with an error over the load angle."""
     angles, at = [], 0.0
     for turns, motor_turns_s in legs:
         count = round(abs(turns) * RATIO / motor_turns_s * RATE_HZ)
@@ -54,7 +54,7 @@ def sweeps(error_arcsec: Callable[[Any], Any], *legs: tuple[float, float]) -> Re
 
 
 def judged(ratio: float, true_ratio: float, load_turns: float) -> str:
-    """Returns the reason why a model of this ratio cannot be wrong by this much."""
+    """Returns the reason why the error of a model's ratio is implausible; empty if it is plausible."""
     ramp = 360.0 * 3600.0 * (1.0 / true_ratio - 1.0 / ratio)
     motion = Motion(np.array([0.0, 360.0 * ratio * load_turns]))
     seen: Any = SimpleNamespace(motion=motion, ratio=ratio)
@@ -115,7 +115,7 @@ def test_two_speeds_separate_place_from_time(legs: list[tuple[float, float]], al
 def test_equal_steps_over_many_lines_do_not_show_line_errors(
     legs: list[tuple[float, float]], resolved: bool
 ) -> None:
-    """At 4 motor turns per second the load passes 7.2 lines of 1800 between two samples."""
+    """At 4 motor turns per second, the load passes 7.2 of 1800 lines between two samples."""
     lines = SubdivisionalError(
         lines_per_turn=1800, orders=(MotorOrder(order=1, amplitude_arcsec=3.0, phase_deg=0.0),)
     )
@@ -132,7 +132,7 @@ def test_equal_steps_over_many_lines_do_not_show_line_errors(
 def test_two_vibrations_do_not_cancel(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> None:
-    """A tone whose amplitude passes through zero is the limit of two large ones with opposite signs."""
+    """A tone whose amplitude passes through zero is the limit of two large tones with opposite signs."""
     record = columns()
     time_s = record["time_s"]
     tone = 4.0 * np.sin(math.tau * 3.13 * time_s) * (2.0 * time_s / time_s[-1] - 1.0)

@@ -1,4 +1,4 @@
-"""95 % intervals of parameters have their nominal coverage and a reasonable width."""
+"""Tests that 95 % intervals of parameters have their nominal coverage and a reasonable width."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from hdbridge.records.record import Record
 Columns = Callable[..., dict[str, Any]]
 SEEDS = range(10, 20)
 LEAST = 0.9
-"""Minimum share of truths within the intervals."""
+"""Minimum fraction of true values within the intervals."""
 
 
 def held(parameter: Parameter, name: str, truth: float) -> bool:
@@ -36,8 +36,8 @@ def held(parameter: Parameter, name: str, truth: float) -> bool:
 
 
 def hidden(seed: int) -> tuple[dict[str, Any], Hypothesis, dict[str, float]]:
-    """Wave of the flexspline, ramp and load order: for the plant, as approximate effects, and as the
-    expected result.
+    """Returns three random errors (flexspline order, ramp, load order) as effects of the plant, as a
+    hypothesis with approximate effects, and as expected parameter values.
     """
     rng = np.random.default_rng(seed)
     order, turn, angle = int(rng.integers(2, 6)), *rng.uniform(-180.0, 180.0, 2)
@@ -88,7 +88,7 @@ def test_intervals_have_their_nominal_coverage(
                 if not name.endswith("phase_deg"):
                     halves.append(0.5 * (parameter.high - parameter.low) / abs(true))
     assert len(inside) == 20 * len(SEEDS)
-    # If the share were as low as LEAST, fewer would be inside in one run of a thousand.
+    # With a coverage of only LEAST, fewer would be inside in one run of a thousand.
     assert sum(inside) >= least(len(inside), LEAST, 1e-3), f"{sum(inside)} of {len(inside)}"
     assert np.median(halves) < 0.02
 
@@ -113,12 +113,12 @@ def test_a_changed_order_is_as_uncertain_as_its_reference(columns: Columns, plan
         for order, size, phase in added:
             truth = {f"order_{order}_amplitude_arcsec": size, f"order_{order}_phase_deg": phase}
             inside += [held(found.parameters[name], name, value) for name, value in truth.items()]
-    # Without the calibration's own variance, one interval in ten would hold.
+    # Without the variance of the calibration itself, only one interval in ten would contain the truth.
     assert sum(inside) >= least(len(inside), LEAST, 1e-3), f"{sum(inside)} of {len(inside)}"
 
 
 def swinging(columns: dict[str, Any], orders: Any, frequency_hz: float) -> dict[str, Any]:
-    """The load on a spring, whose swing exceeds the exciting waves of the motor angle."""
+    """Returns the columns with the additional load motion due to the gear's compliance at these orders."""
     motor = columns["motor_target_deg"]
     rate = np.radians(np.gradient(motor, columns["time_s"]))
     beyond = sum(
@@ -134,7 +134,7 @@ def test_orders_are_reported_at_rest_despite_load_swing(
     order = (7, 5.0, 40.0)
     record = swinging(columns({"motor_order": {"orders": [order]}}), (*plant.ORDERS, order), 40.0)
     found = diagnose(Record(record), model).findings[0].parameters["order_7_amplitude_arcsec"]
-    # At the higher speed, 1.7 turns a second, the load shows 9 % more of this order.
+    # At the higher speed, 1.7 motor turns per second, the amplitude of this order at the load is 9 % higher.
     assert found.low < 5.0 < found.high
     assert found.high - found.low < 0.2
 

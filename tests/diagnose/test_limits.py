@@ -1,4 +1,4 @@
-"""Detection limits agree with the findings of a diagnosis; definition of a repetition."""
+"""Tests that detection limits agree with the findings, and that only equal motions count as repetitions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_cause_that_is_found_hides_no_other(diagnosed: Diagnosed) -> None:
 def test_recordings_of_different_motion_do_not_repeat_each_other(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> None:
-    """Only one of them shows a loop with memory."""
+    """Only one of the recordings shows the loop's return-point memory."""
     whole = columns(law="memory")
     ends = np.searchsorted(whole["time_s"], [0.0, 9.0, 30.0, 1e9])
     parts = [Record({name: each[a:b] for name, each in whole.items()}) for a, b in pairwise(ends)]

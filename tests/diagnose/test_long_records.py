@@ -1,4 +1,4 @@
-"""Averaging a long record keeps the figures of its samples."""
+"""Tests that averaging the samples of a long record does not change its figures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ORDERS = ((2, 9.0, -132.0), (8, 2.0, 124.0), (24, 2.0, 30.0))
 
 
 def test_averaging_keeps_the_amplitude_of_fast_orders() -> None:
-    """Over 150,000 samples at two motor turns a second, means of three reduce order 24 by an eighth."""
+    """With 150,000 samples at two motor turns per second, means of three reduce order 24 by an eighth."""
     count, turns = 150_000, 60.0
     time_s = np.arange(count) / 200.0
     motor = 360.0 * turns * np.abs(np.mod(time_s / (0.5 * turns) + 1.0, 2.0) - 1.0)

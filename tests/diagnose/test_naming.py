@@ -1,4 +1,4 @@
-"""Separation of causes that look alike, and the certainty of a name."""
+"""Tests that similar causes are distinguished, and tests of the probability of a named cause."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ def names(diagnosis: Diagnosis) -> list[str]:
 
 @pytest.fixture
 def drifting(columns: Callable[..., dict[str, Any]], model: TransmissionModel) -> Callable[..., Diagnosis]:
-    """A ripple that grows with temperature, on a day warmer than the model's reference of 20 degrees."""
+    """Returns a function that diagnoses a ripple that grows with temperature, at temperatures above the
+    model's reference of 20 deg C.
+    """
 
     def run(growth_per_k: float, rise_k: float, warmer_k: float) -> Diagnosis:
         record = columns({"amplitude_drift": {"ripple": growth_per_k}}, temperature_rise_k=rise_k)
@@ -41,7 +43,7 @@ def drifting(columns: Callable[..., dict[str, Any]], model: TransmissionModel) -
 
 
 def test_drift_is_reported_from_the_model_temperature(drifting: Callable[..., Diagnosis]) -> None:
-    """From any other temperature, the model's amplitudes would appear to have changed as well."""
+    """Relative to any other temperature, the model's amplitudes would appear to have changed, too."""
     result = drifting(0.025, rise_k=10.0, warmer_k=14.0)
     assert names(result) == ["amplitude_drift"]
     growth = result.findings[0].parameters["ripple_percent_per_k"]
@@ -49,7 +51,7 @@ def test_drift_is_reported_from_the_model_temperature(drifting: Callable[..., Di
 
 
 def test_ripple_drift_is_found_next_to_a_larger_skew(diagnosed: Diagnosed) -> None:
-    """One differs between the directions, the other is the same in both."""
+    """The skew has opposite signs in the two directions; the ripple is equal in both."""
     effects = {"channel_skew": {"ms": 0.7}, "amplitude_drift": {"ripple": 0.006}}
     assert set(names(diagnosed(effects, temperature_rise_k=14.0))) == {"channel_skew", "amplitude_drift"}
 
@@ -69,7 +71,7 @@ def test_a_ripple_that_is_loaded_and_warm_has_grown_by_both(diagnosed: Diagnosed
 def test_a_wave_close_to_a_calibrated_order_is_not_a_change_of_it(
     plant: ModuleType, model: TransmissionModel
 ) -> None:
-    """On a quarter of a load turn the waves differ by half a period, and a free order explains most of it."""
+    """Over a quarter of a load turn, the waves differ by half a period; a free order explains most of it."""
     truth = plant.Truth(effects={"flexspline_order": {"orders": [(2, 16.0, 30.0)]}})
     plan = plant.Plan(rate_hz=16.0, scale=0.2, load_turns=0.25, steps=16)
     found = diagnose(Record(plant.record(truth, plan, 1, True)), model).findings[0]
@@ -106,7 +108,7 @@ def test_small_steps_next_to_a_large_one_are_not_named(diagnosed: Diagnosed) -> 
 
 @pytest.fixture
 def sprung(columns: Callable[..., dict[str, Any]], model: TransmissionModel) -> Callable[..., Diagnosis]:
-    """A mass on a spring, and a torque that is measured with noise."""
+    """Returns a function that diagnoses a compliance under an eccentric mass, with noisy load torque."""
 
     def run(spring: dict[str, float], torque_nm: float, noise_nm: float) -> Diagnosis:
         record = columns({"compliance": spring}, torque_nm=torque_nm)
@@ -166,7 +168,7 @@ def test_a_wider_loop_of_the_same_height_has_changed(diagnosed: Diagnosed) -> No
 
 
 def test_a_sticking_loop_is_not_count_loss(plant: ModuleType) -> None:
-    """Friction is higher at rest, and the axis moves back and forth within the loop's width."""
+    """Friction is higher near rest, and the axis moves back and forth within the width of the loop."""
     rng = np.random.default_rng(2)
     time_s = np.arange(0.0, 28.0, 1.0 / 256.0)
     shaken = rng.normal(size=len(time_s))
@@ -224,7 +226,7 @@ def test_stronger_evidence_raises_the_probability() -> None:
 def test_a_lagging_load_is_a_loop_of_the_opposite_sign(
     columns: Callable[..., dict[str, Any]], plant: ModuleType
 ) -> None:
-    """Nothing is named if the model's load lags as well; if it leads, the loop has changed."""
+    """Nothing is named if the load lags in the model, too; if it leads in the model, the loop has changed."""
     record = Record(columns(offset=-30.0))
     lags = TransmissionModel.from_text(plant.model_text(5, truth=plant.Truth(offset=-30.0)))
     assert [each.cause for each in diagnose(record, lags).findings] == []
@@ -245,5 +247,5 @@ def test_a_lagging_load_is_a_loop_of_the_opposite_sign(
     ids=["more equal orders than one cause has", "bursts beside an order of the load"],
 )
 def test_an_unexplained_residual_leads_the_list(diagnosed: Diagnosed, effects: dict[str, Any]) -> None:
-    """Without `Scales.near` the orders are one cause; the bursts are larger than the load's order."""
+    """Without `Scales.near`, the orders count as one cause; the bursts are larger than the load order."""
     assert names(diagnosed(effects))[0] == "unexplained"

@@ -1,7 +1,7 @@
-"""Rate of hidden causes that are reported first, and rate of false findings.
+"""Tests of the rate at which the hidden cause is reported first, and of the rate of false findings.
 
-A single record proves little: the claim is a rate, and the count over random records must be as large as this
-rate allows. Each run uses a few records; the slow tests and the blind suites use more.
+A single record proves little, so the claim is a rate, with which the count over random records must agree.
+Each run uses a few records; the slow tests and the blind suites use more.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MORE = range(1, 5)
 
 
 def judged(names: Iterable[str], seeds: Iterable[int]) -> dict[str, Verdict]:
-    """Each name hidden once with each seed."""
+    """Returns the verdict on each name with each seed."""
     verdicts = {}
     for name in names:
         for seed in seeds:
@@ -32,7 +32,7 @@ def judged(names: Iterable[str], seeds: Iterable[int]) -> dict[str, Verdict]:
 
 
 def holds(verdicts: dict[str, Verdict], rate: float, good: str) -> None:
-    """True if as many are ``good`` (a member of `Verdict`, or ``silent``) as the rate allows."""
+    """Checks that as many verdicts are ``good`` (a `Verdict` member, or ``silent``) as the rate allows."""
     bad = [
         (name, each)
         for name, each in verdicts.items()

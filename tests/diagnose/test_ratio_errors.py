@@ -1,4 +1,4 @@
-"""A wrong ratio has the same slope over the whole travel."""
+"""Tests that a ratio error is named only if the error has the same slope over the whole travel."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from hdbridge.records.record import Record
 def sloping(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> Callable[[float, float], Diagnosis]:
-    """Record whose load error rises to this many arcsec at its end, from a share of its travel on."""
+    """Returns a function that diagnoses a load error that is zero up to a fraction of the travel and then
+    rises linearly to a given size, arcsec, at its end.
+    """
 
     def run(begins: float, arcsec: float) -> Diagnosis:
         record = columns()

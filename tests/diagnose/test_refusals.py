@@ -1,4 +1,4 @@
-"""A cause with evidence that a rule refuses is reported, and may still be an alias of a named cause."""
+"""Tests that a cause that a rule refuses is reported with the reason, and may be an alias of another."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_linear_drag_is_reported_as_a_delay_with_alias(
 def test_inertial_wind_up_does_not_turn_drag_into_a_delay(
     diagnosed: Callable[..., Diagnosis], drag: dict[str, float], inertia_s2: float, names: set[str]
 ) -> None:
-    """A delay also has an acceleration term, and its linear speed term may cancel that of a drag."""
+    """A delay, too, has an acceleration term, and its linear speed term may cancel that of the drag."""
     result = diagnosed({"velocity_windup": drag, "inertial_windup": {"s2": inertia_s2}})
     assert {each.cause for each in result.findings} == names
 
@@ -55,7 +55,7 @@ def test_inertial_wind_up_does_not_turn_drag_into_a_delay(
 def test_refused_causes_are_reported_if_nothing_else_explains_them(
     diagnosed: Callable[..., Diagnosis],
 ) -> None:
-    """A load that leads while accelerating is neither an inertia on a spring nor a delay."""
+    """A load that leads while accelerating is neither inertial wind-up nor a delay."""
     result = diagnosed({"inertial_windup": {"s2": -1.2e-4}})
     assert [each.cause for each in result.findings] == ["unexplained"]
     reasons = {each.split(": ")[0]: each for each in result.as_dict()["considered"]}
@@ -66,8 +66,8 @@ def test_refused_causes_are_reported_if_nothing_else_explains_them(
 @pytest.mark.parametrize(
     ("unknown", "refused"),
     [
-        ({"kind": "packet", "size": 6.0, "width": 12.0}, LocalDefect),  # waves next to one another
-        ({"kind": "heated", "size": 6.0, "tau": 40.0}, CountLoss),  # rises within seconds, not at once
+        ({"kind": "packet", "size": 6.0, "width": 12.0}, LocalDefect),  # several adjacent waves
+        ({"kind": "heated", "size": 6.0, "tau": 40.0}, CountLoss),  # rises within seconds, not in a step
     ],
 )
 def test_parts_of_an_unknown_cause_are_not_named(
@@ -81,7 +81,7 @@ def test_parts_of_an_unknown_cause_are_not_named(
 def test_the_search_continues_after_a_refusal(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Four impossible causes seem to explain more than the possible one."""
+    """Four impossible causes explain more of the error than the possible one."""
     for kind in CATALOGUE.values():
         if kind is not MotorOrders:
             monkeypatch.setattr(kind, "implausible", lambda *_: "cannot be")

@@ -1,4 +1,4 @@
-"""Views of the residual: its correlation with each coordinate."""
+"""Tests of the views of the residual: its dependence on each coordinate."""
 
 from dataclasses import replace
 
@@ -77,7 +77,7 @@ def test_bins_lose_no_point_and_keep_the_mean(points, spacing):
 def test_travel_and_time_restart_at_each_reversal():
     motor = np.array([0.0, 1.0, 2.0, 2.0, 1.0, 0.0, 3.0])
     motion = Motion(motor_deg=motor, time_s=np.arange(7.0))
-    # A rest belongs to the motion before it, because the axis has not reversed yet.
+    # A rest belongs to the motion before it, because the axis has not yet reversed.
     assert over.since_reversal(motion).values.tolist() == [SMALLEST_WAY_DEG, 1.0, 2.0, 2.0, 1.0, 2.0, 3.0]
     assert over.time_since_reversal(motion).values.tolist() == [SMALLEST_TIME_S, 1.0, 2.0, 3.0, 1.0, 2.0, 1.0]
 
@@ -99,4 +99,4 @@ def test_a_stretch_does_not_predict_itself():
     values = np.where((TIME_S > 400.0) & (TIME_S < 405.0), 5.0, 0.0)  # within one stretch
     prediction = predicted(Coordinate("time", "s", TIME_S, bins=25), values, DIRECTION, folds(TIME_S))
     assert np.all(prediction[values > 0.0] == 0.0)
-    assert np.max(prediction) > 0.0  # it does predict its neighbours
+    assert np.max(prediction) > 0.0  # but it predicts its neighbours

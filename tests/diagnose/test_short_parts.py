@@ -1,4 +1,4 @@
-"""Parts of few samples, and the motion before a record."""
+"""Tests of parts with few samples, and of the motion before a record."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_part_of_one_sample_is_accepted(
 def test_a_part_that_ends_in_its_fast_move_is_accepted(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> None:
-    """Samples of moves are not used, and a run interrupted in its first move has no others."""
+    """Samples of fast moves are not used, and a run interrupted in its first move has no other samples."""
     parts = [
         Record({name: np.asarray(each)[rows] for name, each in columns({}).items()})
         for rows in (slice(0, 1500), slice(1500, 1520))

@@ -1,4 +1,4 @@
-"""A stiffening spring versus the load order that a linear one would need in addition."""
+"""Tests that a stiffening gear is not taken for a linear compliance with an additional load order."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ SEEDS = range(201, 209)
 def stiffening(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> Callable[[int], tuple[dict[str, float], Diagnosis]]:
-    """Returns a spring that stiffens at a torque drawn by the seed, and the findings under a mass."""
+    """Returns a function that diagnoses a gear that stiffens at a random torque under an eccentric mass; it
+    returns the compliance parameters and the diagnosis.
+    """
 
     def run(seed: int) -> tuple[dict[str, float], Diagnosis]:
         rng = np.random.default_rng(seed)
@@ -48,9 +50,9 @@ def test_a_stiffening_spring_is_found_with_its_stages(stiffening: Stiffening) ->
 
 @pytest.mark.slow
 def test_a_curved_spring_is_not_a_load_order(stiffening: Stiffening) -> None:
-    """A screen that offers the spring at a few fixed bends adds an order in half of the records.
+    """A screening with only a few fixed stiffening torques adds a load order in half of the records.
 
-    At that rate none in eight happens in one of 250 runs.
+    At this rate, none in eight records happens in one of 250 runs.
     """
     named = {seed: [each.cause for each in stiffening(seed)[1].findings] for seed in SEEDS}
     assert all(causes == ["compliance"] for causes in named.values()), named

@@ -1,4 +1,4 @@
-"""Fast moves of a load on its spring: an ordinary axis is silent, the wind-up of a soft one is named."""
+"""Tests with fast moves of a compliant axis: a normal axis has no findings, a soft one has wind-up."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 STEP_S, EVERY, SYNC = 5e-4, 20, 32
-"""Time step of the plant, and steps between samples (100 Hz) and between set-points (62.5 Hz)."""
+"""Time step of the plant, s; number of steps between samples (100 Hz) and between set-points (62.5 Hz)."""
 DAMPING = 0.1
 
 
 def moved(rng: np.random.Generator) -> np.ndarray:
-    """Returns the motor angle (n,) of moves whose speed rises and falls in a raised cosine, and of rests."""
+    """Returns motor angles, degrees, shape (n,): moves with raised-cosine speed, and rests between them."""
     speed = [np.zeros(2000)]
     for _ in range(40):
         rows = int(rng.integers(200, 700))
@@ -31,7 +31,7 @@ def moved(rng: np.random.Generator) -> np.ndarray:
 
 
 def on_spring(base: np.ndarray, hertz: float) -> np.ndarray:
-    """Returns the motion of a mass behind a spring and a damper, by the bilinear transform."""
+    """Returns the motion of a mass on a spring and a damper behind ``base``, by the bilinear transform."""
     natural = math.tau * hertz
     damper, double = 4.0 * DAMPING * natural / STEP_S, 4.0 / STEP_S**2
     spring = natural**2 * np.array([1.0, 2.0, 1.0])
@@ -42,7 +42,9 @@ def on_spring(base: np.ndarray, hertz: float) -> np.ndarray:
 
 @pytest.fixture
 def seen(plant: ModuleType, model: TransmissionModel):
-    """Diagnoses fast moves of a load with this natural frequency, and with counts lost halfway."""
+    """Returns a function that diagnoses fast moves of a load with this natural frequency, optionally with a
+    count loss halfway.
+    """
 
     def run(hertz: float, lost_arcsec: float = 0.0, sync: int = 0) -> Diagnosis:
         rng = np.random.default_rng(3)
@@ -75,7 +77,7 @@ def test_an_ordinary_load_is_silent(seen) -> None:
 
 
 def test_set_points_joined_by_straight_lines_are_silent(seen) -> None:
-    """Each set-point shocks the load by more than a spline through the samples shows."""
+    """Each set-point excites the load more than a spline through the samples shows."""
     assert not seen(65.0, sync=SYNC).findings
 
 

@@ -1,4 +1,4 @@
-"""Intervals include systematic errors: another law, or a hidden look-alike."""
+"""Tests that intervals include systematic errors: those of another law, or of a hidden similar effect."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from hdbridge.records.record import Record
 
 Columns = Callable[..., dict[str, Any]]
 HELD = 0.95
-"""Nominal share of truths within the intervals."""
+"""Nominal fraction of true values within the intervals."""
 
 
 def parameters(record: dict[str, Any], model: TransmissionModel, effect: Effect) -> dict[str, Parameter]:
-    """Returns the parameters of an effect that is fitted to a record together with the model."""
+    """Returns the parameters of an effect that is fitted to a record in addition to the model."""
     estimator = Estimator(gather(Record(record), 50.0))
     hypothesis = Hypothesis((*model.effects, effect), Start.FORWARD)
     precise = precisely(estimator, estimator.fit(hypothesis))
@@ -53,14 +53,14 @@ def holds(parameter: Parameter, truth: float) -> bool:
 
 
 def enough(inside: list[bool]) -> bool:
-    """Returns True if the coverage is nominal within chance."""
+    """Returns True if the coverage does not contradict the nominal one."""
     return sum(inside) >= least(len(inside), HELD)
 
 
 def test_drag_with_another_exponent_is_within_its_intervals(
     columns: Columns, model: TransmissionModel
 ) -> None:
-    """The plant's drag falls off with speed to the power 0.8, the law's with the first."""
+    """The shear thinning of the drag has an exponent of 0.8 in the plant and of 1 in the law."""
     inside: list[bool] = []
     for seed in range(41, 46):
         rng = np.random.default_rng(seed)
@@ -96,7 +96,7 @@ def test_effects_present_without_delay_are_not_evidence_of_delay(
 def test_motor_motion_within_a_count_at_rest_is_not_creep(
     plant: ModuleType, columns: Columns, model: TransmissionModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The motor is 0.8 counts ahead of its command, stays so for 0.3 s after each stop, and then lets go."""
+    """The motor is 0.8 counts ahead of its command until 0.3 s after each stop, and then returns."""
     path, motor_angles = plant.path, []
 
     def ahead(plan: Any, rng: np.random.Generator) -> Any:
@@ -139,7 +139,7 @@ def test_turning_short_by_a_count_is_not_a_changed_loop(
 def test_wind_up_of_a_swinging_load_is_within_its_interval(
     plant: ModuleType, model: TransmissionModel
 ) -> None:
-    """The law holds far below the resonance, and these moves accelerate in 0.15 s."""
+    """The law is valid only far below the resonance, but these moves accelerate within 0.15 s."""
     plan = plant.Plan(rate_hz=50.0, scale=0.05, load_turns=0.1, steps=16)
     inside: list[bool] = []
     for seed in range(81, 87):
@@ -161,7 +161,7 @@ def test_wind_up_of_a_swinging_load_is_within_its_interval(
 def test_the_height_of_a_bump_of_another_form_is_within_its_interval(
     columns: Columns, model: TransmissionModel
 ) -> None:
-    """The plant's bump is a Gaussian, the law's a raised cosine."""
+    """The bump is a Gaussian in the plant and a raised cosine in the law."""
     inside: list[bool] = []
     for seed in range(61, 69):
         rng = np.random.default_rng(seed)
@@ -175,7 +175,7 @@ def test_the_height_of_a_bump_of_another_form_is_within_its_interval(
 def test_eccentricity_next_to_an_unknown_spring_is_as_uncertain_as_it_should_be(
     columns: Columns, model: TransmissionModel
 ) -> None:
-    """Under one mass, wind-up and run-out both repeat once per turn, so only their sum is visible."""
+    """Wind-up under an eccentric mass and run-out both repeat once per load turn; only the sum is visible."""
     inside: list[bool] = []
     for seed in range(51, 55):
         rng = np.random.default_rng(seed)
@@ -188,7 +188,7 @@ def test_eccentricity_next_to_an_unknown_spring_is_as_uncertain_as_it_should_be(
         fitted = parameters(record, model, LoadOrders(ratio=50.0, orders=orders_from([1, 2])))
         inside += [holds(fitted["order_1_amplitude_arcsec"], size), holds(fitted["order_1_phase_deg"], phase)]
         twice = fitted["order_2_amplitude_arcsec"]
-        assert twice.low < 4.0 < twice.high < 4.5  # a spring has no second order
+        assert twice.low < 4.0 < twice.high < 4.5  # a linear compliance causes no second order
     assert enough(inside), inside
 
 

@@ -1,4 +1,4 @@
-"""Causes outside the catalogue: smallest detectable size, and exclusions."""
+"""Tests of causes outside the catalogue: smallest size that is reported, and exclusions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LOOPS = {"hysteresis_parameters", "hysteresis_memory"}
 
 
 def test_local_unknown_effects_are_unexplained(diagnosed: Callable[..., Diagnosis]) -> None:
-    """Its residual is below half an arcsecond rms; a cause needs as much at its peak."""
+    """The residual is below 0.5 arcsec rms, whereas a cause needs a peak of at least 0.5 arcsec."""
     (found,) = diagnosed({"unknown": {"kind": "packet", "size": 5.0, "width": 8.0}}).findings
     assert found.cause == "unexplained"
     assert found.left_arcsec < 0.5 < found.peak_arcsec < 6.0
@@ -27,7 +27,7 @@ def test_local_unknown_effects_are_unexplained(diagnosed: Callable[..., Diagnosi
 
 
 def test_effects_below_a_motor_count_are_remarks(diagnosed: Callable[..., Diagnosis]) -> None:
-    """A motor count is 3.2 arcsec at the load; smaller effects cannot be acted on."""
+    """A motor count is 3.2 arcsec at the load; smaller effects cannot be corrected."""
     result = diagnosed({"unknown": {"kind": "packet", "size": 2.8, "width": 12.0}})
     assert not result.findings
     (remark,) = [each for each in result.remarks if "beyond the noise" in each]
@@ -38,16 +38,16 @@ def test_effects_below_a_motor_count_are_remarks(diagnosed: Callable[..., Diagno
 def test_residuals_of_another_law_at_reversals_belong_to_the_loop(
     diagnosed: Callable[..., Diagnosis], law: str
 ) -> None:
-    """The residual is an arcsecond rms, but zero beyond the memory of the loop."""
+    """The residual is 1 arcsec rms, but vanishes once the motor has moved by the width of the loop."""
     (found,) = diagnosed(law=law, rate_hz=16.0).findings
-    # At 16 Hz the errors at turning points are as large as the residual.
+    # With samples at 16 Hz, the errors at turning points are as large as the residual.
     assert found.cause in LOOPS | ({"unexplained"} if law == "bouc_wen" else set())
 
 
 def test_direction_effects_far_from_reversals_are_not_a_changed_loop(
     diagnosed: Callable[..., Diagnosis],
 ) -> None:
-    """A ring that is carried along by more than a turn of the motor before it slips."""
+    """The motion carries a ring along for more than one motor turn before the ring slips."""
     (found,) = diagnosed({"unknown": {"kind": "ring", "size": 5.0, "travel": 400.0}}).findings
     assert found.cause == "unexplained"
 
@@ -57,7 +57,7 @@ TIME_S = np.arange(60_000) / 1000.0
 
 
 def to_and_fro(motor: FloatArray, every: int, load_count_arcsec: float) -> Record:
-    """Record of a healthy axis with a load encoder of this count; one sample in ``every`` is kept."""
+    """Returns a record of a healthy axis with this load resolution; keeps one sample in ``every``."""
     rng, step = np.random.default_rng(5), load_count_arcsec / 3600.0
     load = (
         motor / 100.0 + LOOP.predict(Motion(motor)) / 3600.0 + 0.05 * rng.standard_normal(len(motor)) / 3600.0

@@ -1,8 +1,8 @@
-"""A cause is hidden in the axis by its physics: the diagnosis names it, the extended model compensates it.
+"""Tests with hidden physical causes: the diagnosis names them, and the extended model compensates them.
 
-One bench for each cause of the catalogue, for pairs, for nothing, for another hysteresis law, and for causes
-that are not in the catalogue. Sizes are 5 arcsec at the load (an interpolation error 2) under readings with
-0.3 arcsec of noise. Each plan suits an engineer who suspects the cause.
+There is one bench for each cause of the catalogue, for pairs, for no cause, for another hysteresis law, and
+for causes outside the catalogue. Sizes are 5 arcsec at the load (2 for the subdivisional error) with readings
+that have 0.3 arcsec of noise. Each plan is one that an engineer who suspects the cause would choose.
 """
 
 import json
@@ -45,7 +45,7 @@ from hdbridge.sim.lockstep import nameplate_of
 from hdbridge.sim.truth import Truth
 
 SEEDS = [int(each) for each in os.environ.get("HIDDEN_SEEDS", "1").split()]
-"""More of them hide each cause more often: HIDDEN_SEEDS="1 2 3"."""
+"""Seeds with which each cause is hidden; HIDDEN_SEEDS="1 2 3" sets more than one."""
 MOST_OF_FLOOR = 1.3
 Parts = tuple[Procedure[Any], ...]
 LOOP: Parts = (
@@ -55,39 +55,39 @@ LOOP: Parts = (
     Sines(0.0, (180.0, 45.0, 5.0), 0.1, 1.0),
     Nested(),
 )
-"""Shows the loop and the orders of the motor; every bench begins with it."""
+"""Motion that shows the hysteresis loop and the motor orders; every bench begins with it."""
 FAST: Parts = (Sweep(-15.0, 65.0, SPEED_DEG_S),)
-"""The same orders at another speed, over a part of the load's turn."""
+"""Sweep at another speed over part of a load turn, which shows the same motor orders."""
 TURN: Parts = (Sweep(*REACH_DEG, SPEED_DEG_S),)
-"""Every load angle in both directions: shows dependence on the angle, or on the torque of a mass."""
+"""Sweep over all load angles in both directions: shows dependence on the angle or on the torque of a mass."""
 AGAIN: Parts = (Still(6.0), Sweep(-10.0, 12.0, 4.0)) * 4
-"""Repeated visits to one place: shows changes with time, temperature or wear."""
+"""Repeated visits to one pose: show changes with time, temperature or wear."""
 SPEEDS: Parts = (*FAST, Sweep(-10.0, 30.0, 12.0), Sweep(-4.0, 6.0, 0.7))
 RESTS: Parts = (*FAST, Still(12.0), Sweep(-30.0, 60.0, SPEED_DEG_S), Still(12.0))
 SWINGS: Parts = (Sweep(-15.0, 40.0, 3.0), Sines(0.0, (100.0,), 0.7, 8.0))
-"""Accelerates by 39 deg/s^2 without a jerk, else slow: the wind-up without the ringing of a soft spring."""
+"""Motion with smooth accelerations of up to 39 deg/s^2: shows wind-up without ringing of a soft gear."""
 TWICE: Parts = (Sweep(*REACH_DEG, SPEED_DEG_S, laps=2),)
-"""Four passes over every place."""
+"""Four passes over every load angle."""
 TORQUES: Parts = (*TURN, Sweep(80.0, 102.0, 2.0), Sweep(170.0, 192.0, 2.0))
-"""The same motor turns under several torques of a mass."""
+"""Sweeps of equal motor angles under several torques of an eccentric mass."""
 SLOW: Parts = (*SPEEDS, Sweep(-1.0, 1.0, 0.1))
-"""Down to speeds at which a speed-dependent loop equals its value at rest."""
+"""Sweeps down to a speed at which a speed-dependent loop equals the loop at rest."""
 AT_REST = replace(STEPPING, settle=Settle(minimum_s=1.0))
-"""For a loop that needs a while to forget its speed."""
+"""Stepping test with a longer rest, for a hysteresis loop that depends on past speeds."""
 
 
 def lagging() -> Truth:
-    """The axis whose gear follows its temperature sensor with a lag of a minute."""
+    """Returns an axis whose gear temperature follows the temperature sensor with a lag of one minute."""
     data = bare_truth().model_dump(by_alias=True)
     data["temperature"]["zero_time_constant_s"] = 60.0
     return Truth.model_validate(data)
 
 
 def greased() -> Truth:
-    """The axis whose servo was set up with the drag of its grease present.
+    """Returns an axis whose servo compensates the viscous drag of its grease by feed-forward.
 
-    Otherwise the integral carries the drag, every stop overshoots by three motor counts (2.4 arcsec), and the
-    error at rest is 7.4 times the floor, whatever the model.
+    Otherwise the integral term compensates it, every stop overshoots by three motor counts (2.4 arcsec), and
+    the error at rest is 7.4 times the floor, whatever the model.
     """
     data = bare_truth().model_dump(by_alias=True)
     data["servo"]["viscous_feedforward_nm_s_per_rad"] = 0.004
@@ -95,7 +95,7 @@ def greased() -> Truth:
 
 
 def bouc_wen() -> Truth:
-    """The axis with a loop of about the model's size, but of a law that the catalogue does not have."""
+    """Returns an axis with a loop of about the size of the model's, but of a law outside the catalogue."""
     data = bare_truth().model_dump(by_alias=True)
     data["gear"]["hysteresis"] = {
         "law": "bouc_wen",
@@ -109,7 +109,7 @@ def bouc_wen() -> Truth:
 
 @dataclass(frozen=True)
 class Bench:
-    """The hidden cause, and the command that has to find it."""
+    """Hidden causes, and the motion and test conditions in which they must be found."""
 
     parts: Parts
     causes: tuple[str, ...]
@@ -120,7 +120,7 @@ class Bench:
 
     @contextmanager
     def run(self, folder: Path, seed: int) -> Iterator[Cell]:
-        """Measures the axis with the cause."""
+        """Provides the axis with its hidden causes, already measured."""
         sizes = [(each, 2.0 if each == "subdivisional_error" else 5.0) for each in self.causes]
         parts = (*LOOP, *self.parts)
         with hidden_bench(folder, sizes, seed, parts, self.highest_deg_s2, self.truth, self.cycle_ms) as cell:
@@ -172,7 +172,7 @@ PAIRS = dict(
     )
 )
 QUICK = ("motor_order and channel_skew",)
-"""Pairs that are part of every run; `make test-slow` has all of them, and all causes with more seeds."""
+"""Pairs that are tested in every run; `make test-slow` tests all of them, and all causes with more seeds."""
 UNKNOWN = {"a roller": Bench(TURN, ("unexplained:roller",), cycle_ms=MORE_MS)}
 OTHER_LAW = {"Bouc-Wen": Bench(FAST, (), truth=bouc_wen())}
 LAGGING = {"zero_drift behind its sensor": Bench(AGAIN, ("zero_drift",), truth=lagging())}
@@ -180,7 +180,7 @@ NONE = {"nothing": Bench((*FAST, *TURN), ())}
 
 
 def of(benches: dict[str, Bench]) -> list[Any]:
-    """Returns parameters of a bench and a seed each."""
+    """Returns pytest parameters: each bench with each seed."""
     return [
         pytest.param(
             (bench, seed),
@@ -194,14 +194,14 @@ def of(benches: dict[str, Bench]) -> list[Any]:
 
 @pytest.fixture(scope="module")
 def cell(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
-    """The measured bench of a case; its diagnosis is made once, on request."""
+    """Provides the measured bench of a case; its diagnosis is made only once, on request."""
     bench, seed = request.param
     with bench.run(tmp_path_factory.mktemp("hidden"), seed) as cell:
         yield cell
 
 
 def described(cell: Cell) -> str:
-    """Returns the hidden cause and the findings, for the message of a failure."""
+    """Returns the hidden causes and the findings as text, for the message of a failed assertion."""
     hidden = "; ".join(each.text for each in cell.hidden) or "nothing"
     findings = cell.diagnosis.findings
     found = "; ".join(f"{each.cause} {each.probability:.2f} or {each.aliases}" for each in findings)

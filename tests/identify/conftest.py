@@ -1,4 +1,4 @@
-"""Records of synthetic axes from the formulas, independent of the tested code."""
+"""Fixtures of this folder: records of synthetic axes from formulas, independent of the tested code."""
 
 from dataclasses import dataclass, field
 
@@ -14,7 +14,7 @@ RATE_HZ = 50.0
 
 @dataclass
 class Axis:
-    """An ideal axis with the article's kind of error, read by noisy, counting encoders."""
+    """Ideal axis with a transmission error like the article's, and noisy encoders of finite resolution."""
 
     ratio: float = 20.0
     orders: dict[int, tuple[float, float]] = field(
@@ -31,7 +31,7 @@ class Axis:
     zero_arcsec: float = 700.0
 
     def error(self, motor_deg: np.ndarray, state: float = 1.0) -> np.ndarray:
-        """Transmission error, branch by branch; ``state`` is the initial direction of saturation."""
+        """Computes the transmission error, arcsec; ``state`` is the initial saturation, +1 or -1."""
         radians = np.deg2rad(motor_deg)
         total = sum(
             amplitude * np.cos(order * radians + np.deg2rad(phase))
@@ -51,7 +51,7 @@ class Axis:
         return total + self.offset * loop
 
     def record(self, legs: list[tuple[str, np.ndarray]], seed: int = 0, state: float = 1.0) -> list[Leg]:
-        """Legs of motor angles, one after the other at `RATE_HZ`, as segments; ``state`` as in `error`."""
+        """Records legs of motor angles, one after the other, at `RATE_HZ`; ``state`` is that of `error`."""
         rng = np.random.default_rng(seed)
         motor = np.concatenate([each for _, each in legs])
         count = 360.0 / self.motor_counts
@@ -69,19 +69,19 @@ class Axis:
 
 
 def ramp(begin: float, end: float, motor_deg_s: float) -> np.ndarray:
-    """Constant speed, without the first point."""
+    """Returns motor angles at constant speed, without the first point."""
     count = max(round(abs(end - begin) / motor_deg_s * RATE_HZ), 1)
     return np.linspace(begin, end, count + 1)[1:]
 
 
 def wave(amplitude_deg: float, periods: float = 2.0, period_s: float = 10.0) -> np.ndarray:
-    """A sine about zero that begins at its upper extreme."""
+    """Returns a sine of motor angles about zero that begins at its maximum, without the first point."""
     time = np.arange(1, int(periods * period_s * RATE_HZ) + 1) / RATE_HZ
     return amplitude_deg * np.cos(2 * np.pi * time / period_s)
 
 
 def bench_plan(turns: float = 20.0, speed: float = 200.3) -> list[tuple[str, np.ndarray]]:
-    """Rest, sweeps both ways, sines of three amplitudes, nested reversals; motor degrees."""
+    """Returns the legs of a bench plan, motor degrees: rest, sweeps, sines of three amplitudes, reversals."""
     end = 360.0 * turns
     legs = [
         ("standstill", np.zeros(int(10 * RATE_HZ))),
@@ -106,7 +106,7 @@ def bench_plan(turns: float = 20.0, speed: float = 200.3) -> list[tuple[str, np.
 
 @dataclass(frozen=True)
 class Bench:
-    """Names of this file that the tests use."""
+    """Members of this module for the tests."""
 
     axis = Axis
     ramp = staticmethod(ramp)
@@ -123,5 +123,5 @@ def bench() -> Bench:
 
 @pytest.fixture(scope="session")
 def standard(bench: Bench) -> FitResult:
-    """The fit of the standard axis on the standard plan, with no model active."""
+    """Returns the fit to the standard axis on the standard plan, without an active model."""
     return fit(Axis().record(bench_plan()), 20.0, bench.options)

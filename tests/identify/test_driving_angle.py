@@ -1,4 +1,4 @@
-"""Driving angle of the hysteresis: without chatter, reversing only with the motor."""
+"""Tests that the driving angle of the hysteresis has no chatter and reverses only with the motor."""
 
 from itertools import accumulate
 
@@ -35,7 +35,7 @@ def test_the_count_is_found_at_any_speed(counts, fastest_deg, samples, seed):
 @pytest.mark.parametrize("noise_deg", [1e-5, 1e-3, 0.02])
 @pytest.mark.parametrize("commanded", [True, False])
 def test_fast_moves_between_rare_samples_are_not_noise(noise_deg, commanded):
-    """At 13 Hz a move takes a few samples, and counts below the noise cannot be seen."""
+    """At 13 Hz, a move takes only a few samples, and counts smaller than the noise are invisible."""
     rng = np.random.default_rng(6)
     goals = np.repeat(np.cumsum(rng.choice([-700.0, 700.0], 60)), 12)
     motor = np.convolve(goals, np.array([1.0, 3.0, 5.0, 3.0, 1.0]) / 13.0, "same")[6:-6]
@@ -129,7 +129,7 @@ def test_a_motor_that_rests_and_continues_in_the_same_direction_does_not_turn(co
 )
 @settings(max_examples=60, deadline=None, derandomize=True)
 def test_a_flickering_reading_at_rest_is_averaged(flicker, rate_hz, seed):
-    """Moves to and fro; friction stops the motor a little before the command, anywhere within a count."""
+    """The axis moves to and fro; friction stops the motor up to two counts before the command."""
     rng = np.random.default_rng(seed)
     count = 0.045
     command, motor = [np.zeros(100)], [np.zeros(100)]
@@ -150,7 +150,7 @@ def test_a_flickering_reading_at_rest_is_averaged(flicker, rate_hz, seed):
 
 @pytest.mark.parametrize("rate_hz", [25.0, 50.0, 100.0, 250.0])
 def test_acceleration_effects_are_independent_of_the_sampling_rate(rate_hz: float) -> None:
-    """Moves with half-cosine acceleration in 0.25 s, recorded in whole counts."""
+    """The moves have smooth acceleration, last 0.5 s each, and are recorded in whole counts."""
     time = np.arange(0.0, 60.0, 1.0 / rate_hz)
     turn, amplitude = 2.0 * np.pi / 0.5, 45.0
     since = np.mod(time, 0.8137)
@@ -169,7 +169,7 @@ def test_acceleration_effects_are_independent_of_the_sampling_rate(rate_hz: floa
 def test_a_record_that_begins_and_ends_in_motion_has_its_visible_acceleration(
     rate_hz: float,
 ) -> None:
-    """The drift is proportional to time, and needs no correction, neither inside nor at the ends."""
+    """The acceleration is proportional to time, and needs no correction, neither inside nor at the ends."""
     time = np.arange(0.0, 1.0, 1.0 / rate_hz)
     command = 200.0 * time + 300.0 * time**3
     acceleration = kinematics(command, command, time, reading_of(command))[2]

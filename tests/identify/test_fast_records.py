@@ -1,4 +1,4 @@
-"""Fast sweeps without segment information: undetermined terms are left out."""
+"""Tests with fast sweeps without segment information: undetermined terms are left out."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from hdbridge.errors import InputError
 
 
 def sweep(begin, end, speed, acceleration, rate_hz):
-    """A trapezoidal move without its first point, motor degrees."""
+    """Returns a move with trapezoidal speed, without its first point, motor degrees."""
     way = abs(end - begin)
     speed = min(speed, np.sqrt(way * acceleration))
     rise, total = speed / acceleration, way / speed + speed / acceleration
@@ -24,7 +24,7 @@ def sweep(begin, end, speed, acceleration, rate_hz):
 
 
 def record(bench, speed, acceleration, turns, laps, measured):
-    """Sweeps there and back, motor degrees per second, as one segment without a kind."""
+    """Records sweeps in both directions as one segment without a kind; motor degrees and seconds."""
     axis = bench.axis()
     end = 360.0 * turns
     legs = [sweep(*ends, speed, acceleration, bench.rate_hz) for ends in [(0.0, end), (end, 0.0)] * laps]

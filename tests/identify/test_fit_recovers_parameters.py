@@ -1,4 +1,4 @@
-"""Fits recover the parameters of synthetic axes and their uncertainty."""
+"""Tests that fits recover the parameters of synthetic axes, with the right uncertainty."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from hdbridge.axis.model import TransmissionModel
 
 
 def off(result, effect, parameter, true):
-    """Error in half widths of the interval."""
+    """Returns the error of a fitted parameter in half widths of its interval."""
     found = result.interval(effect, parameter)
     return abs(found.value - true) / found.half_width
 
@@ -161,7 +161,7 @@ def test_spikes_are_left_out_and_counted(standard, bench):
     assert result.outliers.samples == pytest.approx(0.005 * total, rel=0.4)
     assert any("stand out" in each for each in result.warnings)
     drawn = result.traces
-    assert np.max(np.abs(drawn.error_arcsec - drawn.predicted_arcsec)) < 20.0  # nothing where nothing is left
+    assert np.max(np.abs(drawn.error_arcsec - drawn.predicted_arcsec)) < 20.0  # traces omit outliers
     for name in ("offset_arcsec", "width_deg", "exponent"):
         clean, spiked = standard.interval("hysteresis", name), result.interval("hysteresis", name)
         assert abs(spiked.value - clean.value) < clean.half_width
@@ -186,7 +186,7 @@ def test_encoder_delay_is_separated_from_the_offset(bench):
 
 
 def test_a_load_that_cannot_follow_a_reversal_biases_no_loop(bench):
-    """Just after each reversal the hysteresis rises faster than a load on a spring can follow."""
+    """Just after each reversal, the hysteresis changes faster than a compliant load can follow."""
     axis = bench.axis(noise=0.2)
     segments = []
     for each in axis.record(bench.plan()):
@@ -201,7 +201,7 @@ def test_a_load_that_cannot_follow_a_reversal_biases_no_loop(bench):
 
 
 def test_a_load_that_swings_raises_and_shifts_no_orders(bench):
-    """Sweeps at two speeds, each order amplified and delayed as by a damped load of 16 Hz."""
+    """In sweeps at two speeds, each order is amplified and delayed as by a damped resonance at 16 Hz."""
     axis = bench.axis(orders={1: (5.0, -120.0), 6: (8.0, 100.0)}, noise=0.2)
     segments = []
     for each in axis.record(
@@ -249,7 +249,7 @@ def test_default_options_suit_a_bare_record(bench):
 
 
 def test_a_load_that_lags_is_fitted_as_well_as_one_that_leads(bench):
-    """With friction at the load, the loop equals the elastic one with the opposite sign."""
+    """With friction at the load, the hysteresis loop is that of an elastic gear with the opposite sign."""
     axis = bench.axis(offset=-30.0)
     found = fit(axis.record(bench.plan(turns=8.0)), axis.ratio, bench.options)
     assert off(found, "hysteresis", "offset_arcsec", -30.0) < 2.0
@@ -260,7 +260,7 @@ def test_a_load_that_lags_is_fitted_as_well_as_one_that_leads(bench):
 
 
 def test_reversals_between_two_samples_bias_no_parameter_of_the_loop(bench):
-    """Sampled at every fifth point of the path, a reversal may lie 0.4 deg beyond the nearest sample."""
+    """If every fifth point of the path is sampled, a reversal may lie 0.4 deg beyond the nearest sample."""
     axis, every = bench.axis(width=10.0, noise=0.1, motor_counts=3e6), 5
     legs = [
         ("sweep", bench.ramp(0.0, 1440.0, 200.3 / every)),
@@ -283,7 +283,7 @@ def test_reversals_between_two_samples_bias_no_parameter_of_the_loop(bench):
 
 
 def test_a_lag_of_counts_that_varies_with_speed_biases_no_parameter_of_the_loop(bench):
-    """The motor lags its reading by up to a quarter of a count, with a period of 200 counts/s."""
+    """The motor lags its reading by up to a quarter of a count, periodically over speed (200 counts/s)."""
     axis, count = bench.axis(motor_counts=8000.0), 360.0 / 8000.0
     plan = [*bench.plan(turns=8.0), *bench.plan(turns=8.0, speed=61.7)[1:3]]
     speed = np.gradient(np.concatenate([each for _, each in plan])) * bench.rate_hz

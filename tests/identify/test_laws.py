@@ -1,4 +1,4 @@
-"""The hysteresis law is chosen by prediction of held-out data."""
+"""Tests that the hysteresis law is chosen by its prediction of held-out data."""
 
 from dataclasses import replace
 from typing import Any
@@ -11,11 +11,11 @@ from hdbridge.axis.effects import Hysteresis, HysteresisMemory
 from hdbridge.axis.model import TransmissionModel
 
 SLIP = ((0.3, 2.0), (0.3, 6.0), (0.2, 12.0), (0.2, 20.0))
-"""Share of the loop and travel to its limit, motor degrees, of springs with sliders in parallel."""
+"""Fraction of the loop, and travel to the limit, motor degrees, of each Maxwell slip element."""
 
 
 def slip(motor_deg: Any, state: float) -> Any:
-    """Springs that slide, as a share of the offset."""
+    """Returns the Maxwell slip loop with the elements `SLIP`, as a fraction of the offset."""
     steps = np.diff(motor_deg, prepend=motor_deg[0])
     loop = np.zeros(len(motor_deg))
     for share, travel in SLIP:
@@ -27,7 +27,7 @@ def slip(motor_deg: Any, state: float) -> Any:
 
 
 def bouc_wen(motor_deg: Any, state: float) -> Any:
-    """Bouc-Wen loop with yield travel 5 deg, exponent 1.1 and beta 0.75; ends in a long tail."""
+    """Returns a Bouc-Wen loop (yield travel 5 deg, exponent 1.1, beta 0.75), which saturates slowly."""
     loop, z = np.zeros(len(motor_deg)), state
     for index, step in enumerate(np.diff(motor_deg, prepend=motor_deg[0])):
         pieces = max(1, int(abs(step) / 0.25))
@@ -38,7 +38,7 @@ def bouc_wen(motor_deg: Any, state: float) -> Any:
 
 
 def lagging(bench: Any, law: Any) -> Any:
-    """An axis whose load lags by 25 arcsec times a loop."""
+    """Returns an axis whose load lags by 25 arcsec times the loop of a law."""
 
     class Lagging(bench.axis):  # type: ignore[misc, name-defined]
         def error(self, motor_deg: Any, state: float = 1.0) -> Any:
@@ -49,7 +49,9 @@ def lagging(bench: Any, law: Any) -> Any:
 
 
 def beyond(bench: Any) -> Any:
-    """The plan, then small back steps on a branch that continues, which only a law with memory forgets."""
+    """Returns the plan, extended by small reversals within a branch, after which only a law with return-point
+    memory continues on the branch.
+    """
     legs = [("move", bench.ramp(0.0, -60.0, 400.0))]
     for depth in (1.0, 2.0, 4.0, 2.0, 1.0):
         for begin, to in ((-60.0, -53.0), (-53.0, -53.0 - depth), (-53.0 - depth, 0.0), (0.0, -60.0)):
@@ -67,7 +69,7 @@ def test_friction_that_yields_before_it_slips_is_fitted_with_memory(bench: Any) 
 
 
 def test_a_loop_of_another_shape_does_not_bend_the_offset(bench: Any) -> None:
-    """Misfit of the shape is not a drift: samples far from any turning point determine the offset."""
+    """A misfit of the loop's shape is not a drift: samples far from turning points determine the offset."""
     found = fit(lagging(bench, bouc_wen).record(bench.plan()), 20.0, replace(bench.options, highest_order=6))
     (loop,) = found.model.effects[1:]
     assert loop.offset_arcsec == pytest.approx(-25.0, abs=0.5)

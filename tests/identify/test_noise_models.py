@@ -1,4 +1,4 @@
-"""Coloured noise: the banded algebra equals the dense one, and the parameters are found."""
+"""Tests of coloured noise: banded and dense algebra agree, and the parameters of the noise are found."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from hdbridge.analysis.noise import LOOP_LENGTH, NoiseModel, Precision, fit_nois
 
 
 def blocks_of(count, rng, motor=None, error=None, kind="sweep"):
-    time = np.cumsum(rng.uniform(0.3, 1.0, count))  # longer than a block lasts: each sample is a block
+    time = np.cumsum(rng.uniform(0.3, 1.0, count))  # longer than a block, so each sample is a block
     motor = np.cumsum(rng.uniform(5.0, 30.0, count)) if motor is None else motor
     error = np.zeros(count) if error is None else error
     segment = Leg(time, motor, motor / 50.0 + error / 3600.0, kind)
@@ -23,7 +23,9 @@ def blocks_of(count, rng, motor=None, error=None, kind="sweep"):
 
 
 def mixed_blocks(rng, locked):
-    """Forty blocks on some legs, whose travel and fade of the loop are drawn."""
+    """Returns forty blocks on several legs with random reading errors and travels since the last reversal,
+    and the travels in loop widths.
+    """
     blocks, _ = blocks_of(40, rng)
     legs = np.sort(rng.integers(0, 5, 40))
     crossed = np.sort(rng.uniform(0.0, 3.0, 40))
@@ -99,7 +101,7 @@ def test_a_wander_is_found_next_to_white_noise():
     noise = fit_noise(wander + 0.5 * rng.normal(size=6000), blocks, 1)
     assert noise.slow_arcsec == pytest.approx(1.0, rel=0.15)
     assert noise.slow_s == pytest.approx(8.0, rel=0.35)
-    # Noise with a memory shorter than a step is not separable from white noise.
+    # Noise with a correlation time shorter than a step is not separable from white noise.
     assert np.hypot(noise.moving_arcsec, noise.place_arcsec) == pytest.approx(0.5, rel=0.15)
 
 
@@ -132,7 +134,7 @@ def test_blocks_average_a_column_exactly():
 def test_settling_after_a_reversal_is_excluded_but_not_most_of_the_travel():
     time = np.arange(4000) / 250.0
     up, down = np.linspace(0.0, 60.0, 1600), np.linspace(60.0, 40.0, 1600)
-    motor = np.concatenate([up, down, np.tile([38.0, 40.0], 20).repeat(20)])  # then a turn each 0.08 s
+    motor = np.concatenate([up, down, np.tile([38.0, 40.0], 20).repeat(20)])  # then a reversal every 0.08 s
     samples = usable_samples(measured([Leg(time, motor, motor / 50.0, "sweep")]), 50.0, slow_deg_s=1e9)
     assert samples.usable[:1600].all()
     assert np.flatnonzero(~samples.usable[1600:3200]) == pytest.approx(np.arange(1, 26))
@@ -140,7 +142,7 @@ def test_settling_after_a_reversal_is_excluded_but_not_most_of_the_travel():
 
 
 def test_constants_over_a_leg_are_not_motion():
-    """Reading errors within the counts of each leg shift a mean by no more than its error."""
+    """A constant reading error of less than a count in each leg shifts a mean by no more than its error."""
     rng = np.random.default_rng(7)
     motor = np.round(np.concatenate([rng.uniform(5.0, 30.0, 50).cumsum() * s for s in (1, -1, 1, -1)]) / 0.09)
     blocks, _ = blocks_of(200, rng, motor * 0.09)
@@ -161,7 +163,7 @@ def test_a_motor_between_two_counts_is_neither_noise_at_rest_nor_an_outlier():
     assert standing_arcsec(samples) == pytest.approx(noise, rel=0.05)
     error = samples.error_arcsec
     calm = np.zeros(len(error), dtype=bool)
-    assert outlying(error, calm)[1].samples > 100  # as it would be for an encoder without counts
+    assert outlying(error, calm)[1].samples > 100  # as for an encoder of infinite resolution
     assert outlying(error, calm, count / 50.0 * 3600.0)[1].samples == 0
 
 
@@ -169,7 +171,7 @@ def test_slow_or_unseen_motion_is_not_rest():
     rng = np.random.default_rng(7)
     still = rng.normal(size=(3, 1000)) * 0.5 / 3600.0
     time = np.arange(1000) / 250.0
-    creep = np.linspace(0.0, 0.02, 1000)  # a fifth of a count in four seconds, as in a sine's turn
+    creep = np.linspace(0.0, 0.02, 1000)  # a fifth of a count in four seconds, as when a sine reverses
     segments = [
         Leg(time, np.zeros(1000), still[0], "standstill"),
         Leg(time + 60.0, np.full(1000, 90.0), 90.0 / 50.0 + still[1], "standstill"),
@@ -178,4 +180,4 @@ def test_slow_or_unseen_motion_is_not_rest():
     found = standing_arcsec(usable_samples(measured(segments), 50.0, slow_deg_s=1e9))
     assert found == pytest.approx(0.5, rel=0.06)
     rests = standing_arcsec(usable_samples(measured(segments[:2]), 50.0, slow_deg_s=1e9))
-    assert found == pytest.approx(rests, rel=1e-9)  # the creep is not in it
+    assert found == pytest.approx(rests, rel=1e-9)  # does not contain the creep

@@ -1,4 +1,4 @@
-"""Least-squares spectra at the true angles, and the separability of orders."""
+"""Tests of least-squares spectra over the true angles, and of the separability of orders."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def motor_orders(highest):
 
 
 def system(motor_deg, error_arcsec, orders):
-    """Normal equations of the orders' waves and the mean; white noise of one arcsec."""
+    """Returns the normal equations for the orders and the mean, with white noise of 1 arcsec."""
     angles = np.deg2rad(np.outer(motor_deg, [each.per_motor_turn for each in orders]))
     columns = np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(motor_deg), -1)
     columns = np.concatenate([columns, np.ones((len(motor_deg), 1))], axis=1)
@@ -30,7 +30,7 @@ def all_fitted(motor_deg, error_arcsec, orders):
 
 
 def test_a_stepping_test_shows_each_order_where_it_is():
-    """Against the sample number, order 6 would be at 2.26 and order 8 at 0.26 per turn."""
+    """As a function of the sample number, order 6 would appear at 2.26 and order 8 at 0.26 per motor turn."""
     motor = np.arange(240) * 43.56
     truth = [(1, 4.9, -126.8), (2, 9.33, -132.1), (6, 3.18, -127.0), (8, 1.87, 124.3)]
     found = all_fitted(motor, waves(motor, truth) + 12.0, motor_orders(10))

@@ -1,4 +1,4 @@
-"""Limits of a record: undetermined terms are reported, not invented."""
+"""Tests of the limits of a record: undetermined terms are reported, not invented."""
 
 from dataclasses import replace
 

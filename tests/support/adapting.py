@@ -1,4 +1,4 @@
-"""Simulated axis at work with adaptation, over real frames, while its gear changes."""
+"""Simulated axis that runs with adaptation, over real CAN frames, while its gear changes."""
 
 import math
 import random
@@ -42,7 +42,7 @@ SPAN_DEG = 60.0
 
 
 def truth_of(duration_s: float = 3600.0, growth: float = 0.2, second_order_arcsec: float = 3.0) -> Truth:
-    """Returns the article's axis with a growing loop and second order, and usual encoder noise."""
+    """Returns the article's axis with a growing hysteresis loop and second motor order, and encoder noise."""
     data = yaml.safe_load((ARTICLE / "truth.yaml").read_text())
     data["gear"]["ageing"] = {
         "duration_s": duration_s,
@@ -65,7 +65,7 @@ def work(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns moves of the motor between targets, with 0.12 s of rest, as times (n,) and AXIS_SAMPLE (n,).
 
-    Not simulated: the load is where ``truth`` puts it, without dynamics. ``before_deg`` are earlier targets
+    There are no dynamics: the load is at the angle predicted by ``truth``. ``before_deg`` are earlier targets
     that the samples do not contain; the first move starts at the last of them.
     """
     shown = len(before_deg)
@@ -92,14 +92,14 @@ def work(
 
 
 def wandering(stands: int, seed: int = 0, span_deg: float = 2000.0) -> list[float]:
-    """Returns motor angles of a machine at work: small and large moves in both directions."""
+    """Returns a random walk of motor targets, as of a machine at work: small and large moves both ways."""
     steps = np.random.default_rng(seed).normal(0.0, 150.0, stands)
     folded = np.abs(np.mod(np.cumsum(steps) + span_deg, 2 * span_deg) - span_deg)
     return np.round(folded, 3).tolist()
 
 
 def worn(offset_arcsec: float = 0.0, second_order_arcsec: float = 0.0) -> TransmissionModel:
-    """Returns the article's model with changed offset and cosine of the second order."""
+    """Returns the article's model with a changed hysteresis offset and cosine of the second motor order."""
     drift = DriftModel(MODEL)
     change = np.zeros(drift.zero)
     for each in drift.terms:
@@ -110,7 +110,7 @@ def worn(offset_arcsec: float = 0.0, second_order_arcsec: float = 0.0) -> Transm
 
 
 def used_arcsec(adaptation: Adaptation) -> np.ndarray:
-    """Returns the changes of the adapted coefficients in the model in use."""
+    """Returns the changes of the adapted coefficients that the model in use contains."""
     return np.array(adaptation.learned().applied)
 
 
@@ -151,13 +151,13 @@ class Sampler:
         self.use(model)
 
     def use(self, model: TransmissionModel) -> None:
-        """Predicts with another model from here on, after it has followed the last path."""
+        """Predicts with another model from now on; its hysteresis state follows from the last path."""
         self._tracker = model.tracker(Start.VIRGIN)
         for angle in self._demand.tolist():
             self._tracker.advance(angle, Moment())
 
     def samples(self, record: Record) -> SampleArray:
-        """Returns all samples of a record, shape (n,); their time continues from the last record."""
+        """Returns all samples of a record, shape (n,); their time continues that of the previous record."""
         columns, ratio = record.columns, self.axis.gear.ratio
         demand = columns["motor_target_deg"]
         count, period_s = len(demand), self.axis.drive.cycle_s
@@ -180,7 +180,7 @@ class Sampler:
 
 
 class Work:
-    """Axis that runs tests; the adaptation receives the samples and may change the model."""
+    """Axis that runs stepping tests; the adaptation receives the samples and may change the model."""
 
     def __init__(self, drive: Drive, node: DriveNode, settings: AdaptationSettings | None) -> None:
         self._files = History()
@@ -188,9 +188,9 @@ class Work:
         if settings is not None:
             self.follower.adapt(settings.mode, self._files)  # type: ignore[arg-type]
         self.encoder_faults: list[str] = []
-        """Faults of the load encoder, each once."""
+        """Detected faults of the load encoder, without repetition."""
         self.errors_arcsec: list[list[float]] = []
-        """True load position minus its target; one list per test."""
+        """True load position minus its target at each step; one list per stepping test."""
         self.faults = node.faults
         self._drive = drive
         self._machine = node.firmware.motion.machine
@@ -205,7 +205,7 @@ class Work:
 
     @property
     def history(self) -> list[Entry]:
-        """Lines of the history."""
+        """Entries of the adaptation's history."""
         return self._files.entries
 
     @property
@@ -214,7 +214,7 @@ class Work:
         return self._drive.link.clock.now()
 
     def step(self, count: int = 16, step_deg: float = 43.56) -> None:
-        """Runs a stepping test, each at other angles, because repeated angles do not separate the orders."""
+        """Runs a stepping test at new angles, because repeated angles do not separate the orders."""
         start_deg = SPAN_DEG * math.fmod(GOLDEN * len(self.errors_arcsec), 1.0)
         self._loads_deg.clear()
         run = self._bench.run(Stepping(count=count, step_deg=step_deg, start_deg=start_deg))
@@ -230,12 +230,12 @@ class Work:
         self._adapt(self._sampler.samples(run.record))
 
     def until(self, time_s: float) -> None:
-        """Runs stepping tests up to that time."""
+        """Runs stepping tests until that time, s."""
         while self.time_s < time_s:
             self.step()
 
     def three_sigma_arcsec(self, tests: int = 4) -> list[float]:
-        """Returns three sigma of the true load's errors, for each ``tests`` consecutive tests."""
+        """Returns three sigma of the true load error over each group of ``tests`` consecutive tests."""
         errors = self.errors_arcsec
         return [
             Scatter.of([each for test in errors[at : at + tests] for each in test]).three_sigma_arcsec
@@ -265,7 +265,7 @@ Misreading = Callable[[int], int]
 
 
 def _drifts(work: Work) -> Misreading:
-    """Adds a drift of half an arcsec per second."""
+    """Adds a drift of 0.5 arcsec/s to the reading."""
     begun_s = work.time_s
     return lambda counts: counts + round(0.5 * (work.time_s - begun_s) / LOAD_COUNT_ARCSEC)
 
@@ -282,12 +282,12 @@ def _freezes(_: Work) -> Misreading:
 
 
 def _jumps(_: Work) -> Misreading:
-    """Adds 100 arcsec."""
+    """Adds 100 arcsec to the reading."""
     return lambda counts: counts + round(100.0 / LOAD_COUNT_ARCSEC)
 
 
 def _scatters(_: Work) -> Misreading:
-    """Adds ten times the usual noise."""
+    """Adds ten times the usual noise to the reading."""
     noise = random.Random(1)
     return lambda counts: counts + round(noise.gauss(0.0, 10.0 * NOISE_ARCSEC) / LOAD_COUNT_ARCSEC)
 
@@ -295,11 +295,11 @@ def _scatters(_: Work) -> Misreading:
 FAULTS: dict[str, Callable[[Work], Misreading]] = {
     "drift": _drifts, "freeze": _freezes, "jump": _jumps, "noise x 10": _scatters,
 }  # fmt: skip
-"""Faults of a load encoder: functions of its counts, active from their creation on."""
+"""Faults of a load encoder, as functions that change its counts from their creation on."""
 
 
 @contextmanager
 def at_work(truth: Truth, settings: AdaptationSettings | None) -> Iterator[Work]:
-    """Provides a booted axis with the article's model; nothing is adapted without settings."""
+    """Provides a booted axis with the article's model; without settings, nothing is adapted."""
     with booted(AXIS, truth, 1) as (drive, node):
         yield Work(drive, node, settings)

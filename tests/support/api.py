@@ -22,7 +22,7 @@ TOKEN = "a-token-that-nobody-guesses"
 
 @dataclass(frozen=True)
 class Served:
-    """Addresses of the API, and its server."""
+    """Served API: its bridge, its addresses and its server."""
 
     bridge: FakeBridge
     socket: Path
@@ -50,7 +50,7 @@ class Served:
 
 @contextmanager
 def served(bridge: FakeBridge, folder: Path) -> Iterator[Served]:
-    """Serves a machine until the end of the block."""
+    """Serves the API of a machine until the end of the block."""
     tcp = tcp_socket(0)
     port = tcp.getsockname()[1]
     path = folder / "cell.sock"

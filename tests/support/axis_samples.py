@@ -1,8 +1,8 @@
-"""Samples of an axis without a control loop, made from a path, a model and the truth.
+"""Samples of an axis without a control loop, computed from a path, a model and the truth.
 
-The truth is also a model: the gear obeys the laws that the model knows, with other numbers, and a watch must
-notice changes of the numbers. The motor follows its target one cycle late, both encoders count, and the load
-encoder is noisy.
+The truth is also a model: the gear obeys the same laws as the model but with other parameters, and a watch
+must notice changes of the parameters. The motor follows its target one cycle late, both encoders have finite
+resolution, and the load encoder is noisy.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass
 class SampleMaker:
-    """Makes consecutive samples."""
+    """Generates consecutive samples of an axis."""
 
     axis: AxisConfig
     model: TransmissionModel
@@ -35,7 +35,7 @@ class SampleMaker:
     compensated: bool = True
 
     def make(self, load_target_deg: FloatArray, first_cycle: int = 1000) -> Any:
-        """Returns one sample per cycle."""
+        """Returns one sample per cycle for a path of load targets."""
         random = np.random.default_rng([self.seed, first_cycle])
         count = len(load_target_deg)
         period_s, ratio = self.axis.drive.cycle_s, self.model.ratio

@@ -1,4 +1,4 @@
-"""Headless Chromium, driven by its DevTools protocol: shows and operates a page as a person would."""
+"""Headless Chromium, controlled by its DevTools protocol, which shows and operates a page like a user."""
 
 import json
 import os
@@ -27,7 +27,7 @@ DROPPED = (
     "Cannot find context with specified id",
     "Cannot find default execution context",
 )
-"""Chromium's answers to an expression whose document was replaced before its value was known."""
+"""Error messages of Chromium if the document of an expression was replaced before the value was known."""
 
 
 class Navigated(AssertionError):
@@ -45,10 +45,10 @@ class Page:
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
         self.requested: list[str] = []
-        """Addresses that the page has requested."""
+        """URLs that the page has requested."""
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Sends a command of the protocol and returns its answer; notes events that arrive meanwhile."""
+        """Sends a command of the protocol and returns its result; records events that arrive before it."""
         self._asked += 1
         self._line.send(json.dumps({"id": self._asked, "method": method, "params": parameters}))
         while True:

@@ -1,4 +1,4 @@
-"""Drives that all conform to CiA 402 but behave differently where it leaves the choice to the firmware."""
+"""Drives that conform to CiA 402 but differ in behaviour that the standard leaves to the firmware."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from hdbridge.sim.truth import Truth
 
 @dataclass(frozen=True)
 class Character:
-    """Behaviour of a firmware, its quick stop option code, and the mode of the control cycle."""
+    """Behaviour of a drive's firmware, its quick stop option code, and the mode of the control cycle."""
 
     name: str
     behaviour: Behaviour = Behaviour()
@@ -51,7 +51,7 @@ CHARACTERS: Final = (FRIENDLY, RESTLESS, SLUGGISH, AWKWARD, INTERPOLATED)
 
 
 def every_character() -> list[Character]:
-    """Returns all combinations of all choices."""
+    """Returns a character for each combination of all choices."""
     return list(_every_character())
 
 
@@ -64,7 +64,7 @@ def _every_character() -> Iterator[Character]:
 
 
 class PowerCount:
-    """Counts the times that a drive enters 'operation enabled'."""
+    """Counts how often a drive enters 'operation enabled'."""
 
     def __init__(self, node: DriveNode) -> None:
         self.times = 0

@@ -4,7 +4,7 @@ import can
 
 
 class Chatter:
-    """Sends the same frames periodically, from one period on."""
+    """Sends the same frames periodically; the first time after one period."""
 
     def __init__(self, bus: can.BusABC, *frames: tuple[int, bytes], period_s: float = 0.1) -> None:
         self.bus, self.frames, self.period_s, self.due_s = bus, frames, period_s, period_s

@@ -9,5 +9,5 @@ WORKFLOW = EXAMPLE / "motion.yml"
 
 
 def write(folder: Path) -> Path:
-    """Copies all files into a folder."""
+    """Copies all example files into a folder."""
     return shutil.copytree(EXAMPLE, folder, dirs_exist_ok=True)

@@ -1,4 +1,4 @@
-"""Runs ``hdbridge ARGS...`` in the tests' own process, which saves half a second of start-up each time."""
+"""Runs ``hdbridge ARGS...`` in the process of the tests, which saves half a second of start-up each time."""
 
 import io
 import subprocess

@@ -25,7 +25,7 @@ EDS = ROOT / "eds" / "hdbridge-402.eds"
 def simulated_drive(
     behaviour: Any = None, **options: Any
 ) -> Iterator[tuple[NodeTester, DriveNode, IdealMotor]]:
-    """The simulated drive with a motor that is where it should be."""
+    """Provides a tester, the simulated drive and its motor, which follows the demand exactly."""
     motor = IdealMotor(100_000)
     with lockstep_bench(motor, EDS, behaviour=behaviour) as (bus, clock, node):
         yield NodeTester(Link(bus, clock), 1, od=shared_eds(EDS, 1).dictionary, **options), node, motor
@@ -33,7 +33,7 @@ def simulated_drive(
 
 @contextmanager
 def gateway_bus(folder: Path) -> Iterator[tuple[LockstepBus, VirtualClock, DriveNode]]:
-    """The slave of a gateway in front of an ideal axis, with the master's end of its bus."""
+    """Provides the master's interface, the clock, and the slave of a gateway with an ideal axis."""
     axis = AxisConfig.load(ROOT / "profiles" / "article" / "axis.yaml")
     settings = GatewaySettings(bus=BusConfig(interface="virtual", channel="outer"), nodes={axis.name: 5})
     path = write_eds(folder, axis, settings)
@@ -45,6 +45,6 @@ def gateway_bus(folder: Path) -> Iterator[tuple[LockstepBus, VirtualClock, Drive
 
 @contextmanager
 def gateway_slave(folder: Path) -> Iterator[tuple[NodeTester, DriveNode]]:
-    """The same, with a tester on its bus."""
+    """Provides a tester on the bus of `gateway_bus`, and the slave of the gateway."""
     with gateway_bus(folder) as (bus, clock, node):
         yield NodeTester(Link(bus, clock), 5, od=shared_eds(folder / "article.eds", 5).dictionary), node

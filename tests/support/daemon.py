@@ -47,7 +47,7 @@ EVENTS_KEPT = 1000
 
 
 class SteppedClock:
-    """Clock of the service; waiting on it turns the loop."""
+    """Clock of the service; waiting on it runs cycles of the loop."""
 
     def __init__(self, daemon: SteppedDaemon) -> None:
         self._daemon = daemon
@@ -81,7 +81,7 @@ class SteppedTiming:
 
 
 class SteppedDaemon:
-    """Control loop with its simulated drives, and the actions of a service."""
+    """Control loop with its simulated drives, and the actions that a service performs."""
 
     def __init__(
         self,
@@ -110,7 +110,7 @@ class SteppedDaemon:
     def turn(self, turns: int = 1) -> None:
         for _ in range(turns):
             self.controller.turn()
-        self.intruder.queue.queue.clear()  # never read, so it would grow
+        self.intruder.queue.queue.clear()  # nobody reads this queue, so it would grow
         events, lost = self._events.read()
         assert lost == 0
         self.events.extend(events)
@@ -140,7 +140,7 @@ class SteppedDaemon:
         return self.memory.commands.post(kind, axis, **fields)  # type: ignore[arg-type]
 
     def order(self, kind: CommandKind, axis: int = 0, timeout_s: float = 5.0, **fields: float) -> Event:
-        """Posts a command and turns until it is answered."""
+        """Posts a command and runs cycles until it is answered; returns the answer."""
         id_ = self.post(kind, axis, **fields)
         answers = (EventKind.DONE, EventKind.REFUSED)
         found: list[Event] = []
@@ -202,7 +202,7 @@ class SteppedDaemon:
         return any(each.kind is EventKind.MOTION_ENDED and each.id == id_ for each in self.events)
 
     def stream(self, knots: dict[int, Sequence[tuple[float, float, float]]], timeout_s: float = 0.5) -> Event:
-        """Begins a stream of one or several axes, with knots (time, position, velocity) queued before."""
+        """Queues knots (time, position, velocity) of one or several axes and begins their stream."""
         self._streams += 1
         for axis, points in knots.items():
             wanted = [Knot(self._streams, *point) for point in points]
@@ -213,7 +213,7 @@ class SteppedDaemon:
     # ---------------------------------------------------------------- what goes wrong
 
     def interfere(self, can_id: int, data: bytes = b"", **kind: bool) -> None:
-        """Sends a frame from another node, before the next turn."""
+        """Sends a frame from another node, before the next cycle."""
         kind = {"is_extended_id": False, **kind}
         self.intruder.send(can.Message(arbitration_id=can_id, data=data, **kind))
 

@@ -1,4 +1,4 @@
-"""Bench for the fault rows of a whole daemon on a real CAN stack: its cable, its listener, its recovery."""
+"""Bench for the fault rows of a whole daemon on a real CAN stack, with its cable and a listening node."""
 
 import shutil
 import struct
@@ -19,7 +19,7 @@ from support.reliability import DAEMON_VCAN, Seen, record
 from support.running import Daemon
 
 OURS, THEIRS = "hdvx0", "hdvx1"
-"""Ends of the cable: the daemon's and the drive's."""
+"""Interfaces at the ends of the cable: the daemon's and the drive's."""
 NODE: Final = 1
 STATE_TPDO: Final = 0x180 + NODE
 EMERGENCY: Final = 0x080 + NODE
@@ -30,14 +30,14 @@ STANDS: Final = 3
 
 
 class Cable:
-    """A vxcan pair with the simulated drive at its far end; the ends can be disturbed separately."""
+    """Pair of vxcan interfaces with the simulated drive at one end; each end can be disturbed separately."""
 
     def __init__(self, profile: Path) -> None:
         self._profile = profile
         self._drive: subprocess.Popen[str] | None = None
 
     def plug(self) -> None:
-        """Makes the pair and the drive; skips the test if the kernel or the user's rights do not allow it."""
+        """Creates the pair and starts the drive; skips the test if kernel or permissions do not allow it."""
         made = _run("ip", "link", "add", "dev", OURS, "type", "vxcan", "peer", "name", THEIRS)
         if made.returncode:
             pytest.skip(f"no vxcan pair: {made.stderr.strip()}")
@@ -69,7 +69,7 @@ class Cable:
 
     @contextmanager
     def spoilt(self, end: str, *how: str) -> Iterator[None]:
-        """Loses, doubles or delays frames that leave an end (tc-netem); skips if the kernel cannot."""
+        """Drops, duplicates or delays frames that leave an end (tc-netem); skips the test without netem."""
         done = _run("tc", "qdisc", "replace", "dev", end, "root", "netem", *how)
         if done.returncode:
             pytest.skip(f"no netem: {done.stderr.strip()}")
@@ -86,7 +86,7 @@ def _run(*command: str) -> subprocess.CompletedProcess[str]:
 
 
 class Witness:
-    """Passive node on the bus; measures time in cycles of the master."""
+    """Node that listens on the bus, and measures time in cycles of the master."""
 
     def __init__(self, channel: str, period_s: float) -> None:
         self._bus = can.Bus(interface="socketcan", channel=channel, ignore_config=True)
@@ -94,13 +94,13 @@ class Witness:
         self._begun_s = time.time()
 
     def begin(self) -> None:
-        """Discards received frames and starts counting."""
+        """Discards the received frames and starts to count cycles."""
         while self._bus.recv(0) is not None:
             pass
         self._begun_s = time.time()
 
     def cycles_until(self, met: Callable[[can.Message], bool], most: int) -> int:
-        """Returns the cycles up to and including that of a frame; AssertionError after ``most``."""
+        """Returns the number of cycles until a frame meets the condition; AssertionError after ``most``."""
         while (waited_s := time.time() - self._begun_s) < (most + 1) * self._period_s:
             message = self._bus.recv((most + 1) * self._period_s - waited_s)
             if message is not None and met(message):
@@ -108,7 +108,7 @@ class Witness:
         raise AssertionError(f"not within {most} cycles")
 
     def cycles_until_standing(self, most: int) -> int:
-        """Returns the cycles until the motor stands still, by the drive's TPDO."""
+        """Returns the number of cycles until the drive's TPDO shows that the motor stands still."""
         places: list[int] = []
 
         def standing(message: can.Message) -> bool:
@@ -119,7 +119,7 @@ class Witness:
         return self.cycles_until(standing, most)
 
     def cycles_until_disabled(self, most: int) -> int:
-        """Returns the cycles until the motor has no power; AssertionError if it was in motion just before."""
+        """Returns the number of cycles until power is off; AssertionError if the motor moved just before."""
         places: list[int] = []
 
         def disabled(message: can.Message) -> bool:
@@ -145,7 +145,7 @@ class Witness:
 
 @dataclass(frozen=True)
 class Made:
-    """Cycles before a fault was made, and after it."""
+    """Numbers of the cycles just before and just after a fault was made."""
 
     begun: int
     done: int
@@ -153,21 +153,21 @@ class Made:
 
 @dataclass
 class DaemonBench:
-    """Daemon with one axis on a real interface, and the means to disturb both."""
+    """Daemon with one axis on a real interface, and methods to disturb both."""
 
     daemon: Daemon
     cable: Cable
     disk: Path
-    """Folder of its recordings."""
+    """Folder of the daemon's recordings."""
     period_s: float
     heartbeat_timeout_s: float
     witness: Witness
     target_deg: float = FAR_DEG
     since: int = 0
-    """Newest event before the axis was under way."""
+    """Number of the newest event before the axis was set in motion."""
 
     def look_again(self) -> None:
-        """Listens again after the far end of the cable was replaced."""
+        """Replaces the listening node after the far end of the cable was replaced."""
         self.witness.close()
         self.witness = Witness(THEIRS, self.period_s)
 
@@ -192,7 +192,7 @@ class DaemonBench:
         self.witness.begin()
 
     def reported(self, made: Made, kind: str, within: int, words: str = "", reaction: str = "") -> int:
-        """Returns the cycles from a fault until its event; AssertionError if it took more than ``within``."""
+        """Returns the number of cycles from a fault to its event; AssertionError for more than ``within``."""
 
         def found() -> dict[str, Any] | None:
             for each in self.daemon.events_since(self.since):
@@ -207,13 +207,13 @@ class DaemonBench:
         return max(taken, 1)
 
     def made(self, fault: Callable[[], object]) -> Made:
-        """Makes a fault; a program that does it may need some cycles to begin."""
+        """Makes a fault; returns the cycles before and after, because a program may need some cycles."""
         begun = self.daemon.cycle()
         fault()
         return Made(begun, self.daemon.cycle())
 
     def stopped(self, state: str, fault: str) -> None:
-        """Checks that clients see the axis stopped in this state, for this fault."""
+        """Checks that the API reports the axis as stopped in this state, because of this fault."""
         axis = self.daemon.until_axis(state)
         assert axis["fault"]["name"] == fault, axis["fault"]
 
@@ -236,17 +236,17 @@ class DaemonRow:
     within: str
     """Time limit in words, for the page."""
     try_out: Callable[[DaemonBench], tuple[str, int, int]]
-    """Makes the fault and checks its effect; returns it in words, the cycles it took, and those allowed."""
+    """Makes the fault and checks its effect; returns the effect in words, and cycles taken and allowed."""
     last: bool = False
-    """True if it ends the daemon."""
+    """True if the fault ends the daemon."""
     slow: bool = False
-    """True if neither kernel nor clock has a part in it. In every run it is made without them: on the virtual
-    bus, or to the processes of a daemon of simulated drives.
+    """True if the fault involves neither kernel nor clock. It is then made in every run without them: on the
+    virtual bus, or to the processes of a daemon of simulated drives.
     """
 
 
 def try_out(row: DaemonRow, bench: DaemonBench) -> None:
-    """Makes a row's fault on an axis under way, checks its effect and records it."""
+    """Makes a row's fault on an axis in motion, checks its effect and records the result."""
     bench.under_way()
     seen, cycles, allowed = row.try_out(bench)
     assert cycles <= allowed, f"{row.name}: {cycles} cycles, allowed are {allowed}"

@@ -17,7 +17,7 @@ from support.daemon_bench import EMERGENCY, OURS, SLOW_DEG_S, THEIRS, DaemonBenc
 from support.running import gone
 
 CAN_ERR_BUSOFF: Final = 0x40
-"""Constant of linux/can/error.h."""
+"""Bus-off bit of an error frame's identifier (linux/can/error.h)."""
 
 # ------------------------------------------------------------------ the bus
 
@@ -67,7 +67,7 @@ def _bus_off(bench: DaemonBench) -> tuple[str, int, int]:
 
 
 def _stops(bench: DaemonBench, fault: str, end: str, *how: str) -> tuple[str, int, int]:
-    """Disturbs the frames that leave an end so that the axis must stop, then stops disturbing them."""
+    """Disturbs the frames that leave an end of the cable until the axis has stopped."""
     with ExitStack() as spoilt:
         made = bench.made(lambda: spoilt.enter_context(bench.cable.spoilt(end, *how)))
         cycles = bench.reported(made, "fault", NOTICED, Fault[fault].value, "quick stop")
@@ -86,7 +86,7 @@ def _pulled(bench: DaemonBench) -> tuple[str, int, int]:
 
 
 def _delayed(bench: DaemonBench) -> tuple[str, int, int]:
-    # After the window and before the next SYNC. Later ones would count for the next SYNC.
+    # Frames arrive after the window and before the next SYNC; later ones would count for the next SYNC.
     return _stops(bench, "LOST_TPDO", THEIRS, "delay", f"{900 * bench.period_s:.0f}ms")
 
 
@@ -202,8 +202,8 @@ def _second_daemon(bench: DaemonBench) -> tuple[str, int, int]:
 
 
 def _drive_stops_by_itself(bench: DaemonBench, number: signal.Signals) -> tuple[int, int]:
-    """Sends a signal to the control process; returns the cycles until the drive has missed its master, and
-    those allowed.
+    """Sends a signal to the control process; returns the number of cycles until the drive reports the loss of
+    its master, and the number allowed.
     """
     allowed = int(bench.heartbeat_timeout_s / bench.period_s) + 2
     bench.witness.begin()
@@ -297,12 +297,12 @@ def _keeper_killed(bench: DaemonBench) -> tuple[str, int, int]:
 
 
 NOTICED: Final = 3
-"""Cycles from a shell command to the loop's report: one for the fault, the others for the observer."""
+"""Maximum cycles from a shell command to the loop's report: one for the fault, two for the observer."""
 JOG_S: Final = 0.5
 BRAKING: Final = 15
-"""Cycles to brake from a slow jog, until the motor is seen to stand still."""
+"""Maximum cycles to brake from a slow jog, until the motor is seen to stand still."""
 IN_ORDER: Final = 25
-"""Cycles to brake, including the signal's path from process to process."""
+"""Maximum cycles to brake, including the time for the signal to pass between processes."""
 
 _SAME: Final = "latch; verified again, disabled, no restart"
 _BY_ITSELF: Final = "the drive stops by itself; another process, disabled"

@@ -1,4 +1,4 @@
-"""Laws of the daemon's control loop, which a spy on the bus checks frame by frame."""
+"""Laws of the daemon's control loop, checked by a spy on the bus for each frame."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from support.daemon import SteppedDaemon
 
 POWERLESS = frozenset({0x00, 0x02, 0x80})
-"""Controlwords that leave a drive without power or remove it: disable voltage, quick stop, fault reset."""
+"""Controlwords that remove power or leave it off: disable voltage, quick stop, fault reset."""
 ENABLE_OPERATION = 0x0F
 PRE_OPERATIONAL = (0x000, 0x80)
-"""Sent by the loop itself to each node when the bus is open again."""
+"""NMT command that the loop itself sends to each node when the bus has been opened again."""
 SILENT = frozenset({AxisState.UNVERIFIED, AxisState.LENT, AxisState.LATCHED})
 LATCHES = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
 STANDING_COUNTS = 4
-"""Maximum motion of an axis at rest since its last TPDO."""
+"""Maximum motion of an axis at rest since its last TPDO, motor counts."""
 
 
 class AxisLaws:
@@ -37,7 +37,7 @@ class AxisLaws:
         self.allowed = False
         """True if an ENABLE command was given since power was last removed."""
         self.begun = False
-        """True if power has been requested since."""
+        """True if power has been requested since that ENABLE command."""
         self.latched = False
         """True if the loop has reported a stop, and no reset since."""
         self.word = 0
@@ -76,7 +76,7 @@ def most_counts(config: AxisConfig) -> int:
 
 
 class Laws:
-    """Laws of everything on one bus."""
+    """Laws of all frames, events and samples of one bus."""
 
     def __init__(self, daemon: SteppedDaemon) -> None:
         self.daemon = daemon
@@ -84,12 +84,12 @@ class Laws:
         self.relayed = 0
         self.frames = 0
         self.asked: dict[int, CommandKind | int] = {}
-        """Commands without an answer yet."""
+        """Commands not answered yet, by id."""
         self._last_sequence = 0
         daemon.bus.spy = self.spy
 
     def post(self, kind: CommandKind | int, axis: int, id_: int) -> None:
-        """Notes a command in the mailbox."""
+        """Records a command that was put into the mailbox."""
         self.asked[id_] = kind
         if kind == CommandKind.ENABLE and 0 <= axis < len(self.daemon.axes):
             self.axes[self.daemon.axes[axis].config.drive.node_id].allowed = True
@@ -108,13 +108,13 @@ class Laws:
             assert can_id in (0x080, 0x77F), f"{can_id:03X}h was sent"
 
     def turn(self) -> None:
-        """Runs one turn and checks its events."""
+        """Runs one cycle and checks that it relays at most one frame."""
         self.relayed = 0
         self.daemon.turn()
         assert self.relayed <= 1
 
     def take(self, events: list[Event]) -> None:
-        """Checks that each command is answered once."""
+        """Checks that each command is answered only once, and that refusals and stops have a text."""
         for event in events:
             if event.kind in (EventKind.DONE, EventKind.REFUSED) and event.id:
                 assert event.id in self.asked, f"answered twice, or not asked: {event}"
@@ -130,7 +130,7 @@ class Laws:
         return self.axes[self.daemon.axes[axis].config.drive.node_id]
 
     def samples(self) -> None:
-        """Checks that every turn has left one consistent sample."""
+        """Checks that the samples are consecutive, finite and, while enabled, within the position limits."""
         samples, lost = self.daemon.samples.read()
         assert lost == 0
         for sample in samples:

@@ -1,6 +1,6 @@
-"""Random events on both buses of a gateway, and the laws that always hold.
+"""Random events on both buses of a gateway, and the laws that must always hold.
 
-The laws look at the control loop's samples and at what the outer master has sent, not at the gateway.
+The laws examine the control loop's samples and the frames of the outer master, not the gateway.
 """
 
 import errno
@@ -24,7 +24,7 @@ HARMLESS = {"word", "walk", "target", "mode", "wait", "frame"}
 
 
 def draw(rng: Random) -> tuple[str, Any]:
-    """A random event: kind and value."""
+    """Draws a random event: kind and value."""
     kinds: tuple[tuple[str, Any], ...] = (
         ("word", rng.choice(WORDS)),
         *(("walk", 0),) * 4,
@@ -45,7 +45,7 @@ def draw(rng: Random) -> tuple[str, Any]:
 
 
 class Laws:
-    """Requests to one axis."""
+    """Checks of one axis's samples against the requests of the outer master."""
 
     def __init__(self, bench: GatewayBench) -> None:
         self.bench = bench
@@ -53,20 +53,20 @@ class Laws:
         self.limits, self.period_s = config.limits, bench.daemon.period_s
         self.reader = bench.daemon.memory.reader()
         self.disturbed_s = self.asked_s = -1.0
-        """Last event that may stop the axis; last time that the master sent another controlword."""
+        """Times of the last event that may stop the axis, and of the master's last change of controlword."""
         self.word = 0
         self.following = False
         self.mapped = self.operational = True
-        """Mapped by the master, an RPDO waits for SYNC, and the cycle replaces it; by default it acts now."""
+        """True while the master's PDO mapping is in force, so that RPDOs take effect at SYNC, not at once."""
         self.unasked = ""
-        """Reason why the present following, once it moves, is unrequested motion."""
+        """Reason why the present following is unrequested, if it moves; empty if it was requested."""
         self.lowest = self.highest = self.began_deg = 0.0
         self.periods = self.moved = self.enabled = 0
-        """Cycles judged, cycles with a moving set-point, and enablings by the master."""
+        """Number of cycles checked, of cycles with a moving set-point, and of enablings by the master."""
         self.before: tuple[int, float] | None = None
 
     def sent(self, word: int) -> None:
-        """Another controlword on the bus is a request."""
+        """Records a changed controlword on the bus as a request."""
         if word != self.word:
             self.word, self.asked_s = word, self.bench.now_s
 
@@ -103,9 +103,9 @@ class Laws:
                 self.unasked = "followed without a new controlword"
             self.lowest = self.highest = self.began_deg = place
         self.following = following
-        # A disturbance while the command to follow is on its way must not move the axis.
+        # A disturbance while the command to follow is in transit must not cause motion.
         assert not (following and self.unasked and place != self.began_deg), self.unasked
-        # A stop from full speed overshoots by what it needs to brake.
+        # A stop from full speed overshoots by its braking distance.
         slack = limits.velocity_deg_s**2 / (2.0 * limits.acceleration_deg_s2) + limits.velocity_deg_s * 0.15
         assert self.lowest - slack <= place <= self.highest + slack
 
@@ -124,7 +124,7 @@ async def happen(bench: GatewayBench, laws: Laws, kind: str, value) -> None:
         plc.controlword = 0
         plc.send(0, bytes((128, NODE)))
         laws.disturbed_s = bench.now_s
-        await bench.configure()  # a reset has removed it
+        await bench.configure()  # an earlier reset may have removed the configuration
         laws.look()
         laws.mapped = laws.operational = True
         for word, wait_s in ((0x00, 0.1), (0x80, 1.5), (0x06, 0.05), (0x07, 0.05), (0x0F, 0.2)):
@@ -149,7 +149,7 @@ async def happen(bench: GatewayBench, laws: Laws, kind: str, value) -> None:
         await rest(bench, laws, 1e-3 * value)
         bench.start_gateway()
         laws.mapped, laws.operational = False, True
-        laws.disturbed_s = bench.now_s  # until then the loop cannot know
+        laws.disturbed_s = bench.now_s  # the loop cannot detect it earlier
         plc.send(0, bytes((1, NODE)))
     elif kind == "loop":
         daemon.hang(1e-3 * value)

@@ -1,4 +1,4 @@
-"""Other dictionaries for drives, made from the project's own EDS."""
+"""Variants of the project's own EDS, for drives with other object dictionaries."""
 
 import re
 import shutil
@@ -11,12 +11,12 @@ OWN = (bundled_folder("eds") / "hdbridge-402.eds").read_text()
 
 
 def section(index: int, sub: int | None = None) -> str:
-    """Returns the name of an object's section."""
+    """Returns the name of the EDS section of an object."""
     return f"{index:04X}" if sub is None else f"{index:04X}sub{sub:X}"
 
 
 def without(text: str, *objects: int | tuple[int, int]) -> str:
-    """Returns an EDS without these objects, or members (index, sub-index) of objects."""
+    """Returns an EDS without these objects, or without these members (index, sub-index) of objects."""
     for each in objects:
         names = re.escape(section(*each)) if isinstance(each, tuple) else rf"{each:04X}(?:sub\w+)?"
         text, count = re.subn(rf"^\[{names}\]\n(?:(?!\[).*\n)*", "", text, flags=re.MULTILINE)
@@ -25,7 +25,7 @@ def without(text: str, *objects: int | tuple[int, int]) -> str:
 
 
 def stating(text: str, name: str, **keys: object) -> str:
-    """Returns an EDS with these keys in a section; None removes a key."""
+    """Returns an EDS with these keys set in a section; None removes a key."""
     head, found, tail = re.split(
         rf"^(\[{re.escape(name)}\]\n(?:[^\[\n].*\n)*)", text, maxsplit=1, flags=re.MULTILINE
     )
@@ -36,14 +36,14 @@ def stating(text: str, name: str, **keys: object) -> str:
 
 
 def fixed(text: str, name: str, value: object) -> str:
-    """Returns an EDS in which an object is read-only."""
+    """Returns an EDS in which the object of a section is read-only and has this value."""
     return stating(text, name, AccessType="ro", DefaultValue=value)
 
 
 def mapped(
     text: str, communication: int, *words: int, can_id: int | None = None, kind: int | None = None
 ) -> str:
-    """Returns an EDS with a PDO of read-only mapping, and of read-only identifier and type if given."""
+    """Returns an EDS with a PDO whose mapping is read-only, and also its identifier and type if given."""
     mapping = communication + 0x200
     text = fixed(text, section(mapping, 0), len(words))
     for sub in range(1, 9):
@@ -55,7 +55,7 @@ def mapped(
 
 
 def profile_with(folder: Path, eds: str | bytes, *edits: tuple[str, str]) -> AxisConfig:
-    """Returns the article's axis in a folder, with another EDS and edits of its axis file."""
+    """Copies the article's profile to a folder, with another EDS and an edited axis file."""
     shutil.copytree(bundled_profile("article"), folder, dirs_exist_ok=True)
     (folder / "drive.eds").write_bytes(eds if isinstance(eds, bytes) else eds.encode())
     text = (folder / "axis.yaml").read_text()

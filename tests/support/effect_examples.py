@@ -1,4 +1,4 @@
-"""Examples of every effect, and motions with every channel, sampled unevenly."""
+"""Strategies for random effects of every kind, and for motions with every channel, also sampled unevenly."""
 
 import numpy as np
 from hypothesis import strategies as st
@@ -144,7 +144,7 @@ starts = st.sampled_from(list(Start))
 
 
 def _motion(first, steps, seed, even):
-    """Makes a path with all other channels drawn at random."""
+    """Returns a path with all other channels drawn at random."""
     angle = np.cumsum(np.array([first, *steps]))
     draw = np.random.default_rng(seed)
     count = len(angle)

@@ -1,4 +1,4 @@
-"""The simulated axis: without a bus, and booted on one."""
+"""Simulated axis, either without a bus or booted on one."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,7 +15,7 @@ from hdbridge.sim.truth import Truth
 
 
 def record_of(truth: Truth, lead: Callable[[Exercise], None], seed: int = 0) -> Record:
-    """Returns the record of a simulated axis that ``lead`` moves, with every channel."""
+    """Returns a record, with every channel, of a simulated axis that is moved by ``lead``."""
     bench = Exercise(Machine(truth, seed, may_compile=True))
     lead(bench)
     readings = bench.readings()

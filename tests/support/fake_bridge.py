@@ -1,7 +1,7 @@
-"""Machine without drives behind the API: it records requests and moves nothing.
+"""Machine without drives, for tests of the API: it records requests and moves nothing.
 
-The lease is the real one, so permission to move is decided as in the daemon; targets are checked against the
-axis's limits.
+The lease is the real one, so that permission to move is decided as in the daemon; targets are checked against
+the limits of the axis.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ STATUSWORD = Object(0x6041, 0, "Statusword", 6, IntegerType("uint16"))
 
 
 class FakeAxis:
-    """Axis that is always at its last target."""
+    """Axis that is always at its latest target."""
 
     def __init__(self, bridge: FakeBridge, name: str) -> None:
         self._bridge = bridge
@@ -44,7 +44,7 @@ class FakeAxis:
         self.outer: messages.OuterState | None = None
         self.queued: list[messages.QueueItem] = []
         self.moving_s = 0.0
-        """Duration of a move."""
+        """Duration of a move, s."""
 
     def state(self) -> messages.AxisState:
         fault = None
@@ -209,7 +209,7 @@ class FakeReader:
 
 
 class FakeBridge:
-    """Machine with some axes; ``moved`` lists requests that needed the lease, ``stopped`` all others."""
+    """Machine with several axes; ``moved`` lists the requests for motion, ``stopped`` the stops."""
 
     def __init__(self, *names: str) -> None:
         self.now_s: float | None = None

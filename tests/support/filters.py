@@ -1,4 +1,4 @@
-"""Linear filters, and tests of a claimed rate; `scipy.signal` and `scipy.stats` take a second to load."""
+"""Linear filter and test of a claimed rate, without scipy.signal and scipy.stats, which load slowly."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ from scipy.linalg.blas import dtbsv
 from scipy.special import bdtr
 
 CHANCE = 0.01
-"""Probability of refusing a correct claim."""
+"""Probability of rejecting a correct claim."""
 
 
 def filtered(forward: Sequence[float], back: Sequence[float], values: np.ndarray) -> np.ndarray:

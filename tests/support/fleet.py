@@ -21,7 +21,7 @@ effects:
 
 
 def record(seed, extra_arcsec=0.0, samples=700, zero_deg=0.0):
-    """Two sweeps each way over five turns of the motor from its zero, with an order 3 in addition."""
+    """Returns two sweeps each way over five motor turns; ``extra_arcsec`` is the amplitude of order 3."""
     rng = np.random.default_rng(seed)
     time = np.linspace(0.0, 30.0, samples)
     motor = 900.0 * (1.0 - np.cos(2.0 * np.pi * time / 15.0))

@@ -14,7 +14,7 @@ from hdbridge.daemon.recorder.flightlog import FlightLog
 AXIS = AxisConfig.load("profiles/demo")
 PERIOD_S = 0.004
 START_NS = 1_790_000_000_000_000_000
-"""Time of day at the zero of the samples' clock."""
+"""Time of day at time zero of the samples, ns since the epoch."""
 ROOM = 10**12
 
 
@@ -55,7 +55,7 @@ def event(time_s: float, kind: EventKind = EventKind.STOPPED, text: str = "the a
 
 
 class Clock:
-    """Time of day that matches the samples."""
+    """Settable clock, which begins at the time of day of the samples."""
 
     def __init__(self) -> None:
         self.ns = START_NS
@@ -67,7 +67,7 @@ class Clock:
 def flight_log(
     folder: Path, reported: list[str] | None = None, free: Any = None, axes: int = 1, **limits: float
 ):
-    """Returns the recorder without its thread, and its clock."""
+    """Returns a flight log, which is the recorder without its thread, and its clock."""
     clock = Clock()
     settings = RecorderSettings(**{"free_mb": 0.0, **limits})
     notify = reported.append if reported is not None else (lambda _: None)

@@ -1,4 +1,4 @@
-"""Slaves built on other people's CANopen stacks, in simulated time: `durand` and canopen's `LocalNode`."""
+"""Slaves built on third-party CANopen stacks, in simulated time: `durand` and canopen's `LocalNode`."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class PolledNetwork(NetworkABC):
 
 
 class DurandDrive:
-    """A durand node with the objects of CiA 402 and a state machine of a few lines."""
+    """durand node with the objects of CiA 402 and a minimal state machine."""
 
     def __init__(self, bus: can.BusABC, clock: Any) -> None:
         self.clock, self.last_s = clock, clock.now()
@@ -122,7 +122,7 @@ class DurandDrive:
 
 
 class _Periodic:
-    """A periodic message of python-can, on the virtual clock."""
+    """Periodic message of python-can, timed by the virtual clock."""
 
     def __init__(self, bus: _PeriodicBus, message: can.Message, period_s: float) -> None:
         self.bus, self.message, self.period_s = bus, message, period_s
@@ -150,7 +150,7 @@ class _PeriodicBus(can.interfaces.virtual.VirtualBus):
 
 
 class LocalNodeSlave:
-    """canopen's `LocalNode` as it is, with the EDS of the simulated drive; polls replace its threads."""
+    """Unmodified `LocalNode` of canopen with the EDS of the simulated drive; polling replaces its threads."""
 
     def __init__(self, channel: str, clock: VirtualClock, eds: Path) -> None:
         self.bus = _PeriodicBus(channel, clock)
@@ -174,7 +174,7 @@ class LocalNodeSlave:
 
 @contextmanager
 def local_node(eds: Path) -> Iterator[LockstepBus]:
-    """The master's bus with canopen's `LocalNode` on it."""
+    """Provides the master's bus with canopen's `LocalNode` on it."""
     channel, clock = f"foreign-{uuid4()}", VirtualClock()
     slave = LocalNodeSlave(channel, clock, eds)
     clock.nodes.append(slave)
@@ -184,7 +184,7 @@ def local_node(eds: Path) -> Iterator[LockstepBus]:
 
 @contextmanager
 def durand_drive() -> Iterator[tuple[LockstepBus, DurandDrive]]:
-    """The master's bus with the drive of durand on it."""
+    """Provides the master's bus with the durand drive on it, and that drive."""
     channel, clock, before = f"foreign-{uuid4()}", VirtualClock(), get_scheduler()
     with (
         can.Bus(interface="virtual", channel=channel, ignore_config=True) as own,

@@ -1,4 +1,4 @@
-"""A gateway in simulated time: daemon, service, outer bus and a PLC-like master on it, in one thread."""
+"""Gateway in simulated time: daemon, service, and outer bus with a PLC-like master, in one thread."""
 
 import math
 import struct
@@ -24,10 +24,10 @@ COUNTS_PER_DEG = 12_960_000 / 360.0
 
 
 class Plc:
-    """A master written from CiA 301 and CiA 402 alone; it runs on a clock of its own.
+    """PLC-like master, written from CiA 301 and CiA 402 alone; it has its own clock.
 
-    ``plan`` gives controlword and target for each of its cycles; both go out by one synchronous RPDO before
-    SYNC. What came by the TPDO of that SYNC is in ``seen``: time, statusword, position.
+    ``plan`` returns the target of each cycle, or None to keep the last one. Controlword and target are sent
+    in one synchronous RPDO before SYNC.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class Plc:
         *,
         syncs: bool = True,
     ) -> None:
-        """``syncs``: this master produces SYNC."""
+        """``syncs`` is True if this master produces SYNC."""
         self.bus = VirtualBus(channel)
         self.node, self._syncs = node, syncs
         self._clock = clock
@@ -57,7 +57,7 @@ class Plc:
         self.emergencies: list[int] = []
         self.heartbeats: list[int] = []
         self.seen: list[tuple[float, int, int, int]] = []
-        """Time of SYNC, statusword, position, target that was sent before it."""
+        """Time of SYNC, statusword, position, and target sent before that SYNC, for each cycle."""
         self._answers: list[bytes] = []
 
     # ---------------------------------------------------------------- a node of the virtual clock
@@ -123,16 +123,16 @@ class GatewayProcess:
 
 
 class GatewayBench:
-    """Everything between the outer master and the simulated drive."""
+    """Complete chain from the outer masters to the simulated drives."""
 
     def __init__(
         self, service: Service, bus: SpoiltVirtualBus, gateway: Callable[[], Gateway], plcs: list[Plc]
     ) -> None:
         self.service, self.daemon, self.plcs = service, service.daemon, plcs
         self.plc = plcs[0]
-        """The master of the axis that the methods are about."""
+        """Master of the axis on which the methods act."""
         self.bus, self._made = bus, gateway
-        self.daemon.clock.nodes += reversed(plcs)  # before the gateway: a frame arrives when it is sent
+        self.daemon.clock.nodes += reversed(plcs)  # before the gateway, so that frames arrive at once
         self.start_gateway()
 
     def start_gateway(self) -> None:
@@ -142,14 +142,14 @@ class GatewayBench:
         self.daemon.clock.nodes.append(self._process)
 
     def kill_gateway(self) -> None:
-        """Ends the gateway process."""
+        """Stops running the gateway process, as after a kill."""
         self.daemon.clock.nodes.remove(self._process)
 
     async def wait(self, duration_s: float) -> None:
         await self.service.timing.sleep(duration_s)
 
     async def until(self, done: Callable[[], bool], timeout_s: float = 5.0) -> float:
-        """Lets time pass until ``done``; returns how long that took."""
+        """Lets time pass until ``done()`` is true; returns the elapsed time, s."""
         begun_s = self.now_s
         while not done():
             assert self.now_s < begun_s + timeout_s, (
@@ -191,7 +191,7 @@ class GatewayBench:
         return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little", signed=signed)
 
     async def configure(self, mode: int = 8) -> None:
-        """Prepares the slave as a PLC does before it cycles: PDOs mapped by the master, mode, NMT start."""
+        """Configures the slave as a PLC does before cyclic operation: PDO mapping, mode, NMT start."""
         plc = self.plc
         for first, cob, words in (
             (0x1400, 0x200, (0x60400010, 0x607A0020)),
@@ -209,7 +209,7 @@ class GatewayBench:
         plc.target = await self.read(0x6064, signed=True)
 
     async def enable(self) -> float:
-        """Walks the states by controlword levels; returns the time from 'enable operation' to its answer."""
+        """Enables the axis by controlword levels; returns the time from 'enable operation' to its effect."""
         plc = self.plc
         if not plc.cycling:
             plc.begin()
@@ -222,12 +222,12 @@ class GatewayBench:
 
     @property
     def load_deg(self) -> float:
-        """Returns the true angle of the load."""
+        """True load angle, degrees."""
         return float(self.daemon.nodes[0].firmware.motion.machine.load_reading) / 2_880_000 * 360.0
 
 
 async def swing(bench: GatewayBench, amplitude_deg: float = 2.0, period_s: float = 2.0) -> None:
-    """Makes the PLC swing the axis from its present position."""
+    """Makes the PLC move the axis to and fro, starting at its current position."""
     plc, begun, centre = bench.plc, bench.plc.cycle, bench.plc.target
 
     def plan(cycle: int) -> int:
@@ -241,7 +241,7 @@ async def swing(bench: GatewayBench, amplitude_deg: float = 2.0, period_s: float
 def gateway_bench(
     folder: Path, period_s: float = 0.004, drift_ppm: float = 0.0, **options: Any
 ) -> Iterator[GatewayBench]:
-    """A stepped service with a gateway, nothing verified yet, and a PLC-like master that is silent."""
+    """Provides a stepped service with a gateway, no axis verified yet, and a silent PLC-like master."""
     channel = f"outer-{uuid4()}"
     with ExitStack() as stack:
         service = stack.enter_context(stepped_service(folder, **options))

@@ -1,6 +1,6 @@
-"""Faults on the bus of the other master, and of the processes between it and the axis, with the time to stop.
+"""Faults on the outer master's bus and of the processes between it and the axis, with the time to stop.
 
-Each happens while the axis follows the master at half its top speed. The true load is observed.
+Each happens while the axis follows the master at half its maximum speed. The true load is observed.
 """
 
 import errno
@@ -14,36 +14,36 @@ from support.service import play
 
 SPEED_DEG_S = 10.0
 STANDING_DEG = 0.005
-"""Largest movement of a load at rest; it rings, and 10 deg/s are 0.04 deg a cycle."""
+"""Maximum movement of a load at rest, degrees; it rings, and at 10 deg/s it moves 0.04 deg per cycle."""
 OBSERVED_S = 0.7
 STANDS_S = 0.3
 
 
 @dataclass(frozen=True)
 class OuterFault:
-    """One row; without ``within_s`` the axis must continue to follow."""
+    """One fault; without ``within_s`` the axis must continue to follow the master."""
 
     name: str
     happens: Callable[[GatewayBench], Awaitable[None] | None]
     codes: tuple[int, ...] = ()
-    """The master sees one of these EMCYs; empty if it sees none."""
+    """EMCY codes, one of which the master must receive; empty if it must receive none."""
     within_s: float | None = None
-    """Longest time until the load stands."""
+    """Maximum time until the load is at rest, s."""
     prepares: Callable[[GatewayBench], Awaitable[None]] | None = None
-    """Configuration by the master, before it enables the axis."""
+    """Additional configuration by the master before it enables the axis."""
     ends: Callable[[GatewayBench], None] = lambda bench: None
-    """Removes the cause; nothing may move then, although the master sends its targets all the time."""
+    """Removes the fault; nothing may move then, although the master continues to send targets."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Reaction of the axis; times since the fault, s."""
+    """Reaction of the axis; times are since the fault, s."""
 
     codes: tuple[int, ...]
     stands_s: float
-    """Time until the load stands; infinite if it continues to move."""
+    """Time until the load is at rest; infinite if it continues to move."""
     unpowered_s: float
-    """Time until the drive has no power; infinite if it keeps it."""
+    """Time until the drive switches power off; infinite if power stays on."""
 
 
 def pause(duration_s: float) -> Callable[[GatewayBench], None]:
@@ -95,7 +95,7 @@ def no_targets(bench: GatewayBench) -> None:
 
 
 def rpdos_of(length: int) -> Callable[[GatewayBench], None]:
-    """Gives all RPDOs of the master another length."""
+    """Returns a fault that changes the length of the master's RPDOs."""
 
     def happens(bench: GatewayBench) -> None:
         send, own = bench.plc.send, 0x200 + NODE
@@ -109,7 +109,7 @@ def rpdos_of(length: int) -> Callable[[GatewayBench], None]:
 
 
 class Babbler:
-    """A node that sends frames without pause, as fast as 1 Mbit/s carries them, for a while."""
+    """Node that sends frames without a pause, as fast as 1 Mbit/s permits, for 0.3 s."""
 
     FRAME_S = 125e-6
     """Duration of a frame with 8 bytes."""
@@ -183,7 +183,7 @@ def start_daemon(bench: GatewayBench) -> None:
 
 
 async def stall(bench: GatewayBench, duration_s: float) -> None:
-    """Lets the drives and the gateway run while the control process does not, and observes the load."""
+    """Stalls the control process while the drives and the gateway run, and observes the load."""
     for _ in range(round(duration_s / bench.daemon.period_s)):
         bench.daemon.hang(bench.daemon.period_s)
         bench.observe()  # type: ignore[attr-defined]
@@ -228,7 +228,7 @@ ROWS = (
 
 
 def measure(folder: Path, row: OuterFault) -> Seen:
-    """Plays one fault; AssertionError if anything moves after its end without a new request."""
+    """Makes one fault; AssertionError if anything moves after its end without a new request."""
 
     async def scenario(bench: GatewayBench) -> Seen:
         async with bench.service.ready() as bench.bridge:  # type: ignore[attr-defined]
@@ -237,7 +237,7 @@ def measure(folder: Path, row: OuterFault) -> Seen:
                 await row.prepares(bench)
             await bench.wait(0.5)
             await bench.enable()
-            await bench.wait(0.5)  # the correction is faded in
+            await bench.wait(0.5)  # until the correction is ramped in
             ramp(bench)
             await bench.wait(0.6)
             return await observe(bench, row)

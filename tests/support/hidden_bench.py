@@ -1,9 +1,9 @@
 """Bench on the virtual bus with hidden causes in its axis: measure, diagnose, extend, step.
 
-The axis is that of profiles/demo with sensors for torque and temperature. The hidden causes are drawn by a
-seed and put into the truth by their physics. The diagnosis gets the model of an earlier calibration, a few
-per cent off. Everything in between is what a user has: frames on a python-can bus, a recording folder,
-``hdbridge diagnose``, model files.
+The axis is that of profiles/demo with sensors for torque and temperature. The hidden causes are random by
+seed, and are physical changes of the truth. The diagnosis receives the model of an earlier calibration, whose
+parameters are a few per cent off. Everything else is as for a user: frames on a python-can bus, a recording
+folder, ``hdbridge diagnose``, model files.
 """
 
 import math
@@ -33,21 +33,21 @@ from support.hidden import Hidden, Run, hide_all
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 CYCLE_MS = 40
-"""Cycle time for most causes: with a quarter of the samples of `FAST_MS` they are as visible."""
+"""Cycle time for most causes, which a quarter of the samples of `FAST_MS` shows equally well."""
 MORE_MS = 20
-"""Cycle time for causes that are small in each sample, or visible only in a part of the record."""
+"""Cycle time for causes that are small in each sample or visible only in part of the record."""
 FAST_MS = 10
-"""Cycle time for causes that depend on speed or acceleration, and for play, which is crossed in a few
+"""Cycle time for causes that depend on speed or acceleration, and for backlash, which is crossed within a few
 samples."""
 MOTOR_COUNTS = 32_768
-"""Motor resolution: whole-count commands are followed at a fixed fraction of a count, so half a count
-biases a sweep."""
+"""Motor counts per turn; high, because the motor follows whole-count commands at a fixed fraction of a count,
+which biases a sweep by up to half a count."""
 SPEED_DEG_S = 6.1
-"""Speed of the load. At a higher one the load's resonance appears in the higher orders of the motor."""
+"""Speed of the load. At a higher speed, the higher motor orders would excite the load's resonance."""
 ACCELERATION_DEG_S2 = 5.0
-"""Acceleration of the load: low, because acceleration winds the spring up."""
+"""Acceleration of the load; low, because acceleration winds up the gear."""
 REACH_DEG = (0.0, 372.0)
-"""Range of the load: a little more than a turn."""
+"""Range of the load angle: slightly more than one turn."""
 SENSORS = """
 load_torque:
   source: {index: 0x2101, type: int32}
@@ -60,7 +60,7 @@ temperature:
 
 @dataclass(frozen=True)
 class Nested:
-    """Nested reversals, some of them beyond an earlier turning point; motor degrees."""
+    """Procedure of nested reversals, some of them beyond an earlier turning point; motor degrees."""
 
     depths_deg: tuple[float, ...] = (2.0, 5.0, 9.0, 16.0)
     velocity_deg_s: float = 0.5
@@ -75,7 +75,7 @@ class Nested:
 
 @dataclass(frozen=True)
 class Still:
-    """Standstill."""
+    """Procedure that stands still."""
 
     duration_s: float
 
@@ -85,7 +85,7 @@ class Still:
 
 
 STEPPING = Stepping(count=20, step_deg=403.56)
-"""Stepping test at every phase of the motor, over most of a load turn."""
+"""Stepping test with steps at all phases of the motor turn, over most of a load turn."""
 
 
 def axis_config(folder: Path, cycle_ms: int) -> AxisConfig:
@@ -114,7 +114,7 @@ def bare_truth() -> Truth:
 
 
 def model_text(truth: Truth, rng: random.Random) -> str:
-    """Returns an earlier calibration's model file: the right effects, parameters a few per cent off."""
+    """Returns the model file of an earlier calibration: right effects with parameters a few per cent off."""
     law = truth.gear.hysteresis
     rows = "\n".join(
         f"        - {{order: {each.order}, amplitude_arcsec: "
@@ -152,7 +152,7 @@ class Cell:
         self.stepping = STEPPING
 
     def measure(self, parts: Sequence[Procedure[Any]]) -> None:
-        """Runs the procedures as one and saves them as a recording."""
+        """Runs the procedures as a single one and saves the recording."""
         Bench(self.drive).run(Chain(tuple(parts), ACCELERATION_DEG_S2)).save(self.recording)
 
     @cached_property
@@ -167,7 +167,7 @@ class Cell:
 
     @property
     def floor_arcsec(self) -> float:
-        """Three sigma due to the counts of the motor target and the load encoder's noise alone."""
+        """Best possible three sigma, due only to whole counts of the motor target and load encoder noise."""
         axis, encoder = self.drive.axis, self.bare.load_.encoder
         rounding = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
         readings = self.stepping.settle.window_s / axis.drive.cycle_s
@@ -175,7 +175,7 @@ class Cell:
 
 
 def run_of(parts: Sequence[Procedure[Any]], axis: AxisConfig, highest_deg_s2: float) -> Run:
-    """Returns the properties of a plan that set the size of a cause; accelerations are of the load."""
+    """Returns the properties of a plan that determine the sizes of causes; accelerations are of the load."""
     view = axis_view(axis)
     procedure = Chain(tuple(parts), ACCELERATION_DEG_S2)
     ahead = rehearse(procedure, view)
@@ -210,7 +210,7 @@ def hidden_bench(
     truth: Truth | None = None,
     cycle_ms: int = CYCLE_MS,
 ) -> Iterator[Cell]:
-    """Provides an axis with causes of given sizes in it, already measured."""
+    """Provides an axis with causes of given sizes, which has already been measured."""
     rng = random.Random(f"hidden {seed} {causes}")
     folder.mkdir(parents=True, exist_ok=True)
     axis = axis_config(folder, cycle_ms)

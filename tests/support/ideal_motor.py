@@ -1,8 +1,8 @@
-"""A motor without physics, for tests of the drive in front of it."""
+"""Motor without physics, for tests of the drive that controls it."""
 
 
 class IdealMotor:
-    """Follows the demand at once, unless it is ``stuck``; coasts with constant friction."""
+    """Motor that follows the demand at once, unless it is ``stuck``, and coasts with constant friction."""
 
     friction_counts_s2 = 50_000.0
 

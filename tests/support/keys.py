@@ -1,4 +1,4 @@
-"""Changes of nested mappings by dotted keys, with two underscores for the dot."""
+"""Changes nested mappings by dotted keys, in which two underscores replace the dot."""
 
 import copy
 from collections.abc import Mapping
@@ -6,7 +6,7 @@ from typing import Any
 
 
 def with_keys(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a deep copy with keys like ``load__gravity`` changed; missing mappings are made."""
+    """Returns a deep copy in which keys like ``load__gravity`` are changed; missing mappings are created."""
     made = copy.deepcopy(dict(data))
     for path, value in changes.items():
         *parents, last = path.split("__")

@@ -13,15 +13,15 @@ from hdbridge.records.record import Record
 
 @dataclass(frozen=True)
 class Leg:
-    """Samples of one leg; arrays of one length, multi-turn degrees."""
+    """Samples of one leg; arrays of equal length, multi-turn degrees."""
 
     time_s: np.ndarray
     motor_deg: np.ndarray
-    """Command, or the measured angle if ``commanded`` is false."""
+    """Commanded motor angle, or the measured one if ``commanded`` is false."""
     load_deg: np.ndarray
     kind: str = "unknown"
     position_deg: np.ndarray | None = None
-    """Measured motor angle in addition to the command."""
+    """Measured motor angle, if it is given in addition to the command."""
     commanded: bool = True
     zero: int = 0
 

@@ -1,4 +1,4 @@
-"""Hook that acts as another process does on a file just before this one opens it."""
+"""Hook that changes a file, as another process would, just before this process opens it."""
 
 import sys
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Records from formulas, for the tests of the diagnosis; shares no code with the tested effects.
+"""Records computed from formulas, for the tests of the diagnosis; shares no code with the tested effects.
 
 An axis of ratio 50 runs a bench plan (standstill, sweeps at two speeds, sines, nested reversals, steps,
 holds, sweeps again) at a fine time step. The elastic law is one of several, with a state that continues
@@ -27,7 +27,7 @@ RATIO = 50.0
 
 @dataclass
 class Plan:
-    """Durations of the plan's parts; ``scale`` shortens them."""
+    """Parameters of the bench plan; ``scale`` scales the durations of standstills."""
 
     rate_hz: float = 25.0
     scale: float = 1.0
@@ -48,7 +48,7 @@ def path(plan: Plan, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, 
         pieces.append(np.full(max(1, round(seconds / dt)), here))
 
     def move(goal: float, speed: float) -> None:
-        """Makes a smooth move whose speed rises and falls in a raised cosine."""
+        """Adds a smooth move whose speed rises and falls in a raised cosine."""
         nonlocal here
         way = abs(goal - here)
         if way < 1e-9:
@@ -135,7 +135,7 @@ def rise(xi: np.ndarray | float, n: float) -> Any:
 
 
 def kept(direction: np.ndarray) -> np.ndarray:
-    """Fills zeros with the direction of the last motion; forward before the first."""
+    """Replaces zeros with the direction of the last motion, or with forward before the first motion."""
     last = np.maximum.accumulate(np.where(direction != 0, np.arange(len(direction)), -1))
     return np.where(last < 0, 1.0, direction[last])
 
@@ -161,7 +161,7 @@ def loop(motor: np.ndarray, law: str, offset: float, width: float, n: float) -> 
             out[a:b] = sign * np.minimum(sign * branch, offset)
             value = float(out[b - 1])
         return out
-    if law == "memory":  # Masing's rule, by many stop operators whose thresholds follow the branch
+    if law == "memory":  # Masing's rules, by many stop operators whose thresholds approximate the branch
         grid = width * np.linspace(0, 1, 161)[1:] ** 2 / 1.0
         virgin = rise(grid / width, n)
         slope = np.diff(np.concatenate([[0], virgin])) / np.diff(np.concatenate([[0], grid]))
@@ -199,7 +199,7 @@ def loop(motor: np.ndarray, law: str, offset: float, width: float, n: float) -> 
 
 
 def stop(motor: np.ndarray, width: float) -> np.ndarray:
-    """Returns the stop operator of full crossing ``width``, from a saturated forward start."""
+    """Returns the output of a stop operator that crosses from -1 to 1 over ``width``, initially 1."""
     turning = [0, *(np.flatnonzero(np.diff(np.sign(np.diff(motor))) != 0) + 1).tolist(), len(motor) - 1]
     value, out = 1.0, np.empty(len(motor))
     out[0] = 1.0
@@ -210,7 +210,7 @@ def stop(motor: np.ndarray, width: float) -> np.ndarray:
 
 
 def crept(going: np.ndarray, dt: float, tau: float, build: float = 0.1, **_: float) -> np.ndarray:
-    """Returns creep that builds up with the direction of motion, faster than it relaxes at rest."""
+    """Returns creep that builds up in the direction of motion, faster than it relaxes at rest."""
     up, down = math.exp(-dt / (build * tau)), math.exp(-dt / tau)
     y, out = 0.0, np.empty(len(going))
     for i, sense in enumerate(going.tolist()):
@@ -221,7 +221,7 @@ def crept(going: np.ndarray, dt: float, tau: float, build: float = 0.1, **_: flo
 
 @dataclass
 class Truth:
-    """Properties of the axis."""
+    """True properties of the axis: elastic law, orders, other effects, noise."""
 
     law: str = "plain"
     offset: float = 40.0
@@ -236,7 +236,7 @@ class Truth:
 
 
 def record(truth: Truth, plan: Plan, seed: int, command: bool = True) -> dict[str, np.ndarray]:
-    """Returns the columns of a CSV file."""
+    """Returns the columns of a record of the axis on the plan."""
     rng = np.random.default_rng(seed)
     t, motor, _ = path(plan, rng)
     dt = t[1] - t[0]
@@ -254,7 +254,7 @@ def record(truth: Truth, plan: Plan, seed: int, command: bool = True) -> dict[st
         carried["worn"] = run / run[-1] * stop(motor, e["wear"].get("width", 0.3))
     if "creep" in e:
         carried["creep"] = crept(np.sign(v), dt, **e["creep"])
-    # Quantities without a state are only computed at the samples.
+    # Quantities that do not depend on the history are computed only at the samples.
     pick = slice(None, None, 10)
     at = slice(None) if "channel_skew" in e else pick
     t, motor, v, a, d = (np.ascontiguousarray(each[at]) for each in (t, motor, v, a, d))
@@ -339,13 +339,13 @@ def unknown(
 ) -> np.ndarray:
     """Returns an error that is not in the catalogue."""
     size = kind["size"]
-    if kind["kind"] == "saw":  # a saw tooth over the load angle, not periodic in the turn
+    if kind["kind"] == "saw":  # a saw tooth over the load angle, whose period is not a fraction of a turn
         return size * (np.mod(load, 137.0) / 68.5 - 1)
     if kind["kind"] == "square":
         return size * np.sign(np.sin(np.deg2rad(motor * 0.37)))
     if kind["kind"] == "chirp":
         return size * np.sin(np.deg2rad(0.0006 * motor**2 / 10))
-    if kind["kind"] == "one_way":  # a bump series met in one direction only
+    if kind["kind"] == "one_way":  # a series of bumps in one direction only
         return size * (d > 0) * np.abs(np.sin(np.deg2rad(load * 3.3)))
     if kind["kind"] == "beat":
         return size * np.sin(2 * np.pi * t / 47.0) * np.cos(np.deg2rad(motor * 0.5))
@@ -353,11 +353,11 @@ def unknown(
         return size * (np.sin(2 * np.pi * t / 61.0) > 0.8) * np.sin(2 * np.pi * t / 1.7)
     if kind["kind"] == "packet":  # a roller that presses on near one load angle
         return size * np.exp(-(((load - 90.0) / kind["width"]) ** 2)) * np.cos(np.deg2rad(motor * 1.9))
-    if kind["kind"] == "heated":  # by the square of the speed, with a time constant
+    if kind["kind"] == "heated":  # heated in proportion to the square of the speed, with a time constant
         nearer = -math.expm1(-float(np.median(np.diff(t))) / kind["tau"])
         heat = filtered([nearer], [1.0, nearer - 1.0], v**2)
         return size * heat / np.max(heat)
-    if kind["kind"] == "ring":  # carried along by the motion until it slips back, at random
+    if kind["kind"] == "ring":  # a ring that the motion carries along until it slips back at random
         rng, ring, slips = np.random.default_rng(7), np.empty(len(t)), 0.7
         for i, way in enumerate(np.diff(motor, prepend=motor[0]) / kind["travel"]):
             ring[i] = (ring[i - 1] if i else 0.0) + way
@@ -368,7 +368,7 @@ def unknown(
 
 
 def model_text(seed: int, wrong: float = 0.03, truth: Truth | None = None) -> str:
-    """Returns the model file with parameters some per cent off."""
+    """Returns the text of a model file whose parameters are a few per cent off."""
     rng = np.random.default_rng(seed + 77)
     truth = truth or Truth()
 

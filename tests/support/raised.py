@@ -1,4 +1,4 @@
-"""The article's axis with limits at which its servo filters the correction, and its measured response."""
+"""Article's axis with raised limits, at which the servo attenuates the correction; measured response."""
 
 import re
 import shutil
@@ -29,13 +29,13 @@ REMOVED = {
     "counts_per_turn: 2880000": "counts_per_turn: 400000",
     "{index: 0x60E4, subindex: 1": "{index: 0x6064, subindex: 0",
 }
-"""The load encoder's reading is that of the motor, 50 turns to one."""
+"""Edits of the axis file that make the motor encoder, at 50 motor turns per load turn, the load encoder."""
 
 RUNS = EvenSpeed((123.5, 104.0, 83.2, 65.0, 49.4, 36.4, 23.4), window_s=1.2)
 
 
 def raised_axis() -> str:
-    """Returns the text of the axis file."""
+    """Returns the text of the article's axis file with raised limits."""
     text = (ARTICLE / "axis.yaml").read_text(encoding="utf-8")
     for key, value in RAISED.items():
         text, found = re.subn(rf"(?m)^(  {key}: )[-\d.]+", rf"\g<1>{value}", text)
@@ -51,7 +51,7 @@ def raised_profile(folder: Path) -> Path:
 
 
 def without_load_encoder(folder: Path) -> Path:
-    """Removes the load encoder from a profile."""
+    """Removes the load encoder from a profile: the motor encoder replaces it."""
     text = (folder / "axis.yaml").read_text(encoding="utf-8")
     for old, new in REMOVED.items():
         assert old in text
@@ -61,11 +61,11 @@ def without_load_encoder(folder: Path) -> Path:
 
 
 _measured: dict[tuple[bytes, ...], Response] = {}
-"""Responses by the content of their profiles: each takes 6 s of a processor."""
+"""Cached responses by the content of their profiles, because measuring one takes 6 s of CPU time."""
 
 
 def measured_response(profile: Path) -> Response:
-    """Measures the response of a raised profile's axis on a bench, as the motion test does."""
+    """Measures the response of the profile's axis on a bench, as the motion test does."""
     content = tuple((profile / name).read_bytes() for name in ("axis.yaml", "model.yaml", "truth.yaml"))
     if content not in _measured:
         _measured[content] = _measure(profile)
@@ -97,7 +97,7 @@ def _measure(profile: Path) -> Response:
 
 
 def measured_profile(folder: Path) -> Path:
-    """Writes a profile with raised speed limits and the measured response in its model."""
+    """Creates a profile with raised limits whose model contains the measured response."""
     profile = raised_profile(folder)
     model = TransmissionModel.load(profile / "model.yaml")
     replace(model, response=measured_response(profile)).save(profile / "model.yaml")
@@ -105,12 +105,12 @@ def measured_profile(folder: Path) -> Path:
 
 
 def ripple_arcsec(samples: np.ndarray, speed_deg_s: float) -> float:
-    """Returns the rms of the load error about a straight line while the target runs at a speed.
+    """Returns the rms of the load error about a straight line while the target moves at this speed.
 
     ``samples`` are those of one axis from the daemon's ring.
     """
     even = np.flatnonzero(abs(samples["velocity_deg_s"] - speed_deg_s) < 1e-3 * abs(speed_deg_s))
-    even = even[len(even) // 3 :]  # the transient of the ramp
+    even = even[len(even) // 3 :]  # without the transient of the ramp
     assert len(even) > 100
     error = 3600.0 * (samples["load_position_deg"] - samples["load_target_deg"])[even]
     line = np.linspace(-1.0, 1.0, len(error))

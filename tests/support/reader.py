@@ -1,10 +1,10 @@
-"""Reads a page of a report."""
+"""Parser for the HTML pages of reports."""
 
 from html.parser import HTMLParser
 
 
 class Reader(HTMLParser):
-    """Tags with their attributes, and text outside of script and style."""
+    """Parser that collects tags with their attributes, and text outside of script and style."""
 
     def __init__(self, text):
         super().__init__()

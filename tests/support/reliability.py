@@ -1,7 +1,7 @@
-"""Faults that an axis under way must survive, as rows, with the places at which each is tried.
+"""Table of faults that an axis in motion must survive, with the places at which each is tried.
 
 A *place* is a control cycle on a bus: the bench's on the virtual bus and on vcan, the daemon's on the virtual
-bus. Each has a `Bench`. `FURTHER` lists faults that only a daemon can show, each with a test of its own, and
+bus. Each has a `Bench`. `FURTHER` lists faults that only a daemon can show, each with its own test, and
 `daemon_faults` those of a daemon in its own processes on vcan. ``tools/reliability_page.py`` makes
 `docs/reliability.md` from the results.
 """
@@ -25,7 +25,7 @@ from hdbridge.errors import SafetyStop
 from support.characters import CHARACTERS, FRIENDLY, Character
 
 RECORD: Final = "HDBRIDGE_RELIABILITY"
-"""Environment variable: file to which a line of JSON is added for each row that was tried."""
+"""Environment variable with the path of a file, to which a line of JSON is added for each row tried."""
 WORDS: Final = {
     Reaction.GO: "continue, count",
     Reaction.FREEZE: "freeze",
@@ -38,7 +38,7 @@ DAEMON_VCAN = "daemon, vcan"
 
 
 class Bench(Protocol):
-    """Axis under way at constant speed, and the means to disturb it."""
+    """Axis in motion at constant speed, and methods to disturb it."""
 
     node: DriveNode
     supervision: Supervision
@@ -72,34 +72,34 @@ class Row:
     fault: Fault
     reaction: Reaction
     allowed: int | str
-    """Allowed cycles; ``heartbeats`` for the time until the drive's heartbeat counts as lost."""
+    """Maximum number of cycles; ``heartbeats`` is the time until the drive's heartbeat counts as lost."""
     again: bool = False
-    """True if it is made before each cycle, not once."""
+    """True if the fault is made before each cycle, not only once."""
     places: tuple[str, ...] = (VIRTUAL, VCAN, DAEMON)
     everybody: bool = False
-    """True if it affects every axis of the bus."""
+    """True if the fault affects every axis on the bus."""
     without_a_word: bool = False
-    """True if only the statusword shows it."""
+    """True if only the statusword shows the fault; the drive sends no EMCY."""
 
     def unseen_on(self, character: Character) -> bool:
-        """Returns True if a drive of this character shows nothing of the fault.
+        """Returns True if the messages of a drive of this character do not show the fault.
 
-        One that stops without an EMCY, and resumes at SYNC before it samples the values of its TPDOs, shows
-        nothing. An option 605Ah below 5 rules that out.
+        This is so if it stops without an EMCY, and resumes at SYNC before it samples the values of its TPDOs.
+        An option 605Ah below 5 rules that out.
         """
         return self.resumptions_on(character) > 0 and character.behaviour.rpdo_before_tpdo
 
     def resumptions_on(self, character: Character) -> int:
         """Returns how often a drive of this character may resume before a master can detect its stop.
 
-        If it stops without an EMCY, the next SYNC makes it resume by the buffered RPDO; its TPDO of the same
-        SYNC shows the stop. An option 605Ah below 5 rules that out.
+        If it stops without an EMCY, it resumes at the next SYNC because of the buffered RPDO; its TPDO of the
+        same SYNC shows the stop. An option 605Ah below 5 rules that out.
         """
         by_level = character.behaviour.controlword is Controlword.LEVEL
         return int(self.without_a_word and by_level and character.quick_stop_option >= 5)
 
     def allowed_cycles(self, heartbeat_timeout_s: float, period_s: float) -> int:
-        """Returns the allowed cycles as a number."""
+        """Returns the maximum number of cycles."""
         if isinstance(self.allowed, int):
             return self.allowed
         return math.ceil(heartbeat_timeout_s / period_s) + 1
@@ -114,7 +114,7 @@ def _drive(**wishes: Any) -> Wish:
 
 
 def _stale(bench: Bench) -> None:
-    """Repeats the TPDO of the last SYNC."""
+    """Sends the TPDO of the last SYNC again."""
     bench.interfere(0x181, bench.node._tpdos[0].pack())
 
 
@@ -127,13 +127,13 @@ def _frame(can_id: int, data: bytes = b"", times: int = 1, **kind: bool) -> Wish
 
 
 def _glitch(bench: Bench, counts: int) -> None:
-    """Shifts the next sample of the load encoder."""
+    """Shifts only the next sample of the load encoder."""
     jumps = [counts]
     bench.node.faults.load_reading = lambda right: right + (jumps.pop() if jumps else 0)
 
 
 def _miss(code: int) -> Wish:
-    """Makes the drive stop, with its EMCY, as if it had missed its master."""
+    """Makes the drive stop, with an EMCY of this code, as if it had lost its master."""
 
     def make(bench: Bench) -> None:
         bench.node.faults.miss_master(code)
@@ -213,7 +213,7 @@ ROWS: Final = (
 
 @dataclass(frozen=True)
 class Further:
-    """Fault that a bench cannot show but the daemon's loop can; each has a test of its own."""
+    """Fault that the daemon's loop can show, but not a bench; each has its own test."""
 
     name: str
     expected: str
@@ -248,20 +248,20 @@ FURTHER: Final = (
 
 
 def further(name: str) -> Further:
-    """Returns the further fault of that name."""
+    """Returns the row of `FURTHER` with this name."""
     (found,) = (each for each in FURTHER if each.name == name)
     return found
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Result of a row at a place."""
+    """Result of a fault row at one place."""
 
     place: str
     name: str
     seen: str
     taken: float
-    """Cycles that it took."""
+    """Number of cycles until the reaction."""
     allowed: float
     character: str = FRIENDLY.name
 
@@ -283,7 +283,7 @@ def rows_of(place: str) -> list[Row]:
 
 
 def cases_on(place: str, in_every_run: Callable[[Character, Row], bool]) -> list[Any]:
-    """Returns every character with every row as pytest parameters, the others marked slow."""
+    """Returns all pairs of character and row as pytest parameters, marked slow unless ``in_every_run``."""
     return [
         pytest.param(character, row, marks=() if in_every_run(character, row) else pytest.mark.slow,
                      id=f"{character}-{row.name}")
@@ -294,7 +294,7 @@ def cases_on(place: str, in_every_run: Callable[[Character, Row], bool]) -> list
 def try_out(
     row: Row, bench: Bench, place: str, heartbeat_timeout_s: float, character: Character = FRIENDLY
 ) -> Seen:
-    """Makes the fault on an axis under way; AssertionError if its reaction does not come in time."""
+    """Makes the fault on an axis in motion; AssertionError without the expected reaction in time."""
     allowed = row.allowed_cycles(heartbeat_timeout_s, bench.period_s)
     bench.supervision.events.clear()
     row.make(bench)

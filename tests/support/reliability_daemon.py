@@ -19,7 +19,7 @@ from support.characters import FRIENDLY, Character
 from support.service import Service, play, stepped_service, until
 
 FAR_DEG = 390.0
-"""Target of the axes, of either sign."""
+"""Absolute value of the target of the axes, degrees."""
 RPDO = 0x200
 ENABLE_OPERATION = 0x0F
 SETTLED_S = 0.7
@@ -34,7 +34,7 @@ STATES = {
 
 
 class WrongOnce(Compensation):
-    """Compensation that returns a chosen target once."""
+    """Compensation that can return one chosen target instead of its own."""
 
     wrong_deg: float | None = None
 
@@ -45,7 +45,7 @@ class WrongOnce(Compensation):
 
 
 class DaemonBench:
-    """Two axes under way; faults affect the first."""
+    """Two axes in motion; faults affect the first."""
 
     def __init__(self, service: Service) -> None:
         self.service = service
@@ -103,13 +103,13 @@ class DaemonBench:
         return self.daemon.nodes[axis].firmware.motion.machine.motor_counts
 
     def moves_on(self, axis: int) -> bool:
-        """Returns True if an axis moves on undisturbed."""
+        """Returns True if an axis is still enabled and in motion."""
         before = self.motor_counts(axis)
         self.daemon.run(0.1)
         return self.states[axis] is AxisState.ENABLED and abs(self.motor_counts(axis) - before) > 500
 
     def stay_stopped(self, *axes: int) -> None:
-        """Checks that axes come to rest and stay there without power, whatever the commands."""
+        """Checks that axes come to rest and stay at rest and without power, whatever the commands."""
         daemon, states = self.daemon, [*self.states]
         sent: dict[int, list[int]] = {RPDO + 1 + axis: [] for axis in range(2)}
         daemon.bus.spy = lambda can_id, data: sent[can_id].append(data[0]) if can_id in sent else None
@@ -137,7 +137,7 @@ class DaemonBench:
         self.daemon.run(0.6)
 
     def leads_back(self) -> None:
-        """Checks that each stopped axis, once reset, is disabled in its place, and moves once enabled."""
+        """Checks that each stopped axis is disabled after a reset, without motion, and moves once enabled."""
         stopped = [axis for axis, state in enumerate(self.states) if state is not AxisState.ENABLED]
         places = [self.motor_counts(axis) for axis in range(2)]
 

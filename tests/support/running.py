@@ -1,4 +1,4 @@
-"""Whole daemon in its own processes, and the parts of a client that its tests need."""
+"""Whole daemon in its own processes, with the client functions that its tests need."""
 
 import json
 import os
@@ -18,13 +18,13 @@ from support import patience
 
 
 class Daemon:
-    """Running ``hdbridge run ...``: its processes, its API, its log."""
+    """Running ``hdbridge run ...``, with its processes, its API and its log."""
 
     def __init__(self, folder: Path, arguments: Sequence[object], name: str) -> None:
-        """``folder`` contains its runtime folder and output; ``name`` is that of the machine."""
+        """``folder`` contains the daemon's runtime folder and output; ``name`` is the machine's name."""
         self.folder, self.arguments, self.name = folder, arguments, name
         self.events: list[dict[str, Any]] = []
-        """Events in its log, of all processes."""
+        """Events of all processes in the daemon's log."""
         self._manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._manager.bind(str(folder / "notify"))
         environment = {
@@ -36,7 +36,7 @@ class Daemon:
             env=environment, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
         )  # fmt: skip
         self.notifications: list[str] = []
-        """Messages to the service manager."""
+        """Messages that the daemon has sent to the service manager."""
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         self._listener = threading.Thread(target=self._listen, daemon=True)
@@ -50,7 +50,7 @@ class Daemon:
         self._lease: str | None = None
 
     def _listen(self) -> None:
-        """Reads messages at once, because the kernel queues only ten."""
+        """Reads messages to the service manager immediately, because the kernel queues only ten."""
         while line := self._manager.recv(4096).decode():
             self.notifications.append(line)
 
@@ -69,7 +69,7 @@ class Daemon:
         self.until(lambda: line in self.notifications, line)
 
     def until(self, met: Callable[[], Any], what: str) -> Any:
-        """Polls ``met`` until it returns something true, and returns it."""
+        """Polls ``met`` until it returns a true value, and returns that value."""
 
         def still() -> Any:
             if not (found := met()):
@@ -83,7 +83,7 @@ class Daemon:
         return "\n".join(json.dumps(each) for each in (*shown, self.axis()))
 
     def names(self) -> list[str]:
-        """Returns the names of the events in its log."""
+        """Returns the names of the events in the daemon's log."""
         return [str(event["event"]) for event in self.events]
 
     def pids(self, which: str) -> list[int]:
@@ -155,7 +155,7 @@ class Daemon:
         return self._lease
 
     def forget_lease(self) -> None:
-        """Discards the lease, which a new service does not know and which expires if unused."""
+        """Discards the lease, which a new service does not know, and which expires if it is not used."""
         self._lease = None
 
     # ------------------------------------------------------------------ its end
@@ -167,7 +167,7 @@ class Daemon:
         return status
 
     def close(self) -> None:
-        """Ends the daemon and all its processes if they still run."""
+        """Ends the daemon and all its processes that still run."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
             try:

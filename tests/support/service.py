@@ -22,7 +22,7 @@ Result = TypeVar("Result")
 
 
 class AtOnce(Executor):
-    """Runs each call in the caller's thread."""
+    """Executor that runs each call at once in the caller's thread."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         done: Future[Any] = Future()
@@ -31,7 +31,7 @@ class AtOnce(Executor):
 
 
 def article_profiles(folder: Path, count: int, profile: Path = PROFILE) -> list[Profile]:
-    """Makes ``count`` profiles of the article's axis on one bus, nodes 1, 2, ..., which tests may change."""
+    """Creates ``count`` copies of the article's profile on one bus, nodes 1, 2, ..., for tests to change."""
     made = []
     for node in range(1, count + 1):
         own = folder / f"axis{node}"
@@ -58,7 +58,7 @@ class Service:
         self.timing = daemon.timing
 
     def bridge(self, **options: Any) -> ServiceBridge:
-        """Returns a new service."""
+        """Returns a new service bridge to the daemon's loop."""
         return ServiceBridge(self.machine, self.daemon.memory, self.timing, **options)
 
     @asynccontextmanager
@@ -81,7 +81,7 @@ class Service:
 
 
 async def until(bridge: ServiceBridge, done: Callable[[], bool], timeout_s: float = 20.0) -> None:
-    """Turns the loop until ``done``."""
+    """Runs cycles of the loop until ``done()`` is true; AssertionError after the time-out."""
     timing = bridge.core.timing
     end_s = timing.clock.now() + timeout_s
     while not done():

@@ -1,7 +1,7 @@
-"""Random events on one slave, and the laws that always hold.
+"""Random events on one slave, and the laws that must always hold.
 
-The laws look at the motor's demand and at the frames that the master has sent, not at the firmware: no demand
-outside the limits, no motion without a request in the present life of the drive and the master.
+The laws examine the motor's demand and the frames that the master has sent, not the firmware: no demand
+outside the limits, and no motion without a request since the last loss of drive or master.
 """
 
 import struct
@@ -19,16 +19,16 @@ from support.conformance import EDS
 from support.ideal_motor import IdealMotor
 
 LOW, HIGH = -20_000, 20_000
-"""607Dh."""
+"""Software position limits (607Dh), counts."""
 SPEED = 4000 * 8000 / 60.0
-"""6080h; counts/s."""
+"""Maximum motor speed (6080h), counts/s."""
 PERIOD_S = 0.004
 WORDS = (0x00, 0x02, 0x06, 0x07, 0x0F, 0x0F, 0x0F, 0x1F, 0x3F, 0x5F, 0x10F, 0x80, 0x8F)
 MODES = (0, 1, 1, 6, 7, 8, 8, 8, 3)
 
 
 class TimedStage(PowerStage):
-    """A power stage that takes some periods and may fail."""
+    """Power stage that takes some time to switch on and may fail."""
 
     def __init__(self) -> None:
         self.takes, self.left, self.wanted = 0, 0, False
@@ -46,7 +46,7 @@ class TimedStage(PowerStage):
 
 
 class WatchedMotor(IdealMotor):
-    """Checks every demand against the laws."""
+    """Motor that checks every demand against the laws."""
 
     def __init__(self, rng: Random) -> None:
         super().__init__(0)
@@ -65,18 +65,18 @@ class WatchedMotor(IdealMotor):
 
 
 class Laws:
-    """Requests of the master, from its frames alone."""
+    """Checks of the motor's demand against the master's requests, which its frames alone determine."""
 
     def __init__(self) -> None:
         self.home = 0.0
         """Position of the user's zero, counts of the motor."""
         self.mode = 0
-        """6061h."""
+        """Mode of operation display (6061h)."""
         self.powered = False
         self.enabling = False
-        """The last command in a controlword is 'enable operation', and neither side was lost since."""
+        """True if the last command was 'enable operation' and neither side has been lost since."""
         self.targets = self.set_points = False
-        """A target, or a controlword with bit 4, was sent since then."""
+        """True if a target, or a controlword with bit 4, has been sent since the last loss."""
         self.velocity = 0.0
         self.periods = self.moved = self.enabled = 0
 
@@ -86,11 +86,11 @@ class Laws:
         self.set_points |= bool(word & 0x10)
 
     def interrupted(self) -> None:
-        """The master or the drive was lost, so everything must be requested again."""
+        """Records a loss of the master or the drive: everything must be requested again."""
         self.enabling = self.targets = self.set_points = False
 
     def released(self) -> None:
-        """The motor has no power."""
+        """Records that the motor has no power."""
         self.powered = False
         self.velocity = 0.0
 
@@ -117,7 +117,7 @@ class Laws:
 
 
 class Story:
-    """One slave, its master, and the events on both."""
+    """One slave with its master, and the events on both."""
 
     def __init__(self, rng: Random, bus: LockstepBus, clock: VirtualClock, node: DriveNode, stage: TimedStage,
                  motor: WatchedMotor, laws: Laws) -> None:  # fmt: skip
@@ -125,17 +125,17 @@ class Story:
         self.stage, self.motor, self.laws = stage, motor, laws
         self.target = 0
         self.errors: set[int] = set()
-        """Codes that were reported and not ended by 'error reset'."""
+        """Error codes that were reported and not yet ended by 'error reset'."""
 
     def send(self, can_id: int, data: bytes, **kind: Any) -> None:
         self.bus.send(can.Message(arbitration_id=can_id, data=data, **{"is_extended_id": False, **kind}))
         self.listen()
 
     def listen(self) -> None:
-        """An EMCY or a boot-up message is a loss, unless the master has chosen to ignore it (6007h = 0)."""
+        """Records an EMCY or a boot-up message as a loss, unless 6007h = 0 makes the drive ignore it."""
         while (message := self.bus.recv(0)) is not None:
             code = struct.unpack_from("<H", message.data)[0] if message.arbitration_id == 0x081 else 0
-            known = code in (0x0000, 0x8210, 0x8220, *self.errors)  # an RPDO of another length loses nothing
+            known = code in (0x0000, 0x8210, 0x8220, *self.errors)  # a wrong RPDO length is no loss
             emergency = message.arbitration_id == 0x081 and not known
             self.errors = set() if message.arbitration_id == 0x081 and not code else self.errors | {code}
             ignored = code >> 8 in (0x81, 0x87) and self.node.dictionary.value(0x6007) == 0
@@ -159,7 +159,7 @@ class Story:
         self.send(0, b"\x01\x01")
 
     def cycle(self, word: int) -> None:
-        """RPDO, SYNC, one period."""
+        """Sends an RPDO and SYNC, and waits for one period."""
         self.laws.asked(word)
         self.laws.targets = True
         self.send(0x201, struct.pack("<Hi", word, self.target))
@@ -178,7 +178,7 @@ class Story:
             self.cycle(word)
 
     def happen(self) -> None:
-        """One random event."""
+        """Makes one random event."""
         rng = self.rng
         kind = rng.randrange(30)
         if kind < 2 or 20 <= kind < 23:
@@ -233,7 +233,7 @@ class Story:
             data = bytes(rng.randint(0, 255) for _ in range(rng.randint(0, 8)))
             can_id = rng.choice((0x080, 0x201, 0x301, 0x601, 0x000, 0x181))
             if can_id == 0x201 and len(data) >= 6:
-                if (word := data[0] | data[1] << 8) & 0x8F == 0x0F:  # any other one is not obeyed before SYNC
+                if (word := data[0] | data[1] << 8) & 0x8F == 0x0F:  # any other takes effect only at SYNC
                     self.laws.asked(word)
                 self.laws.set_points |= bool(word & 0x10)
                 self.laws.targets = True
@@ -251,13 +251,13 @@ class Story:
         self.lost(True)
 
     def lost(self, really: bool) -> None:
-        """The master is lost, unless it has chosen to ignore that (6007h = 0)."""
+        """Records a loss of the master, unless 6007h = 0 makes the drive ignore it."""
         if really and self.node.dictionary.value(0x6007):
             self.laws.interrupted()
 
 
 def play_events(seed: int, count: int) -> Laws:
-    """Plays random events on a slave; AssertionError if a law is broken. Returns what was seen."""
+    """Plays random events on a slave; AssertionError if a law is broken. Returns the laws' counts."""
     rng = Random(seed)
     laws, motor, stage = Laws(), WatchedMotor(rng), TimedStage()
     behaviour = Behaviour.model_validate(

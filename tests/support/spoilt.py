@@ -11,10 +11,10 @@ from hdbridge.sim.lockstep import LockstepBus, VirtualClock
 
 
 class Spoilt(can.BusABC):
-    """Failures of an interface, and a spy on the frames that it sends."""
+    """Interface that can fail, with a spy on the frames that it sends."""
 
     down: int | None = None
-    """Error number of every call while the interface is down (ENETDOWN) or deleted (ENODEV)."""
+    """Error number of every call while the interface is down (ENETDOWN) or deleted (ENODEV); else None."""
     no_room_for: int | None = None
     """Identifier of a frame for which the transmit queue is full once."""
     full = False
@@ -40,11 +40,11 @@ class Spoilt(can.BusABC):
 
 
 class SpoiltVirtualBus(Spoilt, VirtualBus):
-    """Interface of a virtual bus."""
+    """Interface of a virtual bus that can fail."""
 
 
 class SpoiltBus(Spoilt, LockstepBus):
-    """Master's end of a simulated bus."""
+    """Master's interface of a simulated bus, which can fail."""
 
     def __init__(self, channel: str, clock: VirtualClock) -> None:
         super().__init__(channel, clock)
@@ -52,7 +52,7 @@ class SpoiltBus(Spoilt, LockstepBus):
 
 
 class LoggingBus(SpoiltBus):
-    """Master's end of a simulated bus, which logs the frames sent: time, identifier, data."""
+    """Master's interface of a simulated bus, which logs the frames sent: time, identifier, data."""
 
     def __init__(self, channel: str, clock: VirtualClock) -> None:
         super().__init__(channel, clock)

@@ -1,10 +1,10 @@
-"""Model with a spring of its axis."""
+"""Model that contains the compliance of the gear."""
 
 from hdbridge.axis.model import TransmissionModel
 
 
 def with_spring(model: TransmissionModel, compliance: float) -> TransmissionModel:
-    """Returns the model with a linear spring, arcsec per Nm, as if its calibration had found it."""
+    """Returns the model with a linear compliance, arcsec/Nm, as if the calibration had found it."""
     zones = ", ".join(f"c{zone}_arcsec_per_nm: {compliance:.6g}" for zone in (1, 2, 3))
     return TransmissionModel.from_text(
         model.dump().replace(

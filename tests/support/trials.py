@@ -1,4 +1,4 @@
-"""Trials of the diagnosis: random causes hidden in records from formulas, and the verdict on its result.
+"""Trials of the diagnosis: random causes in records computed from formulas, and a verdict on the result.
 
 The plant (plant.py) shares no code with the effects.
 """
@@ -17,7 +17,7 @@ SHORT = plant.Plan(rate_hz=16.0, scale=0.2, load_turns=1.05, steps=16)
 """Plan of about 15,000 samples."""
 SYNONYMS = {"motor_encoder_eccentricity": {"motor_order"}, "motor_order": {"motor_encoder_eccentricity"}}
 FORMS = frozenset({"at", "width", "tau", "hz", "lines", "reference", "shear", "t1", "build"})
-"""Parameters of an effect that are not a size."""
+"""Parameters of an effect that do not scale with its size."""
 
 
 def _options(rng: np.random.Generator) -> dict[str, tuple[dict[str, object], dict[str, object]]]:
@@ -120,10 +120,10 @@ def planted(name: str, seed: int) -> tuple[set[str], Record, TransmissionModel]:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Agreement of the reported causes with those present."""
+    """Agreement of the reported causes with the causes present."""
 
     all_right: bool
-    """True if each hidden cause is reported, or an alias of a reported one."""
+    """True if each cause present is reported, or is an alias of a reported cause."""
     first_right: bool
     wrong: tuple[str, ...]
     """Reported causes that are not present."""
@@ -131,7 +131,7 @@ class Verdict:
 
 
 def verdict(name: str, there: Set[str], found: Mapping[str, Set[str]]) -> Verdict:
-    """Judges the reported names (most important first, with aliases) in the record ``name`` of `planted`."""
+    """Judges the reported causes (most important first, with their aliases) for the record ``name``."""
     right = [
         any(
             each == cause or each in aliases or cause in SYNONYMS.get(each, ())

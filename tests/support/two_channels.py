@@ -1,4 +1,4 @@
-"""Load torque and temperature: lines for an axis file, and switches for the TPDO that carries both."""
+"""Load torque and temperature channels: lines for an axis file; functions that stop and resume the TPDO."""
 
 CHANNELS = """
 load_torque:
@@ -14,10 +14,10 @@ OFF = 0x8000_0000
 
 
 def stops(node):
-    """Stops the TPDO of object 2101h."""
+    """Stops the TPDO that carries both channels."""
     node.dictionary[0x1802, 1].put(TPDO3 | OFF)
 
 
 def resumes(node):
-    """Resumes the TPDO."""
+    """Resumes the TPDO that carries both channels."""
     node.dictionary[0x1802, 1].put(TPDO3)

@@ -34,7 +34,7 @@ def axis_of(node_id: int, name: str = "", profile: Path = PROFILE, **drive: obje
 
 @dataclass
 class TwoAxes:
-    """Two axes under way, and everything that a test may change."""
+    """Two axes in motion, with all their parts, so that a test can disturb them."""
 
     bus: LoggingBus
     clock: VirtualClock
@@ -45,10 +45,10 @@ class TwoAxes:
     intruder: can.BusABC
     moving: list[bool] = field(default_factory=lambda: [False, False])
     fresh: list[list[bool]] = field(default_factory=lambda: [[], []])
-    """Freshness of each axis's feedback in each turn."""
+    """Freshness of each axis's feedback in each cycle."""
 
     def enable(self, place: int) -> None:
-        """Begins with an axis whose drive is prepared, and turns until its power is on."""
+        """Enables an axis whose drive is prepared: runs cycles until its power is on, then moves it."""
         axis = self.axes[place]
         axis.command = None
         axis.begin()
@@ -62,7 +62,7 @@ class TwoAxes:
         self.moving[place] = True
 
     def turn(self, turns: int = 1) -> None:
-        """Runs turns with both axes at constant speed."""
+        """Runs cycles, in which each moving axis has a constant speed."""
         for _ in range(turns):
             for axis, moves in zip(self.axes, self.moving, strict=True):
                 if moves and isinstance(axis.command, int):
@@ -84,14 +84,14 @@ class TwoAxes:
         return [event.reaction for event in self.axes[place].supervision.events if event.fault is fault]
 
     def stands(self, place: int) -> bool:
-        """Returns True if the axis is truly at rest over the next turns."""
+        """Returns True if the true motor position stays constant over the next 20 cycles."""
         machine = self.nodes[place].firmware.motion.machine
         before = machine.motor_counts
         self.turn(20)
         return abs(machine.motor_counts - before) <= 2
 
     def follows(self, place: int, turns: int = 60) -> bool:
-        """Returns True if the axis keeps moving: feedback fresh and a target in each turn."""
+        """Returns True if the axis keeps following its target, with fresh feedback in each cycle."""
         axis, machine = self.axes[place], self.nodes[place].firmware.motion.machine
         before, seen = machine.motor_counts, len(self.fresh[place])
         self.turn(turns)
@@ -121,7 +121,7 @@ def two_axes(boot: tuple[int, ...] = (0, 1), bitrate_bps: int | None = 1_000_000
             axes = tuple(AxisCycle(drive.image, Supervision(), monitor=drive.monitor) for drive in drives)
             for axis in axes:
                 cycle.join(axis)
-            cycle.exchange()  # as in the daemon, the loop runs before the drives are booted
+            cycle.exchange()  # as in the daemon, the loop already runs when the drives are booted
             for place in boot:
                 drives[place].boot()
             for place in boot:

@@ -24,7 +24,7 @@ ON = AdaptationSettings(mode="on")
 
 
 def line(name: str, work: Work, until_s: float, told: str) -> None:
-    """Prints a row of the table."""
+    """Prints the row of one run in the table."""
     three_sigma = work.three_sigma_arcsec(NEIGHBOURS)
     figures = " | ".join(f"{each:.2f}" for each in (three_sigma[0], max(three_sigma), three_sigma[-1]))
     print(f"| {name} | {until_s / 60.0:.0f} | {figures} | {told} |", flush=True)

@@ -1,15 +1,16 @@
-"""Clients of a running daemon, in one process: pollers, watchers of the live samples, a page, one that moves.
+"""Clients of a running daemon, in one process: pollers, readers of the live samples, a page, one that moves.
 
     python tools/bench/clients.py SOCKET
 
   4 poll    the machine's state five times a second
   5 watch   every sample of every axis, over a WebSocket
-  1 page    as the live page: a WebSocket with what a screen can use, the state and the events once a second
-  1 story   moves, a re-target in motion, jogs, a queue, a stream, compensation off and on, now and then a
-            quick stop and a reset: again and again
+  1 page    like the live page: a WebSocket with as many samples as a screen shows, and once a second the
+            state and the events
+  1 story   repeats moves, a new target in motion, jogs, a queue, a stream, compensation off and on, and
+            sometimes a quick stop and a reset
 
-They run until standard input ends, then their observations are printed as JSON: samples, lost ones, requests,
-longest answer, errors.
+They run until standard input ends; then their observations are printed as JSON: samples received and lost,
+requests, longest response time, errors.
 """
 
 from __future__ import annotations
@@ -33,15 +34,15 @@ POLL_S: Final = 0.2
 PAGE_HZ: Final = 50.0
 KNOTS_HZ: Final = 100.0
 AT_A_TIME: Final = 20
-"""Number of set-points per message."""
+"""Number of streamed set-points per message."""
 AHEAD_S: Final = 1.0
-"""Time by which the path is sent ahead."""
+"""Time by which streamed set-points are sent ahead, s."""
 QUICK_STOP_EVERY: Final = 20
-"""Rounds of the story."""
+"""Number of rounds of the story between two quick stops."""
 
 
 class Seen:
-    """Figures of the clients of this process."""
+    """Observations of all clients in this process."""
 
     def __init__(self) -> None:
         self.samples = self.lost = self.requests = self.points = self.rounds = 0
@@ -50,7 +51,7 @@ class Seen:
 
     @asynccontextmanager
     async def request(self) -> AsyncIterator[None]:
-        """Counts a request and its duration."""
+        """Counts the request in the block and records the longest duration."""
         begin_s = time.monotonic()
         yield
         self.requests += 1
@@ -62,7 +63,7 @@ class Seen:
 
 
 async def poll(client: AsyncClient, seen: Seen) -> None:
-    """Polls the machine's state."""
+    """Polls the machine's state periodically."""
     while True:
         async with seen.request():
             await client.state()
@@ -77,7 +78,7 @@ async def watch(client: AsyncClient, seen: Seen, every: int = 1) -> None:
 
 
 async def page(client: AsyncClient, seen: Seen) -> None:
-    """Sends the requests of the page."""
+    """Sends the requests that the live page sends."""
     state = await client.state()
     every = max(1, round(1.0 / (PAGE_HZ * state.cycle.period_s)))
 
@@ -97,7 +98,7 @@ async def page(client: AsyncClient, seen: Seen) -> None:
 
 
 async def ready(axis: AsyncAxis) -> None:
-    """Enables the axis from any state."""
+    """Enables the axis from any state, after a reset if necessary."""
     state = await axis.state()
     if state.state in ("quick-stopped", "latched"):
         await axis.reset()
@@ -106,7 +107,7 @@ async def ready(axis: AsyncAxis) -> None:
 
 
 async def sine(axis: AsyncAxis, seen: Seen, knots: int) -> None:
-    """Streams ``knots`` set-points on a sine of 1 deg from the present position."""
+    """Streams ``knots`` set-points of a sine with an amplitude of 1 deg about the current position."""
     middle_deg = (await axis.state()).load_target_deg
     assert middle_deg is not None
     async with axis.stream() as stream:
@@ -123,7 +124,7 @@ async def sine(axis: AsyncAxis, seen: Seen, knots: int) -> None:
 
 
 async def story(client: AsyncClient, seen: Seen) -> None:
-    """Requests every motion of an axis, round after round."""
+    """Requests every kind of motion of an axis, repeatedly."""
     chance = random.Random(1)
     async with client.lease(force=True):
         axis = next(iter((await client.axes()).values()))

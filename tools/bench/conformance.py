@@ -1,4 +1,4 @@
-"""The conformance suite on the nodes of docs/gateway.md, in simulated time.
+"""Runs the conformance suite on the nodes of docs/gateway.md, in simulated time.
 
     python tools/bench/conformance.py [--only gateway,slave,drive,durand,canopen] [--failures]
 
@@ -35,7 +35,7 @@ from hdbridge.files.edsfile import read_eds
 
 
 class SteppedBus(VirtualBus):
-    """The outer bus of a tester in a thread that runs only while the clock of the bench polls it."""
+    """Outer bus of a tester whose thread runs only while the clock of the bench polls this bus."""
 
     def __init__(self, bench: GatewayBench) -> None:
         super().__init__(bench.bus.channel_id)
@@ -60,7 +60,7 @@ class SteppedBus(VirtualBus):
         return message
 
     def run(self, wanted: list[Check], path: Path) -> list[Result]:
-        """Runs the tester's thread."""
+        """Runs the checks in the tester's thread."""
         self._turn.acquire()
         try:
             od = read_eds(path, NODE).dictionary
@@ -71,7 +71,7 @@ class SteppedBus(VirtualBus):
 
 
 def whole_gateway(wanted: list[Check], folder: Path) -> list[Result]:
-    """Runs the checks on a gateway with everything behind it."""
+    """Runs the checks on the complete chain from gateway to simulated axis."""
     found: list[Result] = []
 
     async def scenario(bench: GatewayBench) -> None:
@@ -93,7 +93,7 @@ def whole_gateway(wanted: list[Check], folder: Path) -> list[Result]:
 
 @contextmanager
 def foreign(name: str, folder: Path) -> Iterator[NodeTester]:
-    """Yields a node of another stack."""
+    """Yields a tester of a node built on a third-party stack."""
     with local_node(EDS) if name == "canopen" else durand_drive() as opened:
         bus: Any = opened if name == "canopen" else opened[0]
         path = EDS if name == "canopen" else folder / "durand.eds"

@@ -73,7 +73,7 @@ class NeverSleeping:
 
 
 def answers(*node_ids: int) -> tuple[can.Message, ...]:
-    """Returns the two TPDOs of each enabled drive at position zero."""
+    """Returns the two TPDOs of each drive, enabled and at position zero."""
     data = {0x180: TPDO1.pack(STATUS_ENABLED, 0, 0), 0x280: TPDO2.pack(0, 0)}
     return tuple(
         can.Message(arbitration_id=base + node_id, is_extended_id=False, data=data[base])
@@ -91,7 +91,7 @@ def heartbeats(*node_ids: int) -> tuple[can.Message, ...]:
 
 
 class AnsweringBus(VirtualBus):
-    """Master's end of a virtual bus on which other nodes answer SYNC at once."""
+    """Master's interface of a virtual bus on which the other nodes answer SYNC immediately."""
 
     def __init__(self, *node_ids: int) -> None:
         super().__init__(channel=self)
@@ -140,7 +140,7 @@ def answering_kernel(channel: str, *node_ids: int) -> Iterator[None]:
 
 
 def response_of_usual_length(cycle_ms: float) -> Response:
-    """Returns a response whose filter has as many weights as that of the article's axis."""
+    """Returns a response with a filter of typical length: as many weights as for the article's axis."""
     return Response(
         cycle_ms=cycle_ms,
         following_lag_ms=10.0,
@@ -156,7 +156,7 @@ def response_of_usual_length(cycle_ms: float) -> Response:
 
 
 class Axes:
-    """Enabled axes on one bus, each on its own slow sine."""
+    """Enabled axes on one bus, each of which follows its own slow sine."""
 
     def __init__(
         self, bus: can.BusABC, count: int, model: TransmissionModel, clock: Clock | None = None
@@ -184,7 +184,7 @@ class Axes:
         return lambda feedback: counts_for(command(2.0 * sin(feedback.time_s + phase)))
 
     def start(self) -> None:
-        """Prepares a block: latches released, power on."""
+        """Prepares a block: resets latched stops and enables the axes."""
         while self.bus.recv(0.0) is not None:
             pass
         for axis, answer in zip(self.cycle.axes, self.answers, strict=True):
@@ -236,7 +236,7 @@ class Variants:
         while self.bus.recv(0.0) is not None:
             pass
         self.deadline_s = self.clock.now()
-        # The answering process may need a moment until it is warm.
+        # The answering process may be slow in its first cycles.
         for _ in range(20):
             self.cycle.restart()
             self.cycle.supervision.reset()
@@ -287,7 +287,7 @@ class Variants:
         self.cycle.tick(self._command_winding)
 
     def _command(self, feedback: Feedback) -> int:
-        # A slow sine of 2 deg at the load: in steady motion with a reversal now and then.
+        # A slow sine of 2 deg at the load: steady motion with occasional reversals.
         load_deg = 2.0 * math.sin(feedback.time_s)
         return self.image.target_counts_for(self.compensation.command(load_deg))
 
@@ -418,7 +418,7 @@ def report(result: dict[str, float], where: str) -> str:
 def measure(
     interface: str, options: argparse.Namespace, axis: AxisConfig, model: TransmissionModel
 ) -> Result:
-    """Returns the JSON object: the machine, and the median of each variant."""
+    """Returns a description of the interface, and the median of each variant."""
     node_id, blocks, cycles = axis.drive.node_id, options.blocks, options.cycles
     if interface == "virtual":
         with AnsweringBus(node_id) as bus:

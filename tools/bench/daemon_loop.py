@@ -1,4 +1,4 @@
-"""CPU time of one turn of the daemon's control loop, compared with the bench's cycle on the same bus.
+"""CPU time of one cycle of the daemon's control loop, compared with the bench's cycle on the same bus.
 
     python tools/bench/daemon_loop.py [--axes 1,2,6] [--blocks 21] [--cycles 500] [--json FILE]
 
@@ -47,7 +47,7 @@ STATUS_OFF, STATUS_READY, STATUS_ON = 0x0250, 0x0231, 0x0233
 
 
 def configs_of(count: int, cycle_ms: float | None = None) -> list[AxisConfig]:
-    """Returns several of the article's axis on one bus, by default with its cycle."""
+    """Returns several copies of the article's axis on one bus, by default with its cycle time."""
     first = AxisConfig.load(PROFILE)
     cycle = {} if cycle_ms is None else {"cycle_ms": cycle_ms}
     drives = [first.drive.model_copy(update={"node_id": node, **cycle}) for node in range(1, count + 1)]
@@ -61,9 +61,9 @@ def bench_cycle(
     clock: Clock | None = None,
     image: ProcessImage | None = None,
 ) -> tuple[Callable[[], None], Cycle]:
-    """Returns the bench's cycle: `Bench._leg` without the storage of samples; by default it never sleeps.
+    """Returns the bench's cycle (`Bench._leg` without storing samples); by default it never sleeps.
 
-    ``image`` is that of a drive that was made ready for power.
+    ``image`` is the process image of a drive that is ready to be enabled.
     """
     axis = axis or configs_of(1)[0]
     clock = clock or NeverSleeping()
@@ -73,7 +73,7 @@ def bench_cycle(
     compensation.engage()
     observer, sensed = Observer(), Sensed(axis)
     needs, at_rest = bool(compensation.needs), Moment()
-    # The set-point of the same move, so that both loops follow the same path.
+    # Set-points of the same move as in the daemon's loop, so that both follow the same path.
     set_point = SetPoint(axis_view(axis).limits, axis.drive.cycle_s)
     goal = 300.0
     for _ in range(5):
@@ -97,7 +97,7 @@ def bench_cycle(
             goal = -goal
         target_deg = set_point.step()
         feedback = cycle.tick(answer)
-        # Numbers that the bench stores per cycle.
+        # Conversions that the bench makes in each cycle.
         image.motor_deg(feedback.demand_counts)
         image.motor_deg(feedback.motor_counts)
         image.load_deg(feedback.load_counts)
@@ -108,8 +108,8 @@ def bench_cycle(
 def controller_of(
     bus: can.BusABC, memory: Memory, model: TransmissionModel, *, followed: int = 0
 ) -> Controller:
-    """Returns a loop whose axes are enabled and in motion; ``followed``: the first follows a gateway's
-    set-points.
+    """Returns a control loop whose axes are enabled and in motion; with ``followed`` above 0, the first axis
+    follows that many set-points of a gateway.
     """
     configs = configs_of(memory.axes)
     cycle = BusCycle(Link(bus, NeverSleeping()), NeverSleeping(), memory.period_s, bitrate_bps=1_000_000)
@@ -132,7 +132,7 @@ def controller_of(
 
 
 def follow(controller: Controller, memory: Memory, turns: int) -> None:
-    """Makes the axis follow a ramp from the gateway's ring, which another process normally fills."""
+    """Makes the axis follow a ramp of set-points in the gateway's ring, which normally the gateway fills."""
     memory.commands.post(CommandKind.FOLLOW, 0, a=1.0, j=1)
     begin_s, begin_deg = controller.cycle.due_s, controller.axes[0].set_point.position_deg
     for turn in range(turns):
@@ -143,7 +143,7 @@ def follow(controller: Controller, memory: Memory, turns: int) -> None:
 
 
 def loop_block(count: int, model: TransmissionModel, cycles: int, *, followed: bool = False) -> float:
-    """Returns the CPU time of a turn for several axes, us."""
+    """Returns the CPU time of a cycle of the loop with several axes, us."""
     with AnsweringBus(*range(1, count + 1)) as bus, Memory.create(count, 0.004) as memory:
         controller = controller_of(bus, memory, model, followed=cycles + 100 if followed else 0)
         block_us(controller.turn, 50)
@@ -163,7 +163,7 @@ def bench_block(model: TransmissionModel, cycles: int) -> float:
 
 
 def measure(counts: list[int], blocks: int, cycles: int) -> dict[str, float]:
-    """Returns the median CPU time of one cycle of each, us, without the answering nodes."""
+    """Returns the median CPU time per cycle of each variant, us, without that of the answering nodes."""
     model = TransmissionModel.load(PROFILE / "model.yaml")
     variants = {
         "bench": partial(bench_block, model, cycles),

@@ -1,9 +1,9 @@
-"""Time and memory of a diagnosis against the number of samples.
+"""Time and memory of a diagnosis as a function of the number of samples.
 
 .venv/bin/python tools/bench/diagnose.py [samples ...]
 
-One axis (ratio 50) with two causes hidden goes through a bench plan; the record is laid end to end until
-there are enough samples. Processor time is that of one thread if OMP_NUM_THREADS=1 is set.
+One axis (ratio 50) with two hidden causes runs a bench plan; the record is repeated until there are enough
+samples. CPU time is that of one thread if OMP_NUM_THREADS=1 is set.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ HIDDEN = {"backlash": {"gap": 6.0}, "load_order": {"orders": [(1, 5.0, 30.0)]}}
 
 
 def record(samples: int) -> Record:
-    """Returns repetitions of one plan, each with its own time and noise."""
+    """Returns a record that repeats one plan, with continuing time and new noise."""
     once = plant.record(plant.Truth(effects=HIDDEN), plant.Plan(), 1)
     count = len(once["time_s"])
     period = float(np.median(np.diff(once["time_s"])))
@@ -39,7 +39,7 @@ def record(samples: int) -> Record:
 
 
 def main() -> None:
-    """Prints a line for each size."""
+    """Prints a line for each number of samples."""
     sizes = [int(float(each)) for each in sys.argv[1:]] or [32_000, 100_000, 300_000, 1_000_000]
     model = TransmissionModel.from_text(plant.model_text(1))
     before: tuple[int, float] | None = None

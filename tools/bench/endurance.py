@@ -1,14 +1,14 @@
-"""Endurance run of the daemon: growth of its processes, cost of its clients, account of every missed cycle.
+"""Endurance run of the daemon: growth of its processes, cost of its clients, accounting of missed cycles.
 
     python tools/bench/endurance.py [--minutes 30] [--every SECONDS] [--idle SECONDS] [--json FILE]
 
-`hdbridge run --simulate` with all its processes and the recorder; first without clients, then with four
-that poll, five that watch, a live page, and one that moves (the story of `clients.py`).
+Runs `hdbridge run --simulate` with all its processes and the recorder; first without clients, then with four
+that poll, five that read live samples, a live page, and one that moves (the story of `clients.py`).
 
 A figure grows if its median over the last quarter of the run exceeds that over the second quarter by more
-than is allowed. The first quarter is for what fills up: rings, queues of bounded length, caches.
+than the allowed growth. During the first quarter, rings, bounded queues and caches fill up.
 
-Exit status 1 if something grows, or a cycle is missing without a report.
+Exit status 1 if a figure grows, or if a cycle is missing without a report.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ name: endurance
 axes: [{profile: article}]
 recorder: {size_mb: 8, file_mb: 2, file_s: 60, kept_mb: 4, before_s: 10, after_s: 5}
 """
-"""Machine file with a small recorder ring, which is full within minutes."""
+"""Machine file with a small recorder ring, which fills up within minutes."""
 ALLOWED = {"rss_kb": 1024.0, "descriptors": 2.0, "threads": 2.0}
 """Allowed growth of each figure of a process."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Figures of a process, from the kernel."""
+    """Resource use of a process, as reported by the kernel."""
 
     cpu_s: float
     rss_kb: int
@@ -59,7 +59,7 @@ class Cost:
 
     @classmethod
     def of(cls, pid: int) -> Cost:
-        """Reads the figures of a process; raises OSError if it has ended."""
+        """Reads the resource use of a process; raises OSError if the process has ended."""
         proc = Path(f"/proc/{pid}")
         lines = (proc / "status").read_text(encoding="ascii").splitlines()
         fields = dict(line.split(":", 1) for line in lines)
@@ -84,14 +84,14 @@ class Growth:
 
     @classmethod
     def of(cls, name: str, values: Sequence[float], allowed: float) -> Growth:
-        """Computes the growth of at least four equidistant ``values``."""
+        """Computes the growth from at least four equidistant ``values``."""
         quarter = max(len(values) // 4, 1)
         second = statistics.median(values[quarter : 2 * quarter])
         return cls(name, values[0], second, statistics.median(values[-quarter:]), allowed)
 
     @property
     def grows(self) -> bool:
-        """True if the run shows more growth than is allowed."""
+        """True if the figure grows by more than is allowed."""
         return self.last - self.second > self.allowed
 
     def __str__(self) -> str:
@@ -103,7 +103,7 @@ class Growth:
 
 
 class Accounts:
-    """Account of the cycles: each has a sample, was reported as skipped, or was lost by this reader."""
+    """Account of all cycles: each has a sample, was reported as skipped, or was lost by this reader."""
 
     def __init__(self) -> None:
         self.samples = self.lost = self.missing = self.skipped = 0
@@ -126,7 +126,7 @@ class Accounts:
 
 
 class RunningDaemon:
-    """Daemon of the article's axis in its own processes; its log is the file ``log``."""
+    """Daemon of the article's axis in its own processes, which logs to the file ``log``."""
 
     def __init__(self, folder: Path) -> None:
         own = folder / "endurance"
@@ -142,7 +142,7 @@ class RunningDaemon:
             )  # fmt: skip
 
     def until_disabled(self) -> None:
-        """Waits until every drive is verified."""
+        """Waits until every axis is disabled, and thus its drive is verified."""
         end_s = time.monotonic() + PATIENCE_S
         while True:
             with suppress(DaemonError), Client(str(self.socket)) as client:
@@ -153,18 +153,18 @@ class RunningDaemon:
             time.sleep(0.05)
 
     def events(self) -> Iterator[dict[str, Any]]:
-        """Returns the events of the log."""
+        """Yields the events in the log."""
         for line in self.log.read_text(encoding="utf-8").splitlines():
             with suppress(ValueError):
                 yield json.loads(line)
 
     def last_words(self) -> list[str]:
-        """Returns the end of the log, without the requests."""
+        """Returns the last 30 lines of the log, without requests."""
         lines = self.log.read_text(encoding="utf-8").splitlines()
         return [line for line in lines if '"request"' not in line][-30:]
 
     def pids(self) -> dict[str, int]:
-        """Returns the running processes of the daemon."""
+        """Returns the process ids of the daemon's processes, by name."""
         started = {f"{name} process started": name for name in (CONTROL, SERVICE)}
         found = {started[each["event"]]: each["pid"] for each in self.events() if each["event"] in started}
         return {KEEPER: self.process.pid, **found}
@@ -178,7 +178,7 @@ class RunningDaemon:
             yield memory
 
     def close(self) -> None:
-        """Ends the daemon in order."""
+        """Ends the daemon in an orderly way."""
         self.process.send_signal(signal.SIGTERM)
         with suppress(subprocess.TimeoutExpired):
             self.process.wait(60.0)
@@ -210,7 +210,7 @@ def clients(socket: Path) -> Iterator[Callable[[], dict[str, Any]]]:
 
 
 def turn_us(memory: Memory, pid: int, work: Callable[[], object]) -> float:
-    """Returns the CPU time of the control process for a turn while ``work`` runs, us."""
+    """Returns the CPU time of the control process per cycle while ``work`` runs, us."""
     before, turns = Cost.of(pid), memory.status.loop_count
     work()
     return 1e6 * (Cost.of(pid).cpu_s - before.cpu_s) / (memory.status.loop_count - turns)

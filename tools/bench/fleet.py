@@ -1,4 +1,4 @@
-"""Figures of a fleet: accuracy, gain by the prior.
+"""Figures of a simulated fleet: accuracy of its summary, and gain by its prior.
 
 .venv/bin/python tools/bench/fleet.py score FLEET OUT [--limit ARCSEC]
 .venv/bin/python tools/bench/fleet.py prior FLEET OUT
@@ -27,11 +27,11 @@ from hdbridge.fleet.summary import own_recordings, summarise
 
 FOLDS = 5
 DETECTABLE = 2
-"""Recordings in which a cause must exceed the limit of detection before a joint can be listed for it."""
+"""Number of recordings in which a cause must exceed its detection limit for its joint to be listed."""
 
 
 def score(fleet: Path, out: Path, limit_arcsec: float) -> None:
-    """Compares the summary of a run with the hidden causes; joints without a row are left out."""
+    """Compares the summary of a run with the true causes; joints without a row are left out."""
 
     rows = [row for row in Dataset(out).recordings() if row["joint"]]
     answers = json.loads((fleet / "answers.json").read_text())
@@ -86,7 +86,7 @@ def _number(row: dict[str, Any], joints: dict[str, Any]) -> int:
 
 
 def _detectable(joint: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
-    """Returns True if the cause exceeds its detection limit in enough recordings, by those themselves."""
+    """Returns True if the cause exceeds the detection limits of enough recordings."""
     count = 0
     for row in rows:
         if row["joint"] == joint["name"] and row["reason"] is None and row["duplicate_of"] is None:
@@ -100,9 +100,9 @@ def _detectable(joint: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
 
 
 def prior(fleet: Path, out: Path) -> None:
-    """Weighs the names of each joint's recordings by a prior from the other joints; counts right and wrong.
+    """Applies a prior from the other joints to each joint's findings; counts right and wrong findings.
 
-    Unlike `diagnose --prior`, this does not fit recordings again without the dropped names.
+    Unlike `diagnose --prior`, this does not refit the recordings without the dropped findings.
     """
     rows = [row for row in Dataset(out).recordings() if row["joint"]]
     truth = {each["name"]: each for each in json.loads((fleet / "answers.json").read_text())["joints"]}
@@ -136,7 +136,7 @@ def prior(fleet: Path, out: Path) -> None:
 def _count(
     row: Any, true: str | None, prior: Prior, scales: Scales, counts: dict[str, Any], widths: list[float]
 ) -> None:
-    """Counts the names of one recording, and the widths of the intervals of the right cause."""
+    """Counts the findings of one recording, and collects the interval widths of the right cause."""
     right = dict.fromkeys(counts, False)
     for each in row["findings"]:
         if each["cause"] == "unexplained":

@@ -3,18 +3,19 @@
     PYTHONPATH=tests python tools/bench/foreign_motion.py FILE [--kinds KIND...] [--seeds 0-4] [--exact]
     PYTHONPATH=tests python tools/bench/foreign_motion.py FILE --retuned [--seeds 0-4]
 
-Each axis is calibrated by `PLAN` with a motion test, and nothing is known beforehand. With ``--exact`` its
-model is the exact static correction, and only the response is measured. Then the error of the load is
-measured at ten speeds up to the limit, both ways, without, with static and with filtered correction. Axes:
-the foreign servo structures, and the simulated drive with a servo, load and spring drawn at random.
-FILE keeps a line of JSON per axis; axes that it has are not measured again. Printed, per speed: the
-share removed, per cent, median (worst), of the orders that are slower than a third of the SYNC rate, static
-and filtered; and on how many axes the whole ripple is larger than without correction. Then, per path, the
-error and the time to settle without correction and with the one of the calibration; and the error at rest.
+Each axis is calibrated by `PLAN` with a motion test, without prior knowledge. With ``--exact``, its model is
+the exact static correction, and only the response is measured. Then the load error is measured at ten speeds
+up to the limit, both ways, without, with static and with filtered correction. The axes are the foreign servo
+structures, and the simulated drive with random servo, load and stiffness. FILE stores a line of JSON per
+axis; axes in it are not measured again. Prints, per speed, the percentage removed, as median (worst), of the
+orders slower than a third of the SYNC rate, with static and filtered correction, and on how many axes the
+whole ripple is larger than without correction. Then prints, per path, the error and the settling time without
+correction and with that of the calibration; and the error at rest.
 
 With ``--retuned`` the position gains of simulated drives are multiplied by `GAINS` after the measurement of
-the response. FILE gets the removed share of the slow orders over all speeds, per cent, before and after
-refinements by runs at the two speeds `WORK`, their number, and the difference by which the watch judges.
+the response. FILE then stores the percentage of the slow orders removed over all speeds, before and after
+refinements by runs at the two speeds `WORK`, the number of refinements, and the difference that the watch
+evaluates.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ from hdbridge.motion.procedures.plan import Plan
 from hdbridge.sim.lockstep import simulated_bench
 
 SHARES = (0.04, 0.1, 0.2, 0.32, 0.45, 0.58, 0.71, 0.84, 1.0)
-"""Speeds as shares of the limit, in addition to `SLOWEST_DEG_S`. The motion test measures at others."""
+"""Speeds as fractions of the limit, in addition to `SLOWEST_DEG_S`; others than in the motion test."""
 SLOWEST_DEG_S = 1.0
 ORDERS = (1, 2, 3, 4, 6, 8)
 GAINS = (1.0, 0.65, 0.8, 1.25, 1.5)
@@ -68,7 +69,7 @@ WORK = (0.46, 0.35)
 STEPS = 4
 BOUND = AdaptationSettings().bound_share
 CHANCE = 1.02
-"""Factor by which a ripple must be larger to count as larger."""
+"""Ratio of two ripples above which the first counts as larger."""
 PLAN = """
 schema: hdbridge.plan/1
 name: short
@@ -79,13 +80,13 @@ procedures:
   - {procedure: reversals, depths_deg: [2, 4, 8, 12, 16, 24], reach_deg: 60, motor_deg_per_s: 10}
 validation: {count: 20, step_deg: 43.56, motion: true}
 """
-"""The plan `quick` without its long sweep: minutes."""
+"""Plan of the calibration: `quick` without its long sweep; it takes minutes."""
 DATE = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 @contextmanager
 def simulated(seed: int, folder: Path) -> Iterator[tuple[Drive, TransmissionModel]]:
-    """The article's gear on a drawn servo, load and spring; the axis file with raised limits."""
+    """Provides the article's gear with random servo, load and stiffness, and with raised limits."""
     rng = np.random.default_rng([32, seed])
     axis = yaml.safe_load(raised_axis())
     truth = yaml.safe_load((ARTICLE / "truth.yaml").read_text(encoding="utf-8"))
@@ -116,7 +117,7 @@ def simulated(seed: int, folder: Path) -> Iterator[tuple[Drive, TransmissionMode
 
 @contextmanager
 def booted(axis: AxisConfig, folder: Path, seed: int) -> Iterator[Drive]:
-    """The drive of the truth in a folder."""
+    """Provides a booted drive that simulates the truth file in a folder."""
     with (
         simulated_bench(folder / "truth.yaml", axis.eds_path, seed=seed) as (bus, clock, _),
         Drive(bus, axis, clock) as drive,
@@ -126,7 +127,7 @@ def booted(axis: AxisConfig, folder: Path, seed: int) -> Iterator[Drive]:
 
 
 def retuned(seed: int, folder: Path) -> Iterator[dict[str, Any]]:
-    """Returns one document per gain."""
+    """Yields the figures of an axis for each change of its position gain."""
     with simulated(seed, folder) as (drive, static):
         axis, model = drive.axis, replace(static, response=motion_test(drive, static).response)
     truth = yaml.safe_load((folder / "truth.yaml").read_text(encoding="utf-8"))
@@ -168,7 +169,7 @@ def retuned(seed: int, folder: Path) -> Iterator[dict[str, Any]]:
 
 @contextmanager
 def foreign(seed: int, structure: str, folder: Path) -> Iterator[tuple[Drive, TransmissionModel]]:
-    """The foreign axis of a seed, and the correction of its motor orders."""
+    """Provides a foreign axis, random by seed, and the exact correction of its motor orders."""
     truth = draw(seed, structure)
     orders = tuple(MotorOrder(**each._asdict()) for each in truth.mechanics.motor_orders)
     with (
@@ -180,7 +181,7 @@ def foreign(seed: int, structure: str, folder: Path) -> Iterator[tuple[Drive, Tr
 
 
 def calibrated(drive: Drive, folder: Path) -> Calibration:
-    """A calibration with the response in motion."""
+    """Calibrates an axis, response in motion included."""
     path = folder / "plan.yaml"
     path.write_text(PLAN, encoding="utf-8")
     journal = start_journal(folder / "recording", drive.axis, Plan.load(str(path)), DATE, drive.identity)
@@ -188,7 +189,9 @@ def calibrated(drive: Drive, folder: Path) -> Calibration:
 
 
 def figures(drive: Drive, model: TransmissionModel) -> dict[str, Any]:
-    """Whole ripple and slow orders, rms arcsec, per speed: without, with static, with filtered correction."""
+    """Returns the rms of ripple and of slow orders, arcsec, per speed: without, with static, with filtered
+    correction.
+    """
     axis = drive.axis
     limit = axis.limits.velocity_deg_s
     speeds = (SLOWEST_DEG_S, *(round(share * limit, 3) for share in SHARES))
@@ -210,7 +213,7 @@ def figures(drive: Drive, model: TransmissionModel) -> dict[str, Any]:
 
 
 def of_paths(tested: MotionTest) -> dict[str, Any]:
-    """Path error in arcsec and time to settle in ms, per path: without and with the correction in force."""
+    """Returns path error, arcsec, and settling time, ms, per path without and with correction."""
     found = {}
     for each in tested.paths:
         kept = [each.none, each.filtered or each.static]
@@ -219,7 +222,7 @@ def of_paths(tested: MotionTest) -> dict[str, Any]:
 
 
 def _slow(run: Harmonics, third_hz: float, ratio: float) -> float:
-    """Rms of the orders below a third of the SYNC rate, arcsec."""
+    """Returns the rms of the orders below a third of the SYNC rate, arcsec."""
     slow = order_hz(ORDERS, run.speed_deg_s, ratio) < third_hz
     return math.sqrt(0.5 * float(np.sum(abs(run.amplitudes[slow]) ** 2)))
 
@@ -261,7 +264,7 @@ def main(file: Path, kinds: list[str], seeds: range, exact: bool) -> None:
 
 
 def report(kind: str, axes: list[dict[str, Any]]) -> None:
-    """Prints the table of one kind."""
+    """Prints the table for one kind of axis."""
     for each in axes:
         if "error" in each:
             print(f"{kind} {each['seed']}: {each['error']}")

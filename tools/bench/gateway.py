@@ -1,12 +1,12 @@
-"""Stepping through the gateway by another master, next to the same steps of a client of the daemon.
+"""Stepping test by another master through the gateway, compared with the same test by a client of the daemon.
 
     python tools/bench/gateway.py [--steps 60] [--outer-ms 4,10] [--faults]
 
 Both step the simulated axis of the article, compensated by its model, in simulated time, from the same seed.
 The master is the PLC-like one of the tests; it sends a jerk-limited path in cyclic synchronous position mode.
-Prints 3 sigma and mean of the load's error at rest in each direction, their ratio, the answer to 'enable
-operation', and by how much the set-point of the loop lags that of an ideal drive. ``--faults`` prints the
-table of faults on the outer bus instead, with the time to stop.
+Prints 3 sigma and mean of the load error at rest in each direction, their ratio, the response time to 'enable
+operation', and the lag of the loop's set-point behind that of an ideal drive. ``--faults`` instead prints the
+table of faults on the outer bus, with the time to stop.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MEAN_S = 0.1
 
 
 class Errors:
-    """Errors of the load at rest, arcsec, in both directions."""
+    """Load errors at rest, arcsec, by direction."""
 
     def __init__(self) -> None:
         self.found: dict[int, list[float]] = {1: [], -1: []}
@@ -100,7 +100,7 @@ async def through(bench: GatewayBench, steps: int) -> tuple[Errors, float, float
 
 
 def lag(bench: GatewayBench, reader: Any, begun: int) -> float:
-    """Returns the delay that best fits the loop's set-point to that of an ideal drive in the same mode."""
+    """Returns the best-fit delay of the loop's set-point relative to an ideal drive in the same mode, s."""
     samples, _ = reader.read()
     plc = bench.plc
     times = np.array([time_s for time_s, *_ in plc.seen]) + plc.period_s

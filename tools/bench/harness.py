@@ -1,4 +1,4 @@
-"""Harness of the benchmarks: command line, blocks in turn, repetition of disturbed blocks."""
+"""Harness of the benchmarks: command line, interleaved blocks, repetition of disturbed blocks."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ ATTEMPTS = 20
 
 
 class Busy(Exception):  # noqa: N818 - what happened
-    """Raised if the machine stalled within a block, which the cycle reported as a fault."""
+    """Raised if this computer stalled during a block, so that an axis was stopped by a fault."""
 
 
 class Waking:
-    """Machine's clock, which records time and lateness of its last waking."""
+    """Clock of this computer, which records the time and lateness of its last wake-up."""
 
     now = staticmethod(time.monotonic)
 
@@ -40,7 +40,7 @@ class Waking:
 
 
 def parser(text: str | None, *, blocks: int = 0, cycles: int = 0) -> argparse.ArgumentParser:
-    """Returns the options of a benchmark; ``blocks`` and ``cycles`` are defaults, 0: it has none."""
+    """Returns a parser of the common options; ``blocks`` and ``cycles`` are defaults, 0 omits an option."""
     made = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--json", type=Path, help="write the figures for machines")
     if blocks:
@@ -57,7 +57,7 @@ def keep(result: Any, path: Path | None) -> None:
 
 
 def block_us(work: Callable[[], object], cycles: int, timer: Callable[[], float] = time.thread_time) -> float:
-    """Returns the time per call, us."""
+    """Returns the mean time per call of ``work``, us."""
     begin = timer()
     for _ in range(cycles):
         work()
@@ -65,7 +65,7 @@ def block_us(work: Callable[[], object], cycles: int, timer: Callable[[], float]
 
 
 def undisturbed(block: Callable[[], float]) -> float:
-    """Returns the result of a block; begins again if a busy machine has stopped an axis in it."""
+    """Returns the result of a block; repeats the block if a busy computer has caused a stop in it."""
     for _ in range(ATTEMPTS):
         with suppress(SafetyStop, Busy):
             return block()
@@ -73,7 +73,7 @@ def undisturbed(block: Callable[[], float]) -> float:
 
 
 def in_turn(variants: Mapping[str, Callable[[], float]], blocks: int) -> dict[str, list[float]]:
-    """Returns the results of every block of each variant; one block of each in turn."""
+    """Runs one block of each variant in turn, repeatedly; returns the results by variant."""
     times: dict[str, list[float]] = {name: [] for name in variants}
     for _ in range(blocks):
         for name, block in variants.items():

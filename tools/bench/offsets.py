@@ -1,18 +1,19 @@
-"""Velocity and torque offset (60B1h, 60B2h) in addition to the filtered correction.
+"""Effect of velocity and torque offsets (60B1h, 60B2h) in addition to the filtered correction.
 
     PYTHONPATH=tests python tools/bench/offsets.py [AXIS...] [--feedforward 1] [--slew 100000] [--speeds 8]
         [--past 16]
 
-AXIS is `article` or a foreign servo structure with a seed, for example `pi_notch:101`. Its servo is driven by
-set-points, without a bus. The velocity offset is a share of the derivative of the motor's correction, added
-to the velocity demand past command filter, interpolation and dead time: all of it, and the share that the
-servo's own velocity feed-forward (``--feedforward``) leaves. The torque offset is the torque that turns the
-motor by the correction, added past notch and torque filter. The response is measured with the offsets.
+AXIS is `article` or a foreign servo structure with a seed, for example `pi_notch:101`. The servo receives
+set-points directly, without a bus. The velocity offset is a fraction of the derivative of the motor's
+correction, added to the velocity demand after command filter, interpolation and dead time: all of it, or the
+fraction that the servo's own velocity feed-forward (``--feedforward``) omits. The torque offset is the torque
+that moves the motor by the correction, added after notch and torque filter. The response is measured with the
+offsets.
 
-Printed per set of offsets, at `SHARES` of the speed limit: the share removed of the orders slower than a
-third of the SYNC rate, per cent; then the largest size and slew of the correction, arcsec and arcsec/s.
+Prints for each set of offsets, at `SHARES` of the speed limit, the percentage removed of the orders slower
+than a third of the SYNC rate, and the maximum size and slew rate of the correction, arcsec and arcsec/s.
 *static* is the correction without a filter. *exact* has each order set directly at each speed, without filter
-and limits: the most that these inputs can remove.
+and limits: the maximum that these inputs can remove.
 """
 
 from __future__ import annotations
@@ -51,15 +52,15 @@ from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 SHARES = (0.1, 0.32, 0.58, 0.84, 1.0)
 MAXIMUM_ARCSEC = 600.0
 ENGAGED_S = 0.7
-"""Time at rest, in which the correction is faded in."""
+"""Time at rest during which the correction is ramped in, s."""
 UPDATES = 4
 
 Correction = Callable[[float], float]
-"""Correction in arcsec at a load target in degrees; called once per cycle."""
+"""Function that returns the correction in arcsec at a load target in degrees; called once per cycle."""
 
 
 class OffsetServo(Servo):
-    """The simulated servo with offsets; motor degrees per second and Nm."""
+    """Simulated servo with a velocity offset, motor deg/s, and a torque offset, Nm."""
 
     velocity_offset = torque_offset = 0.0
 
@@ -69,7 +70,7 @@ class OffsetServo(Servo):
 
 
 class Article:
-    """The article's axis with raised limits."""
+    """Article's axis with raised limits."""
 
     ratio, cycle_s, speed_deg_s, acceleration_deg_s2 = 50.0, 0.004, 130.0, 300.0
     feedforward = 1.0
@@ -92,7 +93,7 @@ class Article:
 
 
 class Foreign:
-    """A foreign axis, with the exact correction of its motor orders."""
+    """Foreign axis, with the exact correction of its motor orders."""
 
     def __init__(self, structure: str, seed: int, feedforward: float | None) -> None:
         truth = draw(seed, structure)
@@ -107,7 +108,7 @@ class Foreign:
         self.inertia_kg_m2 = truth.mechanics.motor_inertia_kg_m2
         orders = tuple(MotorOrder(**each._asdict()) for each in truth.mechanics.motor_orders)
         self.model = TransmissionModel(self.ratio, (Synchronous(orders=orders),))
-        # A servo with a reference model has no such parameter: it feeds all of the velocity forward.
+        # A servo with a reference model lacks this parameter: it has full velocity feed-forward.
         self.feedforward = getattr(truth.servo.law, "velocity_feedforward", 1.0)
 
     def machine(self):
@@ -122,14 +123,14 @@ Axis = Article | Foreign
 
 
 class Offsets(NamedTuple):
-    """Shares of the derivatives that are sent as offsets."""
+    """Fractions of the correction's derivatives that are sent as offsets."""
 
     velocity: float = 0.0
     torque: float = 0.0
 
 
 class Run(NamedTuple):
-    """A run at constant speed."""
+    """Result of a run at constant speed."""
 
     harmonics: Harmonics
     size_arcsec: float
@@ -137,7 +138,7 @@ class Run(NamedTuple):
 
 
 def run(axis: Axis, speed_deg_s: float, correction: Correction | None, offsets: Offsets) -> Run:
-    """Runs from rest to a speed; evaluates the constant speed after the transient."""
+    """Runs an axis from rest to a speed; evaluates the constant speed after the transient."""
     cycle_s, ratio, speed = axis.cycle_s, axis.ratio, abs(speed_deg_s)
     ramp_s = speed / axis.acceleration_deg_s2
     first = round((ENGAGED_S + ramp_s + TRANSIENT_S) / cycle_s)
@@ -166,7 +167,7 @@ def run(axis: Axis, speed_deg_s: float, correction: Correction | None, offsets: 
 def runs(
     axis: Axis, speeds: Sequence[float], model: TransmissionModel | None, offsets: Offsets, slew: float
 ) -> list[Run]:
-    """Runs each speed both ways."""
+    """Runs an axis at each speed in both directions."""
     found = []
     for speed in (sign * each for each in speeds for sign in (1.0, -1.0)):
         correction = None
@@ -188,7 +189,7 @@ def _corrected(compensation: Compensation) -> Correction:
 
 
 def measured(axis: Axis, shares: Sequence[float], offsets: Offsets, slew: float) -> TransmissionModel | None:
-    """Returns the model with its best response, as the motion test finds it."""
+    """Returns the model with the best response, measured like in the motion test; None without one."""
     speeds = [share * axis.speed_deg_s for share in shares]
     orders, ratio, cycle_s = motor_orders(axis.model), axis.ratio, axis.cycle_s
     tops = ((float(order_hz(each.order, axis.speed_deg_s, ratio)), each.amplitude_arcsec) for each in orders)
@@ -217,7 +218,7 @@ def measured(axis: Axis, shares: Sequence[float], offsets: Offsets, slew: float)
 
 
 def exact(axis: Axis, speeds: Sequence[float], offsets: Offsets) -> list[Run]:
-    """Returns the best runs with orders set per speed and direction, each by a few linear updates."""
+    """Returns the best runs with orders optimised for each speed and direction by a few linear updates."""
     orders = motor_orders(axis.model)
     numbers = np.array([each.order for each in orders])
     te = np.array([each.amplitude_arcsec * np.exp(1j * math.radians(each.phase_deg)) for each in orders])
@@ -256,7 +257,7 @@ def _slow(axis: Axis, speed_deg_s: float) -> np.ndarray:
 
 
 def _rms(axis: Axis, one: Run) -> float:
-    """Rms of the slow orders, arcsec."""
+    """Returns the rms of the slow orders, arcsec."""
     slow = _slow(axis, one.harmonics.speed_deg_s)
     return math.sqrt(0.5 * float(np.sum(abs(one.harmonics.amplitudes[slow]) ** 2)))
 
@@ -294,7 +295,7 @@ def _both(axis: Axis, found: Sequence[Run]) -> np.ndarray:
 
 
 def spread(count: int) -> tuple[float, ...]:
-    """Returns the speeds of the motion test as shares of the limit, or more with their means in between."""
+    """Returns the speeds of the motion test as fractions of the limit, or these and their midpoints."""
     between = [0.5 * sum(pair) for pair in pairwise(TESTED)]
     return TESTED if count == len(TESTED) else tuple(sorted((*TESTED, *between), reverse=True))
 

@@ -2,8 +2,8 @@
 
     python tools/bench/random_events.py [--stack slave|gateway] [--events 100000] [--seed 1]
 
-After each the laws of the tests must hold: no set-point outside the limits, no unrequested motion. Prints
-the states reached, as they come. A story that breaks a law is printed with its seed; exit status 1.
+After each event the laws of the tests must hold: no set-point outside the limits, no unrequested motion.
+Prints the progress. A sequence of events that breaks a law is printed with its seed; exit status 1.
 """
 
 from __future__ import annotations

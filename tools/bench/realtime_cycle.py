@@ -1,16 +1,17 @@
-"""Instructions of a cycle of 1 ms on a PREEMPT_RT kernel, and the number of missed cycles.
+"""Number of instructions of a 1 ms cycle on a PREEMPT_RT kernel, and number of missed cycles.
 
     make bench-realtime
     tools/realtime/run.sh .venv/bin/python tools/bench/realtime_cycle.py --master build/realtime/master
 
-Runs on the kernel of `tools/realtime/run.sh`, on which an instruction is a nanosecond and nothing else runs:
-one commit can be compared with another. The exchanges are those of `cycle.py` and one in C (`master.c`). The
-kernel's gateway answers as the drive. Each has SCHED_FIFO, locked memory and absolute deadlines.
+Runs on the kernel of `tools/realtime/run.sh`, on which an instruction takes one nanosecond and nothing else
+runs, so that commits can be compared. The exchanges are those of `cycle.py` and one in C (`master.c`). The
+kernel's CAN gateway answers in place of the drive. Each exchange has SCHED_FIFO, locked memory and absolute
+deadlines.
 
 Then six axes on one bus, compensated, at 250 Hz.
 
   late    from the deadline to the first instruction of the cycle
-  busy    from there to its last one, system calls included
+  busy    from there to the last instruction of the cycle, system calls included
   missed  cycles that began more than half a period late or were busy beyond the next deadline
 """
 
@@ -62,7 +63,7 @@ class Figures:
 
 
 def timed(name: str, cycle: Callable[[], object], clock: Waking, cycles: int, period_s: float) -> Figures:
-    """Times ``cycles`` cycles, each on its deadline."""
+    """Measures ``cycles`` cycles, each started at its deadline."""
     late_s, busy_s = np.zeros(cycles), np.zeros(cycles)
     for _ in range(WARM_UP):
         cycle()
@@ -74,7 +75,7 @@ def timed(name: str, cycle: Callable[[], object], clock: Waking, cycles: int, pe
 
 
 def in_c(master: Path, channel: str, cycles: int, period_s: float) -> Figures:
-    """Runs the same exchange in C."""
+    """Measures the same exchange in C."""
     command = [str(master), channel, f"{1e6 * period_s:.0f}", str(cycles)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     late_ns, busy_ns = np.array([line.split() for line in done.stdout.splitlines()], dtype=float).T
@@ -82,7 +83,7 @@ def in_c(master: Path, channel: str, cycles: int, period_s: float) -> Figures:
 
 
 def of_axes(channel: str, model: TransmissionModel, clock: Waking, cycles: int) -> tuple[Figures, float]:
-    """Returns several axes at the cycle of the profile, and that cycle in seconds."""
+    """Measures several axes at the cycle time of the profile; returns the figures and that time, s."""
     with (
         answering_kernel(channel, *range(1, AXES + 1)),
         can.Bus(interface="socketcan", channel=channel, ignore_config=True) as bus,
@@ -98,7 +99,7 @@ def of_axes(channel: str, model: TransmissionModel, clock: Waking, cycles: int) 
 
 
 def table(figures: list[Figures], period_s: float) -> str:
-    """Returns one line for each, with ratios to the bare exchange if that was measured."""
+    """Returns a table with one line per kind of cycle, and ratios to the bare exchange if it was measured."""
     bare = next((each for each in figures if each.name.startswith("bare")), None)
     head = (
         f"{'':<28} {'busy us':>8} {'99.9 %':>8} {'most':>8} {'late 99.9 %':>12} {'missed':>14} {'x bare':>7}"

@@ -1,4 +1,4 @@
-"""Instructions of a turn of the daemon's control loop on a PREEMPT_RT kernel, and missed turns.
+"""Number of instructions of a cycle of the daemon's control loop on a PREEMPT_RT kernel, and missed cycles.
 
     make bench-realtime
     tools/realtime/run.sh .venv/bin/python tools/bench/realtime_daemon.py
@@ -51,7 +51,7 @@ from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.link import Link
 
 VARIANTS = {"bench": (1, 1.0), "one": (1, 1.0), "six": (6, 4.0)}
-"""Numbers of axes with their cycle, ms."""
+"""Number of axes and cycle time, ms, of each variant."""
 STATUS_OFF = 0x0250
 POLL_S = 0.02
 JOG_EVERY_S = 0.05
@@ -61,13 +61,13 @@ SPEED = 5.0
 
 
 class TurnClock(Waking):
-    """Records the busy time of the loop between two sleeps, and the lateness of its waking."""
+    """Clock that records the busy time of the loop between two sleeps, and the lateness of its wake-ups."""
 
     def __init__(self, turns: int) -> None:
         super().__init__()
         self.busy_s, self.lateness_s = np.zeros(turns), np.zeros(turns)
         self.turns = 0
-        """Number of turns kept."""
+        """Number of cycles recorded."""
         self.keeping = False
 
     def sleep_until(self, deadline_s: float) -> None:
@@ -80,7 +80,7 @@ class TurnClock(Waking):
 
     @property
     def full(self) -> bool:
-        """True if the buffer of turns is full."""
+        """True if the buffer of recorded cycles is full."""
         return self.turns == len(self.busy_s)
 
 
@@ -88,10 +88,10 @@ class TurnClock(Waking):
 
 
 class Clients:
-    """Requests of the clients of one axis, a repeated sequence of about six seconds."""
+    """Requests of clients to one axis: a repeated sequence of about six seconds."""
 
     def __init__(self, memory: Memory, axis: int, setting: CompensationSetting) -> None:
-        """Takes the ``setting`` of the compensation that is activated in motion."""
+        """``setting`` is the compensation setting that is activated in motion."""
         self._memory, self._axis, self._setting = memory, axis, setting
         self._stream = 0
         self.steps = self._steps()
@@ -104,7 +104,7 @@ class Clients:
         self._post(CommandKind.CHANGE, i=slot.put(setting.to_json()))
 
     def _steps(self) -> Iterator[float]:
-        """Makes one request per `next`; yields the time to wait for the next one, s."""
+        """Makes one request per `next`; yields the time until the next request, s."""
         while True:
             for target in (2.0, -2.0, 3.0, 0.5):
                 self._post(CommandKind.MOVE, a=target, b=SPEED, c=math.nan)
@@ -124,7 +124,7 @@ class Clients:
             yield from self._streamed()
 
     def _streamed(self) -> Iterator[float]:
-        """Streams a slow sine about the present position, 100 knots a second."""
+        """Streams a slow sine about the current position, with 100 knots per second."""
         self._stream += 1
         knots = self._memory.knots[self._axis]
 
@@ -144,7 +144,7 @@ class Clients:
 
 
 def serve(fd: int, axes: int) -> int:
-    """Runs the service's side until standard input is closed; prints its observations as JSON."""
+    """Runs as the service until standard input is closed; prints the observations as JSON."""
     with Memory.attach(fd) as memory:
         samples, events = memory.reader(), memory.event_reader()
         seen: dict[str, Any] = {"samples": 0, "lost": 0, "told": {}, "refused": []}
@@ -218,7 +218,7 @@ def check(controller: Controller) -> None:
 
 
 def measured(axes: int, cycle_ms: float, turns: int, channel: str) -> tuple[Figures, dict[str, Any]]:
-    """Measures the loop with ``axes`` axes; returns figures and the service's observations."""
+    """Measures the loop with this number of axes; returns figures and the service's observations."""
     configs = configs_of(axes, cycle_ms)
     model = TransmissionModel.load(PROFILE / "model.yaml")
     clock = TurnClock(turns)
@@ -275,7 +275,7 @@ def of_bench(cycle_ms: float, turns: int, channel: str) -> Figures:
 
 
 def report(seen: dict[str, Any]) -> None:
-    """Returns the figures of the service, if there was one."""
+    """Prints the observations of the service, if there was one."""
     if seen:
         told = ", ".join(f"{count} {name}" for name, count in sorted(seen["told"].items()))
         print(f"the service saw {seen['samples']} samples and lost none; events: {told}", flush=True)

@@ -1,10 +1,10 @@
-"""Cost of the flight recorder: processor time per message, share of a core, bytes an hour.
+"""Cost of the flight recorder: CPU time per message, fraction of a core, bytes per hour.
 
     python tools/bench/recorder.py [--axes 1 6] [--seconds 120] [--rate 250] [--json FILE]
 
-For each number of axes a machine at work is recorded, second by second as the daemon does it, onto the disk
-of the temporary folder. The axes move and rest in turn; angles are in whole counts, the load encoder is
-noisy. Processor time is that of the thread, without the disk's.
+For each number of axes, a machine in motion is recorded, second by second as in the daemon, onto the disk of
+the temporary folder. The axes alternately move and rest; angles are whole counts, and the load encoder is
+noisy. CPU time is that of the thread, without that of the disk.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MOTOR_COUNTS, LOAD_COUNTS = 8_000, 2_880_000
 
 
 def at_work(seconds: int, rate: int, axes: int) -> Any:
-    """Yields samples of axes that alternately move for 2 s and rest for 1 s."""
+    """Returns samples of axes that alternately move for 2 s and rest for 1 s."""
     random = np.random.default_rng(1)
     count = seconds * rate
     samples = np.zeros(count, sample_dtype(axes))
@@ -65,7 +65,7 @@ def _counted(angle_deg: Any, counts: int) -> Any:
 
 
 def as_recorded(samples: Any, rate: int, folder: Path) -> tuple[float, int]:
-    """Returns processor time and bytes of the recorder."""
+    """Returns the recorder's CPU time, s, and the number of bytes written."""
     axes = samples["axes"].shape[1]
     about = About.of("bench", tuple(AxisAbout(f"axis{each}", RATIO) for each in range(axes)), 1.0 / rate)
     settings = RecorderSettings(free_mb=0.0, file_s=86_400.0, file_mb=4000.0)
@@ -82,7 +82,7 @@ def as_recorded(samples: Any, rate: int, folder: Path) -> tuple[float, int]:
 
 
 def measured(axes: int, seconds: int, rate: int) -> dict[str, float]:
-    """Returns all figures for ``axes`` axes."""
+    """Returns all figures for a machine with this number of axes."""
     samples = at_work(seconds, rate, axes)
     messages = len(samples) * (1 + axes)
     with tempfile.TemporaryDirectory() as folder:
@@ -102,7 +102,7 @@ def measured(axes: int, seconds: int, rate: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measures and prints."""
+    """Measures the recorder for each number of axes and prints the figures."""
     given = parser(__doc__)
     given.add_argument("--axes", type=int, nargs="+", default=[1, 6])
     given.add_argument("--seconds", type=int, default=120)

@@ -2,11 +2,11 @@
 
     tools/socketcan.sh .venv/bin/python tools/bench/socketcan_cycle.py [--cycles 5000] [--json FILE]
 
-First an empty loop of as many periods is timed; neither bus nor drive causes the periods that it misses. Then
-`hdbridge simulate` is started, the drive is booted and enabled over the bus, and the axis swings with the
-compensation of the article's model at work in every cycle. Printed are the periods missed (begun more than
-half a period late), the cycles in which a TPDO was missing, and how late the cycles began. Exit status 0 if
-nothing was missed, 1 otherwise.
+First an empty loop with the same number of periods is timed; the periods that it misses are due neither to
+the bus nor to the drive. Then `hdbridge simulate` is started, the drive is booted and enabled over the bus,
+and the axis moves to and fro, compensated by the article's model in every cycle. Prints the periods missed
+(begun more than half a period late), the cycles in which a TPDO was missing, and the lateness of the cycles.
+Exit status 0 if nothing was missed, 1 otherwise.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ BOOT_ATTEMPTS = 20
 
 @contextmanager
 def simulated_drive(profile: Path, channel: str) -> Iterator[None]:
-    """Runs `hdbridge simulate` in a process of its own for the duration of the block."""
+    """Runs `hdbridge simulate` in its own process for the duration of the block."""
     command = [sys.executable, "-m", "hdbridge", "simulate", str(profile)]
     process = subprocess.Popen([*command, "--interface", "socketcan", "--channel", channel])
     try:
@@ -52,7 +52,7 @@ def simulated_drive(profile: Path, channel: str) -> Iterator[None]:
 
 
 def boot(drive: Drive) -> None:
-    """Boots the drive after waiting for its process."""
+    """Boots the drive, repeatedly until its process is ready."""
     for attempt in range(BOOT_ATTEMPTS):
         try:
             drive.boot()
@@ -65,7 +65,7 @@ def boot(drive: Drive) -> None:
 
 
 def measure(drive: Drive, model: TransmissionModel, cycles: int) -> dict[str, object]:
-    """Runs cycles; returns the missed periods and the lateness."""
+    """Runs cycles; returns the missed periods and the lateness of the cycles."""
     axis, image = drive.axis, drive.image
     clock, supervision = drive.link.clock, Supervision()
     cycle = Cycle(drive.link, clock, image, supervision, axis.drive.cycle_s, monitor=drive.monitor)

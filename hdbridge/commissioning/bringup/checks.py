@@ -1,4 +1,4 @@
-"""List of checks run in order: a check, its outcomes, and the checks it depends on."""
+"""Ordered list of checks: each has an outcome, and may depend on other checks."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -56,10 +56,10 @@ class Check(Generic[P]):
     name: str
     """Word that identifies the check in data."""
     title: str
-    """Subject of the check, in a few words."""
+    """Subject of the check, as shown to the user."""
     run: Callable[[P], Verdict]
     needs: tuple[str, ...] = ()
-    """Names of checks that must have passed before."""
+    """Names of the checks that must have passed first."""
     moves: bool = False
     """True if the check switches power on."""
 

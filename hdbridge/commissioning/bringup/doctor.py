@@ -97,7 +97,7 @@ def answers(context: BringUpContext) -> Verdict:
 
 
 def identity(context: BringUpContext) -> Verdict:
-    """Checks that the drive is that of the axis file and supports the required mode."""
+    """Checks that the drive's identity matches the axis file and that it supports the required mode."""
     axis, sdo = context.axis, context.drive.sdo
     found = {
         name: sdo.fetch(address)
@@ -113,7 +113,7 @@ def identity(context: BringUpContext) -> Verdict:
 
 
 def _retuned(context: BringUpContext) -> list[str]:
-    """Yields lines on servo gains that differ from those during the measurement of the model's response."""
+    """Returns one line for each servo gain that has changed since the model's response was measured."""
     path = context.axis.path.with_name("model.yaml")
     response = TransmissionModel.load(path).response if path.exists() else None
     if response is None or not response.gain_objects:
@@ -156,7 +156,7 @@ def eds(context: BringUpContext) -> Verdict:
 
 
 def _listed(context: BringUpContext) -> Iterator[tuple[int, int]]:
-    """Yields the objects to check: those that are used and listed in the EDS."""
+    """Yields index and subindex of the objects to check: those that are both used and listed in the EDS."""
     axis, sdo = context.axis, context.drive.sdo
     target = context.drive.image.cyclic.target
     for address in (
@@ -217,7 +217,7 @@ def boot(context: BringUpContext) -> Verdict:
 
 
 def rest(context: BringUpContext) -> Verdict:
-    """Checks that both encoders come with every SYNC and stand still without power; reads the channels."""
+    """Checks that both encoders stand still without power and that the additional channels are plausible."""
     drive = context.drive
     with context.interruptible() as interrupted:
         positions = drive.read_positions()
@@ -243,7 +243,7 @@ _OFF: Final = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON)
 _DRIVES_DOING: Final = frozenset(
     {Fault.DROPPED_OUT, Fault.DRIVE_FAULT, Fault.NMT_CHANGE, Fault.LOST_TPDO, Fault.EMERGENCY}
 )
-"""Faults seen by the master's supervision when a drive stops on its own."""
+"""Faults that the master's supervision reports when a drive stops on its own."""
 
 
 def hold(context: BringUpContext) -> Verdict:
@@ -261,7 +261,7 @@ def hold(context: BringUpContext) -> Verdict:
 
 
 def nudge(context: BringUpContext) -> Verdict:
-    """Moves the motor two degrees, out and back."""
+    """Moves the motor two degrees out and back, and checks that it follows."""
     with context.interruptible() as interrupted:
         slow = context.slow(interrupted)
         with slow.enabled():
@@ -282,7 +282,7 @@ def nudge(context: BringUpContext) -> Verdict:
 
 
 def turn(context: BringUpContext) -> Verdict:
-    """Moves the motor one turn each way and compares direction and travel of both encoders."""
+    """Moves the motor about one turn each way, and compares direction and travel of both encoders."""
     with context.interruptible() as interrupted:
         slow = context.slow(interrupted)
         with slow.enabled():
@@ -328,7 +328,7 @@ def settling(context: BringUpContext) -> Verdict:
 
 
 def quick_stop(context: BringUpContext) -> Verdict:
-    """Quick-stops a slow motion and judges travel, time and final state."""
+    """Quick-stops a slow motion, and judges stopping distance, time and final state."""
     with context.interruptible() as interrupted:
         slow = context.slow(interrupted)
         with slow.enabled():
@@ -404,7 +404,7 @@ def set_points(context: BringUpContext) -> Verdict:
 
 
 def switched_off(context: BringUpContext) -> Verdict:
-    """Checks that the drive boots again, and leaves it switched off."""
+    """Boots the drive again and checks that it is switched off."""
     drive = context.boot()
     word = drive.sdo.fetch(objects.STATUSWORD)
     state = decode(word)
@@ -415,7 +415,7 @@ def switched_off(context: BringUpContext) -> Verdict:
 
 
 def _timer(context: BringUpContext) -> int | None:
-    """Returns the communication parameter of a cyclic RPDO with an event timer; None without one."""
+    """Returns the index of the communication parameter of a cyclic RPDO with an event timer, or None."""
     used = (objects.RPDO_COMMUNICATION + layout.number - 1 for layout in context.drive.image.rpdos)
     return next((each for each in used if context.drive.sdo.has(each, 5)), None)
 

@@ -1,4 +1,4 @@
-"""Judgement of measured figures, separate from the measurement. Pure."""
+"""Pure functions that judge measured figures."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 
 TOOTH_SHARE: Final = 0.35
-"""Maximum error of a ratio, as a share of the distance to its neighbour (N and N + 1 differ by 1/N)."""
+"""Maximum error of a ratio, relative to the distance to its neighbour (N and N + 1 differ by 1/N)."""
 CLOSE_SHARE: Final = 0.001
-"""Relative accuracy of the ratio of a sound gear from one motor turn: 26 arcsec at N = 50."""
+"""Relative error of a sound gear's ratio over one motor turn: 26 arcsec at the load for N = 50."""
 DEAD_SHARE: Final = 0.02
-"""Share of the expected travel below which a load encoder counts as not moving."""
+"""Fraction of the expected travel below which a load encoder counts as not moving."""
 USUAL_RATIOS: Final = frozenset(
     each + output for each in (30, 50, 60, 64, 72, 80, 88, 100, 110, 120, 128, 160, 200) for output in (0, 1)
 )
@@ -43,17 +43,17 @@ class Turned(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Accusation:
-    """Key of the axis file whose value would explain the measurement."""
+    """Suspected key of the axis file, with the value that would explain the measurement."""
 
     key: str
     found: float
     expected: float
     weight: float
-    """Weight of the evidence, relative to the other keys."""
+    """Score of the evidence; the key with the highest score is the most likely."""
     why: str
 
     def text(self, axis: AxisConfig) -> str:
-        """For example ``axis.yaml:31:3: gear.ratio: found 50, expected 51 (...)``."""
+        """Returns one line, for example ``axis.yaml:31:3: gear.ratio: found 50, expected 51 (...)``."""
         where = axis.where(self.key)
         return f"{where}: found {_plain(self.found)}, expected {_plain(self.expected)} ({self.why})"
 
@@ -69,7 +69,7 @@ def expected_load_per_motor(axis: AxisConfig) -> float:
 def judge_turn(
     axis: AxisConfig, forward: Turned, backward: Turned, confirmed: frozenset[str] = frozenset()
 ) -> Verdict:
-    """Checks directions, counts of both encoders and ratio against moves in both directions.
+    """Checks directions, counts per turn of both encoders and gear ratio by moves in both directions.
 
     ``confirmed`` are the keys that the drive's own objects confirm.
     """
@@ -182,7 +182,7 @@ def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> Accusation:
             return Accusation(RATIO, found, other, 4.0, f"the output is the other one: teeth.output {held}")
     whole = round(wanted)
     if whole >= 1 and abs(whole / wanted - 1.0) <= tolerance:
-        # Teeth that give the ratio of the file are evidence for it.
+        # Numbers of teeth that give the ratio of the axis file are evidence for that ratio.
         less = 1.0 if teeth is not None else 0.0
         if abs(whole - found) == 1.0:
             return Accusation(RATIO, found, whole, 3.5 - less, "the other output of the same gear")
@@ -195,7 +195,7 @@ def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> Accusation:
 
 
 def _roundest(value: float) -> int:
-    """Returns the close number with the fewest digits, or a power of two if there is one."""
+    """Returns the roundest number within `CLOSE_SHARE`: a power of two, or that with the fewest digits."""
     power = 2 ** round(math.log2(value)) if value >= 1.0 else 1
     if abs(power / value - 1.0) <= CLOSE_SHARE:
         return power
@@ -253,7 +253,7 @@ def judge_rest(axis: AxisConfig, motor: Sequence[int], load: Sequence[int]) -> V
 def judge_channels(
     axis: AxisConfig, readings: Mapping[str, float | None], waited_s: float, rest: Verdict
 ) -> Verdict:
-    """Adds load torque and temperature to the verdict on rest; None is not a plausible reading."""
+    """Adds the additional channels to the verdict on rest; None means that no reading was plausible."""
     text, figures, remedies = rest.measured, dict(rest.figures), list(rest.remedies)
     for key, value in readings.items():
         channel = axis.channels[key]
@@ -308,7 +308,7 @@ def judge_nudge(axis: AxisConfig, asked_counts: float, out_counts: float, back_c
 
 
 def judge_following(axis: AxisConfig, errors_counts: Sequence[int]) -> Verdict:
-    """Compares the following error of a slow move with the window."""
+    """Compares the following error of a slow move with the window of the axis file."""
     worst = max(map(abs, errors_counts))
     worst_deg = abs(axis.motor_encoder.degrees(worst))
     allowed = axis.drive.following_error_deg
@@ -326,7 +326,7 @@ def judge_following(axis: AxisConfig, errors_counts: Sequence[int]) -> Verdict:
 
 
 def judge_torque(axis: AxisConfig, torques_permille: Sequence[float], limit_percent: float) -> Verdict:
-    """Compares the torque of a slow move with its limit."""
+    """Compares the motor torque of a slow move with its limit."""
     worst = max(map(abs, torques_permille)) / 10.0
     text = f"at most {worst:.1f} % of the rated torque, allowed {limit_percent:g} %"
     figures = {
@@ -368,9 +368,9 @@ def judge_settling(
 def judge_stop(
     axis: AxisConfig, speed_deg_s: float, distance_deg: float, time_s: float, what: str, reaction_s: float
 ) -> Verdict:
-    """Checks that the axis stopped within the time and travel permitted by its ramp.
+    """Checks that the axis stopped within the time and distance permitted by its ramp.
 
-    Speed and distance are those of the motor. ``reaction_s`` may pass before braking starts.
+    Speed and distance are those of the motor. ``reaction_s`` is the time allowed before braking starts.
     """
     deceleration = axis.limits.acceleration_deg_s2 * axis.gear.ratio
     cycles_s = 3.0 * axis.drive.cycle_s + reaction_s

@@ -1,7 +1,7 @@
 """Scan of a CAN bus: listens first, then queries each node id, and writes nothing.
 
 Only SDO read requests are sent (and an SDO abort after an unanswered request). A node that is busy with
-another SDO client is skipped, because a second client on the same channel would spoil its transfer.
+another SDO client is skipped, because a second client on the same channel would disrupt its transfer.
 """
 
 from collections.abc import Callable
@@ -54,7 +54,7 @@ ENCODER_UNITS_PER_TURN: Final = Address(0x6001, 0, IntegerType.UINT32, "measurin
 
 @dataclass(slots=True)
 class Node:
-    """One node, as far as known."""
+    """Data of one node, as far as known."""
 
     node_id: int
     nmt_state: int | None = None
@@ -99,7 +99,7 @@ class Node:
 
     @property
     def mode_names(self) -> list[str]:
-        """Supported modes of operation of a drive."""
+        """Abbreviations of the drive's supported modes of operation."""
         return [name for bit, name in MODES.items() if (self.modes or 0) >> bit & 1]
 
     @property
@@ -128,7 +128,7 @@ class Scan:
 
 
 class _Hearing:
-    """Takes every frame and records its sender."""
+    """Observes all frames: records the nodes that send, SDO traffic, and signs of another master."""
 
     def __init__(self, link: Link) -> None:
         self.link = link
@@ -188,9 +188,10 @@ def scan_bus(
     """Listens for ``listen_s``, then queries the device type of every node id, and further objects of those
     that answer.
 
-    ``progress`` receives the completed share. Raises `BusInUseError` before anything is sent if another
-    master is heard, because a request may stop the axis that it moves; it listens for as long as this
-    detection requires. ``force`` skips the detection. Raises `BusError` if the interface fails.
+    ``progress`` receives the completed fraction. Raises `BusInUseError` before anything is sent if another
+    master is heard, because a request may stop the axis that this master moves; the time of listening is
+    extended if the detection requires it. ``force`` skips the detection. Raises `BusError` if the interface
+    fails.
     """
     force = force or link.private
     ear = _Hearing(link)
@@ -219,7 +220,7 @@ def _ask(ear: _Hearing, node_id: int, timeout_s: float) -> Node:
     try:
         node.device_type = sdo.fetch(objects.DEVICE_TYPE)
     except SdoAbortError:
-        pass  # it is present and refuses the one object that every node has
+        pass  # the node is present, but refuses the one object that every node must have
     except SdoError:
         return node
     node.answers = True
@@ -260,7 +261,7 @@ def identity_matches(axis: AxisConfig, node: Node) -> bool:
 
 
 def compare(axis: AxisConfig, scan: Scan) -> tuple[bool, list[str]]:
-    """Returns True if the axis file's drive was found; else False and one line for each necessary change."""
+    """Returns True if the axis file's drive was found, else False and one line for each necessary change."""
     there = scan.node(axis.drive.node_id)
     if there is not None and there.answers and there.usable and identity_matches(axis, there):
         return True, []
@@ -302,7 +303,7 @@ def _identity_lines(axis: AxisConfig, node: Node) -> list[str]:
 
 
 def axis_lines(node: Node) -> list[str]:
-    """Returns lines for an axis file, from the node's own objects."""
+    """Returns the lines of an axis file that the node's own objects determine."""
     if node.profile == 406:
         return _encoder_lines(node)
     identity = ", ".join(f"{name}: {value:#x}" for name, value in node.identity.items())

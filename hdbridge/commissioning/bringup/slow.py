@@ -35,7 +35,8 @@ from hdbridge.motion.procedures.moves import MotionLimits, MoveTo, Path
 MOTOR_SPEED_DEG_S: Final = 120.0
 """Speed of the moves, motor degrees per second, if the limits allow four times as much."""
 LEAD_DEG: Final = 45.0
-"""Motor travel before a measured standstill, which brings the gear's hysteresis to the same side."""
+"""Motor travel before each measured standstill, degrees, so that the gear is on the same branch of its
+hysteresis loop."""
 MARGIN_DEG: Final = 1.0
 """Motor travel kept clear of the axis limits, degrees."""
 LEAST_TRAVEL_DEG: Final = 20.0
@@ -51,9 +52,9 @@ class TravelPlan(NamedTuple):
 
 
 def plan_travel(axis: AxisConfig, here_deg: float) -> TravelPlan | None:
-    """Returns the travel from a motor angle, to the side with more space; None without enough space.
+    """Returns the travel from a motor angle, in the direction with more room; None without enough room.
 
-    One motor turn, or more if the ratio is too high to be distinguished from its neighbour in one turn.
+    The span is one motor turn, or several if one cannot distinguish a high ratio from its neighbour.
     """
     limits, ratio = axis.limits, axis.gear.ratio
     ahead = limits.position_max_deg * ratio - here_deg - MARGIN_DEG
@@ -71,17 +72,17 @@ def plan_travel(axis: AxisConfig, here_deg: float) -> TravelPlan | None:
 
 
 class QuietLink(Link):
-    """Link that withholds some identifiers, like a dead master."""
+    """Link that can withhold frames with chosen identifiers, in order to imitate a dead master."""
 
     def __init__(self, bus: can.BusABC, clock: Clock) -> None:
         super().__init__(bus, clock)
         self.muted: set[int] = set()
         self.sent_s: dict[int, float] = {}
-        """Time at which each identifier was last actually sent; s."""
+        """Time at which a frame with each identifier was last sent, s."""
         self.unheard: set[int] = set()
-        """Identifiers that are received but not passed on."""
+        """Identifiers of received frames that are not passed on."""
         self.withheld: list[Frame] = []
-        """Withheld frames with those identifiers."""
+        """Received frames that were not passed on."""
 
     def recv(self, deadline_s: float) -> Frame | None:
         """Receives a frame, skipping those in `unheard`."""
@@ -110,13 +111,13 @@ class Silence:
     distance_deg: float
     """Motor travel from the last frame to standstill, degrees."""
     emergencies: tuple[Emergency, ...] = ()
-    """Emergency messages of the drive about the silence."""
+    """Emergency messages that the drive sent during the silence."""
     resumed: bool = False
-    """True if the drive entered the quick stop and left it again by the master's own controlword."""
+    """True if the drive entered the quick stop and the master's own controlword took it out again."""
 
 
 class SlowAxis:
-    """Axis in slow motion. ``interrupted`` is called in each cycle and stops the axis by returning True."""
+    """Axis in slow motion. ``interrupted`` is called in each cycle; the axis stops if it returns True."""
 
     def __init__(self, drive: Drive, torque_percent: float, interrupted: Callable[[], bool]) -> None:
         self.axis = drive.axis
@@ -165,7 +166,7 @@ class SlowAxis:
             self.stop()
 
     def stop(self) -> list[Feedback]:
-        """Quick-stops, cycle by cycle, until the motor stands; returns the feedback of these cycles."""
+        """Quick-stops the axis and runs cycles until the motor stands still; returns their feedback."""
         power = self.image.power
         power.quick_stop()
         seen: list[Feedback] = []
@@ -195,7 +196,7 @@ class SlowAxis:
         return list(self._follow(motor_deg, least_s))
 
     def stand(self, duration_s: float = 0.4) -> Turned:
-        """Stands still and returns the mean position of both encoders over the last quarter."""
+        """Holds the position; returns the mean counts of both encoders over the last quarter of the time."""
         seen = self.sit(duration_s)
         tail = seen[-max(len(seen) // 4, 1) :]
         return Turned(
@@ -203,7 +204,7 @@ class SlowAxis:
         )
 
     def speed_deg_s(self, way_deg: float, least_s: float = 0.0) -> float:
-        """Returns the speed of a motor move over ``way_deg`` that lasts at least ``least_s``."""
+        """Returns the motor speed for a travel of ``way_deg`` that lasts at least ``least_s``, deg/s."""
         limits = self.axis.limits
         speed = min(MOTOR_SPEED_DEG_S, 0.25 * limits.velocity_deg_s * self.axis.gear.ratio)
         return min(speed, abs(way_deg) / least_s) if least_s > 0.0 else speed
@@ -241,7 +242,7 @@ class SlowAxis:
     # -- stops --------------------------------------------------------------------------------------------
 
     def stop_on_the_way(self, motor_deg: float) -> tuple[float, float, float]:
-        """Quick-stops half-way; returns the speed before, and travel and time of the stop (motor deg, s)."""
+        """Quick-stops half-way; returns the speed before the stop, its travel and its time (motor deg, s)."""
         moved = self._half_way(self._follow(motor_deg), motor_deg)
         speed = self._measured_speed(moved)
         stopping = self.stop()
@@ -251,7 +252,7 @@ class SlowAxis:
         return speed, way, (rest + 1) * self.cycle.period_s
 
     def lose_heartbeat(self, motor_deg: float, patience_s: float) -> tuple[float, Silence]:
-        """Moves, withholding the master's heartbeat from half-way on; returns the speed and the reaction."""
+        """Moves, and withholds the master's heartbeat from half-way on; returns speed and reaction."""
         moving = self._follow(motor_deg, 2.0 * patience_s + 1.0)
         moved = self._half_way(moving, motor_deg)
         speed = self._measured_speed(moved)
@@ -290,7 +291,7 @@ class SlowAxis:
         )
 
     def lose_set_points(self, motor_deg: float, patience_s: float) -> tuple[float, Silence]:
-        """Stops sending SYNC and set-points half-way, with heartbeat; returns speed and reaction."""
+        """Moves, and withholds only SYNC and set-points from half-way on; returns speed and reaction."""
         moved = self._half_way(self._follow(motor_deg), motor_deg)
         speed, start, drive = self._measured_speed(moved), moved[-1], self._drive
         last_s = self.link.now()
@@ -309,7 +310,7 @@ class SlowAxis:
         return speed, result
 
     def _half_way(self, moving: Iterator[Feedback], motor_deg: float) -> Sequence[Feedback]:
-        """Moves to the middle of the travel, at full speed; ``moving`` is not exhausted."""
+        """Runs the move up to the middle of its travel; the rest of ``moving`` can still be run."""
         begin = self._place_deg
         seen: list[Feedback] = []
         for feedback in moving:
@@ -329,7 +330,7 @@ class SlowAxis:
     def _after_silence(
         self, start_counts: int, noticed_s: float | None, event: Event | None, pause: Callable[[float], None]
     ) -> Silence:
-        """Reads position and standstill by SDO, because the drive may have stopped sending PDOs."""
+        """Waits for standstill, and reads the position by SDO, because the drive may no longer send PDOs."""
         sdo, clock = self._drive.sdo, self.link.clock
         last = sdo.fetch(objects.POSITION_ACTUAL)
         stands = False
@@ -351,7 +352,7 @@ Interruptible = Callable[[], AbstractContextManager[Callable[[], bool]]]
 
 
 class BringUpContext(ExitStack):
-    """One axis under examination; a context manager that leaves the drive off and the bus closed.
+    """Axis under examination, as a context manager that leaves the drive off and the bus closed.
 
     ``load`` reads the axis file and ``connect`` opens its bus. Both are checks, so they are passed as
     functions. ``torque_percent`` limits every motion, percent of the rated torque, in addition to the axis
@@ -407,7 +408,7 @@ class BringUpContext(ExitStack):
         return self._drive
 
     def boot(self) -> Drive:
-        """Reboots the drive, resets a fault left by an earlier check, and returns it switched off."""
+        """Boots the drive again, resets a fault left by an earlier check, and returns the drive, disabled."""
         report = self.drive.boot()
         if report.state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
             self.drive.fault_reset()

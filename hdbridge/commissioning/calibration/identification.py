@@ -29,7 +29,10 @@ def identify(
     *,
     independent_zeros: bool = False,
 ) -> FitResult:
-    """Fits a model; InputError if the recordings are unusable. ``warnings`` lists undetermined quantities."""
+    """Fits a model to recordings; InputError if they are unusable.
+
+    The ``warnings`` of the result list the quantities that the data do not determine.
+    """
     prepared = [observed(each.record, ratio) for each in recordings]
     whole = [replace(each, record=seen.record) for each, seen in zip(recordings, prepared, strict=True)]
     measured = measured_of(whole, independent_zeros=independent_zeros)
@@ -39,10 +42,10 @@ def identify(
 
 
 def measured_of(recordings: Sequence[Recording], *, independent_zeros: bool = False) -> Measured:
-    """Joins recordings in order, with their legs, or as a whole without legs.
+    """Joins recordings in order, leg by leg; a recording without legs is used as a whole.
 
-    ``independent_zeros`` states that the encoders lost their zeros between the recordings. InputError if
-    nothing usable is left.
+    ``independent_zeros`` states that the encoders lost their zeros between the recordings. InputError if no
+    samples are usable.
     """
     pieces: list[_Piece] = []
     for recording in recordings:
@@ -82,7 +85,9 @@ def standings(recording: Recording, ratio: float) -> list[tuple[float, float]]:
 
 
 def resting(recording: Recording, window_s: float) -> FloatArray:
-    """Returns means over windows at standstill, relative to each standstill's mean; arcsec, shape (n,)."""
+    """Returns the load angle at standstill, averaged over windows, relative to the mean of its standstill;
+    arcsec, shape (n,).
+    """
     means: list[FloatArray] = []
     for _, piece in recording.pieces(*STANDING):
         if len(piece) < 2:
@@ -100,7 +105,7 @@ def provenance(
 ) -> dict[str, Any]:
     """Returns the provenance for a model file.
 
-    ``held_out`` is the gain on held-out data, or the reason for its absence, in words.
+    ``held_out`` is the gain on held-out data, or a text with the reason for its absence.
     """
     dates = sorted({each.date for each in recordings if each.date})
     data: dict[str, Any] = {

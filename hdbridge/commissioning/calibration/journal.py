@@ -78,7 +78,7 @@ class Journal:
         identity: Identity,
         notes: dict[str, Any],
     ) -> Self:
-        """Creates a journal, written with its first task. InputError if the folder holds a recording."""
+        """Creates a journal, written with its first task. InputError if the folder contains a recording."""
         if (folder / ABOUT_NAME).exists():
             raise InputError(
                 f"{folder}: there is a recording already; expected a new folder, or --resume to continue it"
@@ -163,7 +163,7 @@ class Journal:
         if not len(record):
             return
         end_s = max((each.end_s for each in self._tasks), default=-PAUSE_S)
-        # Each run on the bench has its own zero of time.
+        # The time of each bench run starts at zero.
         shift_s = end_s + PAUSE_S - float(record.time_s[0])
         if shift_s:
             record = Record({**record.columns, "time_s": record.time_s + shift_s})
@@ -204,7 +204,7 @@ class Journal:
 
 
 def survived_in(folders: Iterable[Path]) -> tuple[str, ...]:
-    """Returns one line for each file with tolerated faults."""
+    """Returns one line for each recorded file whose run tolerated faults."""
     found = []
     for folder in folders:
         if (folder / ABOUT_NAME).exists():

@@ -64,7 +64,7 @@ class Outlook:
 
     tasks: tuple[Task, ...]
     duration_s: float
-    """Duration of the tasks on an ideal axis."""
+    """Duration of the tasks on an ideal axis, s."""
     notes: tuple[str, ...]
 
 
@@ -87,7 +87,7 @@ def start_journal(
     identity: Identity,
     notes: dict[str, Any] | None = None,
 ) -> Journal:
-    """Creates a journal, with the reductions of the plan for this axis in its notes.
+    """Creates a journal, whose notes list the parts of the plan that are shortened for this axis.
 
     InputError if the axis has no encoder at its load.
     """

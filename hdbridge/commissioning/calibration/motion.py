@@ -44,16 +44,16 @@ from hdbridge.motion.procedures.rehearsal import rehearse
 from hdbridge.units import ARCSEC_PER_DEG
 
 CHANCE = 1.05
-"""Ratio above which a ripple counts as larger."""
+"""Ratio of two ripples, or of two path errors, above which the first counts as larger."""
 FADED = 0.5
-"""Share of the wanted gain below which the filter counts as no longer correcting an order."""
+"""Fraction of the required gain below which the filter counts as no longer correcting an order."""
 RETUNED = (
     "the servo does not answer as it did when the response was measured (following lag {:.1f} ms then, "
     "{:.1f} ms now; the response differs by {:.0f} %): it was retuned, or the load changed; measure the "
     "response again"
 )
 CHECKED = (0.64, 0.38, 0.18)
-"""Speeds for checking the stored response, as shares of the limit."""
+"""Speeds at which the stored response is checked, as fractions of the speed limit."""
 NO_LOAD_ENCODER = (
     "load_encoder.source is the motor encoder: the ripple is that of the load angle predicted from motor "
     "encoder and model; path errors are not measured"
@@ -65,7 +65,7 @@ correcting orders beyond the known frequency range."""
 
 @dataclass(frozen=True, slots=True)
 class OrderRipple:
-    """Amplitude of one motor order of the load error at one speed, both directions together; arcsec."""
+    """Amplitude of one motor order in the load error at one speed, rms of both directions; arcsec."""
 
     order: int
     frequency_hz: float
@@ -76,7 +76,7 @@ class OrderRipple:
 
 @dataclass(frozen=True, slots=True)
 class PathResult:
-    """Errors on one path: uncorrected, static, filtered, and filtered with compensated wind-up."""
+    """Errors on one path: without correction, static, filtered, and filtered with wind-up compensation."""
 
     name: str
     none: PathError
@@ -99,22 +99,22 @@ class Ripple:
 
     @property
     def in_force_arcsec(self) -> float | None:
-        """Ripple with the filtered correction, or without a filter with the static correction."""
+        """Ripple with the filtered correction if it was run, otherwise with the static correction."""
         return self.static_arcsec if self.filtered_arcsec is None else self.filtered_arcsec
 
     @property
     def removed_in_force_percent(self) -> float | None:
-        """Share of the ripple that the correction in force removes."""
+        """Percentage of the ripple that the correction in force removes."""
         return _removed(self.none_arcsec, self.in_force_arcsec)
 
     @property
     def removed_percent(self) -> float | None:
-        """Share of the ripple that the filtered correction removes."""
+        """Percentage of the ripple that the filtered correction removes."""
         return _removed(self.none_arcsec, self.filtered_arcsec)
 
     @property
     def removed_static_percent(self) -> float | None:
-        """Share of the ripple that the static correction removes."""
+        """Percentage of the ripple that the static correction removes."""
         return _removed(self.none_arcsec, self.static_arcsec)
 
 
@@ -128,7 +128,7 @@ class MotionTest:
     remarks: tuple[str, ...] = ()
     paths: tuple[PathResult, ...] = ()
     wind_up: InertialWindup | None = None
-    """Wind-up of the load in acceleration, if its compensation reduces the path error."""
+    """Wind-up due to acceleration of the load, if its compensation reduces the path error."""
 
     def applied(self, model: TransmissionModel) -> TransmissionModel:
         """Returns a model with the response and the wind-up of this test."""
@@ -165,7 +165,7 @@ class MotionTest:
 
     @property
     def harms_paths(self) -> bool:
-        """True if the total error on all paths is larger with the filtered correction than without."""
+        """True if the rms error over all paths is larger with the filtered correction than without."""
         filtered = [each.filtered.path_arcsec for each in self.paths if each.filtered is not None]
         return bool(filtered) and _rms(filtered) > CHANCE * _rms(
             [each.none.path_arcsec for each in self.paths]
@@ -173,14 +173,14 @@ class MotionTest:
 
     @property
     def gains_by_wind_up(self) -> bool:
-        """True if compensating for the wind-up reduces the total path error including wind-up."""
+        """True if compensation of the wind-up reduces the path error, with wind-up, over all paths."""
         pairs = [(each.filtered, each.wind_up) for each in self.paths]
         before, after = ([one.delayed_arcsec for one in each if one] for each in zip(*pairs, strict=True))
         return bool(after) and CHANCE * _rms(after) < _rms(before)
 
     @property
     def remaining(self) -> float:
-        """Mean share of the ripple that remains with the filtered correction; 1 without one."""
+        """Mean fraction of the ripple that remains with the filtered correction; 1 without one."""
         shares = [
             1.0 if each.filtered_arcsec is None else each.filtered_arcsec / each.none_arcsec
             for each in self.ripples
@@ -213,7 +213,7 @@ class MotionTest:
 
 
 def motion_test_s(axis: AxisConfig, runs: int = 2 + TRIALS) -> float:
-    """Returns the longest duration of the test on an ideal axis."""
+    """Returns the maximum duration of the motion test on an ideal axis, s."""
     view = axis_view(axis)
     middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
     paths_s = 4.0 * rehearse(PathTest(), view, middle).duration_s
@@ -230,15 +230,15 @@ def motion_test(
 ) -> MotionTest:
     """Runs a booted drive's axis at several speeds and on paths, without and with the model's correction.
 
-    With ``measure`` the response is measured, otherwise the model's own is tested. A filter is kept only if,
-    at every speed, the ripple is no larger than without correction, and the path error is not larger either.
+    With ``measure`` the response is measured, otherwise the model's own is tested. A filter is kept only if
+    neither the ripple at any speed nor the path error is larger than without correction.
     InputError if no motor order of the model is large enough to measure, if the travel is too short, or if a
-    response to be tested was measured at another cycle. Without an encoder at the load, the ripple is that of
-    the load angle predicted from the motor encoder, and no path is run.
+    response to be tested was measured with another cycle time. Without an encoder at the load, the ripple is
+    that of the load angle predicted from the motor encoder, and no path is run.
     """
     runner = _Runner(drive, model, progress, interrupted)
     if not measure:
-        compensation_for(drive.axis, model)  # refuses a response of another cycle before anything moves
+        compensation_for(drive.axis, model)  # rejects a response for another cycle time before any motion
     gains = read_gains(drive.sdo) if isinstance(drive, Drive) else {}
     found = _ripple_test(runner, model, measure)
     if found.response is not None and measure:
@@ -298,7 +298,7 @@ def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> Mo
         filtered = runner.run("filtered correction", replace(model, response=response))
         found = MotionTest(_ripples(runner, none, static, filtered, response), response)
         if not explore and found.harms_at:
-            # The cause is not known, but it lies within the range of the filter.
+            # The frequency responsible is unknown, but lies within the filter's range.
             highest = 0.7 * response.known_to_hz
         elif not explore and (best.response is None or found.remaining < best.remaining):
             best = found
@@ -320,17 +320,16 @@ class ServoCheck:
     stored_lag_ms: float
     lag_ms: float
     difference: float
-    """Rms difference of the motor's response from the stored one, as a fraction of the ripple
-    (`Answers.difference`)."""
+    """Rms difference of measured and stored response, relative to the ripple (`Answers.difference`)."""
 
     @property
     def agrees(self) -> bool:
-        """False if the following lag or the response differs beyond its noise."""
+        """True if neither the following lag nor the response differs significantly."""
         return lags_agree(self.stored_lag_ms, self.lag_ms) and self.difference < DIFFERENT
 
     @property
     def remark(self) -> str | None:
-        """Reason why the stored response is no longer valid; None for a valid one."""
+        """Reason why the stored response is no longer valid; None if it is valid."""
         if self.agrees:
             return None
         return RETUNED.format(self.stored_lag_ms, self.lag_ms, 100.0 * self.difference)
@@ -339,7 +338,7 @@ class ServoCheck:
 def servo_check(
     drive: Drive, model: TransmissionModel, interrupted: Callable[[], bool] = lambda: False
 ) -> ServoCheck:
-    """Runs a booted drive's axis at a few speeds, and compares the motor's response with that of the model.
+    """Runs a booted drive's axis at a few speeds, and compares the motor's response with the stored response.
 
     InputError if the model has no response or no motor order.
     """
@@ -349,7 +348,7 @@ def servo_check(
 
 
 class _Runner:
-    """Runs the procedures with a given correction."""
+    """Runs the procedures of the motion test on one axis, each with the correction of a given model."""
 
     def __init__(
         self,
@@ -368,7 +367,7 @@ class _Runner:
                 "measure the response by; calibrate the axis first"
             )
         self.lag_s = 0.0
-        """Following lag, from the runs without correction."""
+        """Following lag of the axis, s, from the runs without correction."""
         self._model = model
         self.procedure = EvenSpeed.spread(axis_view(axis), shares)
         self._orders_only = TransmissionModel(model.ratio, (Synchronous(orders=tuple(self.motor_orders)),))
@@ -377,11 +376,11 @@ class _Runner:
         self._pace = Pace(motion_test_s(axis), axis.drive.cycle_s, progress, interrupted)
 
     def run(self, name: str, model: TransmissionModel) -> tuple[Harmonics, ...]:
-        """Runs all speeds with this model; returns the orders of each run."""
+        """Runs the axis at all speeds with this model's correction; returns the harmonics of each run."""
         return self._harmonics(self._run(name, model, self.procedure))
 
     def check(self, model: TransmissionModel) -> tuple[tuple[Harmonics, ...], ServoCheck]:
-        """Runs all speeds with a model that has a response; also compares the motor's response with it."""
+        """Runs the axis at all speeds with a model; compares the motor's response with the model's."""
         stored, runs = model.response, self._run("filtered correction", model, self.procedure)
         assert stored is not None
         answers = Answers(stored, self.motor_orders, self.ratio)
@@ -403,7 +402,7 @@ class _Runner:
         return tuple(harmonics(each, self.orders, self.ratio) for each in runs)
 
     def wind_up(self, runs: Sequence[PathRun]) -> InertialWindup | None:
-        """Returns the wind-up in compensated runs; None if it is insignificant or part of the model."""
+        """Fits the wind-up to compensated runs; None if it is insignificant or already in the model."""
         if wind_up_of(self._model) is not None:
             return None
         moves = [each for each in runs if not each.skipped]
@@ -421,12 +420,12 @@ class _Runner:
 
 
 def wind_up_of(model: TransmissionModel) -> InertialWindup | None:
-    """Returns a model's wind-up of the load in acceleration."""
+    """Returns the model's wind-up due to acceleration of the load, or None."""
     return next((each for each in model.effects if isinstance(each, InertialWindup)), None)
 
 
 def predicted_run(run: EvenRun, model: TransmissionModel) -> EvenRun:
-    """Returns a run with the load angle predicted from the motor encoder and the model."""
+    """Returns the run with the load angle replaced by the prediction from motor encoder and model."""
     motor_deg = np.array([each.motor_position_deg for each in run.samples])
     load_deg = motor_deg / model.ratio + model.predict(Motion(motor_deg)) / ARCSEC_PER_DEG
     samples = zip(run.samples, load_deg.tolist(), strict=True)
@@ -462,7 +461,7 @@ def _ripples(
 def faded_orders(
     response: Response, orders: tuple[int, ...], speed_deg_s: float, ratio: float
 ) -> Iterator[int]:
-    """Yields the motor orders that the filter does not correct at a speed."""
+    """Yields the motor orders that the filter does not correct at this speed."""
     cycle_s = response.cycle_ms / 1000.0
     for order in orders:
         hertz = float(order_hz(order, speed_deg_s, ratio))

@@ -22,34 +22,34 @@ from hdbridge.units import ARCSEC_PER_DEG
 FloatArray = NDArray[np.float64]
 
 SETTLED_ARCSEC = 3.0
-"""Distance from the rest position within which the load counts as settled."""
+"""Maximum distance from the rest position at which the load counts as settled."""
 AT_REST_S = 0.2
-"""Length of the final part of the rest that determines the rest error."""
+"""Duration of the final part of the rest, over which the rest error is averaged; s."""
 
 
 LAGS = (0, 1, 2, 4, 8, 16, 32, 64)
-"""Limits in cycles of the lags over which the speed is averaged, for the response of the motor."""
+"""Limits of the lag intervals, in cycles; the motor's response is fitted to the mean target speed in each."""
 WIND_UP_LAGS = LAGS[:6]
-"""Lags of the acceleration, for the wind-up; longer ones would absorb the hysteresis."""
+"""Same for the wind-up, with the target acceleration; longer lags would absorb the hysteresis."""
 
 
 @dataclass(frozen=True, slots=True)
 class PathError:
-    """Error of the load on one path."""
+    """Position error of the load on one path."""
 
     name: str
     path_arcsec: float
-    """Rms over the path."""
+    """Rms error over the path, without servo lag and wind-up."""
     rest_arcsec: float
     """Mean error at rest after the path."""
     settle_s: float
     """Time from the end of the path until the load has settled."""
     delayed_arcsec: float
-    """Rms over the path, including wind-up and the servo's error in acceleration."""
+    """Rms error over the path relative to the delayed target, wind-up and servo error included."""
 
 
 def path_errors(variants: Sequence[Sequence[PathRun]], ratio: float, lag_s: float) -> list[list[PathError]]:
-    """Returns the errors of the same paths run with several corrections, the first without correction.
+    """Returns the errors on the same paths for each of several corrections; the first is no correction.
 
     ``lag_s`` is the following lag of the axis. The motor's response is fitted to the motor encoder of the
     first run, and the wind-up to the others, because hysteresis hides it in the first.
@@ -78,7 +78,7 @@ def path_errors(variants: Sequence[Sequence[PathRun]], ratio: float, lag_s: floa
 def inertia_over_stiffness(
     runs: Sequence[PathRun], model: TransmissionModel, lag_s: float
 ) -> tuple[float, float]:
-    """Fits J / K of the load on its spring to compensated runs; returns it and its 95 % half width, s^2.
+    """Fits J / K (load inertia over stiffness) to compensated runs; returns it and its 95 % half width, s^2.
 
     The load lags behind the motor by J / K times the acceleration, in addition to the model's motor orders.
     """
@@ -116,18 +116,20 @@ def _judged(run: PathRun, error_arcsec: FloatArray, lag_s: float) -> PathError:
 
 
 def _servo_columns(run: PathRun) -> FloatArray:
-    """Returns past speeds of the load target, and the sign of the speed for friction, shape (n, columns)."""
+    """Returns the regressors of the motor's response: past speeds of the load target, and the sign of the
+    speed for friction; shape (n, columns).
+    """
     speed = _speed(run)
     return np.column_stack([*_averages(speed, LAGS), np.sign(speed)])
 
 
 def _wind_up_columns(run: PathRun) -> FloatArray:
-    """Returns past accelerations of the load target, shape (n, columns)."""
+    """Returns the regressors of the wind-up: past accelerations of the load target; shape (n, columns)."""
     return np.column_stack(_averages(np.gradient(_speed(run)), WIND_UP_LAGS))
 
 
 def _averages(values: FloatArray, lags: Sequence[int]) -> list[FloatArray]:
-    """Returns the means of the values between neighbouring lags, (n,) each; zero before the first value."""
+    """Returns the mean of the values over each lag interval, shape (n,); values before the first are zero."""
     total = np.concatenate([np.zeros(lags[-1] + 1), np.cumsum(values)])
     end = len(total)
     count = len(values)
@@ -149,6 +151,6 @@ def _fit(columns: Sequence[FloatArray], values: Sequence[FloatArray]) -> FloatAr
 
 
 def _off(run: PathRun, encoder: str, turns: float) -> FloatArray:
-    """Returns the encoder angle over ``turns``, minus the load target; arcsec, shape (n,)."""
+    """Returns the encoder angle divided by ``turns``, minus the load target; arcsec, shape (n,)."""
     off = [getattr(each, encoder) / turns - each.load_target_deg for each in run.samples]
     return ARCSEC_PER_DEG * np.array(off)

@@ -1,4 +1,4 @@
-"""Complete calibration, from a booted drive to a pending model, and its result, restored from its folder."""
+"""Runs a complete calibration, from a booted drive to a pending model, and restores results from folders."""
 
 import json
 import math
@@ -32,7 +32,7 @@ from hdbridge.units import unit_of
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """Decision on offering a model for commit, with its reason."""
+    """Decision to offer a model for commit, or not, with the reason."""
 
     made: bool
     reason: str
@@ -47,9 +47,9 @@ class Calibration:
     recordings: tuple[str, ...]
     fit: FitResult
     model: TransmissionModel
-    """Model, with its provenance."""
+    """New model, with its provenance."""
     active: TransmissionModel | None
-    """Model for comparison."""
+    """Previously active model, for comparison."""
     axis: str | None = None
     date: str | None = None
     """Date and time of the recording, ISO 8601."""
@@ -58,7 +58,7 @@ class Calibration:
     """Parts of the plan that were shortened for this axis, in words."""
     validation: Validation | None = None
     motion: MotionTest | None = None
-    """Motion test, which measures the response; None without one in the plan."""
+    """Motion test, which measures the response; None if the plan has none."""
     drift: tuple[tuple[float, float], ...] = ()
     """Time (s) and error (arcsec, relative to the first) of each visit to the reference pose."""
     offer: Offer | None = None
@@ -167,7 +167,7 @@ def calibrate(
     recording = journal.recording()
     result = conclude({journal.folder: recording}, axis.gear.ratio, active, axis=axis)
     if active and active.response:
-        # This calibration measured the gear again, but neither the servo nor the load's inertia.
+        # This calibration measured the gear again, but not the servo or the load inertia.
         kept = MotionTest(
             (), active.response, wind_up=wind_up_of(active) if not wind_up_of(result.model) else None
         )
@@ -218,7 +218,7 @@ def calibrate(
 def proposed(
     profile: Path, model: TransmissionModel, reason: str, date: datetime, drive: Drive | Rig
 ) -> Offer:
-    """Makes the model pending; if it cannot be written, the offer's reason still states the figures."""
+    """Makes the model pending; if its file cannot be written, the offer's reason still states the figures."""
     try:
         return Offer(True, reason, propose(profile, model, reason, date, drive.identity))
     except OutputError as problem:
@@ -234,7 +234,7 @@ def conclude(
     axis: AxisConfig | None = None,
     independent_zeros: bool = False,
 ) -> Calibration:
-    """Fits recordings in the given order, keyed by their paths; requires no drive.
+    """Fits a model to recordings, keyed by path, in the given order; requires no drive.
 
     With ``axis``, the model is bound to it.
     """

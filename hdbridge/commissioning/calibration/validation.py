@@ -33,13 +33,13 @@ from hdbridge.records.recording import Recording
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN, figure
 
 WINDOW_S = 0.06
-"""Averaging time of the stepping test at rest."""
+"""Averaging time of a reading at rest in the stepping test, s."""
 CHANCE = 2.0
-"""Number of standard errors above which a stepping test counts as worse."""
+"""Significance limit for a worse stepping test, in standard errors."""
 
 
 def worse_ways(before: Stepped, after: Stepped) -> tuple[str, ...]:
-    """Describes each direction with a significantly larger scatter of steps after than before.
+    """Returns one line for each direction in which the steps scatter significantly more after than before.
 
     The pooled scatter may nevertheless be smaller.
     """
@@ -58,22 +58,22 @@ def worse_ways(before: Stepped, after: Stepped) -> tuple[str, ...]:
 def _chance(steps: int) -> float:
     """Returns the ratio above which a standard deviation from this number of steps is significantly larger.
 
-    The relative standard error of a standard deviation is 1 / sqrt(2 n), that of the ratio of two 1 /
-    sqrt(n).
+    The relative standard error of a standard deviation is 1 / sqrt(2 n), and that of the ratio of two
+    standard deviations is 1 / sqrt(n).
     """
     return 1.0 + CHANCE / math.sqrt(max(steps, 1))
 
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """Stepping test before and after, with the best possible result on the axis."""
+    """Results of the stepping test with the previous and the new model, and the best possible result."""
 
     before: Stepped
     after: Stepped
     floor: Floor
     accuracy_before: AxisAccuracy | None = None
     accuracy_after: AxisAccuracy | None = None
-    """Accuracy by the positioning test; None without one in the plan."""
+    """Accuracy from the positioning test; None if the plan has none."""
     survived: tuple[str, ...] = ()
     """One line for each run with tolerated faults, or with a motor that turns back at rest."""
 
@@ -154,7 +154,7 @@ def floor_of(axis: AxisConfig, recording: Recording) -> Floor:
 
 
 def validation_s(plan: Plan, axis: AxisConfig) -> float:
-    """Returns the duration of a plan's validation on an ideal axis."""
+    """Returns the duration of a plan's validation on an ideal axis, s."""
     view = axis_view(axis)
     stepping, positioning = plan.stepping(view), plan.positioning(view)
     each_s = rehearse(stepping, view, stepping.start_deg).duration_s
@@ -174,11 +174,10 @@ def validate(
     progress: Callable[[str, float, float], None] = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> tuple[Validation, TransmissionModel]:
-    """Runs the stepping and positioning tests with the model before (None: none) and with the new one.
+    """Runs the stepping and positioning tests with ``before`` (None: no compensation), then with ``after``.
 
-    The new model is tested, and returned, with the offset of `at_rest`. If it `_arrives_otherwise` than the
-    one before, its offset is fitted to its own rests, and it is tested again. ``drive`` is booted. The
-    samples of each run go to ``folder``, even if it is stopped.
+    The new model is tested, and returned, with the hysteresis offset fitted by `at_rest`. ``drive`` is
+    booted. The samples of each run are written to ``folder``, even if the run is stopped.
     """
     axis = drive.axis
     stepping = plan.stepping(axis_view(axis))
@@ -268,10 +267,11 @@ def _turning_back(run: Run[SteppingOutcome], axis: AxisConfig) -> Iterator[str]:
 
 
 def at_rest(model: TransmissionModel, run: Run[SteppingOutcome]) -> TransmissionModel:
-    """Returns the model with the offset of its hysteresis fitted to the rests of a stepping test.
+    """Returns the model with its hysteresis offset fitted to the positions at rest in a stepping test.
 
-    In motion, coarse motor encoders are read wrong by a part of a count, and an arriving motor that
-    overshoots by a few hundredths of a degree takes the loop back. Both add to the offset at rest.
+    In motion, the reading of a coarse motor encoder is wrong by a fraction of a count; on arrival, a motor
+    that overshoots by a few hundredths of a degree moves back on the hysteresis loop. Both add to the offset
+    at rest.
     """
     loop = next((each for each in model.effects if isinstance(each, ElasticLoop)), None)
     if loop is None:

@@ -25,9 +25,9 @@ class AxisAccuracy:
     accuracy: float
     """A, bi-directional: largest of mean + 2 s minus smallest of mean - 2 s, over both directions."""
     accuracy_forward: float
-    """A (arrow up): same for the forward approaches."""
+    """A (arrow up): the same for the forward approaches."""
     accuracy_backward: float
-    """A (arrow down): same for the backward approaches."""
+    """A (arrow down): the same for the backward approaches."""
     repeatability: float
     """R, bi-directional: largest max(2 s_i forward + 2 s_i backward + |B_i|; 4 s_i of either)."""
     repeatability_forward: float
@@ -65,7 +65,7 @@ def axis_accuracy(
     forward: Sequence[bool] | np.ndarray[tuple[int], np.dtype[np.bool_]],
     same_deg: float = 1e-6,
 ) -> AxisAccuracy:
-    """Computes the figures from any number of approaches, in any order; arrays of shape (approaches,).
+    """Computes the figures from any number of approaches in any order; the arrays have shape (approaches,).
 
     ``deviation_arcsec`` is the actual position minus the target, ``forward`` is True for approaches in the
     positive direction. Targets closer than ``same_deg`` count as one. Raises `InputError` if a target was
@@ -123,7 +123,7 @@ def axis_accuracy(
 def _statistics(
     group: np.ndarray[tuple[int], np.dtype[np.intp]], deviation: FloatArray, count: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Returns runs, mean and standard deviation (n - 1) at each target."""
+    """Returns number of runs, and mean and standard deviation (n - 1) of the deviations, at each target."""
     runs = np.bincount(group, minlength=count).astype(np.float64)
     mean = np.bincount(group, deviation, count) / np.maximum(runs, 1.0)
     squares = np.bincount(group, (deviation - mean[group]) ** 2, count)

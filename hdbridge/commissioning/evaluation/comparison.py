@@ -69,11 +69,11 @@ def compare_schemes(
 ) -> Comparison:
     """Runs the stepping test under each scheme on a booted drive, which is disabled after each test.
 
-    ``progress`` receives the completed share of the present scheme, ``finished`` each completed run, and
+    ``progress`` receives the completed fraction of the current scheme, ``finished`` each completed run, and
     ``stopped`` the measurements of an interrupted run, so that no measurement is lost.
     """
     drive.axis.require_load_encoder()
-    # All of them first, so that an impossible compensation is refused before anything moves.
+    # All compensations first, so that an impossible one is refused before anything moves.
     compensations = {scheme: compensation_for(drive.axis, scheme.of(model)) for scheme in schemes}
     runs: dict[Scheme, Run[SteppingOutcome]] = {}
     for scheme, compensation in compensations.items():

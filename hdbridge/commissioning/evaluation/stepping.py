@@ -55,7 +55,7 @@ class Scatter:
 
     @classmethod
     def of(cls, errors_arcsec: Sequence[float]) -> Scatter:
-        """Uses the population standard deviation, as is usual for 3 sigma in the literature."""
+        """Uses the population standard deviation for 3 sigma, as is usual in the literature."""
         errors = np.asarray(errors_arcsec)
         return cls(3.0 * float(np.std(errors)), float(np.mean(errors)))
 
@@ -67,7 +67,7 @@ class Stepped:
     model: str
     """Description of the model, or the scheme."""
     errors_arcsec: tuple[tuple[float, ...], tuple[float, ...]]
-    """Error of each step, outward and back."""
+    """Error at rest after each step, outward and back."""
     targets_deg: tuple[tuple[float, ...], tuple[float, ...]]
 
     @classmethod
@@ -82,12 +82,12 @@ class Stepped:
 
     @property
     def cw(self) -> Scatter:
-        """Scatter outward."""
+        """Scatter of the outward steps."""
         return Scatter.of(self.errors_arcsec[0])
 
     @property
     def ccw(self) -> Scatter:
-        """Scatter on the way back."""
+        """Scatter of the return steps."""
         return Scatter.of(self.errors_arcsec[1])
 
     @property

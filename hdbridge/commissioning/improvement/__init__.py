@@ -1,9 +1,9 @@
 """Improvement: diagnosis, extension and trial of a model on a drive.
 
     diagnose     a recording, measured by a plan or given, against the active model
-    further      the shortest experiment of the axis that separates the remaining alternatives
+    further      the shortest experiment that separates the remaining alternative causes
     extension    the extended model, without unpredictable effects
-    trial        stepping with the active and the extended model, in turns
+    trial        stepping with the active and the extended model alternately
     improve      all steps, up to a pending model
 
 Drive and dates are passed in; nothing here depends on whether the drive is simulated.

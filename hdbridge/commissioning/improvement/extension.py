@@ -1,4 +1,4 @@
-"""Selection of the findings for the proposed model, and of the causes that each must be separated from."""
+"""Selects the findings that the proposed model compensates, and gives the reasons for leaving out others."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,16 +14,16 @@ from hdbridge.units import DEG_PER_TURN
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extension:
-    """Extended model, and the findings corrected by the compensation."""
+    """Extended model, and the findings that it compensates."""
 
     model: TransmissionModel
     carried: tuple[Finding, ...]
-    """Findings corrected by the compensation."""
+    """Findings that the extended model compensates."""
     left: tuple[str, ...]
     """Findings that are not compensated, each with the reason."""
 
     refused: tuple[str, ...] = ()
-    """Changes within the model that must not be offered and cannot be removed from it, with the reason."""
+    """Changes of existing effects that must not be offered and cannot be removed, each with the reason."""
 
     @property
     def improves(self) -> bool:
@@ -38,15 +38,15 @@ class Extension:
 def extension_of(
     diagnosis: Diagnosis, active: TransmissionModel, rivals: Mapping[str, Sequence[str]] | None = None
 ) -> Extension:
-    """Returns the diagnosis's extended model without effects bound to the time of its record.
+    """Returns the diagnosis's extended model without effects that are bound to the time of its record.
 
     A lost count or the phase of a vibration has no predictive value. Repeatable effects that are not
-    compensated (orders of the load of unknown origin) stay in the model, where the user can state their
-    origin. Wear continues from the motor turns at the end of the record. Findings without a gain on held-out
+    compensated (load orders of unknown origin) stay in the model, so that the user can state their origin.
+    Wear continues from the motor turns at the end of the record. Findings without a gain on held-out
     data, or with another reason for refusal (`Finding.refusal`), are left out.
 
-    ``rivals`` are the causes from which each finding is not separated (`further.unseparated`). If one of
-    these must not be compensated, the finding is left out too.
+    ``rivals`` lists, for each finding, the causes from which it is not separated (`further.unseparated`). If
+    one of these must not be compensated, the finding is left out too.
     """
     known = {each.name for each in active.effects}
     reasons = {id(each): _why_not(each, (rivals or {}).get(each.cause, ())) for each in diagnosis.findings}
@@ -77,17 +77,17 @@ def extension_of(
 
 
 def named(findings: Sequence[Finding]) -> str:
-    """Lists causes with their alternatives and probabilities, as text."""
+    """Returns the causes of findings with their aliases and probabilities, as text."""
     return ", ".join(f"{alternatives(each)} {each.probability:.2f}" for each in findings)
 
 
 def alternatives(finding: Finding) -> str:
-    """Returns a cause with its alternatives, as text."""
+    """Returns the cause of a finding with its aliases, as text."""
     return " or ".join((finding.cause, *finding.aliases))
 
 
 def _turns_run(diagnosis: Diagnosis) -> float:
-    """Returns the motor turns of the record."""
+    """Returns the total motor travel of the record, in turns."""
     return float(np.sum(np.abs(np.diff(diagnosis.traces.motion.motor_deg)))) / DEG_PER_TURN
 
 

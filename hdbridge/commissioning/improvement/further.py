@@ -1,4 +1,4 @@
-"""Further experiments of the axis, for separating causes that a diagnosis cannot separate."""
+"""Further experiments that the axis can run to separate causes that a diagnosis cannot separate."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -92,7 +92,7 @@ class Choice:
 
     plan: Plan
     duration_s: float
-    """Duration on an ideal axis."""
+    """Duration on an ideal axis, s."""
     separates: tuple[str, ...]
     """Alternatives that the experiment is predicted to separate, as text."""
 
@@ -109,10 +109,10 @@ class Choice:
 def unseparated(
     diagnosis: Diagnosis, model: TransmissionModel, view: AxisView, plans: Sequence[Plan] = ()
 ) -> dict[str, tuple[str, ...]]:
-    """Returns for each cause found the other causes from which it has not been separated.
+    """Returns, for each cause found, the other causes from which it has not been separated.
 
-    These are its aliases in the diagnosis, and causes that none of the ``plans`` used for measuring can
-    separate from it. On a short travel, for example, a load order is a ramp, and one of the two always fits
+    These are its aliases in the diagnosis, and the causes that none of the measured ``plans`` can separate
+    from it. Over a short travel, for example, a load order looks like a ramp, and one of the two always fits
     slightly better.
     """
     reports = [plan_report(each, model, view.limits)["identifiability"] for each in plans]
@@ -137,10 +137,10 @@ def choose(
     view: AxisView,
     done: Collection[str] = (),
 ) -> Choice | None:
-    """Returns the shortest experiment that separates most causes from their ``rivals`` and is not ``done``.
+    """Returns the shortest experiment not ``done`` that separates the most causes from their ``rivals``.
 
-    If none does, returns the experiment for the coordinate of an unexplained residual. None if the axis
-    cannot find out more on its own.
+    If none separates any, returns the experiment for the coordinate of an unexplained residual, or None if no
+    experiment of the axis is of use.
     """
     menu = sorted(
         ((_duration_s(plan, view), plan) for name, plan in machine_plans().items() if name not in done),
@@ -173,7 +173,7 @@ def choose(
 
 
 def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Returns advice to the user for each open question."""
+    """Returns the recommended experiment for each cause that has aliases or is unexplained, as text."""
     return tuple(
         dict.fromkeys(
             f"{alternatives(each)}: {each.experiment}"

@@ -1,4 +1,4 @@
-"""Complete workflow, from a booted drive to a pending model that improves positioning, and its result."""
+"""Runs a complete improvement, from a booted drive to a pending model that positions better."""
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -33,13 +33,13 @@ from hdbridge.records.recording import ABOUT_NAME, Recording
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Further experiment run by the axis."""
+    """One further experiment, and the findings after it."""
 
     experiment: str
     about: str
     recording: str
     separates: tuple[str, ...]
-    """Alternatives that the experiment was predicted to separate; empty if it existed already."""
+    """Alternatives that the experiment was predicted to separate; empty for a resumed experiment."""
     found: tuple[str, ...]
     """Findings after the experiment, each with its alternatives."""
 
@@ -60,13 +60,13 @@ class Improvement:
     """For each cause found, the other causes from which it has not been separated."""
     rounds: tuple[Round, ...]
     further: Choice | None
-    """Experiment from which the axis could find out more on its own."""
+    """Next experiment that the axis could run to separate causes; None if none would help."""
     advice: tuple[str, ...]
     """Advice to the user about open questions."""
     trial: Trial | None
     offer: Offer
     survived: tuple[str, ...] = ()
-    """One line for each file with tolerated faults."""
+    """One line for each recorded file whose run tolerated faults."""
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the document of ``--json``: schema ``hdbridge.improvement/1``."""
@@ -103,7 +103,7 @@ class Source:
     """Data for the diagnosis: a plan to be run (its journal), or existing recordings."""
 
     plan: Plan
-    """Plan with the stepping test of the trial, also for given recordings."""
+    """Plan of the measurement; its stepping test is used in the trial, even with given recordings."""
     folder: Path
     """Folder for all new files."""
     journal: Journal | None = None
@@ -112,7 +112,7 @@ class Source:
     """True if the encoders' zeros were lost between the given recordings."""
 
 
-@left_realtime()  # a fit takes time; a bench returns to real time for each motion
+@left_realtime()  # fitting takes long; a bench resumes real-time priority for each motion
 def improve(
     drive: Drive | Rig,
     source: Source,
@@ -125,12 +125,12 @@ def improve(
     interrupted: Callable[[], bool] = lambda: False,
     notify: Callable[[str], None] = lambda _: None,
 ) -> Improvement:
-    """Diagnoses, extends, steps with both models, and proposes the better one to the profile.
+    """Diagnoses the axis, extends its model, steps with both, and proposes the better one to the profile.
 
     ``profile`` is the folder of axis.yaml, ``active`` its model; ``notify`` receives a line for each step.
-    The axis runs up to ``rounds`` further experiments while causes remain to be separated. Proposes nothing
-    without a finding that can be compensated, or without a gain on held-out data and in stepping. Raises
-    `InputError` if model or recordings belong to another axis or drive.
+    The axis runs up to ``rounds`` further experiments while causes remain to be separated. Nothing is
+    proposed without a finding that can be compensated, or without a gain both on held-out data and in
+    stepping. Raises `InputError` if model or recordings belong to another axis or drive.
     """
     active.check_bound_to(drive.axis, drive.identity)
     drive.axis.require_load_encoder()
@@ -181,7 +181,7 @@ def improve(
 
 @dataclass(frozen=True, slots=True)
 class _Bench:
-    """Common settings of all measurements here."""
+    """Drive, date and callbacks shared by all measurements of an improvement."""
 
     drive: Drive | Rig
     date: datetime
@@ -195,7 +195,7 @@ class _Bench:
 
 
 def _begin(source: Source, bench: _Bench) -> tuple[dict[Path, Recording], bool]:
-    """Returns the recordings to diagnose first, and True if an encoder may have lost its zero in between."""
+    """Returns the first recordings to diagnose, and True if an encoder may have lost its zero in between."""
     if source.journal is not None:
         apart = bench.run(source.journal)
         return {source.journal.folder: source.journal.recording()}, apart
@@ -231,7 +231,11 @@ def _journal(
     active: TransmissionModel,
     plans: Sequence[Plan],
 ) -> tuple[Journal | None, tuple[str, ...]]:
-    """Returns the journal of the next experiment: one begun earlier, else the most useful experiment now."""
+    """Returns the journal of the next experiment, and the alternatives that it separates.
+
+    An experiment already in ``folder`` is resumed, otherwise the most useful one is chosen; the journal is
+    None if there is none.
+    """
     axis = bench.drive.axis
     if (folder / ABOUT_NAME).exists():
         journal = Journal.open(folder)
@@ -251,7 +255,7 @@ def _concluded(
     recording: Recording,
     notify: Callable[[str], None],
 ) -> Improvement:
-    """Adds the trial, if worthwhile, and the offer."""
+    """Returns the result with the trial, if the extended model may be offered, and with the offer."""
     extension, drive = result.extension, bench.drive
     if not extension.carried:
         return replace(result, offer=Offer(False, f"nothing proposed: {'; '.join(extension.left)}"))

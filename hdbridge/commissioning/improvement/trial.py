@@ -1,4 +1,4 @@
-"""Trial of an extended model: stepping with both models in turn, to compare their positioning."""
+"""Trial of an extended model: stepping with both models alternately, to compare their positioning."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -34,7 +34,7 @@ PIECES = 4
 """Number of parts of the travel; both models step in each part, so that a drift affects both equally."""
 SMALL_STEPS = 40
 DEFAULT_WIDTH_DEG = 20.0
-"""Reach of the small steps if the model has no hysteresis; motor degrees."""
+"""Hysteresis width assumed for the small steps if the model has no hysteresis; motor degrees."""
 _WORDS = ("the active model", "the extended model")
 
 
@@ -43,9 +43,9 @@ class Trial:
     """Results of stepping with the active and the extended model, at the load encoder."""
 
     stepping: Validation
-    """Steps longer than the width of the hysteresis, over the plan's travel."""
+    """Steps longer than the hysteresis width, over the plan's travel."""
     small: tuple[Stepped, Stepped]
-    """Steps shorter than that width, about one pose: before and after."""
+    """Steps shorter than the hysteresis width about one pose, with the active and with the extended model."""
 
     @property
     def improves(self) -> bool:
@@ -55,17 +55,17 @@ class Trial:
 
     @property
     def worse(self) -> tuple[str, ...]:
-        """Descriptions of the deterioration in one direction of either test."""
+        """One line for each direction of either test in which the scatter is significantly larger."""
         small = (f"small steps {each}" for each in worse_ways(*self.small))
         return (*self.stepping.worse, *small)
 
     @property
     def of_floor(self) -> float:
-        """Three sigma of stepping with the extended model, relative to the best possible on this axis."""
+        """Ratio of the three sigma of stepping with the extended model to the best possible on this axis."""
         return self.stepping.after.pooled.three_sigma_arcsec / self.stepping.floor.three_sigma_arcsec
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns plain data; ``stepping`` is that of a calibration."""
+        """Returns plain data; ``stepping`` has the format of a calibration's stepping test."""
         before, after = self.small
         return {
             "stepping": self.stepping.as_dict(),
@@ -89,7 +89,7 @@ def try_out(
     progress: Callable[[str, float, float], None] = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Trial:
-    """Steps a booted drive's axis with both models in turn, one part of the travel after the other.
+    """Steps a booted drive's axis with both models alternately, one part of the travel after the other.
 
     Each run's samples are written to ``folder``, even if it is interrupted. Raises `InputError` before any
     motion if the axis lacks a channel that the model's compensation needs.
@@ -116,7 +116,7 @@ def try_out(
 
 
 def trial_s(plan: Plan, axis: AxisConfig, active: TransmissionModel) -> float:
-    """Returns the duration on an ideal axis."""
+    """Returns the duration of the trial on an ideal axis, s."""
     view = axis_view(axis)
     middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
     procedures = _procedures(plan, view, active)
@@ -126,7 +126,7 @@ def trial_s(plan: Plan, axis: AxisConfig, active: TransmissionModel) -> float:
 def _procedures(
     plan: Plan, view: AxisView, active: TransmissionModel
 ) -> list[tuple[str, Stepping | SmallSteps]]:
-    """Returns the plan's stepping test in parts, and the small steps last."""
+    """Returns the parts of the plan's stepping test, followed by the small steps, by name."""
     whole = plan.stepping(view)
     count = max(whole.count // PIECES, 2)
     pieces = [
@@ -158,7 +158,7 @@ def _together(outcomes: Sequence[SteppingOutcome]) -> SteppingOutcome:
 
 
 def _gain(before: Stepped, after: Stepped) -> float:
-    """Returns the decrease of the variance at the same places, in standard errors."""
+    """Returns the decrease of the error variance at the same targets, in standard errors."""
     squares = []
     for stepped in (before, after):
         errors = np.concatenate([np.asarray(each) for each in stepped.errors_arcsec])

@@ -1,4 +1,4 @@
-"""Hides a physical cause in the simulated axis, for a diagnosis to find."""
+"""Injects a hidden physical cause into the simulated axis, for a diagnosis to find."""
 
 from support.hidden.hide import CAUSES, UNKNOWN, hide, hide_all
 from support.hidden.site import Hidden, Run

@@ -1,4 +1,4 @@
-"""Hides causes in the spring, the friction, the load, and the hysteresis."""
+"""Injects causes into the gear's stiffness, friction, load and hysteresis."""
 
 import cmath
 import math
@@ -10,7 +10,7 @@ from support.hidden.site import ARCSEC_PER_RAD, Hidden, Site, solve
 
 
 def hang_mass(site: Site, torque_nm: float) -> float:
-    """Adds a mass to the axis with this peak torque; returns the angle at which it hangs down."""
+    """Adds an eccentric mass with this peak torque to the load; returns the angle at which it hangs down."""
     arm_m = site.uniform(0.08, 0.25)
     down_deg = site.angle_deg()
     site.load["gravity"] = {
@@ -23,11 +23,11 @@ def hang_mass(site: Site, torque_nm: float) -> float:
 
 
 def compliance(site: Site) -> Hidden:
-    """Hides a mass on the axis, on a spring with or without stages."""
+    """Injects an eccentric mass on the load, with a linear or a stiffening gear."""
     stiffness = site.truth.gear.stiffness_nm_per_rad
     torque_nm = site.size_arcsec / ARCSEC_PER_RAD * stiffness
     if site.rng.random() < 0.5:
-        # Usual in catalogues; no stiffer than the simulation's time step resolves.
+        # Typical catalogue values, but no stiffer than the simulation's time step resolves.
         third = min(site.uniform(1.4, 2.0), 0.98 * site.truth.highest_stiffness_nm_per_rad / stiffness)
         second = site.uniform(1.0 + 0.3 * (third - 1.0), 1.0 + 0.7 * (third - 1.0))
         first_nm, second_nm = site.uniform(0.3, 0.5) * torque_nm, site.uniform(0.6, 0.9) * torque_nm
@@ -58,7 +58,7 @@ def compliance(site: Site) -> Hidden:
 
 
 def inertial_windup(site: Site) -> Hidden:
-    """Hides a heavier load on a softer spring; the wind-up is at least that of the axis before."""
+    """Injects a heavier load and a softer gear; the wind-up is at least that of the axis before."""
     acceleration = math.radians(site.run.load_acceleration_deg_s2)
     inertia = site.truth.load_.whole_inertia_kg_m2
     present = inertia * acceleration / site.truth.gear.stiffness_nm_per_rad * ARCSEC_PER_RAD
@@ -67,7 +67,7 @@ def inertial_windup(site: Site) -> Hidden:
     heavier = more ** site.uniform(0.2, 0.5)
     site.load["inertia_kg_m2"] += (heavier - 1.0) * inertia
     site.gear["stiffness_nm_per_rad"] *= heavier / more
-    # The same damping ratio as before.
+    # Keeps the damping ratio.
     site.gear["damping_nm_s_per_rad"] *= heavier / math.sqrt(more)
     frequency_hz = math.sqrt(acceleration / size * ARCSEC_PER_RAD) / math.tau
     _commission_servo(site, heavier, frequency_hz)
@@ -81,7 +81,7 @@ def inertial_windup(site: Site) -> Hidden:
 
 
 def _commission_servo(site: Site, heavier: float, frequency_hz: float) -> None:
-    """Commissions the drive for the true load."""
+    """Adjusts the servo's feed-forward to the new load, as a commissioning would."""
     known = site.part("servo")["load_feedforward"]
     if known is not None:
         known["inertia_kg_m2"] *= heavier
@@ -89,7 +89,7 @@ def _commission_servo(site: Site, heavier: float, frequency_hz: float) -> None:
 
 
 def velocity_windup(site: Site) -> Hidden:
-    """Hides grease at the output that thins with shear, with a little Coulomb friction."""
+    """Injects shear-thinning grease at the output, with a little Coulomb friction."""
     stiffness = site.truth.gear.stiffness_nm_per_rad
     torque_nm = site.size_arcsec / ARCSEC_PER_RAD * stiffness
     speed = math.radians(site.run.load_speed_deg_s)
@@ -114,13 +114,13 @@ def velocity_windup(site: Site) -> Hidden:
 
 
 def backlash(site: Site) -> Hidden:
-    """Hides a dead zone behind the gear: between spring and load, or in the load encoder's coupling."""
+    """Injects backlash behind the gear: between gear and load, or in the load encoder's coupling."""
     play_arcsec = 2.0 * site.size_arcsec
     if site.load["encoder"]["coupling"] is not None and site.rng.random() < 0.5:
         site.load["encoder"]["coupling"]["play_arcsec"] += play_arcsec
         where = "the coupling to the load encoder"
     else:
-        # Friction holds the load in the dead zone. It adds some wind-up, which is subtracted.
+        # Friction holds the load within the backlash. It adds some wind-up, which is subtracted.
         inertia = site.truth.load_.whole_inertia_kg_m2
         friction_nm = 1.5 * inertia * math.radians(site.run.load_acceleration_deg_s2)
         per_nm = ARCSEC_PER_RAD / site.truth.gear.stiffness_nm_per_rad
@@ -153,7 +153,7 @@ def remembering(law: RollingFriction, share: float = 1.0, elements: int = 18) ->
             return part * (1.0 - math.log(part))
         return float((part ** (n - 1.0) - (n - 1.0) * part) / (2.0 - n))
 
-    # Ends of the branch's straight pieces, spaced for the same maximum error in each piece.
+    # Ends of the straight segments that approximate the branch, spaced for equal maximum errors.
     points = [(each / elements) ** (2.0 / (n - 1.0)) for each in range(elements + 1)]
     heights = [0.0] + [crossed(each) for each in points[1:]]
     pairs = zip(zip(points, heights, strict=True), zip(points[1:], heights[1:], strict=False), strict=False)
@@ -173,7 +173,7 @@ def remembering(law: RollingFriction, share: float = 1.0, elements: int = 18) ->
 
 
 def hysteresis_memory(site: Site) -> Hidden:
-    """Hides return-point memory in a part of the loop, or in all of it."""
+    """Injects return-point memory into part of the hysteresis loop, or into all of it."""
     law = _rolling(site)
     whole = _missed_arcsec(law)
     share = min(1.0, site.size_arcsec / whole)
@@ -194,7 +194,7 @@ def hysteresis_memory(site: Site) -> Hidden:
 
 
 def _missed_arcsec(law: RollingFriction) -> float:
-    """Returns the greatest difference of the two laws on nested loops of a few sizes."""
+    """Returns the maximum difference between the laws with and without memory on nested loops, arcsec."""
     worst = 0.0
     for back in (0.05, 0.1, 0.2, 0.4):
         forgetting, memory = law_of(law, 0.0), law_of(remembering(law), 0.0)
@@ -210,7 +210,7 @@ def _missed_arcsec(law: RollingFriction) -> float:
 
 
 def hysteresis_parameters(site: Site) -> Hidden:
-    """Hides a loop that is higher, or wider, than the calibrated one."""
+    """Injects a hysteresis loop that differs from the calibrated one in height, or is wider."""
     law = _rolling(site)
     changed = {"start_arcsec": 0.0}
     size = site.size_arcsec
@@ -249,7 +249,7 @@ def _crossing_miss(one: RollingFriction, other: RollingFriction) -> float:
 
 
 def rate_dependence(site: Site) -> Hidden:
-    """Hides a loop that grows with speed."""
+    """Injects a hysteresis loop that grows with speed."""
     law = site.truth.gear.hysteresis
     if law is None:
         raise ValueError("this needs an axis with hysteresis")
@@ -275,7 +275,7 @@ def rate_dependence(site: Site) -> Hidden:
 
 
 def vibration(site: Site) -> Hidden:
-    """Hides the vibration of a machine nearby."""
+    """Injects the vibration of a machine nearby."""
     frequency_hz = site.stretched(2.0, 18.0)
     gear, load = site.truth.gear, site.truth.load_
     turn = math.tau * frequency_hz

@@ -1,8 +1,8 @@
-"""Hides a physical cause in the simulated axis, for a diagnosis to find.
+"""Injects a hidden physical cause into the simulated axis, for a diagnosis to find.
 
-`hide` draws physically plausible parameters, off any grid, so that the cause has a wanted size, and returns
-the truth with the cause and a description of it. The size is a peak in arcsec at the load, reached somewhere
-in the intended run (`Run`); each description defines it exactly.
+`hide` draws physically plausible random parameters that give the cause the wanted size, and returns the truth
+with the cause, and its description. The size is a peak in arcsec at the load, reached somewhere in the
+intended run (`Run`); each description defines it exactly.
 
 The names of the causes are those of the catalogue in docs/causes.md. ``unexplained`` draws one of several
 causes outside the catalogue; ``unexplained:roller`` and the like choose one of them.
@@ -61,11 +61,11 @@ CAUSES: Mapping[str, Callable[[Site], Hidden]] = MappingProxyType(
 def hide(
     truth: Truth, cause: str, rng: random.Random, size_arcsec: float, run: Run | None = None
 ) -> tuple[Truth, Hidden]:
-    """Adds a cause of about this size to an axis, in addition to those that it has.
+    """Injects a cause of about this size into an axis, in addition to those that the axis has.
 
-    ``Hidden.size_arcsec`` is the true size, because some causes have limits (a tooth error cannot be shifted
-    by more than itself). ValueError for an unknown cause, a size that is not above 0, or an axis that cannot
-    have it (a loop without hysteresis cannot have another width).
+    ``Hidden.size_arcsec`` is the true size, because the size of some causes is limited (for example, the
+    shift of a tooth error). ValueError for an unknown cause, a size that is not above 0, or an axis that
+    cannot have the cause (without hysteresis, no loop can have another width).
     """
     if size_arcsec <= 0.0:
         raise ValueError(f"size_arcsec: found {size_arcsec:g}; expected a number above 0")
@@ -81,7 +81,7 @@ def hide(
 def hide_all(
     truth: Truth, wanted: Iterable[tuple[str, float]], rng: random.Random, run: Run | None = None
 ) -> tuple[Truth, list[Hidden]]:
-    """Adds several causes, each of its size in arcsec, to an axis, one after the other."""
+    """Injects several causes into an axis, one after the other, each with its given size in arcsec."""
     hidden = []
     for cause, size_arcsec in wanted:
         truth, one = hide(truth, cause, rng, size_arcsec, run)

@@ -1,4 +1,4 @@
-"""Hides causes in the encoders: geometry, signals, late samples, lost counts."""
+"""Injects causes into the encoders: geometry, signals, late samples, lost counts."""
 
 import math
 from typing import Any
@@ -9,7 +9,9 @@ from support.hidden.site import ARCSEC_PER_RAD, ARCSEC_PER_TURN, Hidden, Site
 
 
 def _disc(site: Site, arcsec: float, second: float) -> dict[str, Any]:
-    """Returns a disc with this reading error at its shaft once per turn, and ``second`` of it twice."""
+    """Returns a disc with this error of the first order at its shaft, and a fraction ``second`` of it of the
+    second order.
+    """
     radius_mm = site.stretched(12.0, 60.0)
     off_um = arcsec / ARCSEC_PER_RAD * radius_mm * 1000.0
     return {
@@ -22,7 +24,7 @@ def _disc(site: Site, arcsec: float, second: float) -> dict[str, Any]:
 
 
 def motor_encoder_eccentricity(site: Site) -> Hidden:
-    """Hides an eccentric disc of the motor encoder."""
+    """Injects an eccentric disc of the motor encoder."""
     second = site.rng.choice((0.0, site.uniform(0.1, 0.3)))
     disc = _disc(site, site.size_arcsec * site.truth.gear.ratio, second)
     site.part("motor", "encoder")["disc"] = disc
@@ -36,7 +38,7 @@ def motor_encoder_eccentricity(site: Site) -> Hidden:
 
 
 def load_order(site: Site) -> Hidden:
-    """Hides an eccentric disc of the load encoder, or a pitch error of the spline."""
+    """Injects an eccentric disc of the load encoder, or a pitch error of the spline."""
     second = site.rng.choice((0.0, site.uniform(0.1, 0.4)))
     if site.rng.random() < 0.5:
         disc = _disc(site, site.size_arcsec, second)
@@ -62,7 +64,7 @@ def load_order(site: Site) -> Hidden:
 
 
 def channel_skew(site: Site) -> Hidden:
-    """Hides a delay of one encoder's sample against the other's."""
+    """Injects a delay of one encoder's samples relative to the other's."""
     late_ms = site.size_arcsec / (site.run.load_speed_deg_s * 3600.0) * 1000.0
     load = site.rng.random() < 0.5
     encoder = site.load["encoder"] if load else site.part("motor", "encoder")
@@ -77,7 +79,7 @@ def channel_skew(site: Site) -> Hidden:
 
 
 def subdivisional_error(site: Site) -> Hidden:
-    """Hides imperfect sine and cosine signals of the load encoder."""
+    """Injects imperfect sine and cosine signals of the load encoder."""
     part = site.stretched(0.006, 0.04)
     lines = max(180, min(15_000, round(part * ARCSEC_PER_TURN / site.size_arcsec)))
     shares = [site.uniform(0.2, 1.0), site.uniform(0.0, 1.0), site.uniform(0.0, 0.4)]
@@ -107,7 +109,7 @@ def subdivisional_error(site: Site) -> Hidden:
 
 
 def count_loss(site: Site) -> Hidden:
-    """Hides a loss of counts at an unknown time."""
+    """Injects a loss of encoder counts at a random time."""
     motor = site.rng.random() < 0.4
     encoder = site.part("motor", "encoder") if motor else site.load["encoder"]
     per_count = ARCSEC_PER_TURN / encoder["counts_per_turn"] / (site.truth.gear.ratio if motor else 1.0)

@@ -1,4 +1,4 @@
-"""Site of a hidden cause: the axis, the intended run, the wanted size, and the random generator."""
+"""Data for injecting a hidden cause: axis, intended run, wanted size and random generator."""
 
 import math
 import random
@@ -17,7 +17,7 @@ ARCSEC_PER_RAD = math.degrees(1.0) * ARCSEC_PER_DEG
 
 @dataclass(frozen=True)
 class Run:
-    """Run of the axis on a bench, as far as the sizes of causes depend on it."""
+    """Properties of a bench run that determine the sizes of causes."""
 
     duration_s: float = 600.0
     load_speed_deg_s: float = 10.0
@@ -25,7 +25,7 @@ class Run:
     load_acceleration_deg_s2: float = 50.0
     """Highest acceleration of the load."""
     motor_turns: float = 400.0
-    """Travel of the motor, both directions added up."""
+    """Total travel of the motor, both directions added."""
     load_reach_deg: tuple[float, float] = (-360.0, 360.0)
     """Range of the load angle."""
 
@@ -37,18 +37,18 @@ class Hidden:
     cause: str
     size_arcsec: float
     size_is: str
-    """Meaning of the size, in words."""
+    """Definition of the size, in words."""
     text: str
     """Change of the axis, in one line."""
     parameters: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     """Parameters to compare a finding with; names include their units."""
     brings: tuple[str, ...] = ()
-    """Causes that necessarily come with it, and that are also right findings."""
+    """Causes that this cause necessarily implies; they are right findings, too."""
 
 
 @dataclass
 class Site:
-    """Axis in which a cause is being hidden; ``data`` is its truth file, to be changed."""
+    """Axis into which a cause is injected; ``data`` is the content of its truth file, which changes."""
 
     truth: Truth
     rng: random.Random
@@ -77,15 +77,15 @@ class Site:
         return place
 
     def uniform(self, low: float, high: float) -> float:
-        """Draws a number between two, uniformly."""
+        """Draws a number from a uniform distribution."""
         return self.rng.uniform(low, high)
 
     def stretched(self, low: float, high: float) -> float:
-        """Draws a number between two, uniformly in its logarithm."""
+        """Draws a number whose logarithm is uniformly distributed."""
         return math.exp(self.rng.uniform(math.log(low), math.log(high)))
 
     def angle_deg(self) -> float:
-        """Draws an angle."""
+        """Draws an angle from -180 to 180 deg."""
         return self.rng.uniform(-180.0, 180.0)
 
     def sign(self) -> float:
@@ -93,12 +93,12 @@ class Site:
         return self.rng.choice((1.0, -1.0))
 
     def load_angle_deg(self) -> float:
-        """Draws a load angle well within the run's range."""
+        """Draws a load angle from the middle 80 % of the run's range."""
         low, high = self.run.load_reach_deg
         return self.rng.uniform(low + 0.1 * (high - low), high - 0.1 * (high - low))
 
     def tooth_peak_arcsec(self, shift_deg: float | None = None) -> float:
-        """Returns the peak of the tooth error by motor angle, or of its change when that angle is shifted."""
+        """Returns the peak of the tooth error over the motor angle, or of its change by a shift, arcsec."""
         orders = Orders(self.truth.gear.motor_orders)
         if not self.truth.gear.motor_orders:
             raise ValueError("this axis has no tooth error by motor angle")
@@ -112,7 +112,7 @@ class Site:
 
 
 def solve(of: Callable[[float], float], goal: float, low: float, high: float) -> float:
-    """Finds where an increasing function reaches a goal, by bisection; clipped to the range."""
+    """Returns the argument at which an increasing function reaches a goal, by bisection, within the range."""
     if of(high) <= goal:
         return high
     if of(low) >= goal:

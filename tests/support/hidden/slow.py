@@ -1,4 +1,4 @@
-"""Hides slow causes: temperature, wear, creep."""
+"""Injects slow causes: temperature, wear, creep."""
 
 import math
 
@@ -12,7 +12,7 @@ def _warm(site: Site) -> float:
     change_k = site.sign() * site.uniform(4.0, 12.0)
     heat["time_constant_s"] = site.uniform(0.25, 0.8) * duration_s
     if site.rng.random() < 0.6:
-        # It starts cold or warm and approaches the ambient temperature.
+        # The axis starts cold or warm and approaches the ambient temperature.
         passed = -math.expm1(-duration_s / heat["time_constant_s"])
         heat["start_c"] = heat["ambient_c"] - change_k / passed
     else:
@@ -24,7 +24,7 @@ def _warm(site: Site) -> float:
 
 
 def zero_drift(site: Site) -> Hidden:
-    """Hides a zero that moves with temperature."""
+    """Injects a zero drift with temperature."""
     change_k = _warm(site)
     per_k = site.sign() * site.size_arcsec / abs(change_k)
     site.part("temperature")["zero_drift_arcsec_per_k"] = per_k
@@ -38,7 +38,7 @@ def zero_drift(site: Site) -> Hidden:
 
 
 def amplitude_drift(site: Site) -> Hidden:
-    """Hides a tooth error that changes with temperature, sometimes together with the friction."""
+    """Injects a tooth error that changes with temperature, sometimes together with the friction."""
     change_k = _warm(site)
     heat = site.part("temperature")
     heat["reference_c"] = heat["ambient_c"] if heat["start_c"] is None else heat["start_c"]
@@ -56,7 +56,7 @@ def amplitude_drift(site: Site) -> Hidden:
 
 
 def wear(site: Site) -> Hidden:
-    """Hides play between the teeth that grows as the axis runs."""
+    """Injects lost motion between the teeth that grows with the motor's travel."""
     exponent = site.uniform(0.7, 1.0)
     per_1000 = site.size_arcsec / (site.run.motor_turns / 1000.0) ** exponent
     site.gear["wear"] = {"arcsec_per_1000_turns": per_1000, "exponent": exponent}
@@ -70,7 +70,7 @@ def wear(site: Site) -> Hidden:
 
 
 def creep(site: Site) -> Hidden:
-    """Hides creep of the gear, which yields in motion and recovers after a stop."""
+    """Injects creep of the gear, which yields in motion and recovers after a stop."""
     times = [site.stretched(1.0, 4.0)]
     shares = [1.0]
     if site.rng.random() < 0.5:

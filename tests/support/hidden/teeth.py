@@ -1,4 +1,4 @@
-"""Hides causes in the teeth: orders, flanks, damage, the number of teeth."""
+"""Injects causes into the teeth: orders, flanks, damage, number of teeth."""
 
 from hdbridge.sim.loaded_plant import GRAVITY_M_S2
 from support.hidden.elastic import hang_mass
@@ -6,7 +6,7 @@ from support.hidden.site import ARCSEC_PER_RAD, ARCSEC_PER_TURN, Hidden, Site, s
 
 
 def motor_order(site: Site) -> Hidden:
-    """Hides a motor order that the axis does not have yet."""
+    """Injects a motor order that the axis does not have yet."""
     taken = {each.order for each in site.truth.gear.motor_orders}
     order = site.rng.choice([k for k in (3, 5, 7, 9, 10, 11, 12) if k not in taken])
     term = {"order": order, "amplitude_arcsec": site.size_arcsec, "phase_deg": site.angle_deg()}
@@ -17,7 +17,7 @@ def motor_order(site: Site) -> Hidden:
 
 
 def flexspline_order(site: Site) -> Hidden:
-    """Hides an order of the angle between wave generator and flexspline."""
+    """Injects an order of the angle between wave generator and flexspline."""
     taken = {each.order for each in site.truth.gear.flexspline_orders}
     order = site.rng.choice([k for k in (1, 2, 2, 3, 4, 5, 6) if k not in taken])
     term = {"order": order, "amplitude_arcsec": site.size_arcsec, "phase_deg": site.angle_deg()}
@@ -27,7 +27,7 @@ def flexspline_order(site: Site) -> Hidden:
 
 
 def direction_phase(site: Site) -> Hidden:
-    """Hides a shifted tooth error of the other flank, which carries after a reversal."""
+    """Injects a shifted tooth error of the other flank, which carries the load after a reversal."""
     shift_deg = solve(site.tooth_peak_arcsec, site.size_arcsec, 0.01, 15.0)
     flank = {"shift_deg": site.sign() * shift_deg, "travel_deg": site.stretched(0.2, 2.0)}
     site.gear["flank"] = flank
@@ -41,12 +41,12 @@ def direction_phase(site: Site) -> Hidden:
 
 
 def torque_modulation(site: Site) -> Hidden:
-    """Hides a tooth error that grows with the torque of a mass on the axis."""
+    """Injects a tooth error that grows with the torque of an eccentric mass on the load."""
     load, size = site.truth.load_, site.size_arcsec
     nm_per_arcsec = site.truth.gear.stiffness_nm_per_rad / ARCSEC_PER_RAD
     brings: tuple[str, ...] = ("compliance",)
     if load.gravity is None:
-        # Teeth yield less than the spring behind them.
+        # The tooth error changes less than the gear winds up.
         torque_nm = site.uniform(3.0, 6.0) * size * nm_per_arcsec
         hang_mass(site, torque_nm)
     else:
@@ -66,7 +66,7 @@ def torque_modulation(site: Site) -> Hidden:
 
 
 def ratio_error(site: Site) -> Hidden:
-    """Hides a ratio that differs from the axis file."""
+    """Injects a gear ratio that differs from the axis file."""
     ratio = site.truth.gear.ratio
     part = site.sign() * site.size_arcsec / ARCSEC_PER_TURN
     site.gear["ratio"] = ratio / (1.0 + part)
@@ -80,7 +80,7 @@ def ratio_error(site: Site) -> Hidden:
 
 
 def local_defect(site: Site) -> Hidden:
-    """Hides a damaged tooth."""
+    """Injects a damaged tooth."""
     bump = {
         "at_deg": (site.load_angle_deg() + 180.0) % 360.0 - 180.0,
         "width_deg": site.stretched(2.0, 10.0),

@@ -1,10 +1,10 @@
-"""Hides causes outside the catalogue, for which "unexplained" is the right answer."""
+"""Injects causes outside the catalogue, for which "unexplained" is the right finding."""
 
 from support.hidden.site import Hidden, Site
 
 
 def roller(site: Site) -> Hidden:
-    """Hides a roller on the motor's hub that beats with the load angle."""
+    """Injects a roller on the motor's hub, with its own order, that is pressed on near one load angle."""
     truth = {
         "order": site.uniform(0.55, 4.5),
         "amplitude_arcsec": site.size_arcsec,
@@ -18,7 +18,7 @@ def roller(site: Site) -> Hidden:
 
 
 def seat(site: Site) -> Hidden:
-    """Hides a bearing ring that slips in its seat at random angles."""
+    """Injects a bearing ring that slips in its seat at random angles."""
     truth = {
         "slip_arcsec": site.size_arcsec,
         "travel_deg": site.stretched(60.0, 400.0),
@@ -30,7 +30,7 @@ def seat(site: Site) -> Hidden:
 
 
 def cable(site: Site) -> Hidden:
-    """Hides a cable that pulls the load encoder's body beyond a load angle."""
+    """Injects a cable that pulls the load encoder's body beyond a load angle."""
     low, high = site.run.load_reach_deg
     from_deg = low + site.uniform(0.35, 0.65) * (high - low)
     drag = site.uniform(0.2, 0.5)
@@ -45,7 +45,7 @@ def cable(site: Site) -> Hidden:
 
 
 def sensor_warming(site: Site) -> Hidden:
-    """Hides the warming of a load encoder by the square of its speed."""
+    """Injects warming of the load encoder in proportion to the square of its speed."""
     time_constant_s = site.uniform(0.02, 0.06) * site.run.duration_s
     truth = {
         "arcsec_at_10_deg_s": site.sign() * site.size_arcsec * (10.0 / site.run.load_speed_deg_s) ** 2,
