@@ -1,8 +1,9 @@
 """Replays a recording's commands through a simulated drive, without bus and master.
 
 The state before a recording is unknown. The replay therefore switches the drive on at its angle zero and
-moves to the first command at the axis's limits, and does so before each part that does not follow another. If
-the recording begins with the drive holding the axis, its torque sets the integrals of the loops. Between
+moves to the first command at the axis's limits. It repeats this before each part that does not continue the
+previous one. If the recording begins with the drive holding the axis, the recorded torque sets the loops'
+integrals. Between
 consecutive parts, the drive is switched off, as on the bench, and the load continues to ring.
 
 External influences are part of a recording, like its commands. A recorded torque on the load acts on the
@@ -512,7 +513,7 @@ def _followed(
             machine.follow_all(demand[done : off.start + 1], substeps[on], outer_nm[on], held_nm[on])
         )
         pieces.append(_coasted(machine, substeps[off], outer_nm[off]))
-        demand[off.stop] = demand[min(off.stop + 1, len(demand) - 1)]  # where the drive is on again
+        demand[off.stop] = demand[min(off.stop + 1, len(demand) - 1)]  # the drive is on again
         done = off.stop
     whole = Cycles(*(np.concatenate(each) for each in zip(*pieces, strict=True)))
     return Cycles(*(each[commands.lead :] for each in whole))
