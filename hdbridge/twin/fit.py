@@ -567,7 +567,7 @@ VELOCITY_FEEDFORWARD: Final = 0.9
 FEW_STEPS = 3
 """Maximum number of steps of a fit from each start between two halvings."""
 HOPELESS: Final = 2.0
-"""Ratio of a start's cost to the lowest cost, after the same number of steps, above which the start is dropped
+"""Ratio of a start's cost to the lowest cost, after the same number of steps, above which a start is dropped
 even if it is in the better half. The starts that won on three foreign servos had at most 1.8."""
 GAIN: Final = 0.97
 """Maximum ratio of the misfits with and without a block for keeping the block; superfluous parameters gain
