@@ -174,7 +174,7 @@ class Supervision:
         return max(worst, self.reaction)
 
     def also(self, cycle: int, fault: Fault, detail: str) -> Reaction:
-        """Adds a fault that arose from the reaction to the cycle that `judge` has judged."""
+        """Adds a fault that arose during the reaction to the cycle that `judge` has just judged."""
         self._note(cycle, fault, detail, self._runs.get(fault, 0) + 1, frozen=False)
         return self.reaction
 
