@@ -40,7 +40,7 @@ class Check:
     growth_before: Mapping[str, float]
     """Ratio, by channel, of the twin's misfit to this recording and to its own recordings."""
     growth_after: Mapping[str, float]
-    """Same ratio with the changes."""
+    """Ratio as in `growth_before`, but for the twin with the changes."""
     unseen: tuple[str, ...] = ()
     """Causes whose changes, however large, would not show in this motion or with this twin."""
     blind: bool = False

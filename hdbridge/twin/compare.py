@@ -92,7 +92,7 @@ SETTLED_ARCSEC: Final = 10.0
 """Amplitude about the rest position below which a load has settled, arcsec: three motor counts at 8000 counts
 per turn and ratio 50."""
 SETTLED_NOISE: Final = 5.0
-"""Minimum of that amplitude, in units of the noise of the load reading."""
+"""Minimum of the amplitude below which a load has settled, in units of the noise of the load reading."""
 OVER_S: Final = 0.04
 """Window of the rms amplitude: half a period of the slowest ringing, 15 Hz."""
 SHORTEST_SWING: Final = 4

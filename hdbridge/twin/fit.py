@@ -256,14 +256,14 @@ RESPONSE = 1.0
 """Norm of the change of the scaled residuals that determines the later difference steps: one standard
 deviation, the smallest visible change."""
 FARTHEST = 0.1
-"""Longest of these steps, in spreads, because the valley is curved."""
+"""Maximum length of a difference step, in spreads, because the valley of the misfit is curved."""
 WIDE = 3.0
 """Factor of the difference steps for intervals, which are two-sided. A sticking motor breaks away
 differently in each replay, so slopes over short differences are too steep and intervals too narrow."""
 TOO_FAR = 1.0
 """Change of the scaled residuals (rms) above which the loops at the end of a difference count as unstable."""
 NEARER = 0.1
-"""Factor by which such a difference is shortened."""
+"""Factor by which a difference is shortened if its change exceeds `TOO_FAR`."""
 ROUND = 4
 """Number of steps between two estimates of the residuals' scales."""
 EDGE = 1e-6
@@ -284,7 +284,7 @@ class Fitted:
     truth: Truth
     parameters: tuple[Parameter, ...]
     prior: FloatArray
-    """Mean of the prior of their coordinates, shape (p,)."""
+    """Prior mean of the parameters' coordinates, shape (p,)."""
     place: FloatArray
     """Coordinates of the parameters, shape (p,)."""
     covariance: FloatArray
@@ -553,9 +553,10 @@ REJECTIONS: Final = ("speed", "position", "observer")
 """Block that compensates friction and load torque: the integral of the speed error (PI velocity loop) or of
 the position error (PIV), or a disturbance observer."""
 INTEGRAL: Final = 3.0
-"""Integral time times that bandwidth (symmetric optimum: 2 to 4)."""
+"""Integral time times the bandwidth of the velocity loop (symmetric optimum: 2 to 4)."""
 SLOW_INTEGRAL: Final = 30.0
-"""Same factor with an observer, because the observer leaves little to the integral."""
+"""Integral time times the bandwidth of the velocity loop, with an observer, which leaves little to the
+integral."""
 OBSERVED: Final = 0.9
 """Start value of the observer's share of the disturbance: nearly all."""
 FILTER_MS: Final = 0.5
@@ -596,7 +597,7 @@ PLACES: Final = (0.7, 1.0, 1.4)
 
 
 Start = tuple[Truth, tuple[Parameter, ...]]
-"""Start of a fit of a servo, with a prior about the servo's own values."""
+"""Truth from which a fit of a servo structure starts, and the parameters to fit."""
 
 
 def in_best_structure(
@@ -735,7 +736,7 @@ def elsewhere(truth: Truth, usual: Truth) -> list[Truth]:
 
 
 def springs(truth: Truth) -> list[Truth]:
-    """Returns the truth with the load's resonance at each other frequency that its time step resolves."""
+    """Returns variants of the truth with each of `FREQUENCIES_HZ` that its time step resolves."""
     inertia, now = truth.load_.whole_inertia_kg_m2, truth.gear.stiffness_nm_per_rad
     found = []
     for hz in FREQUENCIES_HZ:
@@ -747,12 +748,12 @@ def springs(truth: Truth) -> list[Truth]:
 
 
 def lags(truth: Truth) -> list[Truth]:
-    """Returns the truth with the same lag divided differently between command filter and dead time."""
+    """Returns variants of the truth with the lag divided differently between command filter and dead time."""
     return [_with_dead_time(truth, (1.0 - share) * _lag_ms(truth)) for share in FILTER_SHARES]
 
 
 def delays(truth: Truth) -> list[Truth]:
-    """Returns the truth with the dead time in each other substep within the lag.
+    """Returns variants of the truth with the dead time in every other possible substep, and the same lag.
 
     The demand changes slope at the start of a cycle, and a torque lasts for a substep. A change within a
     substep is spread over two substeps, as by a filter, so the misfit over the dead time has a minimum in
@@ -765,12 +766,12 @@ def delays(truth: Truth) -> list[Truth]:
 
 
 def neighbours(truth: Truth) -> list[Truth]:
-    """Returns those of `delays` whose dead time is one substep shorter or longer."""
+    """Returns the truths of `delays` with a dead time that is one substep shorter or longer."""
     return [each for each in delays(truth) if abs(_substep(each) - _substep(truth)) == 1]
 
 
 def inertias(truth: Truth) -> list[Truth]:
-    """Returns the truth with other motor inertias; a spring too stiff for the time step is made softer."""
+    """Returns variants of the truth with other motor inertias; softens a spring too stiff for the time step."""
     motor = [BY_NAME["motor inertia"]]
     (now,) = coordinates(truth, motor)
     return [at_coordinates(truth, motor, [now + math.log(factor)]) for factor in INERTIA_FACTORS]
@@ -792,12 +793,15 @@ def _with_dead_time(truth: Truth, dead_time_ms: float) -> Truth:
 
 
 def _divided(lag_ms: float, dead_time_ms: float) -> dict[str, float]:
-    """Returns a lag as this dead time and a command filter, by parameter name."""
+    """Returns dead time and command filter that together cause this lag, by parameter name."""
     return {FILTER.name: 0.5 * (lag_ms - dead_time_ms), DEAD_TIME.name: dead_time_ms}
 
 
 def feedforwards(truth: Truth, usual: Truth) -> list[Truth]:
-    """Returns the truth with other load feed-forward frequencies and the usual division of the inertias."""
+    """Returns variants of the truth with other load feed-forward frequencies.
+
+    The feed-forward inertias of motor and load keep their sum and are divided as in ``usual``.
+    """
     servo, load, there = truth.servo, truth.servo.load_feedforward, usual.servo.load_feedforward
     if load is None or there is None:
         return []

@@ -100,11 +100,11 @@ ringing of a load is out of phase after a small change, and a fit does not recov
 
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """Causes that explain a recording, and the growth of the misfit without and with them."""
+    """Named causes of a recording's increased misfit, and the growth of the misfit without and with them."""
 
     causes: tuple[str, ...]
     rivals: tuple[str, ...]
-    """Causes that explain as much in place of the last one."""
+    """Causes that explain the recording equally well in place of the last named cause."""
     truth: Truth
     """The simulation with these causes fitted."""
     growth_before: Mapping[str, float]

@@ -192,7 +192,8 @@ REST_S = 0.1
 RINGS_S = 1.0
 """Time from the end of a leg's motion to the end of the leg; a longer standstill is not part of any leg."""
 LEAST_LEG_S = 0.4
-"""Minimum length of such a leg: an acceleration and the ringing of a load at 15 Hz."""
+"""Minimum length of a leg that the recording does not name: an acceleration and the ringing of a load at
+15 Hz."""
 SIGN_SHARE = 0.2
 """Share of the mean torque that must oppose the motion for the sign to count as wrong."""
 TORQUE_MARGIN = 1.5
@@ -226,7 +227,7 @@ class Commands:
     held: tuple[tuple[int, float], ...] = ()
     """Cycles before which the loops' integrals are set to a holding torque, with that torque in Nm."""
     start_c: float | None = None
-    """Initial temperature of the axis; None for that of the truth."""
+    """Initial temperature of the axis; None for the value of the truth."""
 
 
 def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
@@ -301,7 +302,7 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
 
 
 def cycle_of(part: Record, axis: AxisConfig) -> float:
-    """Returns a record's cycle in seconds, as 60C2h can express it, or the axis's cycle if they agree."""
+    """Returns a record's cycle time, s: the axis's if both agree, else rounded to a value of 60C2h."""
     own_ms = 1e3 * float(np.median(np.diff(part.time_s)))
     if not own_ms > 0.0:
         raise InputError(

@@ -83,9 +83,9 @@ class Twin:
     left: tuple[Left, ...]
     """Residual of each recorded channel, on held-out legs if any."""
     before: Comparison
-    """Recordings against the initial simulation; the kind `HELD_OUT` covers the held-out legs."""
+    """Comparison of the recordings with the initial simulation; the kind `HELD_OUT` is the held-out legs."""
     after: Comparison
-    """Recordings against the twin."""
+    """Comparison of the recordings with the twin."""
     impossible: tuple[str, ...] = ()
     """Implausible values, each in a sentence; only for a twin whose values are not the axis's."""
 
@@ -378,7 +378,7 @@ def fit_twin(
 
 
 def _wrong(replays: Replays, start: Truth, fitted: Fitted) -> tuple[Finding, ...]:
-    """Names the wrong values of the start on a few legs; the values after are those of the fit."""
+    """Names the wrong values of the start, using a few legs; the corrected values come from the fit."""
     few, like = replays.rough, by_law_of(with_sections(start, fitted.parameters), fitted.truth)
     was = scales_by_kind(few.data, misfit_of(replays.data, fitted.residuals), noise_floor(few.data))
     groups = by_cause(fitted.parameters)
