@@ -45,9 +45,9 @@ class Kinds(NamedTuple):
 
     classes: tuple[type, ...]
     room: int
-    """Number of places in a tuple of such attributes."""
+    """Maximum length of a tuple of attributes with this protocol."""
     neutral: float
-    """Value that an unused place returns."""
+    """Value that an unused place in such a tuple returns."""
 
 
 KINDS: Final[dict[Any, Kinds]] = {
