@@ -197,7 +197,7 @@ class Supervision:
         return reaction
 
     def since(self, noted: int) -> list[Event]:
-        """Returns those of the kept events that followed the first ``noted`` events, oldest first."""
+        """Returns the kept events after the first ``noted`` events, oldest first."""
         new = min(self.noted - noted, len(self.events))
         return list(islice(self.events, len(self.events) - new, None)) if new > 0 else []
 
