@@ -1,7 +1,7 @@
 """Comparison of a measured and a simulated record of the same commands.
 
 Each difference is given with the noise of the measured channel, which is the lower limit for a simulation.
-Pure functions.
+Pure.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hdbridge.twin.replay import standing, unknown_rows
 from hdbridge.units import ARCSEC_PER_DEG
 
 # ----------------------------------------------------------------
-# A signal of both records over time, and its spectra. Pure functions.
+# A signal of both records over time, and its spectra. Pure.
 
 SPECTRUM_SAMPLES: Final = 1024
 SHORTEST: Final = 32
@@ -86,7 +86,7 @@ def spectrum_of(trace: Trace, parts: Sequence[slice]) -> Spectrum | None:
 
 
 # ----------------------------------------------------------------
-# Settling time of the load after a stop, and its scatter due to noise. Pure functions.
+# Settling time of the load after a stop, and its scatter due to noise. Pure.
 
 SETTLED_ARCSEC: Final = 10.0
 """Amplitude about the rest position below which a load has settled, arcsec: three motor counts at 8000 counts
