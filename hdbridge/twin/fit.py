@@ -771,7 +771,7 @@ def neighbours(truth: Truth) -> list[Truth]:
 
 
 def inertias(truth: Truth) -> list[Truth]:
-    """Returns variants of the truth with other motor inertias, and a softer spring if the time step needs it."""
+    """Returns variants of the truth with other motor inertias; a spring too stiff for them is softened."""
     motor = [BY_NAME["motor inertia"]]
     (now,) = coordinates(truth, motor)
     return [at_coordinates(truth, motor, [now + math.log(factor)]) for factor in INERTIA_FACTORS]
