@@ -3,8 +3,8 @@
 The state before a recording is unknown. The replay therefore switches the drive on at its angle zero and
 moves to the first command at the axis's limits. It repeats this before each part that does not continue the
 previous one. If the recording begins with the drive holding the axis, the recorded torque sets the loops'
-integrals. Between
-consecutive parts, the drive is switched off, as on the bench, and the load continues to ring.
+integrals. Between consecutive parts, the drive is switched off, as on the bench, and the load continues to
+ring.
 
 External influences are part of a recording, like its commands. A recorded torque on the load acts on the
 simulated load in place of its own weight, and the recorded temperature sets its initial temperature.
