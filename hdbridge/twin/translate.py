@@ -200,7 +200,7 @@ def orders(key: str, effect: Any, draft: Draft) -> None:
 
 
 def direction_phase(effect: effects.DirectionPhase, draft: Draft) -> None:
-    """Sets two flanks. The model's orders are the mean of both flanks; the plant's are those of each flank."""
+    """Sets two flanks. The model's orders are the mean of both flanks; the plant's are those of one flank."""
     held, flanks = list[str](), list[dict[str, Any]]()
     for each in draft.gear.get("motor_orders", ()):
         shift = math.radians(each["order"] * effect.shift_deg)
