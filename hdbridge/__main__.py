@@ -3,8 +3,8 @@
 import os
 import sys
 
-# The matrices here are small: threads in linear algebra cost more than they gain, on a busy computer several
-# times the work. Users who want threads set these variables.
+# Threads in linear algebra cost more than they gain, because the matrices are small; on a busy computer they
+# cost several times the work. Users who want threads set these variables.
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")
 

@@ -7,8 +7,8 @@ from can.typechecking import Channel
 class DataFrame(can.Message):
     """Data frame with an 11-bit identifier; not to be modified after sending.
 
-    A python-can bus accepts it like any message. python-can's virtual bus makes a deep copy for each
-    receiver.
+    A python-can bus accepts it like any message. Its deep copy is cheap, because python-can's virtual bus
+    makes one for each receiver.
     """
 
     __slots__ = ()
@@ -17,7 +17,7 @@ class DataFrame(can.Message):
     is_fd = bitrate_switch = error_state_indicator = False
 
     def __init__(self, can_id: int, data: bytes | bytearray, channel: Channel | None = None) -> None:
-        # The same as the base class does, without checking for impossible cases.
+        # Sets the same attributes as the base class, without its checks.
         self.arbitration_id = can_id
         self.data = bytearray(data)
         self.dlc = len(data)

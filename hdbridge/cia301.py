@@ -1,4 +1,4 @@
-"""Numbers of CiA 301 that both ends of a bus use: NMT states and commands, and 32-bit positions."""
+"""Constants of CiA 301 for the master and the simulated drive: NMT states and commands, 32-bit positions."""
 
 from enum import IntEnum
 from typing import Final
@@ -21,12 +21,12 @@ class NmtState(IntEnum):
 
     INITIALISING = 0x00
     BOOT_UP = 0x00
-    """Byte of a boot-up message, which is that of the state before."""
+    """Byte of a boot-up message; CiA 301 uses the value of INITIALISING."""
     STOPPED = 0x04
     OPERATIONAL = 0x05
     PRE_OPERATIONAL = 0x7F
 
 
 def wrap_int32(value: int) -> int:
-    """Returns the value of a 32-bit object for an unbounded count."""
+    """Wraps an unbounded count to the range of a signed 32-bit object."""
     return (value + INT32_RANGE // 2) % INT32_RANGE - INT32_RANGE // 2

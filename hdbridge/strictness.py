@@ -4,7 +4,7 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Strict(BaseModel):
-    """Immutable model without unknown keys or infinite numbers.
+    """Immutable model that rejects unknown keys and numbers that are not finite.
 
     pydantic's validator is built on first use, because a process reads few kinds of files and few of the
     effects, which alone take a tenth of a second.

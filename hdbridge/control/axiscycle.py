@@ -225,7 +225,7 @@ class AxisCycle:
             self.pending += faults
 
     def turn(self, now: float, count: int, time_s: float, complete: bool) -> Frames | None:
-        """Judges one period and returns the RPDOs to send, or None.
+        """Judges one period of a speaking axis and returns the RPDOs to send, or None.
 
         ``complete`` states that all required TPDOs have arrived.
         """
@@ -387,7 +387,7 @@ class AxisCycle:
         return self._still >= STILL_CYCLES or self._left == 0
 
     def _note(self, stop: Event | None) -> None:
-        """Records that a stop was latched or released since the last cycle."""
+        """Handles a stop that was latched or released since the last cycle; a latched stop starts braking."""
         self._ridden = stop
         self._still, self._left = 0, self._stop_cycles
         if stop is not None:

@@ -283,7 +283,7 @@ class Bench:
 
     @property
     def survived(self) -> tuple[Survived, ...]:
-        """Faults tolerated by the present procedure so far, followed by the fault that stopped it."""
+        """Faults of the present procedure so far, including one that stopped it, and skipped periods."""
         return self._watch.survived(self.cycle.skipped)
 
     def _enable(self) -> None:

@@ -1,4 +1,4 @@
-"""Records from bus logs of any tool, for `fit` and `diagnose`.
+"""Converts bus logs of any tool to recordings, for `fit` and `diagnose`.
 
 Reads the formats of python-can. The PDO mapping is taken from the SDO traffic in the log, else from the axis
 file. Any master is supported. A sample consists of the data sent for one SYNC, at the time of that SYNC;

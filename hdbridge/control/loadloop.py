@@ -36,7 +36,8 @@ _NOISE_S: Final = 1.0
 _DRIFT_S: Final = 600.0
 """Time constant for tracking a drift of the load against the motor at rest."""
 _AGREED_S: Final = 1.0
-"""Time at rest for which an encoder that has moved back must stay there; doubled at each further doubt."""
+"""Time at rest for which a load encoder that has moved back must stay there to end a doubt; doubled at each
+further doubt."""
 _AGREED_MAX_S: Final = 600.0
 _SIGMAS: Final = 8.0
 """Maximum deviation that counts as noise, in standard deviations."""
@@ -140,7 +141,7 @@ class LoadLoop:
         """During a doubt about the encoder: sum of its moves at rest, the greatest such sum, and the
         greatest disagreement."""
         self._agreeing = 0
-        """Number of readings since the sum of moves at rest became small."""
+        """Number of readings since the sum of the load encoder's moves at rest became small."""
         self._agreed = frozenset[int]()
         """Directions of motion after which the encoders have agreed again."""
 
@@ -167,7 +168,7 @@ class LoadLoop:
         self._standing = 0
 
     def reset(self, value_arcsec: float = 0.0) -> None:
-        """Restarts without a doubt at this value, which the load target already contains."""
+        """Restarts at ``value_arcsec``, which the load target already contains, and clears a doubt."""
         if not math.isfinite(value_arcsec):
             raise InputError(f"load loop: a value of {value_arcsec!r} arcsec; expected a finite number")
         self._value = min(max(value_arcsec, -self._maximum), self._maximum)

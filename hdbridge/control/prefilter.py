@@ -39,7 +39,7 @@ class Prefilter:
         first, per_cycle = lead.lead_cycles, lead.per_cycle
         ahead = [first - j / per_cycle for j in range(per_cycle - 1, -1, -1)]
         self._reaches = tuple((s, 0.5 * s * (s + 1.0)) for s in ahead)
-        """Distance of each new prediction: factors of the last step of the target and of its change."""
+        """For each new prediction, the factors of the target's last step and of the step's last change."""
         self._full_step = lead.full_speed_deg_s * period_s
         self._last: float | None = None
         self._step = 0.0

@@ -1,4 +1,4 @@
-"""Tolerated faults of a run, with counts. Pure."""
+"""Faults that occurred in a run, with counts. Pure."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class Correction:
     command: Callable[[float, Moment], float]
     """Returns the motor target in degrees for this cycle's load target (`Compensation.command`)."""
     hold: Callable[[float, Moment], float]
-    """Returns the motor target with the correction frozen (`Compensation.hold`); a change pauses."""
+    """Returns the motor target with the correction frozen (`Compensation.hold`); a change of model pauses."""
 
     def __init__(self, first: Compensation) -> None:
         self._now = first

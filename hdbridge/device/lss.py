@@ -70,7 +70,10 @@ class LssSlave:
         return self._identity(place + 1)
 
     def _in_range(self, command: int, number: int) -> bool:
-        """Returns True for the same vendor and product, and a revision and serial number within the range."""
+        """Returns True if the identity part of this request matches the node.
+
+        Vendor and product code must be equal; revision and serial number must be within the given bound.
+        """
         if command <= 0x47:
             return number == self._part(command - 0x46)
         own = self._part(2 + (command - 0x48) // 2)

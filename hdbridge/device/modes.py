@@ -221,7 +221,7 @@ class ProfilePosition(_Planned):
 class Homing(_Planned):
     """HM: methods 33 and 34 move to the next index pulse, 35 and 37 use the present position.
 
-    The position found becomes 607Ch. There is one index pulse per motor turn.
+    The position found is assigned the value of 607Ch (home offset). There is one index pulse per motor turn.
     """
 
     number = 6

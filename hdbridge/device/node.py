@@ -249,7 +249,7 @@ class DriveNode:
             takers[0x600 + self.node_id] = self._on_sdo_request
             takers[self.dictionary.value(0x1005) & 0x7FF] = self._on_sync
 
-    # ---------------------------------------------------------------- the outside
+    # ---------------------------------------------------------------- public interface
 
     def poll(self, now_s: float) -> None:
         """Receives and answers the waiting frames, and runs all events due until ``now_s``."""

@@ -34,7 +34,7 @@ class Command(Enum):
 
 
 class Control(IntEnum):
-    """Controlword bits beyond the state commands."""
+    """Controlword bits other than the state commands."""
 
     NEW_SET_POINT = 1 << 4  # PP: new set-point; HM: start; IP: interpolate
     CHANGE_IMMEDIATELY = 1 << 5
@@ -44,7 +44,7 @@ class Control(IntEnum):
 
 
 class Status(IntEnum):
-    """Statusword bits beyond those of the state."""
+    """Statusword bits other than the state bits."""
 
     VOLTAGE_ENABLED = 1 << 4
     WARNING = 1 << 7

@@ -10,7 +10,8 @@ _ASTRAY: Final = 0.5
 """Deviation above which tracking restarts at the present SYNC; periods."""
 _ANOTHER: Final = 0.1
 _AGREEING: Final = 3
-"""Number of successive intervals, equal within `_ANOTHER`, after which they replace a different period."""
+"""Number of successive intervals that agree within `_ANOTHER` but differ from the period; then the period
+is set to the last of them."""
 
 
 class SyncClock:
@@ -27,7 +28,7 @@ class SyncClock:
         self._count = self._agreeing = 0
 
     def take(self, now_s: float) -> None:
-        """Takes a received SYNC; ``time_s`` is then its filtered time, without jitter."""
+        """Updates the filter with a received SYNC; ``time_s`` is then its filtered time, without jitter."""
         before_s, self._interval_s = self._interval_s, now_s - self._received_s
         self._received_s = now_s
         interval_s = self._interval_s

@@ -17,7 +17,7 @@ from hdbridge.errors import InputError
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """Object that the boot-up does not write, so that the drive keeps its own value."""
+    """Object that the boot-up leaves to the drive, or that the drive cannot provide."""
 
     index: int
     sub: int

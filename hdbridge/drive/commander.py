@@ -157,7 +157,10 @@ class Commander:
         return actual
 
     def wait_for_standstill(self) -> bool:
-        """Waits until the position stays within two counts; returns False on time-out."""
+        """Waits until two readings of the position, 20 ms apart, differ by at most two counts.
+
+        Returns False on time-out.
+        """
         deadline_s = self.link.now() + BRAKE_TIMEOUT_S
         last = self.sdo.fetch(objects.POSITION_ACTUAL)
         while self.link.now() < deadline_s:

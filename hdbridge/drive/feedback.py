@@ -12,7 +12,7 @@ class Feedback(NamedTuple):
     """Measurements of one cycle. Positions are encoder counts, unwrapped, multi-turn."""
 
     cycle: int
-    """Number of periods since `Cycle.restart`, including skipped periods."""
+    """Number of the period, from 0, including skipped periods; it continues after a restart of the cycle."""
     time_s: float
     """``cycle`` times the period."""
     statusword: int

@@ -242,8 +242,8 @@ class ProcessImage:
         """Returns a function that builds an RPDO frame from controlword and target, either of which may be
         in another RPDO.
 
-        A read-only mapping may contain other objects. The mode of operation is then that of the cycle; all
-        others have their value from the EDS, or 0 if it gives none.
+        A read-only mapping may contain other objects. The mode of operation then has the value for the cycle;
+        all others have their value from the EDS, or 0 if the EDS states none.
         """
         entries, can_id, pack = layout.codec.entries, layout.can_id, layout.codec.pack
         values = [0 if entry.is_gap or od is None else _held(od, entry) for entry in entries]

@@ -126,7 +126,7 @@ def _folder() -> Path:
 
 
 def _open(path: Path) -> int:
-    """Opens the lock file for reading, which suffices for locking: it may belong to another user."""
+    """Opens the lock file for reading only, which suffices for locking, because another user may own it."""
     flags = os.O_RDONLY | os.O_NOFOLLOW
     try:
         try:

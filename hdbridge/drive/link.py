@@ -170,7 +170,7 @@ class Link:
         if message.is_error_frame:
             self.dropped.error += 1
             if self.name.startswith("socketcan") and message.arbitration_id & _ERROR_FRAME_BUS_OFF:
-                # During bus-off, sends "succeed" and nothing arrives: this frame is the only sign.
+                # This frame is the only sign of bus-off, because sends still "succeed" and nothing arrives.
                 self._down = (
                     f"{self.name}: the CAN controller went bus-off; check wiring, bit rate and termination"
                 )

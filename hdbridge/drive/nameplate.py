@@ -43,7 +43,7 @@ def scaling_addresses(axis: AxisConfig) -> tuple[Address, ...]:
 
 
 def device_type_complaints(axis: AxisConfig, device_type: int) -> Iterator[str]:
-    """Checks that 1000h reports a CiA-402 drive."""
+    """Yields a complaint unless 1000h reports a CiA-402 drive."""
     if device_type & 0xFFFF != objects.DEVICE_PROFILE_402:
         yield (
             f"{_at(axis, objects.DEVICE_TYPE)} is {device_type:08X}h, device profile {device_type & 0xFFFF}; "
@@ -63,7 +63,7 @@ def identity_complaints(axis: AxisConfig, found: Mapping[str, int]) -> Iterator[
 
 
 def mode_complaints(axis: AxisConfig, modes: int) -> Iterator[str]:
-    """Checks that 6502h contains the mode of the control cycle; a value of 0 is accepted as unknown."""
+    """Yields a complaint unless 6502h contains the control cycle's mode; a value of 0 counts as unknown."""
     if modes and not modes & cyclic_mode(axis).mode.supported_bit:
         yield (
             f"{_at(axis, objects.SUPPORTED_MODES)} is {modes:08X}h, without the mode {axis.drive.mode} of "

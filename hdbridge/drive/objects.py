@@ -203,4 +203,4 @@ CYCLIC: Final = {
 STANDARD: Final[dict[tuple[int, int], Address]] = {
     (value.index, value.sub): value for value in list(vars().values()) if isinstance(value, Address)
 }
-"""All objects above by (index, sub-index)."""
+"""All objects of this module by (index, sub-index)."""

@@ -20,7 +20,7 @@ _FIRST_OBJECT = 0x1000
 
 
 class PdoLengthError(DriveError):
-    """A PDO's length differs from that of its mapping; the PDO counts as lost."""
+    """A PDO's length differs from the length of its mapping; the PDO counts as lost."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -187,8 +187,9 @@ class SdoClient:
         return known.type
 
     def describe(self, index: int, sub: int) -> str:
-        """For example ``node 1, object 607Ah:00 'Target position'``, with the name from the EDS or the
-        profile.
+        """Describes an object, for example ``node 1, object 607Ah:00 'Target position'``.
+
+        The name is that in the EDS, else that in the profile.
         """
         name = ""
         variable = find(self.od, index, sub)

@@ -174,7 +174,7 @@ class Supervision:
         return max(worst, self.reaction)
 
     def also(self, cycle: int, fault: Fault, detail: str) -> Reaction:
-        """Adds a fault that arose from the reaction to the cycle that `judge` has judged."""
+        """Adds a fault that arose during the reaction to the cycle that `judge` has just judged."""
         self._note(cycle, fault, detail, self._runs.get(fault, 0) + 1, frozen=False)
         return self.reaction
 
@@ -197,7 +197,7 @@ class Supervision:
         return reaction
 
     def since(self, noted: int) -> list[Event]:
-        """Returns those of the kept events that followed the first ``noted`` events, oldest first."""
+        """Returns the kept events after the first ``noted`` events, oldest first."""
         new = min(self.noted - noted, len(self.events))
         return list(islice(self.events, len(self.events) - new, None)) if new > 0 else []
 

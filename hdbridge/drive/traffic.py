@@ -21,7 +21,7 @@ _STATES: Final[dict[int, str]] = {
 
 
 def bus_faults(heartbeat_id: int) -> dict[int, tuple[Fault, str]]:
-    """Returns the fault for each frame that only the single master of a bus sends.
+    """Returns, by identifier, the fault of each frame that only the single master of a bus may send.
 
     ``heartbeat_id`` is the identifier of the master's heartbeat.
     """

@@ -45,7 +45,7 @@ class PlannedWrite:
     field: str = ""
     """Field of the axis file that determines the value; empty without one."""
     type: IntegerType | None = None
-    """Integer type; None for that of the EDS or the profile."""
+    """Integer type; None if the EDS or the profile determines it."""
     compared: int = _EVERYTHING
     """Mask of the bits that must read back as written."""
     kept: int = 0

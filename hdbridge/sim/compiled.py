@@ -45,9 +45,9 @@ class Kinds(NamedTuple):
 
     classes: tuple[type, ...]
     room: int
-    """Number of places in a tuple of such attributes."""
+    """Maximum length of a tuple of attributes with this protocol."""
     neutral: float
-    """Value that an unused place returns."""
+    """Value that an unused place in such a tuple returns."""
 
 
 KINDS: Final[dict[Any, Kinds]] = {
@@ -324,7 +324,7 @@ _UNIONS: Final[dict[Any, Any]] = {}
 def _register() -> None:
     """Registers the methods of all classes with numba, and unique names for the compiled code."""
     types.Record.mangling_args = property(_name_in_code)  # type: ignore[method-assign, assignment]
-    # Each pass of numba's compiler prints types: by their names, which is fast, not by their contents.
+    # Each pass of numba's compiler prints types. Printing their names is much faster than their contents.
     types.Record.__repr__ = types.Type.__repr__  # type: ignore[method-assign]
     declared = {name for cls in STATES for name in _attributes(cls)}
     for cls in STATES:

@@ -199,7 +199,7 @@ class Late:
             self._angles[place] = shaft_deg
 
     def feed(self, shaft_deg: float) -> None:
-        """Takes the angle after one more substep."""
+        """Stores the shaft's angle after one more substep, and updates the delayed angle."""
         angles, oldest = self._angles, self._oldest
         angles[oldest] = shaft_deg
         first = oldest + 1 if oldest + 1 < self._kept else 0
@@ -256,7 +256,7 @@ class Body:
         self.deg = 0.0
 
     def feed(self, shaft_deg: float) -> None:
-        """Takes the shaft's angle after one more substep."""
+        """Updates the shift, given the shaft's angle after one more substep."""
         shift_deg = 0.0
         for each in self._errors:
             shift_deg += each.error_deg(shaft_deg)

@@ -1,8 +1,8 @@
-"""Decides whether and when the simulated axis is compiled: if numba is installed, once compiling pays off.
+"""Switches the simulated axis to compiled code as soon as that pays off, if numba is installed.
 
 numba comes with the extra ``hdbridge[fast]``. Loading it takes a second, and compiling takes another twelve
 the first time on a computer; compiled code is kept on disk. A process therefore begins in Python and switches
-to the compiled axis after as many substeps as pay for compiling. The results are the same.
+to the compiled axis after enough substeps to pay for compiling. The results are the same.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class Factor(Protocol):
     """Factor by which the size of a cause is multiplied."""
 
     def factor(self, now: Conditions) -> float:
-        """Returns the factor under these conditions, one substep after the last call."""
+        """Advances by one substep and returns the factor under these conditions."""
         ...
 
 

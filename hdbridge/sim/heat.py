@@ -14,7 +14,7 @@ class Heat:
     body_c: float
     """Temperature of motor and gear."""
     rub: float
-    """Motor friction at this temperature, relative to that of the truth file."""
+    """Motor friction at the present temperature, relative to the friction in the truth file."""
     since_s: float
     """Time since the axis was switched on."""
     _ambient_c: float

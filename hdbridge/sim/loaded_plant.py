@@ -217,7 +217,7 @@ class LoadedPlant(Plant):
         return min(limit, max(-limit, held))
 
     def _play(self, load_deg: float) -> float:
-        """Moves the near side of the coupling, which the load drags along once the play is used up."""
+        """Returns the angle of the coupling's near side, which the load drags along beyond the play."""
         played = min(load_deg + self._play_deg, max(load_deg - self._play_deg, self._played_deg))
         self._played_deg = played
         return played

@@ -91,9 +91,9 @@ class _PolledQueue(Queue[can.Message]):
 class _PolledBus(VirtualBus):
     """Virtual bus of python-can, polled by one thread, with less overhead per frame.
 
-    The general ``recv`` reads the wall clock and takes two locks, although in lockstep most polls find
-    nothing; the general ``send`` makes a deep copy and takes another lock. It works together with ordinary
-    virtual buses on the same channel. It never waits, whatever the time-out of ``recv``.
+    The inherited ``recv`` reads the wall clock and takes two locks, although in lockstep most polls find
+    nothing; the inherited ``send`` makes a deep copy and takes another lock. This bus works together with
+    ordinary virtual buses on the same channel. It never waits, whatever the time-out of ``recv``.
     """
 
     def __init__(self, channel: str) -> None:

@@ -1,7 +1,7 @@
 """Substeps of the simulated axis: the drive's loops, the mechanics, and the sampling of the encoders.
 
-`hdbridge.sim.machine` calls it once per control cycle. All inputs and outputs are numbers, so it can be
-compiled as a whole.
+`hdbridge.sim.axis` calls `Loops` once per control cycle. All inputs and outputs are numbers, so the class can
+be compiled as a whole.
 """
 
 from hdbridge.sim.encoder import Body, Disc, Late

@@ -276,7 +276,7 @@ class Servo:
         return self._load_gain * (new_speed - speed)
 
     def _turn(self, direction: float) -> float:
-        """Reverses the friction feed-forward; returns the integral without the torque that it now provides.
+        """Reverses the friction feed-forward; returns the integral reduced by the new feed-forward torque.
 
         Without friction feed-forward, the integral does not change.
         """

@@ -1,8 +1,8 @@
 """Faults of a simulated drive by name: one row each.
 
-They are those of the fault table in docs/reliability.md, seen from the other end of the bus: actions of the
-drive, its encoders, other nodes and the interface. Faults of the program itself (a target that is not a
-number, a full disk) must be caused by the program.
+They cause the faults of the fault table in docs/reliability.md, by actions of the drive, its encoders, other
+nodes and the interface. Faults of the program itself (a target that is not a number, a full disk) must be
+caused by the program.
 """
 
 import struct
@@ -365,7 +365,7 @@ OF_THE_PROGRAM: Final = (
     "the target is not a number within the limits",
     "a load torque or temperature stays away",
 )
-"""Rows of the fault table that no fault here causes: faults of the program, and consequences of others."""
+"""Rows of the fault table without a fault here: faults of the program, and consequences of other faults."""
 
 
 def find(name: str) -> Row:

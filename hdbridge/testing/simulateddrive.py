@@ -92,7 +92,7 @@ class SimulatedDrive:
         name, bus = self._settings.truth.name, self._settings.bus
         return f"<simulated drive {self.node_id}, axis {name!r}, on {bus}: {self.state}>"
 
-    # ---------------------------------------------------------------- what is true
+    # ---------------------------------------------------------------- true state
 
     @property
     def truth(self) -> TrueState:
@@ -116,7 +116,7 @@ class SimulatedDrive:
         """NMT state as text, such as ``operational``."""
         return words(self._node.nmt.name)
 
-    # ---------------------------------------------------------------- what happened
+    # ---------------------------------------------------------------- history
 
     @property
     def log(self) -> tuple[Event, ...]:
@@ -161,7 +161,7 @@ class SimulatedDrive:
         for_s: float | None = None,
         **arguments: float,
     ) -> Fault:
-        """Causes a fault: now, after a time (the drive's), or once the load passes an angle.
+        """Causes a fault at once, after ``after_s`` of drive time, or when the load passes ``beyond_deg``.
 
         It ends ``for_s`` after it began, at the end of a ``with`` block, or by ``.end()``. Raises
         `InputError` for an unknown name or argument, with the nearest one, and if the fault is impossible on

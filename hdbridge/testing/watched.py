@@ -265,7 +265,7 @@ class WatchedDrive(DriveNode):
         bind(lambda: value)
         return lambda: bind(before)
 
-    # ---------------------------------------------------------------- the drive, watched
+    # ---------------------------------------------------------------- methods of the drive, with recording
 
     def next_event_s(self) -> float:
         """Returns the time by which ``poll`` must be called; triggers of faults count as events."""

@@ -1,7 +1,8 @@
-"""Changes since a twin was made: compares the present misfit with that of its fit, and names the causes.
+"""Detects changes of an axis since its twin was made, and names their causes.
 
-The unit of the comparison is the misfit of the fit. This is the noise if the twin has the axis's values, and
-more if it replays another drive, so both kinds of twin are checked in the same way.
+The misfit to a new recording is compared with the misfit of the twin's fit. The latter equals the noise if
+the twin has the axis's values and is larger if the twin replays another drive, so both kinds of twin are
+checked in the same way.
 """
 
 from __future__ import annotations
@@ -23,11 +24,12 @@ from hdbridge.units import figure
 CHECK_S = 17.0
 """Duration of the pieces into which a check divides a longer recording."""
 NOTICEABLE = 2.5
-"""Change that a check must be able to show, in units of a parameter's least change."""
+"""Change of a parameter that a recording must reveal, in units of its least change. If a recording does not,
+the parameter's cause is reported as not observable."""
 WARMTH = "temperature"
 OWN = ("load friction", WARMTH, "current limit", "velocity feed-forward")
-"""Parameters that a check fits in addition to those of a fit; the temperature unless twin and recording have
-it."""
+"""Parameters that a check fits in addition to those of a fit. The temperature is left out if both the twin
+and the recording contain it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +40,7 @@ class Check:
     growth_before: Mapping[str, float]
     """Ratio, by channel, of the twin's misfit to this recording and to its own recordings."""
     growth_after: Mapping[str, float]
-    """Same ratio with the changes."""
+    """Ratio as in `growth_before`, but for the twin with the changes."""
     unseen: tuple[str, ...] = ()
     """Causes whose changes, however large, would not show in this motion or with this twin."""
     blind: bool = False
@@ -94,7 +96,7 @@ def check(
     floor, noise = noise_floor(data), about["noise"]
     scale = {name: max(noise.get(name, 0.0), floor[name]) for name in CHANNELS}
     was = scales_by_kind(data, about.get("misfit", {}), scale)
-    # A recorded temperature is not a change.
+    # A recorded temperature is an input, not a change of the axis.
     known_warmth = BY_NAME[WARMTH].path in twin.intervals and all(
         each.commands.start_c is not None for each in data.pieces
     )
@@ -111,10 +113,11 @@ def check(
 
 
 def _shows(replays: Replays, twin: Truth, own: Sequence[Parameter], was: Mapping[str, Any]) -> bool:
-    """Returns True if a noticeable change of one of the parameters cannot have happened unseen.
+    """Returns True if the recording reveals a noticeable change of at least one of the parameters.
 
-    The twin with such a change, in either direction, then no longer explains the recording. The twin's own
-    residual may hide a change or add to it, so the changed twin is compared with the recording itself.
+    A change is revealed if the twin with this change, in either direction, no longer explains the recording.
+    The twin's own residual may hide a change or add to it, so the changed twin is compared with the recording
+    rather than with the twin.
     """
     for each in own:
         (now,) = coordinates(twin, [each])

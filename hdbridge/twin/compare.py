@@ -1,7 +1,7 @@
 """Comparison of a measured and a simulated record of the same commands.
 
-Each difference is stated with the noise of the measured channel, which is the best that a simulation can
-reach. Pure.
+Each difference is given with the noise of the measured channel, which is the lower limit for a simulation.
+Pure.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hdbridge.twin.replay import standing, unknown_rows
 from hdbridge.units import ARCSEC_PER_DEG
 
 # ----------------------------------------------------------------
-# Two records of a signal over time, and their spectra. Pure.
+# A signal of both records over time, and its spectra. Pure.
 
 SPECTRUM_SAMPLES: Final = 1024
 SHORTEST: Final = 32
@@ -86,12 +86,13 @@ def spectrum_of(trace: Trace, parts: Sequence[slice]) -> Spectrum | None:
 
 
 # ----------------------------------------------------------------
-# Settling time of the load after a stop, and its scatter by noise. Pure.
+# Settling time of the load after a stop, and its scatter due to noise. Pure.
 
 SETTLED_ARCSEC: Final = 10.0
-"""Amplitude about the rest position below which a load has settled: three motor counts (8000, ratio 50)."""
+"""Amplitude about the rest position below which a load has settled, arcsec: three motor counts at 8000 counts
+per turn and ratio 50."""
 SETTLED_NOISE: Final = 5.0
-"""Minimum of that amplitude, in units of the noise of the load reading."""
+"""Minimum of the amplitude below which a load has settled, in units of the noise of the load reading."""
 OVER_S: Final = 0.04
 """Window of the rms amplitude: half a period of the slowest ringing, 15 Hz."""
 SHORTEST_SWING: Final = 4
@@ -110,7 +111,11 @@ def settling_s(time_s: FloatArray, load_arcsec: FloatArray, noise_arcsec: float,
 def scatter_s(
     time_s: FloatArray, load_arcsec: FloatArray, noise_arcsec: float, band: float, noises: Sequence[float]
 ) -> float:
-    """Returns the rms difference of two settling times of this motion that noise of these sizes causes."""
+    """Returns the standard deviation, s, of the difference of two settling times that is due to noise alone.
+
+    ``noises`` are the noise levels of the two records, arcsec. The estimate uses `DRAWS` random samples of
+    each.
+    """
     rng = np.random.default_rng(0)
     own = settling_s(time_s, load_arcsec, noise_arcsec, band)
     squares = 0.0
@@ -122,7 +127,7 @@ def scatter_s(
 
 
 def overshoot_arcsec(load_arcsec: FloatArray, way: float) -> float:
-    """Returns the overshoot beyond the rest position; ``way`` is the sign of the motion before."""
+    """Returns the overshoot beyond the rest position; ``way`` is the sign of the preceding motion."""
     return max(0.0, float(np.max(way * (load_arcsec - _rest_arcsec(load_arcsec)))))
 
 
@@ -197,7 +202,7 @@ class Comparison:
 
     rows: tuple[Row, ...]
     traces: Mapping[str, Trace]
-    """Figures by signal."""
+    """Traces by signal."""
     spectra: Mapping[str, Spectrum]
 
     def row(self, channel: str, kind: str = ALL) -> Row | None:
@@ -243,7 +248,7 @@ def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio:
     traces = {name: Trace(time_s, one, twin[name]) for name, one in real.items() if name in twin}
     count_deg = least_change(np.concatenate([np.diff(motor[part]) for part in parts]), motor)
     groups = _groups(time_s, legs, ~unknown_rows(measured, count_deg))
-    # At rest, the torque depends on a thousandth of a count.
+    # At rest, the torque depends on a thousandth of a count, so it is not compared.
     rests = [standing(part, count_deg) for part in measured.parts()]
     goes = ~np.concatenate([each.stuck | each.still for each in rests])
     rows = [
@@ -310,8 +315,8 @@ def _of_signal(
         apart = rms(one[inside] - other[inside])
         noise = noise_of(one, inside, parts)
         if name == TEMPERATURE:
-            # A replay starts at a reading, so both roundings add up to one step at most. A constant reading
-            # does not show its step.
+            # A replay starts at a rounded reading, so both roundings add up to one step at most. A constant
+            # reading does not reveal the step size.
             noise *= math.sqrt(12.0)
             if not noise:
                 return

@@ -66,18 +66,21 @@ from hdbridge.twin.parameters import (
 from hdbridge.twin.replay import MOVING_DEG_S, demand_deg
 
 # ----------------------------------------------------------------
-# Start values that the recordings show without replays.
+# Start values estimated from the recordings without replays.
 
 FILTER, DEAD_TIME = BY_NAME["command filter"], BY_NAME["servo dead time"]
 LIMIT: Final = BY_NAME["current limit"]
 HELD_ROWS = 3
 """Minimum number of rows at the highest torque for a limit; a mere peak lasts one or two."""
 LATEST_S = 0.1
-"""Maximum age of the demand."""
+"""Maximum lag of the motor behind the demand, s."""
 
 
 def start_of(truth: Truth, data: Data) -> Truth:
-    """Returns the truth with the age of the demand, and with the highest torque as its limit if held."""
+    """Returns the truth with command filter and dead time estimated from the lag behind the demand.
+
+    If the recording holds its highest torque for some rows, this torque becomes the drive's torque limit.
+    """
     servo, values = truth.servo, dict[str, float]()
     held_percent = 100.0 * _held_nm(data) / truth.motor.rated_torque_nm
     if held_percent < min(servo.torque_limit_percent, data.axis.limits.torque_percent):
@@ -90,7 +93,7 @@ def start_of(truth: Truth, data: Data) -> Truth:
 
 
 def _held_nm(data: Data) -> float:
-    """Returns the highest torque if it is held for `HELD_ROWS`, else infinity; without rows at standstill."""
+    """Returns the highest torque outside standstill, Nm, if it lasts for `HELD_ROWS` rows, else infinity."""
     torque_nm = [np.abs(piece.measured[TORQUE]) * piece.counts[TORQUE] for piece in data.pieces]
     highest = max(float(np.max(each)) for each in torque_nm)
     for each in torque_nm:
@@ -102,7 +105,7 @@ def _held_nm(data: Data) -> float:
 
 
 def lag_s(data: Data) -> float:
-    """Returns the age of the demand: the ratio of following error and speed of the delayed command."""
+    """Estimates the motor's lag behind the demand, s: following error divided by speed (least squares)."""
     lag = 0.0
     for _ in range(2):  # the second time with the command delayed by the lag
         products = squares = 0.0
@@ -132,7 +135,7 @@ LAWS: Final[Mapping[str, dict[str, float]]] = {
 }
 """Unit loops of the laws with few parameters; the exponent of the first is that of a published gear."""
 LONG = 20.0
-"""Travel after which each loop has reached its limit, in widths."""
+"""Travel after which each loop is saturated, in loop widths."""
 _TRUE: Final[TypeAdapter[Hysteresis]] = TypeAdapter(Hysteresis)
 
 
@@ -253,14 +256,14 @@ RESPONSE = 1.0
 """Norm of the change of the scaled residuals that determines the later difference steps: one standard
 deviation, the smallest visible change."""
 FARTHEST = 0.1
-"""Longest of these steps, in spreads, because the valley is curved."""
+"""Maximum length of a difference step, in spreads, because the valley of the misfit is curved."""
 WIDE = 3.0
 """Factor of the difference steps for intervals, which are two-sided. A sticking motor breaks away
 differently in each replay, so slopes over short differences are too steep and intervals too narrow."""
 TOO_FAR = 1.0
 """Change of the scaled residuals (rms) above which the loops at the end of a difference count as unstable."""
 NEARER = 0.1
-"""Factor by which such a difference is shortened."""
+"""Factor by which a difference is shortened if its change exceeds `TOO_FAR`."""
 ROUND = 4
 """Number of steps between two estimates of the residuals' scales."""
 EDGE = 1e-6
@@ -281,7 +284,7 @@ class Fitted:
     truth: Truth
     parameters: tuple[Parameter, ...]
     prior: FloatArray
-    """Mean of the prior of their coordinates, shape (p,)."""
+    """Prior mean of the parameters' coordinates, shape (p,)."""
     place: FloatArray
     """Coordinates of the parameters, shape (p,)."""
     covariance: FloatArray
@@ -384,7 +387,7 @@ class _Problem:
             return self.residuals(at(move))
 
         def slopes(move: FloatArray) -> FloatArray:
-            # `least_squares` also asks for them after the last step, and does not use them.
+            # `least_squares` also requests slopes after the last step, but does not use them.
             latest = self.slopes(at(move)) if left or self.along is None else self.along
             return np.concatenate([latest * self.spread, prior])
 
@@ -539,9 +542,9 @@ def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
 
 
 # ----------------------------------------------------------------
-# Servo structures: the simulated servo is put together from blocks (`hdbridge.sim.servo`). A servo far from
-# the start is a minimum of its own. Blocks are added one at a time, and kept if they reduce what is left of
-# legs that the fit has not seen.
+# Servo structures: the simulated servo consists of blocks (`hdbridge.sim.servo`). A structure far from the
+# start has its own minimum. Blocks are added one at a time, and kept if they reduce the residuals on held-out
+# legs.
 
 BANDWIDTHS: Final = ((25.0, 100.0), (80.0, 300.0), (200.0, 800.0))
 """Position gain, 1/s, and velocity gain over the total inertia, rad/s: a geared axis with a soft load, an
@@ -550,9 +553,10 @@ REJECTIONS: Final = ("speed", "position", "observer")
 """Block that compensates friction and load torque: the integral of the speed error (PI velocity loop) or of
 the position error (PIV), or a disturbance observer."""
 INTEGRAL: Final = 3.0
-"""Integral time times that bandwidth (symmetric optimum: 2 to 4)."""
+"""Integral time times the bandwidth of the velocity loop (symmetric optimum: 2 to 4)."""
 SLOW_INTEGRAL: Final = 30.0
-"""Same factor next to an observer, which leaves little to the integral."""
+"""Integral time times the bandwidth of the velocity loop, with an observer, which leaves little to the
+integral."""
 OBSERVED: Final = 0.9
 """Start value of the observer's share of the disturbance: nearly all."""
 FILTER_MS: Final = 0.5
@@ -564,8 +568,8 @@ VELOCITY_FEEDFORWARD: Final = 0.9
 FEW_STEPS = 3
 """Maximum number of steps of a fit from each start between two halvings."""
 HOPELESS: Final = 2.0
-"""Ratio to the lowest cost after as many steps above which a start is dropped as well. The starts that won
-on three foreign servos had at most 1.8."""
+"""Ratio of a start's cost to the lowest cost, after the same number of steps, above which a start is dropped
+even if it is in the better half. The starts that won on three foreign servos had at most 1.8."""
 GAIN: Final = 0.97
 """Maximum ratio of the misfits with and without a block for keeping the block; superfluous parameters gain
 less."""
@@ -593,7 +597,7 @@ PLACES: Final = (0.7, 1.0, 1.4)
 
 
 Start = tuple[Truth, tuple[Parameter, ...]]
-"""Start of a fit of a servo, with a prior about the servo's own values."""
+"""Truth from which a fit of a servo structure starts, and the parameters to fit."""
 
 
 def in_best_structure(
@@ -601,7 +605,8 @@ def in_best_structure(
 ) -> Fitted:
     """Fits the servo structure that explains a few legs best, and adds blocks that held-out legs confirm.
 
-    A servo that is already fitted joins the ``others`` at the end, because these require as many steps.
+    The fitted servo ``near`` is compared only with the best of the ``others``, because these need some steps
+    first.
     """
     scale = Scales(units(few.data))
     begun = [by_halving(few, each, scale) for each in ([(near.truth, near.parameters)], [*others]) if each]
@@ -619,7 +624,7 @@ def in_best_structure(
 def by_halving(
     few: Replays, begun: Iterable[Start], known: Scales, keep: Callable[[Fitted], None] = lambda _: None
 ) -> Fitted:
-    """Fits from each start for a few steps, from the better half for as many more, until one is left.
+    """Fits from each start for a few steps, continues with the better half, and repeats until one is left.
 
     Successive halving (Jamieson and Talwalkar, AISTATS 2016) does not lose a start with a longer way to a
     better minimum to one that is already near its minimum. All legs count, because a few held-out legs do not
@@ -640,7 +645,7 @@ def by_halving(
 
 
 def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
-    """Yields the servos at which a fit starts.
+    """Yields the servo structures from which fits start.
 
     An acceleration feed-forward uses the filtered demand, or differences over whole SYNC cycles, which is a
     moving average of one cycle. A lag beyond the longest possible dead time is attributed to the command
@@ -691,7 +696,7 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
 
 
 def more_blocks(best: Fitted) -> Iterator[Start]:
-    """Yields the servo with one more or a replaced block."""
+    """Yields variants of the servo with one block added or replaced."""
     truth, servo = best.truth, best.truth.servo
     if servo.notch is None:
         load = truth.load_.whole_inertia_kg_m2
@@ -715,7 +720,7 @@ def more_blocks(best: Fitted) -> Iterator[Start]:
 
 
 # ----------------------------------------------------------------
-# Places at which a fit may have another minimum.
+# Alternative start values, because the misfit may have other minima there.
 
 FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
 """Start values of the load's resonance frequency, because a fit finds only the nearest minimum."""
@@ -731,7 +736,7 @@ def elsewhere(truth: Truth, usual: Truth) -> list[Truth]:
 
 
 def springs(truth: Truth) -> list[Truth]:
-    """Returns the truth with the load's resonance at each other frequency that its time step resolves."""
+    """Returns variants of the truth with each of `FREQUENCIES_HZ` that its time step resolves."""
     inertia, now = truth.load_.whole_inertia_kg_m2, truth.gear.stiffness_nm_per_rad
     found = []
     for hz in FREQUENCIES_HZ:
@@ -743,12 +748,12 @@ def springs(truth: Truth) -> list[Truth]:
 
 
 def lags(truth: Truth) -> list[Truth]:
-    """Returns the truth with the same lag divided differently between command filter and dead time."""
+    """Returns variants of the truth with the lag divided differently between command filter and dead time."""
     return [_with_dead_time(truth, (1.0 - share) * _lag_ms(truth)) for share in FILTER_SHARES]
 
 
 def delays(truth: Truth) -> list[Truth]:
-    """Returns the truth with the dead time in each other substep within the lag.
+    """Returns variants of the truth with the dead time in every other possible substep, and the same lag.
 
     The demand changes slope at the start of a cycle, and a torque lasts for a substep. A change within a
     substep is spread over two substeps, as by a filter, so the misfit over the dead time has a minimum in
@@ -761,12 +766,12 @@ def delays(truth: Truth) -> list[Truth]:
 
 
 def neighbours(truth: Truth) -> list[Truth]:
-    """Returns those of `delays` whose dead time is one substep shorter or longer."""
+    """Returns the truths of `delays` with a dead time that is one substep shorter or longer."""
     return [each for each in delays(truth) if abs(_substep(each) - _substep(truth)) == 1]
 
 
 def inertias(truth: Truth) -> list[Truth]:
-    """Returns the truth with other motor inertias; a spring too stiff for the time step is made softer."""
+    """Returns variants of the truth with other motor inertias; a spring too stiff for them is softened."""
     motor = [BY_NAME["motor inertia"]]
     (now,) = coordinates(truth, motor)
     return [at_coordinates(truth, motor, [now + math.log(factor)]) for factor in INERTIA_FACTORS]
@@ -788,12 +793,15 @@ def _with_dead_time(truth: Truth, dead_time_ms: float) -> Truth:
 
 
 def _divided(lag_ms: float, dead_time_ms: float) -> dict[str, float]:
-    """Returns a lag as this dead time and a command filter, by parameter name."""
+    """Returns dead time and command filter that together cause this lag, by parameter name."""
     return {FILTER.name: 0.5 * (lag_ms - dead_time_ms), DEAD_TIME.name: dead_time_ms}
 
 
 def feedforwards(truth: Truth, usual: Truth) -> list[Truth]:
-    """Returns the truth with other load feed-forward frequencies and the usual division of the inertias."""
+    """Returns variants of the truth with other load feed-forward frequencies.
+
+    The feed-forward inertias of motor and load keep their sum and are divided as in ``usual``.
+    """
     servo, load, there = truth.servo, truth.servo.load_feedforward, usual.servo.load_feedforward
     if load is None or there is None:
         return []
@@ -913,7 +921,7 @@ FIT_S = 60.0
 """Duration of the pieces of a longer recording that are fitted, with all kinds of motion if possible,
 because a thousand replays of a quarter of an hour would take hours."""
 MORE_STEPS = 10
-"""Steps from another place over the whole recording."""
+"""Steps from an alternative start over the whole recording."""
 STEPS = 30
 """Maximum steps over the whole recording."""
 MORE = 1.1
@@ -941,8 +949,9 @@ def free_parameters(truth: Truth, more: Sequence[str] = ()) -> tuple[Parameter, 
 def fit(replays: Replays, progress: Progress = lambda _: None) -> Fitted:
     """Fits the parameters, starting from the truth with which the recordings were prepared.
 
-    If its servo leaves many times the noise, other servos join the starts; if it leaves a little, blocks are
-    added. Ctrl-C ends the fit at the best place so far, if any.
+    If the residuals with this truth's servo are many times the noise, other servo structures are tried as
+    well. If they exceed the noise slightly, blocks are added. Ctrl-C ends the fit at the best place so far,
+    if any.
     """
     reached: list[Fitted] = []
     try:

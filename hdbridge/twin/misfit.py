@@ -587,7 +587,7 @@ def misfit_of(
 
 
 def signals_of(data: Data) -> dict[str, FloatArray]:
-    """Returns the measured signals by channel, in its unit; for the load, its error without the zero."""
+    """Returns the measured signals by channel, in its unit; for the load, its error without its mean."""
     demanded_deg = np.concatenate([demand_deg(each.commands, data.axis) for each in data.pieces])
     motor_deg = demanded_deg - data.measured[FOLLOWING]
     error = data.measured[LOAD] - ARCSEC_PER_DEG / data.axis.gear.ratio * motor_deg
@@ -595,11 +595,11 @@ def signals_of(data: Data) -> dict[str, FloatArray]:
 
 
 SHARE: Final = 0.01
-"""Share of a channel's signal that is the minimum unit of its misfit."""
+"""Minimum scale of a channel's misfit, as a share of its rms signal."""
 
 
 def units(data: Data) -> dict[str, float]:
-    """Returns a hundredth of the signal, or the noise if larger, by channel, in its unit."""
+    """Returns the scale of each channel's misfit: a hundredth of its rms signal, or its noise if larger."""
     noise = noise_in_motion(data)
     return {
         name: max(noise[name], SHARE * rms(measured[data.counts[name]]))
@@ -616,7 +616,7 @@ def judged_rows(data: Data) -> dict[str, Mask]:
 
 
 def misfit(data: Data, left: Mapping[str, FloatArray]) -> float:
-    """Returns the root mean square over the channels in `units`, on held-out legs if any."""
+    """Returns the rms residual over all channels, each relative to `units`, on held-out legs if any."""
     scale, rows = units(data), judged_rows(data)
     return rms(np.array([rms(left[name][each] / scale[name]) for name, each in rows.items() if each.any()]))
 
@@ -628,8 +628,8 @@ NOISE_LEVEL: Final = 1.3
 """Maximum rms residual of an explained channel, in units of the noise in motion. Replays of the true values
 of axes 608, 609 and 612 (tools/twin_random_axes.py) leave 0.3 to 1.22."""
 MOST_NOISE: Final = 3.0
-"""Maximum if the residual is also a small share of the signal. Axis 620, whose intervals contain 1 of 18
-true values, leaves 2.9 to 28 with its true values."""
+"""Maximum rms residual of an explained channel, in units of the noise, if it is also at most `MOST_SHARE` of
+the signal. Axis 620, whose intervals contain 1 of 18 true values, leaves 2.9 to 28 with its true values."""
 MOST_SHARE: Final = 0.05
 """Maximum share for `MOST_NOISE`: rms residual over rms signal."""
 

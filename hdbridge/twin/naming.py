@@ -82,30 +82,29 @@ def worse_than_chance(left: FloatArray, change: FloatArray, legs: NDArray[np.int
 
 
 # ----------------------------------------------------------------
-# Causes: the ones that bring the misfit back, one after the other.
+# Forward selection of the causes that bring the misfit back to its former level.
 
 GROWN = 1.5
 """Ratio above which two misfits count as different; smaller ratios result from noise and different legs."""
 EXPLAINED = 0.5
-"""Minimum share of the growth that a named cause explains, in squares: most of the growth left by the other
-causes."""
+"""Minimum share of the remaining growth, in squares, that a named cause explains: half."""
 OF_REPLAY = 0.25
-"""Minimum share of all growth if the values are not the axis's, because such a simulation is wrong by a
-share of each change, and smaller remainders are not causes."""
+"""Minimum share of all growth, in squares, if the twin's values are not the axis's. Such a simulation shows
+each change with an error, and a remainder of that size is not another cause."""
 STEPS = 8
 """Maximum steps of the fit of one cause."""
 SIZES = (2.5, 6.0)
 """Changes of each parameter, in both directions, at which a fit may start, in units of its least change. The
-ringing of a load is out of phase after a small change, from which a fit finds no way back."""
+ringing of a load is out of phase after a small change, and a fit does not recover from that."""
 
 
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """Causes that explain a recording, and the growth of the misfit without and with them."""
+    """Named causes of a recording's increased misfit, and the growth of the misfit without and with them."""
 
     causes: tuple[str, ...]
     rivals: tuple[str, ...]
-    """Causes that explain as much in place of the last one."""
+    """Causes that explain the recording equally well in place of the last named cause."""
     truth: Truth
     """The simulation with these causes fitted."""
     growth_before: Mapping[str, float]
@@ -187,7 +186,7 @@ def shifted(truth: Truth, parameter: Parameter, by: float) -> Truth:
 
 
 def _excess(grown: Mapping[str, float]) -> float:
-    """Returns the sum of squares of the channels' growth."""
+    """Returns the sum over the channels of the squared growth in excess of one."""
     return sum(max(each**2 - 1.0, 0.0) for each in grown.values())
 
 

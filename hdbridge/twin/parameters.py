@@ -235,19 +235,20 @@ def at_coordinates(truth: Truth, parameters: Sequence[Parameter], place: Sequenc
 TORQUE_PER_INERTIA: Final = 10_000.0
 """Acceleration of the bare rotor of a small brushless servo motor at its rated torque, rad/s^2."""
 INERTIA_RATIO: Final = 3.0
-"""Load over motor inertia seen by the motor; the article's bench has 3."""
+"""Load inertia, seen by the motor, over motor inertia; the article's bench has 3."""
 RESONANCE_HZ: Final = 40.0
 """Resonance of the load on the gear's spring: 15 to 80 Hz for arms on strain wave gears."""
 DAMPING_RATIO: Final = 0.2
-"""Damping ratio of that resonance: material and grease; the article's bench has 0.2."""
+"""Damping ratio of the load on the gear's spring: material and grease; the article's bench has 0.2."""
 COULOMB_SHARE: Final = 0.1
 """No-load running torque of strain wave gears at the motor, as a share of the rated torque: 5 to 15 %."""
 VISCOUS_SHARE: Final = 0.2
-"""Grease of strain wave gears at 20 deg C, as a share of the rated torque at 3000 rpm."""
+"""Viscous friction of the grease in strain wave gears at 20 deg C and 3000 rpm, as a share of the rated
+torque."""
 RATED_SPEED_RAD_S: Final = 3000.0 * math.tau / 60.0
 """Rated speed of small servo motors."""
 STRIBECK_RAD_S: Final = 5.0
-"""Stribeck speed of bearings and teeth in grease: a film carries from some tens of turns a minute on."""
+"""Stribeck speed of bearings and teeth in grease: the film forms at some tens of revolutions per minute."""
 COUPLING_HZ: Final = 1000.0
 """Resonance of an encoder on an unknown coupling: stiffer than a recording shows."""
 COUPLING_DAMPING: Final = 0.1
@@ -257,7 +258,7 @@ NOTCH_HZ: Final = 100.0
 OBSERVER_HZ: Final = 50.0
 """Bandwidth of disturbance observers: one to three velocity loops, 20 to 150 Hz."""
 SHORTEST_FILTER_MS: Final = 0.02
-"""Negligible filter: a tenth of a short substep."""
+"""Time constant of a negligible filter: a tenth of a short substep."""
 BRAKE_SHARE: Final = 3.0
 """Torque of a holding brake, as a share of the rated torque: more than the torque of the motor."""
 POSITION_GAIN_PER_S: Final = 200.0
@@ -265,7 +266,7 @@ POSITION_GAIN_PER_S: Final = 200.0
 VELOCITY_BANDWIDTH_RAD_S: Final = 1000.0
 """Bandwidth of the velocity loop on the motor's own inertia: 160 Hz."""
 INTEGRAL_TIME_MS: Final = 15.0
-"""About three times the period of the velocity loop's bandwidth."""
+"""Integral time: two to three periods of the velocity loop's bandwidth."""
 COMMAND_FILTER_MS: Final = 1.0
 """Short filter by which drives interpolate the demand between SYNCs."""
 FRICTION_FEEDFORWARD_SHARE: Final = 0.8

@@ -1,9 +1,10 @@
 """Replays a recording's commands through a simulated drive, without bus and master.
 
 The state before a recording is unknown. The replay therefore switches the drive on at its angle zero and
-moves to the first command at the axis's limits, and does so before each part that does not follow another. If
-the recording begins with the drive holding the axis, its torque sets the integrals of the loops. Between
-consecutive parts, the drive is switched off, as on the bench, and the load continues to ring.
+moves to the first command at the axis's limits. It repeats this before each part that does not continue the
+previous one. If the recording begins with the drive holding the axis, the recorded torque sets the loops'
+integrals. Between consecutive parts, the drive is switched off, as on the bench, and the load continues to
+ring.
 
 External influences are part of a recording, like its commands. A recorded torque on the load acts on the
 simulated load in place of its own weight, and the recorded temperature sets its initial temperature.
@@ -191,7 +192,8 @@ REST_S = 0.1
 RINGS_S = 1.0
 """Time from the end of a leg's motion to the end of the leg; a longer standstill is not part of any leg."""
 LEAST_LEG_S = 0.4
-"""Minimum length of such a leg: an acceleration and the ringing of a load at 15 Hz."""
+"""Minimum length of a leg that the recording does not name: an acceleration and the ringing of a load at
+15 Hz."""
 SIGN_SHARE = 0.2
 """Share of the mean torque that must oppose the motion for the sign to count as wrong."""
 TORQUE_MARGIN = 1.5
@@ -225,7 +227,7 @@ class Commands:
     held: tuple[tuple[int, float], ...] = ()
     """Cycles before which the loops' integrals are set to a holding torque, with that torque in Nm."""
     start_c: float | None = None
-    """Initial temperature of the axis; None for that of the truth."""
+    """Initial temperature of the axis; None for the value of the truth."""
 
 
 def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
@@ -300,7 +302,7 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
 
 
 def cycle_of(part: Record, axis: AxisConfig) -> float:
-    """Returns a record's cycle in seconds, as 60C2h can express it, or the axis's cycle if they agree."""
+    """Returns a record's cycle time, s: the axis's if both agree, else rounded to a value of 60C2h."""
     own_ms = 1e3 * float(np.median(np.diff(part.time_s)))
     if not own_ms > 0.0:
         raise InputError(
@@ -512,7 +514,7 @@ def _followed(
             machine.follow_all(demand[done : off.start + 1], substeps[on], outer_nm[on], held_nm[on])
         )
         pieces.append(_coasted(machine, substeps[off], outer_nm[off]))
-        demand[off.stop] = demand[min(off.stop + 1, len(demand) - 1)]  # where the drive is on again
+        demand[off.stop] = demand[min(off.stop + 1, len(demand) - 1)]  # the drive is on again
         done = off.stop
     whole = Cycles(*(np.concatenate(each) for each in zip(*pieces, strict=True)))
     return Cycles(*(each[commands.lead :] for each in whole))

@@ -37,7 +37,7 @@ RISE_K: Final = 100.0
 """Temperature rise of a winding at rated torque (IEC 60034-1 allows 105 K for class F by the resistance
 method, the usual rating of motors). The housing warms less."""
 MATTERS_K: Final = 5.0
-"""Smallest relevant change of that temperature rise."""
+"""Smallest relevant change of the temperature rise at rated torque."""
 RESISTANCE: Final = Parameter(
     "thermal resistance", "temperature.resistance_k_per_w", "K/W", 1e-4, 1e3, 0.7, 0.25, AMBIENT.cause,
     _WARM_UP,
@@ -49,7 +49,7 @@ COPPER_LOSS: Final = Parameter(
     "copper loss", "temperature.copper_loss_w", "W", 0.0, 1e5, RISE_K, MATTERS_K, AMBIENT.cause, _WARM_UP,
     linear=True,
 )  # fmt: skip
-"""Spread and least change are those at one kelvin per watt."""
+"""Its spread and least change apply to a thermal resistance of 1 K/W; `_scaled` adapts them."""
 THERMAL: Final = (AMBIENT, RESISTANCE, TIME_CONSTANT, COPPER_LOSS)
 
 STEP_S: Final = 1.0
@@ -77,7 +77,7 @@ class _Part:
     friction_w: FloatArray
     """Friction power, averaged over the step that ends at each time."""
     torque_squares: FloatArray
-    """Squared torque over rated torque, averaged over the same step."""
+    """Square of torque over rated torque, averaged over the step that ends at each time."""
     weather_k: FloatArray
     """Change of the truth's ambient temperature since the start of the part."""
     reading_c: FloatArray

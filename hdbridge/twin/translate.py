@@ -180,7 +180,7 @@ def ratio_error(effect: effects.RatioError, draft: Draft) -> None:
 
 
 def orders(key: str, effect: Any, draft: Draft) -> None:
-    """Adds the effect's orders to the tooth error over the angle of this key."""
+    """Adds the effect's orders to the tooth error selected by ``key``, such as ``motor_orders``."""
     sums: dict[int, complex] = {
         each["order"]: cmath.rect(each["amplitude_arcsec"], math.radians(each["phase_deg"]))
         for each in draft.gear.get(key, ())
@@ -200,7 +200,7 @@ def orders(key: str, effect: Any, draft: Draft) -> None:
 
 
 def direction_phase(effect: effects.DirectionPhase, draft: Draft) -> None:
-    """Sets two flanks. The model's orders are the mean of both flanks, the plant's orders those of each."""
+    """Sets two flanks. The model's orders are the mean of both flanks; the plant's are those of one flank."""
     held, flanks = list[str](), list[dict[str, Any]]()
     for each in draft.gear.get("motor_orders", ()):
         shift = math.radians(each["order"] * effect.shift_deg)
@@ -243,7 +243,7 @@ def torque_modulation(effect: effects.TorqueModulation, draft: Draft) -> None:
 
 
 def local_defect(effect: effects.LocalDefect, draft: Draft) -> None:
-    """Sets a damaged tooth with the same raised cosine."""
+    """Sets a damaged tooth with the raised cosine of the effect."""
     width = min(180.0, 2.0 * effect.half_width_deg)
     bump = {"at_deg": effect.centre_deg, "width_deg": width, "height_arcsec": effect.height_arcsec}
     draft.gear["damage"] = [*draft.gear.get("damage", ()), bump]
@@ -308,7 +308,7 @@ def _disc(orders: Iterable[effects.MotorOrder], ratio: float, at_deg: Any) -> di
 
 
 def channel_skew(effect: effects.ChannelSkew, draft: Draft) -> None:
-    """Sets the delay of the other encoder: a late load reading means an older motor reading."""
+    """Sets the motor encoder's delay if the load encoder is sampled later, else the load encoder's delay."""
     delay_ms = effect.delay_ms
     late = "motor" if delay_ms > 0.0 else "load"
     draft.part(late, "encoder")["late_ms"] = min(abs(delay_ms), LATEST_MS)
@@ -352,7 +352,7 @@ def subdivisional_error(effect: effects.SubdivisionalError, draft: Draft) -> Non
 
 
 def count_loss(effect: effects.CountLoss, draft: Draft) -> None:
-    """Sets count losses of the load encoder at the same times after switching on."""
+    """Sets count losses of the load encoder, at the effect's times after switching on."""
     counts_per_arcsec = draft.axis.load_encoder.counts(1.0) / 3600.0
     losses = [
         {"time_s": each.time_s, "counts": round(each.size_arcsec * counts_per_arcsec)}
@@ -370,7 +370,8 @@ def count_loss(effect: effects.CountLoss, draft: Draft) -> None:
 # Effects of temperature, travel and time.
 
 LINEAR_BUILD_UP: Final = 0.5
-"""Build-up ratio below which the plant's element, with equal times of strain and release, deviates."""
+"""Build-up ratio below which, or above the inverse of which, the plant deviates: its element strains and
+releases with equal time constants."""
 
 
 def zero_drift(effect: effects.ZeroDrift, draft: Draft) -> None:
@@ -400,7 +401,7 @@ def amplitude_drift(effect: effects.AmplitudeDrift, draft: Draft) -> None:
 
 
 def wear(effect: effects.Wear, draft: Draft) -> None:
-    """Sets a gap between the teeth that grows with the travel; the model's loop may also widen."""
+    """Sets a gap between the teeth that grows with the travel; refuses a model whose elastic loop widens."""
     if effect.growth_arcsec_per_kiloturn > 0.0:
         draft.refuse("the loop widens in the sense of the elastic one: the plant's teeth wear to a gap only")
         return
@@ -446,7 +447,8 @@ HOLDS: Final = 1.5
 """Ratio of the friction that holds the load in a dead zone to its inertial torque at the highest
 acceleration."""
 MOST_HELD: Final = 0.3
-"""Maximum wind-up of the spring by this friction, as a share of half the gap."""
+"""Maximum wind-up of the spring by the friction that holds the load in a dead zone, as a share of half the
+gap."""
 
 
 def compliance(effect: effects.Compliance, draft: Draft) -> None:
@@ -536,7 +538,10 @@ def hysteresis_parameters(effect: effects.HysteresisParameters, draft: Draft) ->
 
 
 def hysteresis(effect: effects.Hysteresis | effects.HysteresisMemory, draft: Draft) -> None:
-    """Sets the same law if the load leads (parallel sliders for one with memory), or friction at the load."""
+    """Sets the effect's law as the gear's hysteresis if the load leads, or friction at the load if it lags.
+
+    A law with memory becomes parallel sliders.
+    """
     draft.place = "gear.hysteresis"
     if effect.offset_arcsec < 0.0:
         _lagging(effect, draft)
@@ -619,7 +624,7 @@ def rate_dependence(effect: effects.RateDependence, draft: Draft) -> None:
 
 
 def vibration(effect: effects.Vibration, draft: Draft) -> None:
-    """Sets a torque that shakes the load by the same amplitude with the motor held."""
+    """Sets a torque that shakes the load with the effect's amplitude while the motor is held."""
     if effect.frequency_hz > HIGHEST_SHAKE_HZ:
         draft.refuse(f"the plant is shaken by up to {HIGHEST_SHAKE_HZ:g} Hz")
         return
@@ -652,7 +657,7 @@ OF_GEAR: Final = (
     "torque_growth_per_nm", "backlash_arcsec", "rate_dependence", "wear", "ageing", "creep", "damage",
     "roller", "seat",
 )  # fmt: skip
-"""Keys of the section `gear` for transmission error, which are replaced by those of a model."""
+"""Keys of the section `gear` for transmission error, which a translation removes before it adds a model's."""
 OF_ENCODERS: Final = ("disc", "late_ms", "losses", "signals", "cable", "sensor_warming")
 OF_TEMPERATURE: Final = (
     "zero_drift_arcsec_per_k", "zero_time_constant_s", "reference_c", "tooth_growth_per_k",

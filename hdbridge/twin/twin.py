@@ -83,9 +83,9 @@ class Twin:
     left: tuple[Left, ...]
     """Residual of each recorded channel, on held-out legs if any."""
     before: Comparison
-    """Recordings against the initial simulation; the kind `HELD_OUT` covers the held-out legs."""
+    """Comparison of the recordings with the initial simulation; the kind `HELD_OUT` is the held-out legs."""
     after: Comparison
-    """Recordings against the twin."""
+    """Comparison of the recordings with the twin."""
     impossible: tuple[str, ...] = ()
     """Implausible values, each in a sentence; only for a twin whose values are not the axis's."""
 
@@ -186,7 +186,7 @@ def replays_only(twin: Twin) -> str:
 def better(before: Comparison, after: Comparison) -> Verdict:
     """Compares the rms differences of load error, following error, torque and (if recorded) temperature.
 
-    On held-out legs, or on all legs without any.
+    Uses the held-out legs, or all legs if none are held out.
     """
     kind = HELD_OUT if any(row.kind == HELD_OUT for row in after.rows) else ALL
     where = "on legs that the fit has not seen" if kind == HELD_OUT else "on the legs that it was fitted to"
@@ -195,7 +195,7 @@ def better(before: Comparison, after: Comparison) -> Verdict:
         for name in SIGNALS
         if (was := before.row(name, kind)) is not None and (now := after.row(name, kind)) is not None
     }
-    # A replay starts at a reading and may be off by a step from there on; smaller differences are equal.
+    # A replay starts at a rounded reading and may stay off by one step, so smaller differences are equal.
     step_k = max((each.noise for each in pairs.get(TEMPERATURE, ())), default=0.0)
     if max((each.difference for each in pairs.get(TEMPERATURE, ())), default=0.0) <= step_k:
         pairs.pop(TEMPERATURE, None)
@@ -205,7 +205,7 @@ def better(before: Comparison, after: Comparison) -> Verdict:
             worse.append(
                 f"{TITLES[name]} differs by {now.difference:.3g} {now.unit}, before by {was.difference:.3g}"
             )
-        # Noise is in both differences. Differences below this limit are equal.
+        # Both differences contain noise. Differences below this limit are equal.
         least = step_k if name == TEMPERATURE else max(EQUAL * now.noise, 1e-12)
         ratios.append(math.log(max(now.difference, least) / max(was.difference, least)))
     gain = 1.0 - math.exp(sum(ratios) / len(ratios)) if ratios else 0.0
@@ -378,7 +378,7 @@ def fit_twin(
 
 
 def _wrong(replays: Replays, start: Truth, fitted: Fitted) -> tuple[Finding, ...]:
-    """Names the wrong values of the start on a few legs; the values after are those of the fit."""
+    """Names the wrong values of the start, using a few legs; the corrected values come from the fit."""
     few, like = replays.rough, by_law_of(with_sections(start, fitted.parameters), fitted.truth)
     was = scales_by_kind(few.data, misfit_of(replays.data, fitted.residuals), noise_floor(few.data))
     groups = by_cause(fitted.parameters)

@@ -12,7 +12,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 
 class TrueStiffening(Strict):
-    """Further stages of the spring, which is stiffer (or softer) beyond each torque than before."""
+    """Second and third stage of the spring, with another stiffness beyond each of two torques."""
 
     first_torque_nm: float = Field(gt=0, le=1e6, description="torque T1 at which the first stage ends")
     second_stiffness_nm_per_rad: float = Field(gt=0, le=1e9, description="stiffness K2 beyond T1")

@@ -50,7 +50,7 @@ class TrueNotch(Strict):
 
 
 class TrueObserver(Strict):
-    """Disturbance observer: lagged difference between the torque and that which accelerates the inertia."""
+    """Disturbance observer: low-pass of the motor torque minus the torque that accelerates the inertia."""
 
     frequency_hz: float = Field(gt=0, le=500, description="corner frequency of the estimate")
     share: float = Field(ge=0, le=1, description="part of the estimate that is added to the torque")

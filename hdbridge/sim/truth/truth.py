@@ -84,7 +84,7 @@ class Truth(Strict):
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Reads a truth file, or that of a profile's folder; InputError gives file:line:column."""
+        """Reads a truth file, or the truth.yaml of a profile's folder; InputError gives file:line:column."""
         path = Path(path)
         return read_yaml(path / "truth.yaml" if path.is_dir() else path).validate(cls)
 
