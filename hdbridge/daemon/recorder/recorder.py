@@ -42,7 +42,7 @@ class FlightRecorder:
         in_use: Callable[[], Mapping[str, CompensationSetting]] = dict,
         free: Callable[[Path], int] = free_bytes,
     ) -> None:
-        """``in_use`` returns the setting that compensates each axis. The recorder's threads call ``notify``."""
+        """``in_use`` returns the setting that compensates each axis. The threads here call ``notify``."""
         self.folder = folder
         self.flight: FlightLog | None = None
         """None if the folder could not be created."""
