@@ -1,6 +1,6 @@
 """The keeper: starts, monitors and ends the daemon's processes, and does nothing else.
 
-It holds what must outlive a child: the shared memory, the listening sockets, the lock of the CAN interface.
+It owns the resources that must outlive a child: shared memory, listening sockets, lock of the CAN interface.
 
     a child is        the keeper
     ----------------  ----------------------------------------------------------------------------------

@@ -281,7 +281,7 @@ class EncoderHealth:
     """Monitors the load encoder of one axis in the loop's samples."""
 
     def __init__(self, axis: AxisConfig, model: TransmissionModel, index: int = 0) -> None:
-        """``index`` is that of the axis in a sample; ``model`` is that of the predicted errors in samples."""
+        """``index`` is the place of the axis in a sample; ``model`` predicts the errors in the samples."""
         self.status = EncoderStatus()
         """State after the last samples taken."""
         self._index = index
@@ -305,7 +305,7 @@ class EncoderHealth:
         self._tail: SampleArray | None = None
         """Last samples, which are evaluated again with the next ones."""
         self._held: tuple[float, float] | None = None
-        """Last load reading, and the motor angle at its last change; degrees."""
+        """Last load reading, and the motor angle at which it last changed; degrees."""
         self._pending: dict[bool, list[Residuals]] = {True: [], False: []}
         """Samples of the incomplete blocks at rest (True) and in motion (False)."""
         self._since: tuple[bool, float] = (True, -math.inf)

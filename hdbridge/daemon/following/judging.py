@@ -240,7 +240,7 @@ class Watch:
         recent = self._observations
         while recent and not 0.0 <= now_s - recent[0].time_s <= WINDOW_S:
             recent.popleft()
-        # An axis at rest gives no new evidence, and an uncalibrated one has no model to test.
+        # An axis at rest provides no new evidence, and an uncalibrated one has no model to test.
         if not self._new or self._faulty or not self._drift.model.effects:
             return False
         self._new = False

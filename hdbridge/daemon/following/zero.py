@@ -25,9 +25,9 @@ from hdbridge.daemon.following.measuring import DriftModel, Observation
 from hdbridge.daemon.machinefile import AdaptationSettings
 
 SPANS_S: Final = (15.0, 60.0, 180.0)
-"""Time spans up to now in which a drift is searched, from fast to slow; a step is searched in the last."""
+"""Durations of the spans up to now that are tested for a drift; the longest is also tested for a step."""
 EVERY_S: Final = 2.0
-"""Interval between judgements."""
+"""Minimum interval between fits."""
 LEAST: Final = 16
 """Minimum number of observations in a span."""
 SIGMAS: Final = 8.0

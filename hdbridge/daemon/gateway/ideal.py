@@ -28,5 +28,5 @@ class IdealAxis:
         self.velocity_counts_s = (end_counts - start_counts) / (substeps * self.dt_s)
 
     def coast(self, substeps: int, braked: bool) -> None:
-        """Stands still without power."""
+        """Stays at rest without power."""
         self.velocity_counts_s = 0.0

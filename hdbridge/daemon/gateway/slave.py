@@ -111,7 +111,7 @@ class LoadAxis(PowerStage):
         """Axis in the newest cycle; None before the first."""
         self._measured = (-math.inf, 0.0)
         self._series = max(self._cells[OuterCell.WANTED], self._cells[OuterCell.GRANTED]) + 1
-        """Number of the next series of set-points; no number is used twice, by any process."""
+        """Number of the next series of set-points; no process uses a number twice, even after a restart."""
         self._wanted = 0
         self._wanted_s = 0.0
         self._begun = False

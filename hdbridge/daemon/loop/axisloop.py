@@ -107,7 +107,7 @@ class AxisLoop:
         self._why = ""
         """Reason for stopping, if the supervision did not report one."""
         self.stands = True
-        """True if the axis stands and the stop was reported; False only in QUICK_STOPPED and LATCHED."""
+        """True if the axis is at rest and its stop was reported; False only in QUICK_STOPPED and LATCHED."""
         self._place = self._still = 0
         """Motor counts in the last turn of a stop, and the number of consecutive turns at standstill."""
         self._handlers: dict[CommandKind, Callable[[Command], None]] = {
@@ -227,7 +227,7 @@ class AxisLoop:
     def _turns(self, time_s: float) -> int:
         return math.ceil(time_s / self._period_s)
 
-    # ---------------------------------------------------------------- what each command does
+    # ---------------------------------------------------------------- command handlers
 
     def _verified(self, command: Command) -> None:
         self._seed(command)
@@ -270,7 +270,7 @@ class AxisLoop:
         if self.state in (*MAY_MOVE, AxisState.LENT):
             self._why = "quick stop by command: latched"
         if self.state is AxisState.LENT:
-            # The next RPDO overrides what the service does by SDO.
+            # The next RPDO overrides the controlword that the service sends by SDO.
             self.image.power.quick_stop()
             self.cycle.begin()
 
@@ -441,7 +441,7 @@ class AxisLoop:
         self._happened(Happening.OVERDUE)
 
     def _after_stop(self) -> None:
-        """Reports a stop once the axis stands or the time-out has passed."""
+        """Reports a stop once the axis is at rest or the time-out has passed."""
         if self.supervision.stop is None and self.state is AxisState.QUICK_STOPPED:
             if not self._obeyed():
                 return
@@ -456,7 +456,7 @@ class AxisLoop:
         self._report(EventKind.STOPPED, int(explained), code, text)
 
     def _obeyed(self) -> bool:
-        """Returns True if a commanded quick stop is over: the motor stands, or the time-out has passed."""
+        """Returns True if a commanded quick stop is over: the motor is at rest or the time-out has passed."""
         counts, before = self.cycle.feedback.motor_counts, self._place
         self._place = counts
         driven = self.image.power.state is State.OPERATION_ENABLED

@@ -59,7 +59,7 @@ class ServiceAxis:
         """True if `prepare` has done the SDO transfers before power-on, and nothing has invalidated them."""
         self.motion = AxisMotion(self.link, self.check_may)
         self.stopped: Entry | None = None
-        """Last stop, once the axis stands; None before."""
+        """Last stop, once the axis is at rest; None before."""
         self.loop_doubt = "the reason is in the log of an earlier service"
         """Text of the last event of the load loop."""
         self.following: Following | None = None
@@ -83,7 +83,7 @@ class ServiceAxis:
         if event.kind is EventKind.STOPPED:
             self.stopped = entry
         elif event.kind is EventKind.STATE and event.code in STOPPED:
-            self.stopped = None  # the reason is reported once it stands
+            self.stopped = None  # the reason is reported once the axis is at rest
         elif event.kind is EventKind.LOAD_LOOP:
             self.loop_doubt = event.text
 

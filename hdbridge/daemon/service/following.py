@@ -47,15 +47,15 @@ class Following:
         recorder: FlightRecorder | None = None,
         diagnosis: AutoDiagnosis | None = None,
     ) -> None:
-        """``index`` is that of the axis in a sample, ``folder`` contains state and history of its
-        adaptation.
+        """``index`` is the place of the axis in a sample; ``folder`` contains the files of its adaptation.
 
-        ``worker`` has one thread. Verdicts are noted in ``recorder``; bad verdicts start ``diagnosis``.
+        ``worker`` has one thread. Verdicts are noted in ``recorder``; those in `DIAGNOSED` start
+        ``diagnosis``.
         """
         self.state = messages.AdaptationState(mode=messages.AdaptationMode(settings.mode))
         """State of the adaptation."""
         self.advice: list[str] = []
-        """Present verdict of the watch unless the model is valid, and what is not watched."""
+        """Present verdict of the watch unless the model is valid; the reason if the axis is not watched."""
         self._index, self._axis = index, axis
         self._settings, self._folder = settings, folder
         self._worker, self._recorder, self._diagnosis = worker, recorder, diagnosis

@@ -59,7 +59,8 @@ class Lease:
 
         With ``force``, it is taken even from another holder. With ``lasts``, it does not expire.
 
-        Raises LeaseError if the lease is held, InputError if the client's name is empty or too long.
+        Raises LeaseError if the lease is held and ``force`` is False, and InputError if the client's name is
+        empty or too long.
         """
         if not client.strip() or len(client) > LONGEST_NAME:
             raise InputError(
