@@ -1,4 +1,4 @@
-"""Conformance tests of a node to CiA 301, 305, 306 and 402: timed checks, in one table per subject.
+"""Conformance tests of a node (CiA 301, 305, 306 and 402): timed checks, in one table per subject.
 
 The checks use only a `Link` and its clock, so they run on a virtual bus in simulated time and on a real bus.
 """
