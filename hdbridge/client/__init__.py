@@ -1,7 +1,7 @@
 """Messages and clients of the daemon.
 
-Imports nothing of the daemon. `messages` needs only pydantic, the clients the extra ``hdbridge[daemon]``;
-they are imported on first use.
+This package imports nothing of the daemon. `messages` needs only pydantic. The clients need the extra
+``hdbridge[daemon]`` and are imported on first use.
 """
 
 from importlib import import_module

@@ -41,11 +41,11 @@ class Address:
 def find(
     text: str | Path | None = None, token: str | None = None, environment: Mapping[str, str] = os.environ
 ) -> Address:
-    """Returns the address of a daemon, by its socket, URL or machine name; by none of them if only one runs.
+    """Returns the address of the daemon whose socket path, URL or machine name is ``text``.
 
-    Without ``text``, ``$HDBRIDGE_SOCKET`` is used, then ``$HDBRIDGE_URL`` (with the token
-    ``$HDBRIDGE_TOKEN``), then the sockets of this user's daemons and of the service manager's. Raises
-    DaemonError unless exactly one is found, and InputError for an invalid address.
+    Without ``text``, ``$HDBRIDGE_SOCKET`` is used, then ``$HDBRIDGE_URL``, then the only running daemon of
+    this user or of the service manager. The default of ``token`` is ``$HDBRIDGE_TOKEN``. Raises DaemonError
+    unless exactly one daemon is found, and InputError for an invalid address.
     """
     given = str(text or environment.get("HDBRIDGE_SOCKET") or environment.get("HDBRIDGE_URL") or "")
     token = token or environment.get("HDBRIDGE_TOKEN") or None

@@ -82,7 +82,7 @@ class AsyncClient:
         self._grant: LeaseGrant | None = None
         self._uds = None if self.address.socket is None else str(self.address.socket)
         self._tls = ssl.create_default_context() if self.address.url.startswith("https") else None
-        # Without TLS it loads no certificates.
+        # Without TLS, the transport need not load certificates.
         under = httpx.AsyncHTTPTransport(uds=self._uds, verify=False if self._tls is None else self._tls)
         self._http = httpx.AsyncClient(
             transport=under, base_url=self.address.url + PREFIX, headers=self.address.headers, trust_env=False
@@ -176,7 +176,7 @@ class AsyncClient:
 
     @asynccontextmanager
     async def connected(self, path: str) -> AsyncIterator[AsyncLink]:
-        """Opens a WebSocket of the API."""
+        """Opens a WebSocket of the API for the block."""
         address = self.address
         options: dict[str, Any] = {
             "additional_headers": address.headers,
@@ -246,7 +246,7 @@ class AsyncClient:
             async with self._lock:
                 self._holding -= 1
                 if self._holding == 0:
-                    with suppress(DaemonError):  # lost, or the daemon is: it is not held any more
+                    with suppress(DaemonError):  # the lease or the daemon is gone: nothing to release
                         await self.ask("DELETE", "/lease", LeaseState)
                     self._grant = None
 
@@ -324,9 +324,10 @@ class AsyncAxis:
         return await self._post("move", body, waits=True)
 
     async def jog(self, velocity_deg_s: float, duration_s: float | None = None) -> AxisState:
-        """Turns at a speed for a time, then brakes; without a time, must be called again within `JOG_S`.
+        """Turns at a speed for a duration, then brakes; without one, must be called again within `JOG_S`.
 
-        Raises LeaseError without a time if the lease is not held, because it would end with this call.
+        Raises LeaseError without a duration unless the lease is held, because the lease, and with it the jog,
+        would end with this call.
         """
         body = messages.Jog.given(velocity_deg_s=velocity_deg_s, timeout_s=JOG_S)
         if duration_s is None:
@@ -358,7 +359,7 @@ class AsyncAxis:
         return await self._delete("queue")
 
     async def rest(self) -> AxisState:
-        """Waits until the axis is at rest and no way points wait; raises SafetyStop if it was stopped."""
+        """Waits until the axis is at rest and its queue is empty; raises SafetyStop if it was stopped."""
         while True:
             found = await self.state()
             if found.fault is not None:
@@ -369,11 +370,10 @@ class AsyncAxis:
 
     @asynccontextmanager
     async def stream(self, timeout_s: float = JOG_S) -> AsyncIterator[AsyncStream]:
-        """Follows set-points that are put within the block; at its end, the axis comes to rest at the last
-        one.
+        """Follows the set-points that are put within the block; at its end, the axis rests at the last one.
 
         The first set-point is the axis's position. The axis brakes if no point is left for ``timeout_s``, or
-        if an error leaves the block.
+        if the block raises an error.
         """
         begin = messages.StreamBegin.given(lease="", timeout_s=timeout_s)
         async with self.client.lease() as grant, self.client.connected(f"{self._path}/stream") as link:
@@ -399,7 +399,7 @@ class AsyncAxis:
         return await self._post("adaptation", messages.Adapt.given(mode=mode))
 
     async def adaptation_back(self) -> AxisState:
-        """Discards the changes by the adaptation."""
+        """Discards the changes by the adaptation, which only observes from then on."""
         return await self._delete("adaptation")
 
     async def read(self, object_: str) -> SdoValue:
@@ -425,7 +425,7 @@ class AsyncStream:
         self._ended = False
 
     async def put(self, points: Iterable[Point]) -> None:
-        """Sends points: (time s, load angle deg) or (time, angle, speed deg/s), time since the start.
+        """Sends points (time s, load angle deg) or (time, angle, speed deg/s); time is since the start.
 
         Waits while the daemon's buffer is full. Raises InputError if a point is refused; the axis then
         brakes.
@@ -456,7 +456,7 @@ class AsyncStream:
 
 
 class AsyncLink:
-    """WebSocket that raises errors of hdbridge."""
+    """WebSocket that sends and receives messages, and raises errors of hdbridge."""
 
     def __init__(self, connection: ClientConnection, address: Address) -> None:
         self._connection = connection

@@ -1,4 +1,4 @@
-"""The synchronous client: the asyncio client, run by an event loop in a thread of its own.
+"""The synchronous client: runs the asyncio client in an event loop in its own thread.
 
     from hdbridge import Client
 
@@ -8,7 +8,8 @@
         for target_deg in (10, 20, 30):
             print(axis.move(target_deg).error_arcsec)
 
-Each method is that of `hdbridge.client.aio` and returns on completion. It may be called from any thread.
+Each method does the same as in `hdbridge.client.aio`, returns on completion, and may be called from any
+thread.
 """
 
 from __future__ import annotations
@@ -135,7 +136,7 @@ class Axis:
 
 
 class Client:
-    """Client of a daemon, with the arguments of `AsyncClient`. To be closed or used as a context manager."""
+    """Client of a daemon, with the arguments of `AsyncClient`; to be closed or used as a context manager."""
 
     def __init__(
         self,
@@ -147,7 +148,7 @@ class Client:
     ) -> None:
         self._own = AsyncClient(address, token=token, name=name, timeout_s=timeout_s)
         self._thread = _Thread(self._own)
-        weakref.finalize(self, self._thread.end)  # a client may live for one line only
+        weakref.finalize(self, self._thread.end)  # for a client that is not closed, such as a temporary one
 
     @property
     def address(self) -> Address:

@@ -1,6 +1,6 @@
-"""Conformance of any node on a bus to CiA 301 and CiA 402: timed checks, in one table per subject.
+"""Conformance tests of a node (CiA 301, 305, 306 and 402): timed checks, in one table per subject.
 
-Pure over a `Link` and its clock: the checks run on the virtual bus in simulated time and on a real bus.
+The checks use only a `Link` and its clock, so they run on a virtual bus in simulated time and on a real bus.
 """
 
 from hdbridge.conformance.suite import checks, run

@@ -37,7 +37,7 @@ def _name(each: ODVariable) -> str:
 
 
 def _entries(t: NodeTester) -> list[ODVariable]:
-    t.eds  # noqa: B018 - needed
+    t.eds  # noqa: B018 - ends the check as not applicable without an EDS
     return [each for each in t.variables() if each.index >= 0x1000]
 
 

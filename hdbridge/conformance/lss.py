@@ -1,6 +1,6 @@
 """Checks of the layer setting services: selection, identity, node id, bit timing, fast scan.
 
-Only the node with the identity in 1018h is selected, so no other node on the bus takes a command.
+Only the node with the identity in 1018h is selected, so no other node on the bus executes a command.
 """
 
 import struct
@@ -52,7 +52,7 @@ def _answered(t: NodeTester, answer: bytes | None, command: int, *values: int) -
 
 
 def _check(name: str, text: str, *, stores: bool = False) -> Callable[[_Function], None]:
-    """Adds a check that begins with the node in configuration state and ends in waiting state."""
+    """Decorates the function of a check, which begins in configuration state and ends in waiting state."""
 
     def add(function: _Function) -> None:
         @CHECKS.check(f"lss.{name}", text, "CiA 305", stores=stores)

@@ -42,7 +42,7 @@ _STOP_S: Final = 0.5
 """Maximum time from a stop command to standstill."""
 
 
-# ---------------------------------------------------------------- on the way
+# ---------------------------------------------------------------- position and power state
 
 
 def _position(t: NodeTester) -> int:
@@ -101,7 +101,7 @@ def _bring(t: NodeTester, state: int, mode: int | None = None) -> None:
 
 
 def _fault(t: NodeTester) -> None:
-    """Makes the enabled drive lose the heartbeat of its master, with the reaction *fault* (6007h = 1)."""
+    """Enables the drive and brings it to FAULT by the loss of a heartbeat (6007h = 1)."""
     t.require(0x6007)
     t.require(0x1016, 1)
     t.write(0x6007, 0, 1, 2)
@@ -814,7 +814,7 @@ def _homing(method: int) -> None:
 
 
 def _home_back(t: NodeTester, position: int, offset: int) -> None:
-    """Restores the coordinates from before the check."""
+    """Homes again, so that positions are as before the check."""
     _home(t, position)
     t.control(0x0F)
     t.put(0x607C, 0, offset, 4)

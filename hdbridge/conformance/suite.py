@@ -1,4 +1,4 @@
-"""Collects all checks in order, and runs them."""
+"""List of all checks in order, and their execution."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress

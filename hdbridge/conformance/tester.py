@@ -1,6 +1,6 @@
 """Tester: frames, SDO, PDO configuration and power states for the checks.
 
-Everything is done at the level of frames, because a check must also do what a correct master never does.
+The tester works at the level of frames, because a check must also do what a correct master never does.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ class Timing:
 class NodeTester:
     """Master's side of the checks on one node.
 
-    ``travel`` is the distance of test moves in user units; None for 0.02 turns of the motor shaft (608Fh).
+    ``travel`` is the distance of test moves in user units; None for 0.02 motor turns (608Fh), at least 20.
     ``stopped`` is called while the tester waits; if it returns True, `StoppedError` ends the run.
     """
 
@@ -211,7 +211,7 @@ class NodeTester:
         self.link.bus.send(message)
 
     def mark(self) -> int:
-        """Returns the present place in the log; frames that have already arrived are before it."""
+        """Returns the present end of the log, after adding the frames that have already arrived."""
         self.wait(0.0)
         return len(self.log)
 
@@ -235,7 +235,10 @@ class NodeTester:
         return [frame for frame in self.log[since:] if frame.can_id == can_id]
 
     def hears(self, can_id: int, timeout_s: float | None = None, since: int | None = None) -> Frame | None:
-        """Waits for the next frame with an identifier; None on time-out."""
+        """Returns the first frame with an identifier since a place in the log, by default from now on.
+
+        Waits for it if necessary; returns None on time-out.
+        """
         place = len(self.log) if since is None else since
         end_s = self.now + (self.timing.answer_s if timeout_s is None else timeout_s)
         while True:
@@ -309,7 +312,7 @@ class NodeTester:
         return True
 
     def boot_up(self, since: int) -> Frame:
-        """Waits for the boot-up message."""
+        """Returns the boot-up message, waiting for it if necessary; fails on time-out."""
         deadline_s = self.now + self.timing.boot_s
         frame, place = None, since
         while frame is None or frame.data[:1] != b"\0":
@@ -320,7 +323,7 @@ class NodeTester:
         return frame
 
     def watch_state(self) -> None:
-        """Makes the node report its NMT state by heartbeats, or else by node guarding."""
+        """Switches the node's heartbeat on, if it has one; `state` uses node guarding otherwise."""
         if not self._state_watched and self.has(0x1017):
             self.write(0x1017, 0, _HEARTBEAT_MS, 2)
             self._state_watched = True
@@ -396,7 +399,7 @@ class NodeTester:
         self.true(answer[0] == 0x80, f"{what}: accepted", "an abort")
 
     def upload(self, index: int, sub: int = 0) -> bytes:
-        """Uploads an object, expedited or segmented; `AbortedError` if the node refuses."""
+        """Uploads an object, expedited or segmented; raises `AbortedError` if the node refuses."""
         answer = self.answer(_request(0x40, index, sub))
         self._raise_abort(answer, f"upload of {index:04X}h:{sub:02X}")
         self.equal(answer[0] >> 5, 2, "command of the upload response")
@@ -414,7 +417,7 @@ class NodeTester:
                 return data
 
     def download(self, index: int, sub: int, data: bytes) -> None:
-        """Downloads up to four bytes expedited, more in segments; `AbortedError` if the node refuses."""
+        """Downloads up to four bytes expedited, more in segments; raises `AbortedError` if refused."""
         what = f"download to {index:04X}h:{sub:02X}"
         if len(data) <= 4:
             self._raise_abort(self.answer(expedited(index, sub, data)), what)
@@ -445,7 +448,7 @@ class NodeTester:
         self.need(self.has(index, sub), f"no object {index:04X}h:{sub:02X}")
 
     def read(self, index: int, sub: int = 0, *, signed: bool = False) -> int:
-        """Uploads an integer."""
+        """Uploads an object and returns it as an integer."""
         return int.from_bytes(self.upload(index, sub), "little", signed=signed)
 
     def put(self, index: int, sub: int, value: int, size: int) -> None:
@@ -547,7 +550,7 @@ class NodeTester:
             self.wait(0.005)
 
     def walk(self) -> None:
-        """Walks from SWITCH ON DISABLED to OPERATION ENABLED."""
+        """Brings the drive from SWITCH ON DISABLED to OPERATION ENABLED."""
         for state, word in ENABLING:
             self.control(word)
             self.reaches(state)
@@ -593,7 +596,7 @@ class NodeTester:
         self.nmt(NMT_PRE_OPERATIONAL)
 
     def tidy(self) -> None:
-        """Undoes the changes of the check; resets the communication if that fails."""
+        """Undoes the changes of the check; resets the node if that fails."""
         self.send(0x600 + self.node_id, abort())  # ends a transfer that the check has left open
         self.nmt(NMT_PRE_OPERATIONAL)
         try:

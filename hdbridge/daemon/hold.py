@@ -1,4 +1,6 @@
-"""Creation of a daemon: log, lock, sockets and shared memory, which outlive its processes, and the keeper."""
+"""Sets up a daemon: log, interface lock, sockets and shared memory, which outlive its child processes, and
+the keeper.
+"""
 
 import os
 import secrets
@@ -28,7 +30,7 @@ def hold(
     ``page`` is a loopback port for the live page (0: any free one). Its address is printed to standard error,
     with a token for this run; a machine with ``api.tcp`` has its page there instead. ``force`` starts even if
     another process controls the interface or another master is active on the bus. Raises InputError, BusError
-    or DaemonError if it cannot start, before anything was sent.
+    or DaemonError if it cannot start, before anything is sent on the bus.
     """
     log = log or LogSettings()
     begin_log(log)
@@ -59,6 +61,6 @@ def hold(
 
 
 def _print_page(listener: socket.socket, token: str | None) -> None:
-    """Prints the address of the page for the user, because a token must not be logged."""
+    """Prints the address of the page to standard error and not to the log, which must not contain a token."""
     host, port = listener.getsockname()
     print(f"page: http://{host}:{port}/{f'#token={token}' if token else ''}", file=sys.stderr, flush=True)

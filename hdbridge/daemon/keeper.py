@@ -1,15 +1,15 @@
 """The keeper: starts, monitors and ends the daemon's processes, and does nothing else.
 
-It holds what must outlive a child: the shared memory, the listening sockets, the lock of the CAN interface.
+It owns the resources that must outlive a child: shared memory, listening sockets, lock of the CAN interface.
 
     a child is        the keeper
     ----------------  ----------------------------------------------------------------------------------
-    control, dead     restarts it; its axes come up disabled. If it dies too often in a minute, or by
-                      SIGTERM from somebody else, the keeper ends the daemon
+    control, dead     restarts it, even after a SIGTERM to it alone; its axes come up disabled. If it dies
+                      too often in a minute, the keeper ends the daemon
     control, hung     kills it after `Times.hung_s`; the bus is silent, so the drives have stopped already
-    service, dead     restarts it after increasing delays; the loop continues
+    service, dead     restarts it after increasing delays; the control loop continues
     service, hung     kills it after `Times.service_hung_s`
-    gateway           as the service; its axes brake and lose power because their set-points end
+    gateway           same as the service; its axes brake and lose power because their set-points end
 
 The bus can be lent to another program of this computer. On the service's request the control process stops
 its axes and ends, and the keeper releases the lock of the interface. The program that acquires the lock has
@@ -48,7 +48,7 @@ _ERRORS: Final = range(2, 16)
 it."""
 _FIRST_ATTEMPTS: Final = 3
 PATIENCE_S: Final = 1.0
-"""Maximum wait for a manager with a full queue, for messages that it must not miss."""
+"""Maximum wait if the service manager's queue is full, for messages that must not be lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class Times:
     begin_s: float = 60.0
     """Start-up of a child."""
     hung_s: float = 5.0
-    """Duration of a turn of the control process; the drives' own watchdogs act long before."""
+    """Time without a completed cycle of the control process; the drives' own watchdogs act much earlier."""
     service_hung_s: float = 30.0
     """Interval without a sign of life of the service."""
     gateway_hung_s: float = 5.0
@@ -75,7 +75,7 @@ class Times:
     stop_s: float = 30.0
     """Braking of all axes by the control process."""
     service_stop_s: float = 10.0
-    """End of the service after that."""
+    """Exit of service and gateway after that."""
 
 
 SIMULATED: Final = Times(begin_s=600.0, gateway_hung_s=120.0, stop_s=300.0, service_stop_s=120.0)
@@ -120,7 +120,7 @@ class Child:
         return f"ended by signal {-status}"
 
     def send(self, number: signal.Signals) -> None:
-        """Sends a signal unless the process has ended; its id cannot be reused before `ended` is called."""
+        """Sends a signal unless the process has ended; its id is not reused before `ended` is read."""
         self._process.send_signal(number)
 
     def close(self) -> None:
@@ -149,7 +149,7 @@ class Budget:
 
 
 class BackOff:
-    """Delays that double with each failure up to a maximum; a long life resets them."""
+    """Exponential back-off: the delay doubles with each failure up to a maximum; a long run resets it."""
 
     def __init__(self, first_s: float, longest_s: float, well_after_s: float) -> None:
         self._first_s, self._longest_s, self._well_after_s = first_s, longest_s, well_after_s
@@ -164,20 +164,20 @@ class BackOff:
 
 
 class Heartbeat:
-    """Hang detection by a counter, measured in looks without an advance.
+    """Hang detection: counts consecutive checks at which a process's counter has not advanced.
 
-    It does not use time, so a monitor that was itself suspended does not blame others.
+    It uses no clock, so a monitor that was itself suspended does not report others as hung.
     """
 
     def __init__(self) -> None:
         self._last = 0
         self.misses = 0
-        """Number of consecutive looks without an advance."""
+        """Number of consecutive checks without an advance."""
         self.begun = False
         """True if the counter has advanced since the restart."""
 
     def look(self, value: int) -> bool:
-        """Returns True if the counter has advanced since the last look."""
+        """Returns True if the counter has advanced since the last check."""
         advanced = value != self._last
         self._last = value
         self.misses = 0 if advanced else self.misses + 1
@@ -185,12 +185,12 @@ class Heartbeat:
         return advanced
 
     def restart(self, value: int) -> None:
-        """Begins again with a restarted process; ``value`` is the present value of its counter."""
+        """Restarts the detection for a restarted process; ``value`` is the present value of its counter."""
         self._last, self.misses, self.begun = value, 0, False
 
 
 class Notifier:
-    """Notifies the service manager, if any. It never fails."""
+    """Sends notifications (sd_notify) to the service manager, if there is one. Errors are ignored."""
 
     def __init__(self, address: str | None = None, watchdog_s: float | None = None) -> None:
         """``address`` is the manager's socket; an address that begins with @ is abstract."""
@@ -201,7 +201,7 @@ class Notifier:
 
     @classmethod
     def of_environment(cls, environment: MutableMapping[str, str] = os.environ) -> Self:
-        """Returns the notifier of the environment, and removes it there so that children do not notify."""
+        """Returns a notifier from environment variables; removes these, so that children do not notify."""
         address = environment.pop("NOTIFY_SOCKET", None)
         period_us = environment.pop("WATCHDOG_USEC", "")
         meant = environment.pop("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
@@ -226,7 +226,7 @@ class Notifier:
             self._status = words
 
     def _send(self, line: str, patience_s: float = 0.0) -> bool:
-        """Returns True if the manager accepted the message; waits at most ``patience_s`` for it."""
+        """Sends a message; returns False if the manager did not accept it within ``patience_s``."""
         if self._address is None:
             return True
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
@@ -238,7 +238,7 @@ class Notifier:
 
 @dataclass(slots=True)
 class _Helper:
-    """Process in addition to the control process, restarted after increasing delays, whatever ended it."""
+    """Child other than the control process. It is restarted after increasing delays, whatever ended it."""
 
     name: str
     program: Sequence[str]
@@ -246,7 +246,7 @@ class _Helper:
     alive: Cell
     """Cell with the time of its last sign of life."""
     begun: Cell
-    """Cell with the process id."""
+    """Cell to which the process writes its id when it is ready."""
     hung_s: float
     child: Child | None = None
     due_s: float | None = None
@@ -258,7 +258,7 @@ class Loan:
     """Loan of the bus to another program: requested, then begun, and over when the lock is free again."""
 
     COLLECTED_S: Final = 10.0
-    """Time for the borrower to acquire the lock."""
+    """Maximum time until the borrower acquires the lock."""
 
     def __init__(self, lock: InterfaceLock) -> None:
         self._lock = lock
@@ -267,12 +267,12 @@ class Loan:
         self._collected = False
 
     def begin(self, now_s: float) -> None:
-        """Releases the lock."""
+        """Begins the loan by releasing the lock."""
         self._begun_s, self._collected = now_s, False
         self._lock.release()
 
     def is_over(self, now_s: float) -> bool:
-        """Acquires the lock once the borrower has finished or has not come; returns True on success."""
+        """Reacquires the lock when the borrower has released it or did not come; returns True on success."""
         if self._lock.holder:
             self._collected = True
             return False
@@ -287,7 +287,7 @@ class Loan:
 
 
 class Keeper:
-    """Keeper of the processes of one machine."""
+    """Starts, monitors and ends the processes of one machine."""
 
     def __init__(
         self,
@@ -299,7 +299,7 @@ class Keeper:
         times: Times = Times(),
         lock: InterfaceLock | None = None,
     ) -> None:
-        """``lock`` is the lock of the interface, which is held; None for a bus that cannot be lent."""
+        """``lock`` is the acquired lock of the CAN interface; None for a bus that cannot be lent."""
         self._start, self._memory, self._listeners = start, memory, listeners
         self._notifier, self._programs, self._times = notifier, programs, times
         self._budget = Budget(start.machine.limits.restarts_per_minute, 60.0)
@@ -439,7 +439,7 @@ class Keeper:
             self._memory.forget_gateway()
 
     def _lend(self, loan: Loan, now_s: float) -> None:
-        """Ends the control process if the bus is wanted; starts a new one when the bus is free again."""
+        """Ends the control process if a loan is requested; starts a new one when the bus is free again."""
         status = self._memory.status
         if loan.asked_s is None:
             if status[Cell.BUS_WANTED] and self._control is not None:
@@ -491,7 +491,7 @@ class Keeper:
     # ------------------------------------------------------------------ the end
 
     def _heed_signals(self, now_s: float) -> None:
-        """Handles signals: the first brakes to rest, the second quick-stops, the third ends everything."""
+        """Handles signals: the first brakes to rest, the second quick-stops, the third kills all children."""
         while self._heeded < self._signals:
             self._heeded += 1
             if self._heeded == 1:
@@ -502,7 +502,7 @@ class Keeper:
                 self._end_all()
 
     def _stop(self, now_s: float, status: int, why: str) -> None:
-        """Brakes the axes and ends; the service ends last, so that it records the stop."""
+        """Brakes the axes and ends the daemon; the service ends last, so that it records the stop."""
         if self._stopping_since_s is not None:
             return
         self._stopping_since_s, self._status = now_s, status

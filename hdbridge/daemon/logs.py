@@ -33,7 +33,7 @@ class LogSettings:
     """Log settings of the daemon's processes."""
 
     verbose: int = 0
-    """SDO transfers are logged as well from 1 on."""
+    """Verbosity; from 1 on, SDO transfers are logged as well."""
     file: Path | None = None
     """File to which all records are appended, one JSON object per line."""
 
@@ -89,7 +89,7 @@ def begin_log(settings: LogSettings) -> None:
 
 
 def log_once(settings: LogSettings, where: str, event: str, facts: dict[str, object]) -> None:
-    """Logs one event in a process that logs nothing afterwards, not even from its libraries."""
+    """Logs one event, then removes its handlers and logs nothing more of hdbridge in this process."""
     before = tuple(_ROOT.handlers)
     begin_log(settings)
     logging.getLogger(where).info(event, facts)

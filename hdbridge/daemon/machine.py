@@ -60,10 +60,10 @@ class Axis:
     """Axis of the machine, with its files."""
 
     config: AxisConfig
-    """Axis file, on the machine's bus."""
+    """Content of the axis file, with the machine's bus."""
     profile: Profile
     compensation: Scheme = Scheme.EXTENDED
-    """Part of the active model that compensates from the start."""
+    """Part of the active model that compensates at start-up."""
     adaptation: AdaptationSettings = AdaptationSettings()
     load_loop: LoadLoopSettings | None = None
 
@@ -102,7 +102,7 @@ class Machine:
 
     @property
     def folder(self) -> Path:
-        """Folder of the file, to which its relative paths refer."""
+        """Folder of the file, the base of the relative paths in it."""
         return self.path.parent
 
     @property
@@ -142,13 +142,13 @@ class Machine:
 
     @classmethod
     def find(cls, text: str) -> Self:
-        """Loads a machine file, a folder with ``machine.yaml``, a profile, or a bundled name."""
+        """Loads a machine by its file, a folder with ``machine.yaml``, a profile, or a bundled name."""
         path = machine_file(text)
         return cls.load(path) if path is not None else cls.of_profile(text)
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Loads a machine file, or that of a folder; InputError has file:line:column."""
+        """Loads a machine file, or the one in a folder. Raises InputError with file:line:column."""
         path = Path(path)
         document = read_yaml(path / "machine.yaml" if path.is_dir() else path)
         file = document.validate(MachineFile)
@@ -188,7 +188,7 @@ class Machine:
         return replace(self, axes=axes, bus=axes[0].config.bus)
 
     def axis(self, name: str) -> Axis:
-        """Returns an axis by its name; InputError lists the names."""
+        """Returns the axis with this name; raises InputError, which lists the names, if there is none."""
         for axis in self.axes:
             if axis.name == name:
                 return axis
@@ -220,7 +220,7 @@ def _axis(file: MachineFile, number: int, places: _Places) -> Axis:
 
 
 def _given(environment: Mapping[str, str]) -> Path | None:
-    """Returns the state folder created by the service manager."""
+    """Returns the state folder created by the service manager; None without one."""
     text = environment.get("STATE_DIRECTORY", "").split(":")[0]
     return Path(text) if text else None
 
@@ -239,7 +239,7 @@ def _absolute(profile: Profile) -> Profile:
 
 
 class _Places:
-    """Source of error messages about a machine file, or about the axis file that replaces it."""
+    """Creates errors that refer to the machine file, or to the axis file that replaces it."""
 
     def __init__(self, path: Path, document: Document | None) -> None:
         self._path, self._document = path, document
@@ -251,7 +251,7 @@ class _Places:
         return self._document.error(at, message)
 
     def where(self, at: Location) -> str:
-        """Returns ``line 5`` of the file, for reference in another message."""
+        """Returns a position in the file, such as ``line 5``, for use in another message."""
         return f"line {self._document.position(at)[0]}" if self._document is not None else str(self._path)
 
 
@@ -269,7 +269,7 @@ def _agreed(axes: Sequence[Axis], ask: Callable[[AxisConfig], T], places: _Place
 
 
 def _check_together(axes: Sequence[Axis], bus: BusConfig, places: _Places) -> None:
-    """Checks that names are unique, and that the axes can share a bus and its cycle has time for them."""
+    """Checks that names are unique, that the axes can share a bus, and that the bus load fits the cycle."""
     names: dict[str, int] = {}
     for number, axis in enumerate(axes):
         if (other := names.setdefault(axis.name, number)) != number:
@@ -288,7 +288,7 @@ def _check_together(axes: Sequence[Axis], bus: BusConfig, places: _Places) -> No
 
 
 def _check_gateway(file: MachineFile, axes: Sequence[Axis], bus: BusConfig, places: _Places) -> None:
-    """Checks for known axes, one node id each, a separate bus, and positions that fit into an int32."""
+    """Checks that the gateway has its own bus, known axes, unique node ids, and positions within 32 bits."""
     gateway = file.gateway
     if gateway is None:
         return
@@ -318,7 +318,7 @@ def _check_gateway(file: MachineFile, axes: Sequence[Axis], bus: BusConfig, plac
 
 
 def _check_interfaces(file: MachineFile, places: _Places) -> None:
-    """Checks that python-can has the interfaces of the file."""
+    """Checks that python-can supports the interfaces in the file."""
     gateway = file.gateway
     for at, bus in ((("bus",), file.bus), (("gateway", "bus"), gateway.bus if gateway else None)):
         if bus is not None and (unknown := unknown_interface(bus.interface)):

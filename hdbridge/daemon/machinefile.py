@@ -200,7 +200,7 @@ class MachineFile(_Part):
 
 
 def token_complaint(path: Path) -> str | None:
-    """Returns the error of a token file; None if it is valid."""
+    """Returns the error message for a token file; None if the file is valid."""
     try:
         content, mode = path.read_text(encoding="ascii").strip(), path.stat().st_mode
     except (OSError, UnicodeDecodeError) as problem:

@@ -1,7 +1,7 @@
 """Service process: ``python -m hdbridge.daemon.serve FD``, started by the keeper.
 
-It assembles bridge, API, recorder, watch, adaptation and log, and ends them in order. It has one event loop;
-blocking work runs in threads. If it dies, the axes complete their present commands.
+This process assembles bridge, API, recorder, watch, adaptation and log, and closes them in order. It has one
+event loop; blocking work runs in threads. If it dies, the axes complete their present commands.
 """
 
 import asyncio
@@ -33,25 +33,25 @@ from hdbridge.daemon.start import Start, run_child, runtime_folder
 from hdbridge.errors import HdbridgeError
 
 THREADS_PER_AXIS: Final = 2
-"""Threads per axis, because its drive may be verified while another of its requests blocks."""
+"""Threads per axis: one can verify the drive while another request of the same axis blocks."""
 SPARE_THREADS: Final = 4
 LOOK_S: Final = 1.0
 """Interval between checks for the socket file."""
 FOLLOW_S: Final = 1.0
 """Interval between checks for adapted models."""
 LAST_WORDS_S: Final = 35.0
-"""Maximum wait for the control process to bring its axes to rest, so that this is recorded."""
+"""Maximum wait for the control process to bring its axes to rest, so that the stop is recorded."""
 
 
 def run(start: Start) -> None:
-    """Serves until SIGTERM."""
+    """Runs the service process until SIGTERM."""
     begin_log(start.log)
     with Memory.attach(start.memory_fd) as memory:
         asyncio.run(serve(start, memory))
 
 
 async def serve(start: Start, memory: Memory) -> None:
-    """Runs the service until SIGTERM and the end of the control process."""
+    """Runs the service until SIGTERM, then until the control process has ended (at most `LAST_WORDS_S`)."""
     machine = start.machine
     terminated = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, terminated.set)
@@ -97,7 +97,10 @@ async def serve(start: Start, memory: Memory) -> None:
 def follow(
     machine: Machine, bridge: ServiceBridge, recorder: FlightRecorder | None, stack: AsyncExitStack
 ) -> list[Following]:
-    """Follows all axes, each in a thread of its own; bad verdicts are diagnosed if flights are recorded."""
+    """Returns a `Following` for each axis, with its own thread each.
+
+    If flights are recorded, the watch's verdicts are diagnosed automatically.
+    """
     diagnosis = AutoDiagnosis(recorder.folder) if recorder is not None and recorder.flight else None
     if diagnosis is not None:
         stack.callback(diagnosis.close)
@@ -135,7 +138,7 @@ def listeners(machine: Machine, descriptors: Sequence[int], page_token: str | No
 
 
 async def _keep_socket(start: Start, server: ApiServer, note: Callable[[str], None]) -> None:
-    """Binds the Unix socket again whenever its file has disappeared; open connections stay."""
+    """Binds the Unix socket again whenever its file has disappeared; open connections are kept."""
     path, bound, noted = start.socket, start.socket_file, ""
     while True:
         found = (0, 0)
@@ -167,7 +170,7 @@ async def _say_when_served(server: ApiServer, memory: Memory) -> None:
 
 
 async def _last_words(bridge: ServiceBridge, memory: Memory) -> None:
-    """Continues while the axes are brought to rest, so that clients see this and it is recorded."""
+    """Keeps serving while the axes are brought to rest, so that clients see the stop and it is recorded."""
     end_s = asyncio.get_running_loop().time() + LAST_WORDS_S
     status = memory.status
     while bridge.core.observer.alive and status.loop_pid and asyncio.get_running_loop().time() < end_s:

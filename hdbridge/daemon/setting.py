@@ -34,7 +34,7 @@ class CompensationSetting:
         return self.scheme.of(self.adapted or self.model)
 
     def compensation(self, axis: AxisConfig) -> Compensation:
-        """Returns the inverse for the control loop; that of the whole model if the scheme is `NONE`.
+        """Returns the inverse model for the control loop; if the scheme is `NONE`, that of the whole model.
 
         Raises InputError if the model does not fit the axis.
         """

@@ -1,4 +1,4 @@
-"""Start data that the keeper passes to its children, the first steps of each child, the runtime folder.
+"""Start data that the keeper passes to its children, set-up of a child, and the runtime folder.
 
 A child is a fresh interpreter, not a fork, and inherits only descriptors. One of them contains the pickled
 start data, in memory that no other process can open. All processes, including restarted ones, therefore use
@@ -38,7 +38,7 @@ class Simulation:
     """Files of the simulated axes' true parameters, one per axis."""
     seed: int = 0
     speed: float = 1.0
-    """Maximum virtual seconds per second."""
+    """Maximum ratio of virtual to real time."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Start:
     """Process id of the keeper; a child with another parent has already lost the keeper."""
     simulation: Simulation | None = None
     force: bool = False
-    """If True, communicate even if another master is active. The keeper holds the interface's lock anyway."""
+    """If True, the daemon communicates even if another master is active, and does not lock the interface."""
     socket: Path = Path()
     """Path of the Unix socket of the API."""
     socket_file: tuple[int, int] = (0, 0)
@@ -89,7 +89,7 @@ class Start:
 
 
 def run_child(arguments: list[str], name: str, run: Callable[[Start], None]) -> int:
-    """Runs a child on the keeper's data; reports an error of hdbridge and returns the exit status."""
+    """Runs a child with the keeper's start data; prints an `HdbridgeError` and returns the exit status."""
     try:
         start = Start.inherited(arguments)
         begin_child(start, name)
@@ -101,7 +101,7 @@ def run_child(arguments: list[str], name: str, run: Callable[[Start], None]) -> 
 
 
 def when_terminated() -> Callable[[], bool]:
-    """Returns a function that is True once this process has received SIGTERM, which no longer ends it."""
+    """Catches SIGTERM from now on; returns a function that returns True once SIGTERM was received."""
     received: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _: received.append(number))
     return lambda: bool(received)
@@ -126,7 +126,7 @@ def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
     """
     given = environment.get("RUNTIME_DIRECTORY", "").split(":")[0]
     if given:
-        return Path(given)  # the service manager has made it, with the mode that its unit asks for
+        return Path(given)  # created by the service manager, with the mode in its unit
     folder = session_folder(environment)
     try:
         folder.mkdir(mode=0o700, exist_ok=True)

@@ -37,7 +37,7 @@ _ABOUT: Final = (
 
 
 def create_app(bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> FastAPI:
-    """Returns the ASGI application; access is decided by the `guard.py` of each listener."""
+    """Returns the ASGI application. The guard of each listener controls the access to it."""
     app = FastAPI(
         title="hdbridge",
         version=__version__,

@@ -87,7 +87,7 @@ class Policy:
     def knows_origin(self, origin: str | None, host: str, scheme: str) -> bool:
         """Returns True if a request does not come from a web page, or comes from a page loaded from here.
 
-        A page loaded through a reverse proxy has one of the names, over HTTPS.
+        A page loaded through a reverse proxy has HTTPS and one of `names` as its origin.
         """
         if origin is None or origin.lower() == f"{scheme}://{host}".lower():
             return True
@@ -114,7 +114,7 @@ class Policy:
 
 
 def too_deep(body: bytes) -> bool:
-    """Returns True if JSON is nested too deeply for a valid request; a parser would recurse into it."""
+    """Returns True if JSON is nested deeper than `DEPTH_MAXIMUM`, because the parser is recursive."""
     depth = 0
     for match in _BRACKETS.finditer(body):
         first = match[0][:1]
@@ -204,7 +204,7 @@ class Guard:
         problem = self._refused(scope)
         if problem is None:
             _log.info("websocket", _about(scope))
-            # A client may disconnect at any moment, even while it is told why its WebSocket is closed.
+            # A client may disconnect at any moment, even while it receives the reason for a close.
             with self._traffic.under_way("websocket"), suppress(WebSocketDisconnect):
                 await self._app(scope, receive, send)
             _log.info("websocket ended", _about(scope))

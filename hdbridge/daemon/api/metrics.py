@@ -1,7 +1,7 @@
 """`/metrics` for Prometheus: loop timing, faults, axes and API requests.
 
-A sink of the observer, whose `take` costs a few microseconds per batch. Everything else is read on each
-scrape.
+`Metrics` is a sink of the observer; its `take` costs a few microseconds per batch. Everything else is read
+on each scrape.
 """
 
 from collections import Counter

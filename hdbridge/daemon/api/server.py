@@ -1,8 +1,8 @@
 """Server: uvicorn on open sockets, with one guard per socket.
 
-This module limits the connections, the time for a request's head, the message size and the silence of a
-WebSocket in uvicorn itself. A connection beyond the limit replaces the connection that has been idle longest,
-so idle connections do not block others.
+Limits in uvicorn itself: number of connections, time for a request's head, message size, silence of a
+WebSocket. A connection beyond the limit replaces the connection that has been idle longest, so idle
+connections do not block others.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class _Server(uvicorn.Server):
 
 
 class _Watched(asyncio.Protocol):
-    """Connection whose peer is identified by the kernel, checked every `HEAD_S`."""
+    """Connection that is checked every `HEAD_S`; the kernel identifies the peer of a Unix socket."""
 
     client: tuple[str, int] | None
     loop: asyncio.AbstractEventLoop
@@ -153,7 +153,7 @@ class _Connection(_Watched, H11Protocol):
 
     @property
     def idle(self) -> bool:
-        """True if no complete request is being answered."""
+        """True while no completely received request is being answered."""
         return self.cycle is None or self.cycle.response_complete or self.cycle.more_body
 
     def on_response_complete(self) -> None:
@@ -161,7 +161,7 @@ class _Connection(_Watched, H11Protocol):
         super().on_response_complete()
 
     def _check(self) -> None:
-        """Closes a connection without a complete head in time, or whose peer does not read."""
+        """Closes a connection that sends no complete head in time, or whose peer does not read."""
         if self.transport.get_protocol() is not self:  # upgraded to a WebSocket, which has pings
             return
         unsent, self._unsent = self._unsent, self.transport.get_write_buffer_size()

@@ -44,7 +44,7 @@ def unix_socket(path: Path, group: str | None = None) -> socket.socket:
     _clear(path)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        # The file gets the mode of the descriptor when it is bound: it is never open to others.
+        # The bind creates the file with the descriptor's mode, so it is never open to others.
         os.fchmod(listener.fileno(), MODE)
         listener.bind(os.fspath(path))
         if gid != -1:
@@ -94,7 +94,7 @@ def peer_of(connected: socket.socket) -> Peer | None:
 
 
 def daemon_of(connected: socket.socket) -> int:
-    """Returns the process id of the daemon at the other end of a Unix socket, which is that of its keeper."""
+    """Returns the process id of the daemon (its keeper) at the other end of a Unix socket."""
     peer = peer_of(connected)
     assert peer is not None
     if "hdbridge.daemon.serve" not in command_line(peer.pid):
@@ -110,7 +110,7 @@ def _group(name: str) -> int:
 
 
 def _clear(path: Path) -> None:
-    """Removes the socket file of a daemon that no longer runs."""
+    """Removes the socket file of a daemon that no longer runs; raises DaemonError if one listens there."""
     try:
         mode = path.lstat().st_mode
     except OSError:

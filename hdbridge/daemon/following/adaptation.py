@@ -1,9 +1,10 @@
 """Adaptation of one axis: observations update an estimate, and the model in use follows it within bounds.
 
 A window of observations is complete once the axis has moved enough (`Excitation`). It is rejected as a whole
-if neither wear nor temperature can cause it, because both are slow and similar everywhere. Learning is then
-frozen until the cause ends, and the updates by the last windows before the fault are reverted. `health` and
-`zero` judge the load encoder; the tests here need the estimate. Pure: observations contain the time.
+if neither wear nor temperature can explain it, because both are slow and act alike at all angles. Learning is
+then frozen until the cause ends, and the updates by the last windows before the fault are reverted. `health`
+and `zero` judge the load encoder; the tests here are those that need the estimate. There is no I/O and no
+clock, because observations contain the time.
 """
 
 import math
@@ -35,18 +36,19 @@ from hdbridge.errors import InputError
 from hdbridge.strictness import Strict
 
 ONE_WAY_TURNS = 4.0
-"""Multiple of the turns of `Excitation` after which a window without reversals updates the memoryless
-terms."""
+"""Multiple of `Excitation.turns` at which a window with too few reversals is complete. It updates only the
+terms without hysteresis."""
 CLEAR_WINDOWS = 3
 """Consecutive plausible windows that end a freeze."""
 REVERTED_WINDOWS = 3
 """Number of windows before a fault whose updates are reverted."""
 RATE_INTERVALS = 2.0
-"""Maximum number of update intervals in the rate limit after a pause."""
+"""Maximum number of update intervals that count for the rate limit after a pause."""
 LEAST_SHARE = 0.99
-"""Share of the permitted change per interval from which a change is applied, however small it is."""
+"""Share of the permitted change per interval from which a change is applied, even below
+`AdaptationSettings.smallest_arcsec`."""
 GATE_SIGMAS = 6.0
-"""Standard deviations by which an observation may differ from the model."""
+"""Maximum deviation of an observation from the model, in standard deviations."""
 
 Entry = Mapping[str, Any]
 """Line of the history: ``event``, ``axis_time_s`` and further data, all serialisable as JSON."""
@@ -59,7 +61,7 @@ class Freeze:
     reason: str
     """Reason in words, with figures."""
     lasting: bool = False
-    """True if the freeze does not end automatically, because the zero must be learned again."""
+    """True if the freeze does not end automatically, but only with a new zero or by command."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,13 +124,13 @@ class Adaptation:
         self._earlier: deque[tuple[FloatArray, FloatArray]] = deque(maxlen=REVERTED_WINDOWS)
         """Estimates and covariances before each of the last windows."""
         self._begun_s: float | None = None
-        """Time since which learning has not been frozen; None before the first window."""
+        """Begin of the first window learned since the start or the last freeze; None before."""
         self._window_s: float | None = None
         """End of the last window, used or not."""
         self._proposed = self._used = np.zeros(drift.zero)
         """Changes of the coefficients in the last proposed model, applied or not, and in the model in use."""
         self._changed_s = -math.inf
-        """Time at which a change was last made or considered."""
+        """Time at which a change was last proposed or considered."""
         self._refined_s = -math.inf
         """Time at which the response was last refined."""
         if learned is not None:
@@ -189,7 +191,7 @@ class Adaptation:
         return not (self.mode == "off" or self.freeze_reason is not None or recent)
 
     def refine(self, response: Response) -> Proposal:
-        """Takes a refined response in motion, without a rate limit, because a servo is retuned at once."""
+        """Takes a refined response in motion, without a rate limit, because retuning a servo is sudden."""
         model, apply = replace(self.model, response=response), self.mode == "on"
         self._refined_s = self._now_s if apply else math.inf  # only observed: reported once
         if apply:
@@ -241,7 +243,7 @@ class Adaptation:
         return None if self._zero_arcsec is None else self._zero - self._zero_arcsec
 
     def waiting_reason(self, *, path_known: bool) -> str | None:
-        """Returns the reason for a freeze or a wait; None while it learns or is off."""
+        """Returns the reason for a freeze or a wait; None while the adaptation learns or is off."""
         if self.mode == "off":
             return None
         if self.freeze_reason is not None:
@@ -251,7 +253,7 @@ class Adaptation:
         return None if self.windows else "not enough motion yet"
 
     def estimated_changes(self) -> dict[str, float]:
-        """Returns the present changes of parameters by the load encoder, before rate limits."""
+        """Returns the estimated change of each parameter that differs, before rate limits, by name."""
         change = self.estimate_arcsec
         estimated = self._drift.changed(change) if np.any(change) else self.committed
         changes = changes_between(self.committed, self.committed, estimated)
@@ -335,7 +337,7 @@ class Adaptation:
             self._begun_s = window[0].time_s
 
     def _rate_allowance_arcsec(self, window: list[Observation], rows: FloatArray) -> FloatArray:
-        """Returns the change that the rates permit for the time without observations, (n,)."""
+        """Returns the change that the rate limits permit since the last window, (n,)."""
         if self._window_s is None:
             return np.zeros(len(window))
         gap_h = max(window[0].time_s - self._window_s, 0.0) / 3600.0
@@ -381,7 +383,7 @@ class Adaptation:
         self._estimator.covariance = covariance
 
     def _zero_drifts(self, rates: Sequence[Rate]) -> Freeze | None:
-        """Tests whether the zero moves faster than the settings permit."""
+        """Returns a lasting freeze if the zero moves faster than the settings permit."""
         most = self.settings.zero_rate_arcsec_per_hour
         for each in rates:
             if each.exceeds(most / 60.0):
@@ -458,7 +460,10 @@ def _changes_json(changes: Sequence[Change]) -> dict[str, dict[str, float]]:
 
 
 def _shift(residual_arcsec: FloatArray, gate_arcsec: FloatArray) -> Freeze | None:
-    """Tests whether a window's residuals are within the gate that wear and warmth permit, both (n,)."""
+    """Returns a freeze if residuals exceed the gate for wear and temperature, both (n,).
+
+    It is lasting if all residuals are shifted alike.
+    """
     if np.all(np.abs(residual_arcsec) <= gate_arcsec):
         return None
     shift = float(np.median(residual_arcsec))

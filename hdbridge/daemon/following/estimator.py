@@ -5,8 +5,8 @@ parameter scaled by its expected range. The eigenvectors are the directions that
 direction is *excited* if the batch alone determines it better than that range. The covariance grows before
 the update only along excited directions (Cao and Schwartz 2000, *A directional forgetting algorithm based on
 the decomposition of the information matrix*, Automatica 36; here for a batch at a time). Unobserved
-directions are therefore neither learned nor forgotten, and there is no covariance wind-up, because the
-variance grows only where the batch reduces it below its scale again.
+directions are therefore neither learned nor forgotten. There is no covariance wind-up, because the variance
+grows only where the same batch then reduces it below the scale.
 
 Parameters may be held: their uncertainty is accounted for, but neither they nor their variance change
 (Schmidt's consider filter). Without forgetting, the result is that of `analysis.linear` for one batch.
@@ -43,7 +43,7 @@ STEP_ARCSEC = 1e-4
 """Step of a coefficient for the derivatives of parameters."""
 SIGMAS_AT_BOUND = 3.0
 MAX_CORRELATION = 0.95
-"""Largest correlation of neighbouring residuals allowed for in a standard error."""
+"""Upper limit of the correlation of neighbouring residuals in a standard error."""
 
 
 @dataclass(slots=True)
@@ -196,7 +196,7 @@ def ranged_fit(
 
 
 def correlated(left: FloatArray) -> float:
-    """Returns the factor of a coefficient's variance by the correlation of neighbouring residuals (n,)."""
+    """Returns the factor by which correlation of neighbouring residuals (n,) increases a variance."""
     correlation = float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-300)
     correlation = min(max(correlation, 0.0), MAX_CORRELATION)
     return (1.0 + correlation) / (1.0 - correlation)

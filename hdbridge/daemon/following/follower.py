@@ -1,4 +1,4 @@
-"""Following one axis: one pass over its samples, from the health of the load encoder to both verdicts.
+"""Follower of one axis: one pass over its samples, from encoder health to verdict and adaptation.
 
     samples -> encoder health -> measuring -> zero -> watch (is the model still valid?)
                                                    -> adaptation (what has drifted, and by how much?)
@@ -49,7 +49,7 @@ UNIFORM: Final = 12.0**0.5
 
 
 class Outcome(NamedTuple):
-    """Results of a number of samples."""
+    """Result of the samples taken: new verdicts, and a proposal if due."""
 
     raised: list[Raised]
     proposal: Proposal | None = None
@@ -72,7 +72,7 @@ class Follower:
         index: int = 0,
         settings: AdaptationSettings | None = None,
     ) -> None:
-        """``index`` is that of the axis in a sample; there is no adaptation before `adapt`."""
+        """``index`` is the place of the axis in a sample; there is no adaptation before `adapt`."""
         self.model = model
         self.health = EncoderHealth(axis, model, index)
         self.adaptation: Adaptation | None = None
@@ -142,7 +142,7 @@ class Follower:
         return self.advance(together, status)
 
     def advance(self, samples: SampleArray, status: EncoderStatus) -> Outcome:
-        """Measures, judges and adapts with consecutive samples; ``status`` is that of the load encoder."""
+        """Measures, judges and adapts with these samples; ``status`` is that of the load encoder."""
         axis: Any = samples["axes"][:, self._index]
         cycle, times_s = samples["cycle"], 1e-9 * samples["time_ns"].astype(np.float64)
         self._now_s = float(times_s[-1])
@@ -178,7 +178,7 @@ class Follower:
         return Outcome(raised, proposal)
 
     def in_force(self, model: TransmissionModel) -> None:
-        """Judges by another model, which the control process uses from now on."""
+        """Switches to another model, which the control process uses from now on."""
         self.health.restart()
         self._servo.use(model.response)
 
@@ -191,7 +191,7 @@ class Follower:
         if not adaptation.may_refine:
             return None
         refined = self._servo.refined(self._settings.bound_share)
-        # The first step assumes the load of the calibration, the second knows what the first has done.
+        # The first refinement assumes the load of the calibration; the second knows the effect of the first.
         if self._servo.worse and (refined is None or self._servo.refinements > 1):
             return adaptation.withdraw()
         return None if refined is None else adaptation.refine(refined)
@@ -209,7 +209,7 @@ class Follower:
         )
 
     def _refined(self, used: Response | None) -> messages.RefinedResponse | None:
-        """Returns the change of the committed response by the one in use; None if they agree within 1 %."""
+        """Returns the difference of the response in use from the committed one; None if less than 1 %."""
         committed = self.model.response
         if committed is None or used is None:
             return None
@@ -234,7 +234,7 @@ class Follower:
             self._files.write(entries, adaptation.learned())
 
     def _begin_of_path(self, axis: Any, cycle: Any) -> int:
-        """Returns the first row of the path without lost cycles or lost power."""
+        """Returns the first row after the last lost cycle or power loss, if any, which restarts the path."""
         driven = in_states(axis, DRIVEN)
         next_cycle = self._next_cycle if self._next_cycle is not None else int(cycle[0])
         gaps = np.diff(cycle, prepend=next_cycle - 1) != 1

@@ -4,15 +4,15 @@ Three faults are detected within a second, each by a sign that a gear cannot pro
 
 * frozen: the reading does not change at all while the motor turns;
 * jumped: the residual steps although motor, speed and predicted error do not;
-* noisy: the jitter of a reading is several times its usual value, or readings jump there and back.
+* noisy: the jitter of the reading is several times its usual value, or single readings jump away and return.
 
 `zero` adds a zero that drifts, or that steps in motion.
 
 The signs are in the residual, which is measured minus predicted transmission error. A gear's error depends on
-its motor: it does not jump while the motor hardly moves, does not stay constant while the motor turns, and
-does not become noisier within a second. The prediction in a sample is that at the motor angle *issued* in
-its cycle. The encoders are read at its SYNC, when the motor still lags, so the prediction is taken from an
-earlier time, by the mean lag.
+the motor angle: it does not jump while the motor hardly moves, does not stay constant while the motor turns,
+and does not become noisier within a second. The prediction in a sample is that at the motor angle *issued* in
+its cycle. The encoders are read at the SYNC of that cycle, when the motor still lags, so the prediction is
+delayed by the mean lag.
 
 Jumps and noise in motion are judged only with a calibrated model, because without its prediction the gear's
 own error looks the same. The other signs are judged on every axis.
@@ -20,8 +20,8 @@ own error looks the same. The other signs are judged on every axis.
 An encoder that drifts as slowly as a gear warms up, or is eccentric, is not separable from the gear by the
 load encoder alone. A reading that freezes at rest is detected at the next motion.
 
-Frozen and noisy end automatically once the reading has been good for a while. After a jump or a drift, the
-encoder's zero is unknown until `reset`, or until the drive is verified or homed again.
+A frozen or noisy encoder recovers automatically once the reading has been good for a while. After a jump or a
+drift, the encoder's zero is unknown until `reset`, or until the drive is verified or homed again.
 """
 
 import math
@@ -45,7 +45,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 DRIVEN: Final = (AxisState.ENABLED, AxisState.STOPPING)
 """States in which the motor follows the issued targets."""
 LONGEST_LAG_S: Final = 0.05
-"""Largest lag of a motor that follows."""
+"""Upper limit of the motor's estimated lag."""
 SIDE = 5
 """Number of samples on either side of a jump; their median ignores two misread samples."""
 MEDIAN_ERROR = 1.25
@@ -74,7 +74,7 @@ BLOCK_SAMPLES = 20
 SETTLE_S = 0.1
 """Time in which the load's oscillation after the start or end of a motion fades."""
 LEARNING_BLOCKS = 40
-"""Blocks after which the usual jitter is known."""
+"""Number of blocks after which the usual jitter counts as known."""
 MAX_LEARNING_BLOCKS = 480
 """Maximum number of blocks for the usual jitter; later ones might include a slow fault."""
 NOISY_BLOCKS = 3
@@ -84,7 +84,7 @@ UNTESTED_ARCSEC = 3.0
 SIGMAS = 8.0
 """Standard deviations of noise that no reading exceeds: probability 1e-15."""
 NOISE_RATIO = 4.0
-"""Ratio of jitter to its usual value; normal is 1, a damaged track gives 10."""
+"""Maximum ratio of jitter to its usual value. Normal is 1; a damaged track results in 10."""
 SPIKES = 3
 """Minimum number of readings that jump there and back within ten seconds for a fault."""
 FROZEN_ARCSEC = 120.0
@@ -200,7 +200,7 @@ def find_jump(
 
 
 def seen_swing_s2(found: Residuals, steps_arcsec: FloatArray) -> float:
-    """Returns the largest of the `steps` per acceleration; 0 without acceleration."""
+    """Returns the largest of the `steps` per acceleration, s2; 0 without acceleration."""
     if not len(steps_arcsec):
         return 0.0
     shaken = _windows(found["shaken_deg_s2"], 2 * SIDE).max(axis=0)
@@ -281,7 +281,7 @@ class EncoderHealth:
     """Monitors the load encoder of one axis in the loop's samples."""
 
     def __init__(self, axis: AxisConfig, model: TransmissionModel, index: int = 0) -> None:
-        """``index`` is that of the axis in a sample, ``model`` predicts the samples' errors."""
+        """``index`` is the place of the axis in a sample; ``model`` predicts the errors in the samples."""
         self.status = EncoderStatus()
         """State after the last samples taken."""
         self._index = index
@@ -305,11 +305,11 @@ class EncoderHealth:
         self._tail: SampleArray | None = None
         """Last samples, which are evaluated again with the next ones."""
         self._held: tuple[float, float] | None = None
-        """Load reading that does not change, and the motor angle since when."""
+        """Last load reading, and the motor angle at which it last changed; degrees."""
         self._pending: dict[bool, list[Residuals]] = {True: [], False: []}
         """Samples of the incomplete blocks at rest (True) and in motion (False)."""
         self._since: tuple[bool, float] = (True, -math.inf)
-        """True at rest, and the time since when."""
+        """True at rest, and the time at which this rest or motion began."""
 
     def reset(self) -> None:
         """Ends a fault, after maintenance or after the encoder's zero was set."""
@@ -356,7 +356,7 @@ class EncoderHealth:
         return max(typical, 0.3 * self._load_count_arcsec)
 
     def accuse(self, fault: EncoderFault, why: str) -> EncoderStatus:
-        """Reports a fault and returns the state; a fault that lasts replaces one that passes."""
+        """Sets a fault and returns the state; a latched fault replaces one that is not."""
         self._bad_s = self._now_s
         if self.status.fault is None or (fault in LATCHED and self.status.fault not in LATCHED):
             self.status = EncoderStatus(fault, f"load encoder {fault.value}: {why}")
@@ -438,7 +438,7 @@ class EncoderHealth:
                     pending.clear()
 
     def _judge_block(self, block: Residuals, *, standing: bool) -> None:
-        # The load's own motion is slow or predicted; noise is in both differences.
+        # Slow motion adds little jitter to the load, predicted motion to the residual; noise adds to both.
         jitter = min(jitter_deg(block["load_deg"]) * ARCSEC_PER_DEG, jitter_deg(block["residual_arcsec"]))
         usual = self._usual(standing=standing)
         noisy = jitter > NOISE_RATIO * usual
@@ -458,7 +458,7 @@ def _standing(found: Residuals) -> BoolArray:
 
 
 def held_out_arcsec(model: TransmissionModel) -> float:
-    """Returns the model's rms residual on held-out data in arcsec, from its file."""
+    """Returns the model's rms residual on held-out data from its file, arcsec; else `UNTESTED_ARCSEC`."""
     held_out = model.provenance.get("held_out")
     value = held_out.get("after_arcsec") if isinstance(held_out, dict) else None
     if isinstance(value, int | float) and math.isfinite(value) and value > 0.0:

@@ -56,7 +56,7 @@ RAISE_S: Final = 60.0
 WITHDRAW_S: Final = 300.0
 """Time without evidence after which a verdict is withdrawn."""
 NOISE_RATIO: Final = 1.5
-"""Ratio of the noise in operation to that of a calibration."""
+"""Assumed ratio of the noise in operation to that of a calibration."""
 ORDER_ARCSEC: Final = 0.8
 """Smallest relevant change of the orders, at the load."""
 LOOP_ARCSEC: Final = 1.5
@@ -85,7 +85,8 @@ class Verdict(Enum):
 
     HOLDS = "the model holds"
     RECALIBRATE = "recalibrate"
-    """Parts of the model have changed as by wear, temperature or ageing, which a calibration corrects."""
+    """Parts of the model have changed in a way that wear, temperature or ageing causes and a calibration
+    corrects."""
     SOMETHING_CHANGED = "something changed"
     """No such change explains the measurements, so a diagnosis is required."""
     ENCODER = "the load encoder is not believed"
@@ -136,7 +137,7 @@ class Evidence:
         return self.left_arcsec > self.left_allowed_arcsec
 
     def verdict(self, before: Verdict) -> Verdict:
-        """Returns the verdict; near a limit, the verdict before."""
+        """Returns the verdict; if the residual is only just below its limit, the verdict ``before``."""
         if not self.moved and not self.unexplained:
             clear = self.left_arcsec < CLEARLY * self.left_allowed_arcsec
             return Verdict.HOLDS if clear else before
@@ -178,7 +179,7 @@ def _places(observations: Sequence[Observation]) -> tuple[FloatArray, FloatArray
 
 
 class Watch:
-    """Verdicts on one axis and its model."""
+    """Raises and withdraws verdicts on one axis and its model."""
 
     def __init__(self, drift: DriftModel, noise_arcsec: float) -> None:
         """``noise_arcsec`` is the standard deviation of an observation."""
@@ -239,7 +240,7 @@ class Watch:
         recent = self._observations
         while recent and not 0.0 <= now_s - recent[0].time_s <= WINDOW_S:
             recent.popleft()
-        # An axis at rest gives no new evidence, and an uncalibrated one has no model to test.
+        # An axis at rest provides no new evidence, and an uncalibrated one has no model to test.
         if not self._new or self._faulty or not self._drift.model.effects:
             return False
         self._new = False
@@ -290,7 +291,7 @@ class Watch:
         )
 
     def _as_calibrated(self, rows: FloatArray, observed: FloatArray) -> tuple[float, float]:
-        """Returns the rms about zero and disc, and its upper limit by the model's intervals."""
+        """Returns the rms error without zero, disc and trend, and its limit by the intervals, arcsec."""
         zero = self._drift.zero
         nuisance, followed = rows[:, zero:], rows[:, :zero]
         basis, _ = np.linalg.qr(nuisance)
@@ -302,7 +303,7 @@ class Watch:
         return float(np.sqrt(about @ about / free)), float(np.sqrt(share * (self._noise**2 + allowed)))
 
     def _chi_square(self, free: int) -> float:
-        """Returns the chi square that chance exceeds at the rate of false alarms, by degrees of freedom."""
+        """Returns the critical chi square at the false-alarm probability, for ``free`` degrees of freedom."""
         from scipy.special import chdtri  # noqa: PLC0415 - the daemon's service starts without scipy
 
         return float(chdtri(free, self._alpha))
@@ -328,7 +329,7 @@ class Watch:
         return Moved(_largest_changes(self._drift.model, changed), wear)
 
     def _zero_moved(self, zero: Displacement) -> Moved | None:
-        """Returns the significant change of the zero since it was learned."""
+        """Returns the change of the zero since it was learned; None if it is not significant."""
         if abs(zero.arcsec) < max(ZERO_ARCSEC, math.sqrt(self._chi_square(1)) * zero.error):
             return None
         return Moved(f"zero: by {zero.arcsec:+.1f} arcsec", abs(zero.arcsec) <= self._zero_bound)

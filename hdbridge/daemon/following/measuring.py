@@ -44,7 +44,7 @@ from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 LOAD_ORDERS = (1, 2)
 """Orders per turn of the load: eccentricity and ovality of the encoder's disc."""
 SAME_ARCSEC = 1e-6
-"""Maximum difference of trackers started in either direction once the state counts as known."""
+"""Maximum difference of two trackers, started in opposite directions, at which the state counts as known."""
 SETTLE_S = 0.05
 """Settling time of the load after a fast move, and after a reversal in a slow move."""
 SHORTEST_S = 0.04
@@ -55,7 +55,7 @@ zero."""
 FAST_S = 0.25
 """Duration of an observation in fast motion."""
 EVEN = 1e-3
-"""Maximum relative change of a constant speed from one sample to the next."""
+"""Maximum relative change from one sample to the next at which a speed counts as constant."""
 CELL_DEG = 3.0
 """Motor travel of an observation in slow motion."""
 REVERSAL_DEG = 0.3
@@ -80,7 +80,7 @@ class DriftModel:
     """Linear model of drift: coefficients that wear or temperature change, zero, load encoder disc."""
 
     def __init__(self, model: TransmissionModel, parameters: Sequence[str] | None = None) -> None:
-        """``parameters`` as in `AdaptationSettings`; InputError for a parameter that the model lacks."""
+        """``parameters`` as in `AdaptationSettings`; raises InputError for one that the model lacks."""
         self.model = model
         self.terms = _terms(model, parameters)
         self.zero = sum(len(each.effect.coefficients()) for each in self.terms)
@@ -102,7 +102,7 @@ class DriftModel:
         return replace(self.model, effects=refreshed(effects), path=None)
 
     def columns_in(self, whole: DriftModel) -> IntArray:
-        """Returns the places of this model's columns in a model of more parameters, shape (count,)."""
+        """Returns the indices of this model's columns in a model with more parameters, shape (count,)."""
         columns = {each.number: each.columns for each in whole.terms}
         own = [np.arange(whole.count)[columns[each.number]] for each in self.terms]
         return np.concatenate([*own, np.arange(whole.zero, whole.count)])
@@ -135,11 +135,11 @@ class DriftColumns:
         return all(each.known for each in (*self._fixed, *self._units.values()))
 
     def state(self) -> tuple[float, ...]:
-        """Returns the path-dependent values: the sum of the other effects, and columns with memory."""
+        """Returns the path-dependent values: the sum of the fixed effects, and the columns with memory."""
         return (sum(each.value for each in self._fixed), *(each.value for each in self._units.values()))
 
     def rows(self, motor_deg: FloatArray, states: FloatArray) -> FloatArray:
-        """Returns all columns at motor angles (n,), given `state` there, (n, s); shape (n, count)."""
+        """Returns all columns at motor angles (n,) with `state` values (n, s); shape (n, count)."""
         drift = self._drift
         rows = np.zeros((len(motor_deg), drift.count))
         rows[:, list(self._units)] = states[:, 1:]
@@ -154,7 +154,7 @@ class DriftColumns:
 
 
 class _Tracked:
-    """Two trackers of an effect, started in either direction, until they agree."""
+    """Tracker of an effect, and a second one started in the opposite direction until both agree."""
 
     def __init__(self, effect: Effect) -> None:
         self._tracker = effect.tracker(Start.FORWARD)

@@ -1,8 +1,8 @@
-"""Servo watch: tests whether the servo still responds as measured for the model.
+"""Servo watch: tests if the servo still responds as in the response measured for the model.
 
-It judges runs at constant speed, in which the correction moves the set-points, by the motor encoder's
-response. Neither a change of the gear nor a fault of the load encoder therefore has an influence. The load
-encoder's readings in these runs refine the response. Uses no clock.
+It judges runs at constant speed, in which the correction modulates the set-points, by the motor encoder.
+Neither a change of the gear nor a fault of the load encoder therefore has an influence. The load encoder's
+readings in these runs refine the response. Uses no clock.
 """
 
 from statistics import median
@@ -21,7 +21,7 @@ from hdbridge.daemon.memory import SampleFlag
 from hdbridge.units import DEG_PER_TURN
 
 EVEN: Final = 1e-3
-"""Maximum relative deviation of a constant speed."""
+"""Maximum relative deviation at which a speed counts as constant."""
 TRANSIENT_S: Final = 0.6
 """Time at constant speed before a run begins."""
 RUN_S: Final = 1.0
@@ -50,14 +50,14 @@ class ServoWatch:
         self._response = response
         self._answers = None if response is None else Answers(response, self._orders, self._ratio, earlier)
         self._before_arcsec2: dict[tuple[int, int], float] = {}
-        """Remaining mean square of each order at each frequency with the committed response."""
+        """Residual mean square of each order at each frequency with the committed response."""
         self._run: list[NDArray[Any]] = []
         self._speed_deg_s = 0.0
         self._even = 0
         """Number of samples at this speed so far."""
 
     def use(self, response: Response | None) -> None:
-        """Judges by another response from now on."""
+        """Switches to another response."""
         if response != self._response:
             before = self._before_arcsec2
             if self._answers is not None and self._response == self._committed:
@@ -74,7 +74,7 @@ class ServoWatch:
 
     @property
     def worse(self) -> bool:
-        """True if the response leaves more load error than the committed response, at the same places."""
+        """True if the response leaves more load error than the committed one, at common frequencies."""
         before = self._before_arcsec2
         if self._answers is None or self._response == self._committed:
             return False
@@ -95,8 +95,8 @@ class ServoWatch:
     def take(self, axis: NDArray[Any], *, joined: bool, believed: bool) -> str | None:
         """Takes the next samples of the axis; returns the evidence if the verdict changes.
 
-        ``joined`` is False if cycles are missing before or between them, ``believed`` during a fault of the
-        load encoder.
+        ``joined`` is False if cycles are missing before or within the samples. ``believed`` is False during a
+        fault of the load encoder.
         """
         if self._answers is None or not self._orders or not len(axis):
             return None

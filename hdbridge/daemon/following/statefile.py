@@ -45,7 +45,7 @@ class AdaptationFiles:
         parameters: tuple[str, ...] | None,
         now: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
-        """Creates the folder if it does not exist; OutputError if this fails."""
+        """Creates the folder if it does not exist; raises OutputError if this fails."""
         make_folder(folder)
         text = replace(model, provenance={}).dump() + json.dumps(parameters)
         self._fingerprint = hashlib.sha256(text.encode()).hexdigest()

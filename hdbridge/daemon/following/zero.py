@@ -1,15 +1,15 @@
-"""Zero of the load encoder: the one judgement of its motion, for encoder health, watch and adaptation.
+"""Zero of the load encoder: estimates its motion for encoder health, watch and adaptation.
 
-The zero is the difference of the two encoders' zeros. A gear cannot step it, and wear and temperature move it
-slowly and not far. What moves it faster or farther is the load encoder or its coupling. Because it is one
-number, one fit to the recent observations judges it for all:
+The zero is the difference of the two encoders' zeros. A gear cannot make it step, and wear and temperature
+move it slowly and not far. A faster or larger change comes from the load encoder or its coupling. One fit to
+the recent observations serves all three users:
 
     error = columns @ change + zero + rate * time + load encoder disc + share of the speed + noise
 
-The columns and the range of their changes are those of the adaptation, so a gear that has worn is not taken
-for a zero that moves, however few places the axis visits. The error refers to the committed model, so a
-change of the model in use changes nothing here. Noise is the larger of the counts' and of what is left, and
-allows for its correlation.
+The columns and the range of their changes are those of the adaptation, so wear of the gear is not mistaken
+for motion of the zero, however few places the axis visits. The error refers to the committed model, so a
+change of the model in use has no effect here. The noise is the larger of quantisation by the counts and rms
+residual; standard errors allow for the correlation of residuals.
 """
 
 from collections import deque
@@ -25,34 +25,34 @@ from hdbridge.daemon.following.measuring import DriftModel, Observation
 from hdbridge.daemon.machinefile import AdaptationSettings
 
 SPANS_S: Final = (15.0, 60.0, 180.0)
-"""Time spans up to now that are searched for a drift, from fast to slow; the last is searched for a step."""
+"""Durations of the spans up to now that are tested for a drift; the longest is also tested for a step."""
 EVERY_S: Final = 2.0
-"""Interval between judgements."""
+"""Minimum interval between fits."""
 LEAST: Final = 16
 """Minimum number of observations in a span."""
 SIGMAS: Final = 8.0
-"""Standard errors by which a rate must exceed its limit."""
+"""Number of standard errors by which a rate must exceed its limit, and a step must exceed zero."""
 LASTING: Final = 3
-"""Number of successive judgements that must agree on a drift; a knock does not last that long."""
+"""Number of successive fits that must agree on a drift; a knock does not last that long."""
 RATE_ARCSEC_MIN: Final = 3.0
 """Maximum rate of a gear's zero. Warming up moves it by 5 to 60 arcsec in 10 to 60 minutes, typically by 1
 per minute (`effects.zero_drift`)."""
 MAX_ARCSEC: Final = 60.0
 """Maximum total change of a gear's zero."""
 LEARNED_MIN: Final = 0.5
-"""Minutes of observations from which the zero is learned."""
+"""Minimum duration of the observations from which the zero is learned, minutes."""
 FREE_COLUMNS: Final = 4
 """Number of columns without a known range: time, step, zero, and one for the speed."""
 COUNTS_SHARE: Final = 0.3
-"""Least noise of an observation, which is a mean, as a share of that of a single sample by the counts."""
+"""Minimum noise of an observation (a mean), as a share of the quantisation noise of a single sample."""
 SPEED_ARCSEC: Final = 5.0
-"""Expected size of an error in proportion to speed, at the highest speed of the span."""
+"""Expected size of the error proportional to speed, at the highest speed of the span."""
 STEP_ARCSEC: Final = 6.0
-"""Smallest step of the zero that counts as one."""
+"""Smallest change of the zero that counts as a step."""
 STEP_OBSERVATIONS: Final = 20
 """Minimum number of observations on either side of a step."""
 STEP_BETTER: Final = 0.6
-"""Maximum ratio of the mean squares left by a step and by a drift that begins there."""
+"""Maximum ratio of the residual mean square with a step to that with a drift that begins there."""
 
 
 class Rate(NamedTuple):
@@ -78,14 +78,14 @@ class Displacement(NamedTuple):
 
 
 class Zero:
-    """Judges the zero of one axis since its drive was verified."""
+    """Estimates the zero of one axis and its changes since the drive was verified."""
 
     def __init__(self, drift: DriftModel, sigma_arcsec: float) -> None:
-        """``sigma_arcsec`` is the standard deviation of a single sample by the encoders' counts."""
+        """``sigma_arcsec`` is the standard deviation of a single sample due to the encoders' counts."""
         self.rates: list[Rate] = []
-        """Rates at the last judgement, one per span with enough observations."""
+        """Rates of the last fit, one per span with enough observations."""
         self.moved: Displacement | None = None
-        """Displacement at the last judgement; None until the zero is learned."""
+        """Displacement by the last fit; None until the zero is learned."""
         self._judged = bool(drift.model.effects)
         """False without a prediction, because the gear's own error may look like a moving zero."""
         self._sigma_arcsec = COUNTS_SHARE * sigma_arcsec
@@ -143,7 +143,7 @@ class Zero:
     def _fit(
         self, rows: FloatArray, error_arcsec: FloatArray, information: FloatArray
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Returns the coefficients, their standard errors and the mean square that is left."""
+        """Returns the coefficients, their standard errors and the residual mean square."""
         sigma = self._sigma_arcsec
         change, _ = ranged_fit(rows, error_arcsec, sigma, information)
         left = error_arcsec - rows @ change
@@ -158,7 +158,7 @@ class Zero:
         return Rate(float(change[0]), float(errors[0]), float(rows[-1, 0] - rows[0, 0]))
 
     def _displaced(self, rows: FloatArray, error_arcsec: FloatArray) -> None:
-        """Learns the zero, or determines how far it has moved since.
+        """Learns the zero, or determines its displacement since then.
 
         The disc is fixed at its learned value, because over part of a turn it is hardly separable from the
         zero.
@@ -183,7 +183,7 @@ class Zero:
     def _stepped(
         self, time_s: FloatArray, rows: FloatArray, error_arcsec: FloatArray
     ) -> tuple[EncoderFault, str] | None:
-        """Returns a step of the zero if it fits far better than a drift that begins at the same time."""
+        """Returns a fault if a step of the zero fits far better than a drift that begins at the same time."""
         count = len(rows)
         before = np.arange(STEP_OBSERVATIONS, count - STEP_OBSERVATIONS + 1)
         if not len(before):
@@ -209,7 +209,7 @@ class Zero:
         )
 
     def _drifts(self) -> tuple[EncoderFault, str] | None:
-        """Returns a drift that is too fast or too far for a gear, once it has lasted."""
+        """Returns a fault once a drift too fast or too large for a gear has lasted."""
         away = 0.0 if self.moved is None else self.moved.arcsec
         drifts = any(each.exceeds(RATE_ARCSEC_MIN) for each in self.rates)
         self._suspicions = self._suspicions + 1 if drifts or abs(away) > MAX_ARCSEC else 0

@@ -1,4 +1,4 @@
-"""Ideal axis behind the slave of a gateway: the load is exactly at the demand. For tests of other masters."""
+"""Ideal axis behind a gateway's slave: the load is exactly at the demand. For tests of outer masters."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ class IdealAxis:
     def __init__(self, motor_counts_per_load_count: float) -> None:
         self.torque_limit_permille = 0.0
         self.motor_counts = 0
-        """Load position, which is the motor position of this drive."""
+        """Load position in counts, which the drive reports as its motor position."""
         self.velocity_counts_s = 0.0
         self._scale = motor_counts_per_load_count
 
     @property
     def load_counts(self) -> int:
-        """Reading of the motor encoder, which this drive also reports as its second encoder."""
+        """Position of the axis's motor in counts, which the drive reports as its second encoder."""
         return round(self.motor_counts * self._scale)
 
     def follow(self, start_counts: float, end_counts: float, substeps: int) -> None:
@@ -28,5 +28,5 @@ class IdealAxis:
         self.velocity_counts_s = (end_counts - start_counts) / (substeps * self.dt_s)
 
     def coast(self, substeps: int, braked: bool) -> None:
-        """Stands still without power."""
+        """Stays at rest without power."""
         self.velocity_counts_s = 0.0

@@ -1,4 +1,4 @@
-"""Object dictionary of a gateway axis: that of the device, at the scale of the load."""
+"""Object dictionary of a gateway axis: that of the simulated device, scaled to the load."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hdbridge.daemon.machinefile import GatewaySettings
 
 BRIDGE: Final = 0x2200
-"""Record of the bridge's own values."""
+"""Index of the record with the bridge's own values."""
 _INT32, _UNSIGNED8 = 0x0004, 0x0005
 BRIDGE_VALUES: Final = (
     ("Error at the load, measured, 0.01 arcsec", _INT32),
@@ -34,7 +34,7 @@ BRIDGE_VALUES: Final = (
 )
 """Name and type of the sub-indices of this record, from 1."""
 _WITHOUT: Final = ("2100", "2101")
-"""Objects of the simulated drive's environment."""
+"""Objects that are removed, because they belong to the simulated drive's environment."""
 _PDOS: Final[Mapping[str, int | str]] = {
     "1400sub2": 255,
     "1600sub0": 1,
@@ -58,7 +58,7 @@ _PDOS: Final[Mapping[str, int | str]] = {
     "1A02sub1": "0x60410010",
     "1A02sub2": "0x60640020",
 }
-"""Default mapping of CiA 402: the first pair event-driven, mode and position prepared but not valid.
+"""Default PDOs as in CiA 402: the first pair is event-driven; mode and position are mapped but not valid.
 
 The statusword is also sent every 50 ms, for masters that expect it periodically."""
 _MOST: Final = 0xFFFF_FFFF

@@ -1,7 +1,7 @@
 """Gateway process: ``python -m hdbridge.daemon.gateway.process FD``, started by the keeper.
 
-It has the outer bus and its end of the shared memory. The control process does not wait for it. If the
-gateway process dies, the set-points of its axes end, so the axes brake and lose their power.
+It uses the outer bus and the shared memory. The control process does not wait for it. If the gateway process
+dies, the set-points of its axes end, so the axes brake and lose their power.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ ALIVE_S: Final = 0.1
 
 
 class SimulatedClock:
-    """Virtual clock of simulated drives: its time in the last turn of the loop, plus the time since.
+    """Virtual clock of simulated drives: time of the last turn of the loop, plus the time since then.
 
     It waits for a late loop, but not for a loop whose process is gone.
     """
@@ -64,7 +64,7 @@ class SimulatedClock:
 
 
 def serve(start: Start) -> None:
-    """Simulates the drives of the outer bus until SIGTERM. Raises `BusError` if the bus fails."""
+    """Serves the gateway's drives on the outer bus until SIGTERM. Raises `BusError` if the bus fails."""
     begin_log(start.log)
     machine, terminated = start.machine, when_terminated()
     settings = machine.gateway
@@ -106,7 +106,7 @@ def serve(start: Start) -> None:
                 status[Cell.GATEWAY_TIME_NS] = time.monotonic_ns()
             return terminated()
 
-        # A real-time priority below that of the control loop, which must not wait on a shared processor.
+        # One below the priority of the control loop, which must not wait for this process on a shared CPU.
         priority, cpus = max(machine.realtime.priority - 1, 0), machine.realtime.cpus
         with prepare_realtime(priority, cpus) if simulation is None else nullcontext() as conditions:
             _LOG.info("gateway process", {"conditions": str(conditions or "simulated")})

@@ -1,7 +1,7 @@
-"""Slaves of a gateway: CiA-402 drives on the outer bus in front of the axes of the control loop.
+"""Slaves of a gateway: CiA-402 drives on the outer bus that represent axes of the control loop.
 
-A slave is a device of `hdbridge.device`. Its plant and power stage are an axis of the loop, seen through the
-shared memory. It writes set-points and requests power, which the service grants; it has no other access.
+A slave is a device of `hdbridge.device`. Its plant and power stage are an axis of the loop, accessed through
+the shared memory. It writes set-points and requests power, which the service grants; it has no other access.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ VELOCITY_S: Final = 0.02
 """Averaging time of the actual velocity."""
 
 TAKEN: Final = 0xFF01
-"""Another client of the daemon has the axis."""
+"""Error code: another client of the daemon uses the axis."""
 NOT_POWERED: Final = 0xFF02
-"""The inner drive did not receive power, or lost it; the daemon's log has the reason."""
+"""Error code: the inner drive was not powered, or lost its power; the daemon's log has the reason."""
 STOPPED: Final = 0xFF03
-"""A quick stop by command, or a stop without a code of its own."""
+"""Error code: a quick stop by command, or a stop without its own code."""
 INNER_BUS: Final = 0x7500
-"""CiA 402: communication, additional module."""
+"""Error code of CiA 402: communication, additional module."""
 ERROR_CODES: Final[Mapping[Fault, int]] = {
     Fault.HANG: 0x6010,
     Fault.OVERRUN: 0x6010,
@@ -111,7 +111,7 @@ class LoadAxis(PowerStage):
         """Axis in the newest cycle; None before the first."""
         self._measured = (-math.inf, 0.0)
         self._series = max(self._cells[OuterCell.WANTED], self._cells[OuterCell.GRANTED]) + 1
-        """Number of the next series of set-points; no number is used twice, by any process."""
+        """Number of the next series of set-points; no process uses a number twice, even after a restart."""
         self._wanted = 0
         self._wanted_s = 0.0
         self._begun = False
@@ -122,7 +122,7 @@ class LoadAxis(PowerStage):
     # ---------------------------------------------------------------- the newest cycle
 
     def look(self, newest: SampleArray | None, now_s: float, alive: bool) -> None:
-        """Takes the newest cycle, shape (1,), and checks for errors; ``newest``: None without a new cycle."""
+        """Takes the newest cycle, shape (1,), and checks for errors; ``newest`` is None without a new one."""
         if newest is not None:
             self._take(newest)
         sample = self.sample
@@ -147,7 +147,7 @@ class LoadAxis(PowerStage):
         if time_s - since_s >= VELOCITY_S:
             moved = motor_deg - before_deg
             if abs(moved) <= 1.5 * abs(self._motor_deg) or not math.isfinite(since_s):
-                moved = 0.0  # a count of chatter at rest
+                moved = 0.0  # chatter of one count at rest
             self.velocity_counts_s = moved / self._ratio / (time_s - since_s) * self._counts_per_deg
             self._measured = (time_s, motor_deg)
 
@@ -165,7 +165,7 @@ class LoadAxis(PowerStage):
         if was_on and not self.is_on:
             if sample["state"] == AxisState.ENABLED:
                 return TAKEN
-            # The set-points end before SYNC is overdue if this process got the processor late.
+            # If this process was scheduled late, the set-points end before SYNC is overdue.
             node = self._node
             outer = node is not None and node.firmware.follows_the_bus and node.sync_is_late(now_s)
             return ErrorCode.SYNC_LOST if outer else NOT_POWERED
@@ -225,7 +225,7 @@ class LoadAxis(PowerStage):
     def coast(self, substeps: int, braked: bool) -> None:
         """Writes nothing, because there are no set-points without power."""
 
-    # ---------------------------------------------------------------- what only the bridge knows
+    # ---------------------------------------------------------------- the bridge's own objects
 
     def values(self) -> tuple[Callable[[], int], ...]:
         """Returns the readers of the sub-indices of `BRIDGE`, from 1."""
@@ -243,7 +243,7 @@ class LoadAxis(PowerStage):
         )
 
     def _load_deg(self, sample: SampleArray) -> float:
-        """Returns the load angle; without an encoder at the load, that by motor encoder and model."""
+        """Returns the load angle, degrees; without a load encoder, that from motor encoder and model."""
         load_deg = float(sample["load_position_deg"])
         if math.isnan(load_deg):
             predicted_deg = float(sample["predicted_arcsec"]) / ARCSEC_PER_DEG

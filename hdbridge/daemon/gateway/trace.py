@@ -1,6 +1,7 @@
 """Trace of the other master on the outer bus: its configuration, its actions and its mistakes.
 
-Pure: frames in, lines out. It sends nothing, so it may observe a bus in operation or read a bus log.
+It takes frames and returns lines, without I/O. It sends nothing, so it may observe a bus in operation or read
+a bus log.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ _CYCLIC: Final = (7, 8)
 _READY: Final = (State.READY_TO_SWITCH_ON, State.SWITCHED_ON)
 _INVALID: Final = 1 << 31
 _LATE: Final = 1.5
-"""Ratio of a SYNC interval to the period above which a SYNC counts as missing; the gateway stops the axis
-after four."""
+"""Ratio of a SYNC interval to the period above which a SYNC counts as missing; after four periods without
+SYNC, the gateway stops the axis."""
 _QUIET_S: Final = 1.0
 """Time without an expected SYNC or heartbeat after which the master is at fault."""
 _PDO_ADVICE: Final = (
@@ -70,7 +71,7 @@ class Line:
 
 
 class Trace:
-    """Trace of one node. ``od`` is the dictionary of its EDS."""
+    """Trace of one node. ``od`` is the object dictionary from its EDS."""
 
     def __init__(self, node_id: int, od: ObjectDictionary) -> None:
         self._node, self._od = node_id, od
@@ -281,7 +282,7 @@ class Trace:
 
     @property
     def period_s(self) -> float | None:
-        """Median interval of SYNC; None before the third."""
+        """Median interval of SYNC; None before the third SYNC."""
         return median(self._intervals_s) if len(self._intervals_s) > 1 else None
 
     @property

@@ -1,8 +1,9 @@
 """One axis in the control loop: its state, the commands it accepts and the events it reports.
 
 `AxisLoop.command` takes the service's commands between two turns. `AxisCycle` requests a target in each turn
-in which the drive is enabled. The state determines which function provides it (`_enabling`, `Follower.follow`
-or `_pursue`), so the turn itself decides nothing. `AxisLoop.after` evaluates the result of the turn.
+in which the drive is enabled. The state determines which function provides the target (`_enabling`,
+`Follower.follow` or `_pursue`), so the turn itself makes no decision. `AxisLoop.after` evaluates the result
+of the turn.
 """
 
 import math
@@ -50,7 +51,7 @@ _FRESH, _COMPENSATING, _LIMITED, _MEMORY_KNOWN, _CHANGING, _AT_REST, _UNDERRUN, 
 
 
 class AxisLoop:
-    """One axis. It sends nothing and is unverified until the service reports that its drive is verified."""
+    """One axis. It is unverified and sends nothing until the service reports that its drive is verified."""
 
     def __init__(
         self,
@@ -106,9 +107,9 @@ class AxisLoop:
         self._why = ""
         """Reason for stopping, if the supervision did not report one."""
         self.stands = True
-        """True if the axis stands and the stop was reported; False only in QUICK_STOPPED and LATCHED."""
+        """True if the axis is at rest and its stop was reported; False only in QUICK_STOPPED and LATCHED."""
         self._place = self._still = 0
-        """Motor counts in the last turn of a stop, and the number of turns without a change."""
+        """Motor counts in the last turn of a stop, and the number of consecutive turns at standstill."""
         self._handlers: dict[CommandKind, Callable[[Command], None]] = {
             CommandKind.VERIFIED: self._verified,
             CommandKind.RELEASE: self._silence,
@@ -210,7 +211,7 @@ class AxisLoop:
             self._report(EventKind.REFUSED, id_, kind, why)
 
     def _stand(self) -> None:
-        """Ends all following of set-points."""
+        """Ends the motion: stops following set-points, and leaves the stream and its group."""
         self.cycle.command = None
         self._powering_off = False
         self._mode = MotionMode.HOLD
@@ -226,7 +227,7 @@ class AxisLoop:
     def _turns(self, time_s: float) -> int:
         return math.ceil(time_s / self._period_s)
 
-    # ---------------------------------------------------------------- what each command does
+    # ---------------------------------------------------------------- command handlers
 
     def _verified(self, command: Command) -> None:
         self._seed(command)
@@ -269,7 +270,7 @@ class AxisLoop:
         if self.state in (*MAY_MOVE, AxisState.LENT):
             self._why = "quick stop by command: latched"
         if self.state is AxisState.LENT:
-            # The next RPDO overrides what the service does by SDO.
+            # The next RPDO overrides the controlword that the service sends by SDO.
             self.image.power.quick_stop()
             self.cycle.begin()
 
@@ -303,7 +304,7 @@ class AxisLoop:
         self.cycle.command = self._pursue
 
     def _pursue(self, feedback: Feedback) -> int | None:
-        """Follows the gateway's set-points of one period ago; the newest may still be on their way."""
+        """Follows the gateway's set-points one period late, because the newest may not have arrived yet."""
         if self.set_point.mode is MotionMode.FOLLOW:
             aim = self._outer.at(self._due_s() - self._period_s)
             if aim is None:
@@ -332,7 +333,7 @@ class AxisLoop:
         try:
             power.go(State.SWITCH_ON_DISABLED)
         except TransitionError:
-            power.quick_stop()  # only a reset leads out of a fault; this at least aims for no power
+            power.quick_stop()  # only a fault reset leaves this state; at least, no power is requested
 
     def _power_off(self) -> None:
         self.cycle.command = None
@@ -440,7 +441,7 @@ class AxisLoop:
         self._happened(Happening.OVERDUE)
 
     def _after_stop(self) -> None:
-        """Reports a stop once the axis stands or the time-out has passed."""
+        """Reports a stop once the axis is at rest or the time-out has passed."""
         if self.supervision.stop is None and self.state is AxisState.QUICK_STOPPED:
             if not self._obeyed():
                 return
@@ -455,7 +456,7 @@ class AxisLoop:
         self._report(EventKind.STOPPED, int(explained), code, text)
 
     def _obeyed(self) -> bool:
-        """Returns True if a commanded quick stop is over: the motor stands, or the time-out has passed."""
+        """Returns True if a commanded quick stop is over: the motor is at rest or the time-out has passed."""
         counts, before = self.cycle.feedback.motor_counts, self._place
         self._place = counts
         driven = self.image.power.state is State.OPERATION_ENABLED

@@ -37,7 +37,7 @@ _OFF: Final = frozenset({State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_
 
 
 class Controller:
-    """All axes of one bus, controlled through the shared memory."""
+    """Control loop of all axes of one bus; takes commands from the shared memory and reports to it."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class Controller:
         for axis in self.axes:
             cycle.join(axis.cycle)
         self.ended = False
-        """True once `end` has switched off the power of all axes; no more turns are due."""
+        """True once `end` has switched all axes off, or has timed out; no more turns are due."""
 
         self._reopen = reopen
         self._axis_of_node = {node: axis for axis in self.axes for node in axis.config.nodes}
@@ -256,7 +256,7 @@ class Controller:
         self._ending_left = round(ENDING_TIMEOUT_S / self.cycle.period_s)
         self._report(_ALL, EventKind.ENDING)
         for axis in self.axes:
-            # The service can no longer stop a lent axis; the loop's quick stop overrides it.
+            # The service can no longer stop a lent axis; the loop's quick stop overrides its SDO transfers.
             lent = axis.state is AxisState.LENT
             self._order(axis, CommandKind.QUICK_STOP if lent else CommandKind.DISABLE)
 

@@ -7,7 +7,7 @@ from hdbridge.daemon.memory.layout import EventKind
 from hdbridge.drive.supervision import Fault, Reaction, Supervision
 
 OVER_S: Final = 1.0
-"""Time without a fault after which it counts as over, and is reported again on its return."""
+"""Time after which an absent fault counts as over, so that it is reported again if it returns."""
 CODES_KEPT: Final = 64
 FAULT_INDEX: Final = {fault: place for place, fault in enumerate(Fault)}
 """Number of each fault in events and samples."""

@@ -21,10 +21,10 @@ FIRST_KNOT_S: Final = 2.0
 
 
 class KnotFeed:
-    """Knot feed of one axis; idle until a stream begins.
+    """Passes the knots of a client's stream to the set-point of one axis; idle until a stream begins.
 
     Stream numbers increase. Knots of an ended stream are discarded. Knots of a later stream wait until it
-    begins, because they may be passed on shortly before the present stream ends.
+    begins, because the service may queue them shortly before the present stream ends.
     """
 
     def __init__(self, knots: Queue[Knot], set_point: SetPoint) -> None:
@@ -55,7 +55,7 @@ class KnotFeed:
         self._following = False
 
     def feed(self) -> str | None:
-        """Passes on the next knots. If one is refused, brakes the axis and returns the reason; else None."""
+        """Passes on the next knots. If one is refused, brakes the axis and returns the reason, else None."""
         knots, set_point, stream = self._knots, self._set_point, self._stream
         taken = 0
         for _ in range(STALE_KNOTS_A_TURN):
@@ -98,7 +98,7 @@ class OuterFeed:
         """Time between the last two set-points, at most `LONGEST_SPACING_S`."""
         self._first = True
         self._last_s = self._last_deg = self._rate_deg_s = self._end_s = 0.0
-        """Time and position of the last set-point, the velocity to it, and the time at which they end."""
+        """Time and position of the last set-point, the velocity to it, and the time limit for the next."""
 
     def begin(self, series: int, patience_s: float, time_s: float, position_deg: float) -> None:
         """Begins at rest; ``patience_s`` is the maximum time at rest without a set-point."""
@@ -108,7 +108,7 @@ class OuterFeed:
         self._end_s = time_s + FIRST_KNOT_S
 
     def at(self, time_s: float) -> float | None:
-        """Returns the position at a time that never decreases; None once the set-points have ended."""
+        """Returns the position at a time, which must not decrease; None once the set-points have ended."""
         for _ in range(OUTER_KNOTS_A_TURN):
             if self._last_s >= time_s:
                 break

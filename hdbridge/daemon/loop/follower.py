@@ -52,7 +52,7 @@ class Follower:
         self._issued = 0
         self._most = fastest_counts(config, load_loop)
 
-    # ---------------------------------------------------------------- what compensates
+    # ---------------------------------------------------------------- compensation
 
     def engage(self, on: bool) -> None:
         """Fades the correction in or out."""
@@ -63,7 +63,7 @@ class Follower:
             self.correction.disengage()
 
     def use(self, setting: CompensationSetting, *, moving: bool) -> None:
-        """Compensates by a setting from now on, with a ramp if the axis moves, else at once.
+        """Applies a compensation setting, with a ramp if the axis is enabled (``moving``), else at once.
 
         Raises InputError and changes nothing if the setting does not fit the axis.
         """
@@ -148,7 +148,7 @@ class Follower:
 
     @property
     def loop_doubt(self) -> str:
-        """Reason why the load loop does not act; empty while it may act."""
+        """Reason for which the load loop does not act; empty while it may act."""
         return self._load_loop.doubt if self._load_loop is not None else ""
 
     def _trimmed(self, load_loop: LoadLoop, target_deg: float, feedback: Feedback) -> float:

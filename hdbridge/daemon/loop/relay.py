@@ -1,4 +1,4 @@
-"""Filter for the frames relayed between the service and the bus. Pure.
+"""Filter for the frames relayed between the service and the bus, without I/O.
 
 The service may send SDO and NMT frames to the axes' nodes and nothing else: SYNC, set-points and the
 master's heartbeat come from the loop alone. While an axis may move, its nodes can be read but not written

@@ -6,7 +6,7 @@ states (`hdbridge.drive.states`); these states determine what the loop may do wi
 a row is refused and changes nothing.
 
 Only an ENABLE command leads to ENABLING, and only ENABLING leads to ENABLED. No axis is therefore enabled
-automatically, nor after a stop before its latch is released.
+automatically, or after a stop before its latch is released.
 """
 
 from enum import Enum, IntEnum
@@ -37,7 +37,7 @@ class AxisState(IntEnum):
 
 
 MAY_MOVE: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPING})
-"""States in which the drive may have power by the loop's command."""
+"""States in which the loop may have commanded power."""
 STOPPED: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
 """States of a latched stop."""
 UNKNOWN: Final = frozenset({AxisState.UNVERIFIED, AxisState.LATCHED})

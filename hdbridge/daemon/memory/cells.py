@@ -1,4 +1,4 @@
-"""Shared memory, numbers in it that one process writes and others monitor, and an axis's setting."""
+"""Shared memory region, its cells (integers that one process writes and others read), and setting slots."""
 
 import fcntl
 import mmap
@@ -15,7 +15,7 @@ _STRIDE: Final = LINE // 8
 
 
 class Region:
-    """Mapped memfd, as bytes and as cells.
+    """Mapped memfd, accessible as bytes and as int64 cells.
 
     It has no name in any file system, so no other process can open it, and it is freed with the last process
     that holds it, however that process ends. It is sealed against shrinking, so no access can fail later.
@@ -79,9 +79,9 @@ class Cell(IntEnum):
 
 
 class Cells:
-    """Integers by the members of an enumeration, each in its own cache line; access to each is atomic.
+    """Integers indexed by an enumeration, each in its own cache line; access to each is atomic.
 
-    Each has one writer, except ``STOP_ASKED``, which any process may set.
+    Each is written by one process, except that the keeper clears the cells of a process that has ended.
     """
 
     def __init__(self, region: Region, offset: int, kind: type[IntEnum]) -> None:
@@ -102,7 +102,7 @@ class Status(Cells):
 
     @property
     def loop_count(self) -> int:
-        """Number of turns of the loop, over all control processes so far."""
+        """Number of turns of the loop, summed over all control processes so far."""
         return self[Cell.LOOP_COUNT]
 
     @property
@@ -129,7 +129,7 @@ class OuterCells(Cells):
         self._buffer, self._at = region.view, place.offset + OuterCell.VIEW * LINE
 
     def show(self, view: OuterView) -> None:
-        """Writes the view of the outer master in one copy, unlike `pack_into`, which begins with zeros."""
+        """Writes the outer master's view in one copy; `pack_into` would write zeros first."""
         self._buffer[self._at : self._at + OUTER_VIEW.size] = OUTER_VIEW.pack(*view)
 
     def values(self) -> tuple[float, ...]:
@@ -142,9 +142,10 @@ class OuterCells(Cells):
 
 
 class SettingSlot:
-    """Slot of one axis with both ends. It contains the last setting sent, under its number.
+    """Slot for the compensation setting of one axis, with the sides of service and loop.
 
-    It outlives both processes: a starting service reads the setting of an earlier one.
+    It contains the last setting sent and its number. It outlives both processes, so a starting service reads
+    the setting of an earlier one.
     """
 
     def __init__(self, region: Region, place: Place) -> None:
@@ -165,7 +166,7 @@ class SettingSlot:
         return int(self._used[0])
 
     def put(self, data: bytes) -> int:
-        """Stores a setting; returns its number, which is the argument of CHANGE. InputError if too large."""
+        """Stores a setting; returns its number, the argument of CHANGE. Raises InputError if too large."""
         if len(data) > self._capacity:
             raise InputError(
                 f"the compensation takes {len(data)} bytes, the control process takes at most "
@@ -189,5 +190,5 @@ class SettingSlot:
         return data
 
     def use(self, number: int) -> None:
-        """Acknowledges, at the loop's end, that this setting is now in use."""
+        """Acknowledges, on the side of the loop, that this setting is now in use."""
         self._used[0] = number

@@ -122,7 +122,7 @@ class _Slots(Generic[T]):
 
 
 class Ring(_Slots[T]):
-    """Producer's end of a ring; `RingReader` is a consumer's end."""
+    """Producer's side of a ring; `RingReader` is a consumer's side."""
 
     def __init__(self, region: Region, place: Place, form: Format[T]) -> None:
         super().__init__(region, place, form)
@@ -203,7 +203,7 @@ class SampleReader(RingReader[Sequence[float]]):
 
 
 class Queue(_Slots[T]):
-    """Bounded queue with both ends; each process uses one end."""
+    """Bounded queue with the sides of producer and consumer; each process uses one side."""
 
     def __init__(self, region: Region, place: Place, form: Format[T]) -> None:
         super().__init__(region, place, form)
@@ -219,7 +219,7 @@ class Queue(_Slots[T]):
         return self._slots - len(self)
 
     def add(self, item: T) -> int:
-        """Adds an item, at the producer's end; returns its sequence number, or 0 if the queue is full."""
+        """Adds an item, on the producer's side; returns its sequence number, or 0 if the queue is full."""
         with self._producing:
             sequence: int = self._head[0] + 1
             if sequence - self._tail[0] > self._slots:
@@ -238,13 +238,13 @@ class Queue(_Slots[T]):
         return added
 
     def peek(self) -> T | None:
-        """Returns the next item, at the consumer's end, or None."""
+        """Returns the next item, on the consumer's side; None if there is none."""
         sequence: int = self._tail[0] + 1
         if sequence > self._head[0]:
             return None
         values = self._copy(sequence)
         if values is None:
-            # Not completely visible yet. If it stays so, it must not block the slots behind it.
+            # Not completely visible yet. If this persists, the slot must not block those behind it.
             self._misses += 1
             if self._misses >= MISSES:
                 self.drop()
@@ -268,7 +268,7 @@ class Queue(_Slots[T]):
         self._tail[0] += 1
 
     def take(self) -> T | None:
-        """Removes and returns the next item, or None."""
+        """Removes and returns the next item; None if there is none."""
         item = self.peek()
         if item is not None:
             self._misses = 0
@@ -276,7 +276,7 @@ class Queue(_Slots[T]):
         return item
 
     def clear(self) -> None:
-        """Discards waiting items, at the consumer's end, because they were meant for an earlier loop."""
+        """Discards the waiting items, on the consumer's side, because they were meant for an earlier loop."""
         self._tail[0] = self._head[0]
 
 

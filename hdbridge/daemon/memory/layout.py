@@ -28,7 +28,7 @@ MAGIC: Final = b"hdbridge"
 VERSION: Final = 5
 PAGE: Final = 4096
 LINE: Final = 64
-"""Size of a cache line; data of different writers is in different lines."""
+"""Size of a cache line, bytes; data of different writers is in different lines."""
 AXES_AT_MOST: Final = 64
 
 SAMPLES_KEPT: Final = 16_384
@@ -144,7 +144,7 @@ LEVELS: Final = {
     EventKind.DONE: logging.DEBUG,
     EventKind.MOTION_ENDED: logging.DEBUG,
 }
-"""Severity by kind of event, as of log records; all others are INFO."""
+"""Log level by kind of event; all others are INFO."""
 
 
 class Event(NamedTuple):
@@ -262,7 +262,7 @@ class Axis(NamedTuple):
     flags: int
     load_target_deg: float
     motor_target_deg: float
-    """The drive's demand, 6062h, as in a record."""
+    """The drive's position demand, 6062h, as in a record."""
     motor_position_deg: float
     load_position_deg: float
     """NaN if the axis has no encoder at its load."""

@@ -64,7 +64,10 @@ class Memory:
 
     @classmethod
     def create(cls, axes: int, period_s: float, *, checked: bool = not ORDERED) -> Self:
-        """Creates memory. ``checked`` adds checksums to the slots, for weakly ordered processors."""
+        """Creates memory. ``checked`` adds checksums to the slots, for weakly ordered processors.
+
+        Raises InputError for an invalid number of axes or period.
+        """
         period_ns = round(1e9 * period_s)
         if not 1 <= axes <= AXES_AT_MOST or period_ns < 1:
             raise InputError(
@@ -112,7 +115,7 @@ class Memory:
         return cls(Region(fd, size, checked=bool(checked)), layout, period_ns)
 
     def forget_gateway(self) -> None:
-        """Marks all axes as not shown to another master."""
+        """Clears the outer master's view of all axes, because no gateway process runs."""
         for cells in self.outer:
             cells.show(NO_OUTER)
 

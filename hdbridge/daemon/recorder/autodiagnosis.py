@@ -5,7 +5,8 @@ results are stored next to the recordings:
 
     FOLDER/diagnoses/DATE-AXIS/record/          the record (hdbridge record export)
     FOLDER/diagnoses/DATE-AXIS/model.yaml       the model that was in use
-    FOLDER/diagnoses/DATE-AXIS/diagnosis.json   result of hdbridge diagnose, with a page to read
+    FOLDER/diagnoses/DATE-AXIS/diagnosis.json   result of hdbridge diagnose; diagnosis.html shows it
+    FOLDER/diagnoses/DATE-AXIS/why.txt          reason for the diagnosis
     FOLDER/diagnoses/DATE-AXIS/log.txt          output of the commands
 """
 
@@ -52,7 +53,7 @@ class AutoDiagnosis:
     ) -> Future[None] | None:
         """Diagnoses the last minutes, and calls ``report`` with the result in another thread.
 
-        Returns None if this axis was diagnosed within `INTERVAL_S`.
+        Returns None if this axis was diagnosed within `INTERVAL_S`, or after `close`.
         """
         now_ns, last_ns = self._wall_ns(), self._last_ns.get(axis)
         if self._ended.is_set() or (last_ns is not None and now_ns - last_ns < INTERVAL_S * _NS):

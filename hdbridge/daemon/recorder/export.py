@@ -37,7 +37,7 @@ _NS: Final = 1e9
 
 
 def axis_of(about: About, name: str | None, where: Path) -> tuple[int, AxisAbout]:
-    """Returns index and description of the named or only axis; else InputError lists the names."""
+    """Returns index and description of the named or only axis; else raises InputError with the names."""
     names = [each.name for each in about.axes]
     if name is None and len(names) == 1:
         return 0, about.axes[0]

@@ -42,7 +42,7 @@ _NUMBER: Final = {"type": "integer"}
 _EVENT_SCHEMA: Final = {
     "type": "object",
     "properties": {
-        # Those of Foxglove's own log messages, so that its log panel shows them.
+        # The fields of Foxglove's log messages, so that its log panel shows the events.
         "timestamp": {"type": "object", "properties": {"sec": _NUMBER, "nsec": _NUMBER}},
         "level": _NUMBER,
         "message": _TEXT,

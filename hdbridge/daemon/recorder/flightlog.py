@@ -8,8 +8,8 @@ Names begin with the date in UTC, so they sort by time.
 
 Once a second, new data is written as one chunk and synced, so a kill loses at most the last second. Free
 space is checked first. While the disk is full, data is dropped and counted, and the beginning and end of this
-condition are reported. A fault or a client's mark moves the files around its time to a place from which the
-ring does not remove them.
+condition are reported. A fault or a client's mark moves the files around its time to ``kept``, which has its
+own size limit.
 """
 
 import logging

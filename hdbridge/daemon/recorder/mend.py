@@ -81,7 +81,7 @@ def mend(path: Path) -> Path | None:
 
 
 def _copied(path: Path, file: BinaryIO, out: BinaryIO) -> tuple[int, bool]:
-    """Copies every complete record; returns the number of messages, and whether the file was finished."""
+    """Copies every complete record; returns the number of messages, and True if the file was finished."""
     writer = Writer(out, chunk_size=CHUNK_BYTES)
     schemas: dict[int, int] = {0: 0}
     channels: dict[int, int] = {}

@@ -32,7 +32,7 @@ TORN: Final = (McapError, ZstdError, struct.error, ValueError, MemoryError)
 
 
 class GoneError(InputError):
-    """The recording no longer exists: the recorder or a user removed it."""
+    """The recording no longer exists, because the recorder or a user has removed it."""
 
 
 class LoggedEvent(NamedTuple):
@@ -145,7 +145,10 @@ def records_of(file: BinaryIO, where: Path) -> Iterator[McapRecord]:
 
 
 def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
-    """Reads a file; ``axes`` selects the axes with samples (None for all). InputError names the file."""
+    """Reads a file; ``axes`` selects the axes whose samples are read (None for all).
+
+    Raises InputError, which names the file.
+    """
     topics: dict[int, str] = {}
     messages: dict[str, list[bytes]] = defaultdict(list)
     metadata: dict[str, Mapping[str, str]] = {}

@@ -42,7 +42,7 @@ class FlightRecorder:
         in_use: Callable[[], Mapping[str, CompensationSetting]] = dict,
         free: Callable[[Path], int] = free_bytes,
     ) -> None:
-        """``in_use`` returns the setting that compensates each axis. Its threads call ``notify``."""
+        """``in_use`` returns the setting that compensates each axis. The threads here call ``notify``."""
         self.folder = folder
         self.flight: FlightLog | None = None
         """None if the folder could not be created."""
@@ -57,7 +57,7 @@ class FlightRecorder:
             self._notify(f"{folder}: cannot create this folder: {problem.strerror}; nothing is recorded")
             return
         self.flight = flight
-        # The duration of the mending does not matter: each file is mended completely or not at all.
+        # Mending may take long or be killed, because each file is mended completely or not at all.
         for name, run in (("recorder", self._run), ("recorder-mend", self._mend)):
             thread = threading.Thread(target=run, args=(flight,), name=name, daemon=True)
             thread.start()

@@ -1,4 +1,4 @@
-"""One axis, for clients: power, motion, compensation and objects of the drive.
+"""One axis as seen by clients: power, motion, compensation and objects of the drive.
 
 The drive is booted and verified by SDO before the control process sends it anything. It is prepared by SDO
 each time before power is switched on, and verified again after a restart or a bus failure. An axis is never
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from hdbridge.daemon.setting import CompensationSetting
 
 CHANGE_S: Final = 120.0
-"""Time-out for fading in another compensation, however slow its ramp."""
+"""Time-out for fading in another compensation, long enough for a slow ramp."""
 POWER_S: Final = 20.0
 """Time-out for ENABLE and DISABLE, including braking."""
 FAULT_RESET_S: Final = 2.0
@@ -56,10 +56,10 @@ class ServiceAxis:
         self.commissioning = Commissioning(axis.config, core)
         self.models = AxisModels(axis, core.memory.settings[index])
         self.is_prepared = False
-        """True if all SDO work before power is done, and no SDO transfer has followed."""
+        """True if `prepare` has done the SDO transfers before power-on, and nothing has invalidated them."""
         self.motion = AxisMotion(self.link, self.check_may)
         self.stopped: Entry | None = None
-        """Last stop, once the axis stands; None before."""
+        """Last stop, once the axis is at rest; None before."""
         self.loop_doubt = "the reason is in the log of an earlier service"
         """Text of the last event of the load loop."""
         self.following: Following | None = None
@@ -83,7 +83,7 @@ class ServiceAxis:
         if event.kind is EventKind.STOPPED:
             self.stopped = entry
         elif event.kind is EventKind.STATE and event.code in STOPPED:
-            self.stopped = None  # the reason is reported once it stands
+            self.stopped = None  # the reason is reported once the axis is at rest
         elif event.kind is EventKind.LOAD_LOOP:
             self.loop_doubt = event.text
 
@@ -127,7 +127,7 @@ class ServiceAxis:
                 await self._verify()
             self.models.check_drive(self.commissioning.identity)
             if link.state is not AxisState.DISABLED:
-                await link.do(CommandKind.ENABLE)  # refused, with the reason
+                await link.do(CommandKind.ENABLE)  # raises RefusedError with the reason
             if self.is_prepared:
                 self.is_prepared = False
                 seeds = link.seeds()
@@ -140,7 +140,7 @@ class ServiceAxis:
                 raise
 
     async def prepare(self) -> None:
-        """Prepares the drive by SDO, so that the next `enable` requires none. Raises like `enable`."""
+        """Prepares the drive, so that the next `enable` needs no SDO transfers. Raises like `enable`."""
         self.check_free()
         async with self._drive:
             if self.link.state is AxisState.DISABLED:
@@ -172,7 +172,10 @@ class ServiceAxis:
         await self.link.do(CommandKind.STOP)
 
     async def reset(self, holder: str) -> None:
-        """Releases a latched stop: resets the drive's fault, verifies the drive if needed; disabled."""
+        """Releases a latched stop, resets the drive's fault and verifies the drive if necessary.
+
+        The axis is disabled afterwards.
+        """
         self.check_may(holder)
         async with self._alone("the axis is being reset"):
             self.motion.replace(None, "the axis was reset")
@@ -212,7 +215,7 @@ class ServiceAxis:
         self.core.log.note("the drive was verified; the axis is disabled", self.link.index)
 
     async def home(self, holder: str, run: messages.Home) -> float:
-        """Homes by a method of 6098h, disabled before and after; returns the load angle afterwards."""
+        """Homes by a method of 6098h; returns the load angle afterwards. Disabled before and after."""
         self.check_may(holder)
         async with self._alone("the axis is being homed"):
             self.is_prepared = False
@@ -272,7 +275,7 @@ class ServiceAxis:
         return not self.models.settled
 
     async def settle(self) -> None:
-        """Makes the control process compensate by the chosen setting if it does not."""
+        """Sends the chosen setting to the control process unless that uses it already."""
         async with self._changing:
             if not self.models.settled:
                 await self._use(self.models.chosen)
@@ -283,7 +286,7 @@ class ServiceAxis:
             await self._use(await self._work(self.models.moved, model))
 
     def followed(self, holder: str) -> Following:
-        """Returns the adaptation, to change it; InputError for an axis without adaptation."""
+        """Returns the adaptation, for a change by ``holder``; raises InputError for an axis without one."""
         self.core.lease.check(holder)
         if self.following is None:
             raise InputError(

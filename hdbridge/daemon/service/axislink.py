@@ -80,7 +80,7 @@ class AxisLink:
         return _POWER[int(self.value("power"))] if newest is not None else State.UNKNOWN
 
     def seeds(self) -> Arguments:
-        """Counts of both encoders and statusword, as arguments of ENABLE."""
+        """Returns the counts of both encoders and the statusword, as arguments of ENABLE."""
         encoder = self.config.load_encoder
         motor = round(self.value("motor_position_deg") / self.config.motor_encoder.degrees(1))
         load = (
@@ -142,7 +142,7 @@ class AxisLink:
             await self.core.timing.sleep(POLL_S)
 
     def look(self, activity: Activity) -> None:
-        """Checks a motion without waiting; raises like `arrival`."""
+        """Checks a motion without waiting. Raises like `arrival`, and RefusedError if it has ended."""
         done, _ = self._look(activity, stopping=False)
         if done or activity.over:
             raise RefusedError(f"{self.name}: {activity.over}")

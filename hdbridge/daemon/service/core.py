@@ -40,7 +40,7 @@ class Core:
         self.lease = Lease(lease_s, timing.clock.now)
         self.refuse: Callable[[CommandKind | None], None] = lambda _: None
         """Raises RefusedError if the bus is lent and no command (None: no frame) can be sent."""
-        # From the present time on, so that the streams of an earlier service have other numbers.
+        # Start from the present time, so that the numbers differ from those of an earlier service.
         self._streams = count(int(1000.0 * timing.clock.now()) + 1)
 
     def next_stream(self) -> int:
@@ -50,7 +50,7 @@ class Core:
     async def do(
         self, kind: CommandKind, axis: int = -1, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
     ) -> Event:
-        """Posts a command and returns the event that reports its completion or beginning.
+        """Posts a command and returns the event that reports its completion or start.
 
         Raises RefusedError with the control process's reason if nothing was done, and DaemonError if it
         does not answer within ``within_s``.

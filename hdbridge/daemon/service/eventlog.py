@@ -1,8 +1,8 @@
 """Event log: the control process's events and the service's notes, in two bounded lists. Thread-safe.
 
 One list has every entry, for the service itself. Clients see the other list, which omits routine entries
-(`_routine`), because a calibration ends thousands of legs, which must not displace yesterday's stop. Each
-list has its own numbering. `Journal` writes the log lines of the control process, which itself writes none.
+(`_routine`), because the thousands of motions of a calibration must not displace yesterday's stop. Each list
+has its own numbering. `Journal` writes the log lines of the control process, which itself writes none.
 """
 
 import logging

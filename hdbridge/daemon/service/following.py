@@ -1,4 +1,4 @@
-"""Following in the service: passes each axis's samples to its own thread, and uses its verdicts and models.
+"""Following in the service: passes samples to a thread per axis, and uses the verdicts and adapted models.
 
 The committed model and its version stay in use. The control process compensates with the adapted parameters,
 whatever the scheme. Watch and adaptation restart when another model is committed.
@@ -47,15 +47,15 @@ class Following:
         recorder: FlightRecorder | None = None,
         diagnosis: AutoDiagnosis | None = None,
     ) -> None:
-        """``index`` is that of the axis in a sample, ``folder`` contains state and history of its
-        adaptation.
+        """``index`` is the place of the axis in a sample; ``folder`` contains the files of its adaptation.
 
-        ``worker`` has one thread. Verdicts are noted in ``recorder``; bad verdicts start ``diagnosis``.
+        ``worker`` has one thread. Verdicts are noted in ``recorder``; those in `DIAGNOSED` start
+        ``diagnosis``.
         """
         self.state = messages.AdaptationState(mode=messages.AdaptationMode(settings.mode))
         """State of the adaptation."""
         self.advice: list[str] = []
-        """Present verdict of the watch unless the model is valid, and what is not watched."""
+        """Present verdict of the watch unless the model is valid; the reason if the axis is not watched."""
         self._index, self._axis = index, axis
         self._settings, self._folder = settings, folder
         self._worker, self._recorder, self._diagnosis = worker, recorder, diagnosis
@@ -98,7 +98,7 @@ class Following:
             return
         try:
             await self._axis.follow(model)
-        except HdbridgeError as problem:  # refused in this state; tried again later
+        except HdbridgeError as problem:  # refused in this state; retried later
             if str(problem) != self._not_applied:
                 _log.warning("adaptation not applied", {"axis": self._axis.name, "why": str(problem)})
             self._not_applied = str(problem)
@@ -121,14 +121,14 @@ class Following:
     # ------------------------------------------------------------------ in the worker's thread
 
     def _begin(self, model: TransmissionModel) -> None:
-        """Follows another committed model."""
+        """Starts to follow another committed model."""
         self._save()
         self._follower = Follower(self._axis.axis.config, model, self._index, self._settings)
         self.advice = self._unwatched()
         self._adapt()
 
     def _adapt(self) -> None:
-        """Adapts in the mode of the settings."""
+        """Starts the adaptation, or changes its mode, according to the settings."""
         follower, settings = self._follower, self._settings
         self._problem = ""
         if follower is None or (follower.adaptation is None and settings.mode == "off"):

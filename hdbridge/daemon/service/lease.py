@@ -1,4 +1,4 @@
-"""Lease: only one client at a time may move axes. Pure: the clock is passed in.
+"""Lease: only one client at a time may move axes. There is no I/O; the clock is passed in.
 
 A client takes the lease and receives a token, which is required in every request that moves an axis. The
 lease expires when its holder has made no request during the time-out, so that a dead client does not block
@@ -41,7 +41,7 @@ class Lease:
         self._taken_s = self._heard_s = 0.0
         self._lasts = False
         self.doing: Callable[[], str] = lambda: ""
-        """Returns the present activity of the machine and how to end it, in words, for refusals."""
+        """Returns a description of the present motions, for refusals; empty at rest."""
 
     @property
     def holder(self) -> Holder | None:
@@ -55,11 +55,12 @@ class Lease:
         )
 
     def take(self, client: str, *, force: bool = False, lasts: bool = False) -> str:
-        """Takes the lease and returns its token. ``force`` takes it from another holder; one that ``lasts``
-        does not expire.
+        """Takes the lease and returns its token.
 
-        Raises LeaseError if another client holds the lease, InputError if the client's name is empty or too
-        long.
+        With ``force``, it is taken even from another holder. With ``lasts``, it does not expire.
+
+        Raises LeaseError if the lease is held and ``force`` is False, and InputError if the client's name is
+        empty or too long.
         """
         if not client.strip() or len(client) > LONGEST_NAME:
             raise InputError(

@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 LEND_S: Final = 40.0
 """Maximum time until the axes are at rest without power and the control process has ended."""
 SIGNAL_AGAIN_S: Final = 1.0
-"""Interval between stop signals to the borrower, whose third signal would end it at once."""
+"""Minimum interval between stop signals to the borrower, which ends at once on the third."""
 _STOPS: Final = frozenset({CommandKind.STOP, CommandKind.QUICK_STOP})
 
 
 class Lending:
-    """Bus of a machine, as an object to lend."""
+    """Lends the bus of a machine, and refuses commands to the axes meanwhile."""
 
     def __init__(self, core: Core, bus: BusConfig, reason_against: str) -> None:
         """``reason_against`` explains why the bus cannot be lent; empty if it can."""

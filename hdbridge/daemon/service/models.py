@@ -68,7 +68,7 @@ class AxisModels:
         return self._checked(replace(self.chosen, scheme=scheme))
 
     def with_load_loop(self, on: bool) -> CompensationSetting:
-        """Returns the chosen setting with the load loop on or off; InputError if the axis lacks one."""
+        """Returns the chosen setting with the load loop on or off; raises InputError if there is none."""
         if self._axis.load_loop is None:
             raise InputError(f"{self._axis.name}: has no load loop; give the axis one in the machine file")
         return replace(self.chosen, load_loop=on)
@@ -104,7 +104,7 @@ class AxisModels:
         return setting
 
     def _active(self) -> CompensationSetting:
-        """Returns the setting of the active model, with its version, by the machine file's scheme."""
+        """Returns the setting with the active model, its version and the machine file's scheme."""
         axis = self._axis
         number = None
         if axis.profile.model.exists():

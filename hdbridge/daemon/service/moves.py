@@ -100,13 +100,13 @@ class AxisMotion:
         async with self.commanding:
             link = self._link
             if link.state is not AxisState.ENABLED:
-                await link.do(CommandKind.STREAM_BEGIN, a=timeout_s)  # refused, with the reason
+                await link.do(CommandKind.STREAM_BEGIN, a=timeout_s)  # raises RefusedError with the reason
             stream = ServiceStream(link, activity, timeout_s)
             self.replace(activity, "a stream took its place")
         return stream
 
     async def queue(self, holder: str, points: Sequence[QueueItem]) -> int:
-        """Appends all or none of these moves, each begun at the end of the one before.
+        """Appends all or none of these moves, each of which begins at the end of the one before.
 
         Returns the number of waiting moves. Raises InputError for an invalid point, RefusedError if another
         motion is in progress or the queue is full.
@@ -120,7 +120,7 @@ class AxisMotion:
         if self.queued + len(points) > QUEUE_MOST:
             raise RefusedError(f"{name}: {self.queued} way points wait; more than {QUEUE_MOST} are not taken")
         if points and self._link.state is not AxisState.ENABLED:
-            await self.move(holder, points[0].target_deg)  # refused, with the reason
+            await self.move(holder, points[0].target_deg)  # raises RefusedError with the reason
         self._points.extend(points)
         if (present := self.under_way(Kind.QUEUE)) is not None:
             present.holder = holder
@@ -191,7 +191,7 @@ class AxisMotion:
                     # The queue may have been cleared while this move was being sent.
                     if not activity.over and self._points and self._points[0] is point:
                         self._points.popleft()
-                # Waits for this move, whose end is not that of the queue.
+                # Waits for this move only; the activity of the queue continues.
                 move = Activity(Kind.MOVE, activity.holder, activity.command_id, activity.since)
                 await link.arrival(move, activity)
                 await link.until(lambda: bool(activity.over), point.dwell_s)

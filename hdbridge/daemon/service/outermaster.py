@@ -59,7 +59,7 @@ class Latency:
                 found.clear()  # the axis no longer follows
 
     def of(self, place: int) -> tuple[float, float] | None:
-        """Returns an axis's median and 99th percentile, s; None while it follows no outer master."""
+        """Returns the median and 99th percentile of an axis's latency, s; None without an outer master."""
         found = self._found[place]
         if not found:
             return None
@@ -100,7 +100,7 @@ class OuterMaster:
                 _log.error("gateway fault", {"axis": axis.name, "error": fault})
                 self._mark(f"gateway fault {fault}", axis.link.index)
             if not self._core.memory.status.loop_pid:
-                continue  # each of these requests needs the control process, and waits for it
+                continue  # the requests below wait for the control process
             holds = self._core.lease.holds(self._token)
             granted_by = granted_by or self._token  # an earlier service may have granted it
             cells[OuterCell.HELD] = int(holds)
@@ -140,7 +140,7 @@ class OuterMaster:
         link, token = axis.link, self._token
 
         def is_withdrawn() -> bool:
-            """Returns True if the lease may have been taken meanwhile, even if it is free again."""
+            """Returns True if the request is withdrawn, or the lease was taken even if it is free again."""
             return not self._core.lease.holds(token) or cells[OuterCell.WANTED] != series
 
         try:

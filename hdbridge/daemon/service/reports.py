@@ -35,13 +35,13 @@ _NUMBERS: Final = (
     "velocity_deg_s", "motor_target_deg", "motor_position_deg", "motor_torque_nm", "correction_arcsec",
     "predicted_arcsec", "weight",
 )  # fmt: skip
-"""Numbers of a sample that a state has under the same name."""
+"""Numbers of a sample that `messages.AxisState` has under the same name."""
 _FLAGS: Final = {
     str(each.name).lower(): each
     for each in SampleFlag
     if each.name in {"AT_REST", "COMPENSATING", "LIMITED", "MEMORY_KNOWN", "CHANGING", "UNDERRUN"}
 }
-"""Flags of a sample that a state has under the same name."""
+"""Flags of a sample that `messages.AxisState` has under the same name, in lower case."""
 _KINDS: Final = {kind: messages.EventKind[kind.name] for kind in EventKind}
 
 
@@ -120,10 +120,10 @@ def model_in_use(in_use: CompensationSetting) -> messages.ModelInUse | None:
 def outer_state(
     cells: OuterCells, node_id: int, alive_ns: int, latency_s: tuple[float, float] | None
 ) -> messages.OuterState:
-    """Returns an axis as seen by the other master; ``alive_ns`` is the last sign of life of the gateway
-    process.
+    """Returns the state of an axis as seen by the outer master.
 
-    ``latency_s`` holds median and 99th percentile of the time from a set-point to the frame that contains it.
+    ``alive_ns`` is the time of the gateway process's last sign of life. ``latency_s`` holds median and 99th
+    percentile of the time from an outer SYNC to the drive's first frame with its target.
     """
     view, (median_s, most_s) = cells.view, latency_s or (None, None)
     period_s = 1e-9 * cells[OuterCell.PERIOD_NS]

@@ -1,8 +1,8 @@
 """Streams: set-points of a client, sent to the control process as knots with velocities.
 
 A point without a velocity takes the slope between its neighbours, so it waits for the next point; the last
-point of a stream is at rest. The stream begins once it has `LEAD_S` of path or its end, so the client may lag
-by that time.
+point of a stream is at rest. The stream begins once `LEAD_S` of path or its end has been received, so the
+client may lag by that time.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ BEGIN_DEG: Final = 1e-6
 
 
 class Knots:
-    """Converts the points of a stream to knots. Pure.
+    """Converts the points of a stream to knots, without I/O.
 
     ``begin_deg`` is the position of the axis, at rest at time 0.
     """
@@ -35,7 +35,10 @@ class Knots:
         """Last point with a knot, and the newest point while its velocity is unknown."""
 
     def add(self, points: Sequence[StreamPoint]) -> list[Knot]:
-        """Returns the knots that these points complete. InputError if any is invalid; none is then used."""
+        """Returns the knots that these points complete.
+
+        Raises InputError if a point is invalid; none of the points is used then.
+        """
         if not points:
             return []
         knots: list[Knot] = []

@@ -17,11 +17,12 @@ POLL_S = 0.005
 
 
 CREDIT_S: Final = 0.25
-"""Maximum simulated time that can accumulate, because the clock is read between turns of the loop."""
+"""Maximum simulated time of completed turns that has not yet passed on the clock; the rest is forfeited."""
 STEP_S: Final = 0.1
-"""Maximum interval between two readings that counts; after a longer one, the service itself was suspended."""
+"""Maximum time by which one reading advances the clock. A longer interval between two readings means that the
+service itself was suspended."""
 HANG_S: Final = 5.0
-"""Time without a turn after which the loop counts as hung or dead, and real time passes."""
+"""Time without a turn after which the loop counts as hung or dead, and the clock follows real time."""
 SHORTEST_WAIT_S: Final = 0.001
 
 
@@ -69,7 +70,7 @@ class SimulatedClock:
 
 
 class Timing:
-    """Clock that runs in real time, and a pool of threads. To be closed when the service ends."""
+    """Clock and thread pool of the service; must be closed when the service ends."""
 
     def __init__(self, threads: int, clock: Clock | None = None) -> None:
         """Up to ``threads`` blocking calls run at the same time; others wait.

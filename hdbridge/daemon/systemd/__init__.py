@@ -1,4 +1,4 @@
-"""systemd files that run a machine's daemon and configure its CAN interface. Writes nothing."""
+"""Texts of the systemd files that run a machine's daemon and configure its CAN interface. Writes nothing."""
 
 import os
 import pwd
@@ -88,13 +88,13 @@ def _render(template: str, about: dict[str, object]) -> str:
 
 
 def _quoted(word: Path | str) -> str:
-    """Quotes a word for systemd, with literal specifiers and variables."""
+    """Quotes a word for systemd, and escapes specifiers and variables."""
     text = str(word).replace("\\", "\\\\").replace("%", "%%").replace("$", "$$").replace('"', '\\"')
     return f'"{text}"' if any(each.isspace() or each in "\"';\\" for each in text) else text
 
 
 def _folders(machine: Machine) -> list[Path]:
-    """Returns the folders that must be writable: of models, recordings, adaptation and the socket."""
+    """Returns the folders that must be writable: those of models, recordings, adaptation and the socket."""
     folders = {machine.folder, *(axis.profile.folder for axis in machine.axes)}
     if machine.api.socket is not None:
         folders.add(machine.beside(machine.api.socket).parent)
@@ -102,7 +102,7 @@ def _folders(machine: Machine) -> list[Path]:
 
 
 def _home(machine: Machine) -> str:
-    """Returns the value of ProtectHome, because files and interpreter may be in home folders."""
+    """Returns the value of ProtectHome: ``read-only`` if files or interpreter are in home folders."""
     needed = [*_folders(machine), Path(sys.executable), Path(sys.prefix), Path(__file__)]
     inside = any(home in each.parents for each in needed for home in _HOMES)
     return "read-only" if inside else "yes"

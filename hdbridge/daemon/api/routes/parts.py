@@ -85,7 +85,7 @@ FoundAxis = Annotated[ServiceAxis, Depends(_found)]
 
 
 async def _kept(bridge: Bridge, request: Request, holder: Holder = "") -> AsyncIterator[str]:
-    """Renews the lease while the request is in progress, unless the client disconnects."""
+    """Renews the lease while the request is in progress, until the client disconnects."""
 
     async def renew() -> None:
         with suppress(LeaseError):

@@ -1,7 +1,7 @@
 """WebSockets for live samples and for streamed set-points.
 
-A slow client does not slow down the daemon. It receives the newest samples and the number lost, and its
-set-points are accepted only as the buffer empties.
+A slow client does not slow down the daemon. It receives the newest samples and the number of lost ones. Its
+set-points are accepted only as fast as the buffer empties.
 """
 
 import asyncio
