@@ -323,6 +323,7 @@ class ServiceAxis:
             raise RefusedError(
                 f"{self.name}: no object is written while the axis is enabled; disable it first"
             )
+        self.is_prepared = False
         return await self._work(self.commissioning.write, object_, value)
 
     async def close(self) -> None:

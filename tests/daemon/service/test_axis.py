@@ -45,3 +45,15 @@ async def test_impossible_requests_are_refused_with_the_loops_text(service: Serv
         assert isinstance(value, int)
         with pytest.raises(InputError):
             await axis.sdo_read("no such object")
+
+
+async def test_a_prepared_drive_is_prepared_again_after_a_write(service: Service) -> None:
+    async with service.ready() as bridge:
+        axis = bridge.axes["axis1"]
+        token = bridge.lease.take("test")
+        await axis.prepare()
+        _, cyclic = await axis.sdo_read("6060h")
+        await axis.sdo_write(token, "6060h", "1")
+        await axis.enable(token)
+        _, mode = await axis.sdo_read("6060h")
+        assert mode == cyclic
