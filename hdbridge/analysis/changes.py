@@ -186,7 +186,7 @@ def _orders(
     if not changed:
         return None
     all_of_it = now.fitted(now.coefficients() - given.coefficients())
-    seen = 0.5 * float(np.ptp(estimator.does(all_of_it, fitted.hypothesis.start)))
+    seen = 0.5 * float(np.ptp(estimator.contribution(all_of_it, fitted.hypothesis.start)))
     was, is_now = (together(each) for each in zip(*changed, strict=True))
     difference = is_now.fitted(is_now.coefficients() - was.coefficients())
     causes = causes_of(was, is_now)
@@ -214,7 +214,7 @@ def _freed(
     peak = 0.5 * float(np.ptp(change))
     if peak < estimator.floor_arcsec:
         return None
-    aliases = tuple(search.instead_of_change(fitted, place, given))
+    aliases = tuple(search.alternatives_to_change(fitted, place, given))
     return _Change(
         precise.hypothesis.effects[place],
         peak,

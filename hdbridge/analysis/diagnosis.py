@@ -40,7 +40,15 @@ from hdbridge.analysis.search import (
     waves_alike,
     with_measured,
 )
-from hdbridge.analysis.swing import Base, Swing, between_samples, seen_swing, settled, without
+from hdbridge.analysis.swing import (
+    Base,
+    Swing,
+    between_samples,
+    noise_bounded,
+    settled,
+    visible_swing,
+    without,
+)
 from hdbridge.analysis.unexplained import (
     Rest,
     is_unexplained,
@@ -63,6 +71,8 @@ UNCALIBRATED = (
     "too high"
 )
 LOSES = "it does not predict what is left out"
+UNDETERMINED = "the record does not determine its size"
+UNWRITTEN = "it cannot be written into the model"
 FIT_FIRST = "none yet: fit a model first (hdbridge fit), then diagnose with it"
 
 
@@ -103,14 +113,14 @@ def diagnose(
     progress("searching for causes")
     base = Base.of(data, model.effects)
     between = between_samples(base, scales)
-    swing = seen_swing(base, between, scales)
+    swing = visible_swing(base, between, scales)
     search, found = _searched(data, model, scales, between, swing)
     if swing is None or not between.names:  # a larger cause may mask them
         # Inertial wind-up is the slow part of both, so it is excluded from the base.
         others = [each for each in found.hypothesis.effects if each.channels != {Channel.ACCELERATION}]
         base, before = Base.of(data, others), (between.names, swing)
         between = between if between.names else between_samples(base, scales)
-        swing = swing or seen_swing(base, between, scales)
+        swing = swing or visible_swing(base, between, scales)
         if (between.names, swing) != before:
             search, found = _searched(data, model, scales, between, swing)
     progress("judging what was found")
@@ -130,6 +140,9 @@ def _searched(
         search = _search(data, model, scales, between)
         calm = settled(search.estimator, search.begun(), model.effects, swing)
         search = _search(calm, model, scales, between)
+    if (quieter := noise_bounded(search.estimator, search.begun())) is not search.estimator.data:
+        soft = swing is not None and swing.soft
+        search = _search(quieter, model, scales, between.without(lambda _: soft))
     estimator = search.estimator
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)
@@ -194,18 +207,17 @@ class _Judge:
         while True:
             judged = self._likely_only(fitted)
             findings = self._with_unexplained(judged.findings, judged.left)
-            fitted, findings, extended = self._written(judged.fitted, findings)
-            lost = [each for each in findings if each.gain and not (each.within or each.gain.predicts)]
+            fitted, findings, extended, lost = self._written(judged.fitted, findings)
             if not lost:
                 break
-            self.considered.extend(f"{each.cause}: {LOSES}" for each in lost)
-            fitted = self._without(judged.whole, lost)
+            self.considered.extend(f"{each.cause}: {why}" for each, why in lost)
+            fitted = self._without(judged.whole, [each for each, _ in lost])
         known = {each.cause for each in findings} | {each.split(":")[0] for each in self.considered}
         refused = self.search.reported_refusals(judged.fitted)
         self.considered.extend(each for each in refused if each.split(":")[0] not in known)
         refitted = estimator.fit(Hypothesis(given, judged.fitted.hypothesis.start))
-        before, _ = estimator.left_by(given)
-        after, start = estimator.left_by(extended.effects)
+        before, _ = estimator.residual_of(given)
+        after, start = estimator.residual_of(extended.effects)
         measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
         cleared = copy(estimator)  # the record without the errors found in it
         cleared.observed = estimator.observed - before + after
@@ -243,33 +255,37 @@ class _Judge:
 
     def _written(
         self, fitted: Fitted, findings: list[Finding]
-    ) -> tuple[Fitted, list[Finding], TransmissionModel]:
-        """Returns the fit of the extended model, the findings that the model contains, and the model.
+    ) -> tuple[Fitted, list[Finding], TransmissionModel, list[tuple[Finding, str]]]:
+        """Returns the fit of the extended model, its findings, the model, and causes to exclude from it.
 
-        A finding is dropped if its parameters are out of bounds, if the compensation could not invert the
-        model with it, or if the record does not determine it. The given effects remain unchanged if the
-        refitted ones do not predict held-out data.
+        A cause is excluded, with the reason, if its parameters are out of bounds, if the compensation could
+        not invert the model with it, if the record does not determine it, or if it does not predict held-out
+        data. The given effects remain unchanged if the refitted ones do not predict held-out data.
         """
         estimator, given = self.estimator, self.model.effects
-        while True:
-            as_reported = as_named(estimator, fitted, given, {each.cause for each in findings})
-            alone = {each.cause for each in findings if each.left_alone}
-            spread = covariance(estimator, as_reported)
-            as_reported = as_reported.having(supported(estimator, as_reported, given, alone))
-            named = {each.cause for each in findings if not each.within}
-            sound = as_reported.hypothesis.effects
-            chosen = [place for place in range(len(given), len(sound)) if sound[place].name in named]
-            (gain,) = of_written(estimator, as_reported, given, [chosen], [*range(len(given)), *chosen])
-            if gain and not gain.predicts:
-                as_reported = as_reported.having((*given, *sound[len(given) :]))
-            reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
-            extended = extended_model(self.model, as_reported, chosen, spread, reason, len(given))
-            written = [new for new in extended.effects if new not in given]
-            missing = [each for each in findings if not (each.left_alone or _is_in(each, written))]
-            if not missing:
-                return as_reported, self._with_gains(as_reported, findings, chosen), extended
-            self.considered.extend(f"{each.cause}: it cannot be written into the model" for each in missing)
-            findings = [each for each in findings if each not in missing]
+        as_reported = as_named(estimator, fitted, given, {each.cause for each in findings})
+        alone = {each.cause for each in findings if each.left_alone}
+        spread = covariance(estimator, as_reported)
+        as_reported = as_reported.having(supported(estimator, as_reported, given, alone))
+        named = {each.cause for each in findings if not each.within}
+        sound = as_reported.hypothesis.effects
+        chosen = [place for place in range(len(given), len(sound)) if sound[place].name in named]
+        (gain,) = of_written(estimator, as_reported, given, [chosen], [*range(len(given)), *chosen])
+        if gain and not gain.predicts:
+            as_reported = as_reported.having((*given, *sound[len(given) :]))
+        reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
+        extended = extended_model(self.model, as_reported, chosen, spread, reason, len(given))
+        written = [new for new in extended.effects if new not in given]
+        missing = [each for each in findings if not (each.left_alone or _is_in(each, written))]
+        lost = [(each, UNWRITTEN) for each in missing if not each.within]
+        if lost:
+            return as_reported, findings, extended, lost
+        # The model's own part stays as it was given.
+        self.considered.extend(f"{each.cause}: {UNWRITTEN}" for each in missing)
+        findings = [each for each in findings if each not in missing]
+        findings = self._with_gains(as_reported, findings, chosen)
+        lost = [(each, LOSES) for each in findings if each.refuted]
+        return as_reported, findings, extended, lost
 
     def _with_gains(self, fitted: Fitted, findings: list[Finding], added: list[int]) -> list[Finding]:
         """Returns the findings with the gain of the written model, which has new effects at ``added``."""
@@ -323,13 +339,15 @@ class _Judge:
         """
         while True:
             judged = self._judged(fitted)
+            least = self.estimator.scales.named_from
             likely = [
-                each for each in judged.findings if each.probability >= self.estimator.scales.named_from
+                each
+                for each in judged.findings
+                if each.probability >= least and (each.within or not each.undetermined)
             ]
             doubted = [each for each in judged.findings if each not in likely]
             self.considered.extend(
-                f"{each.cause}: {'more likely something else' if each.probability else LOSES}"
-                + f" (prior: {each.prior})" * bool(each.prior)
+                f"{each.cause}: {self._doubt(each)}" + f" (prior: {each.prior})" * bool(each.prior)
                 for each in doubted
             )
             left = self._without(fitted, doubted)
@@ -339,6 +357,11 @@ class _Judge:
         usual = {each.cause for each in likely if _ordinary(each)}
         self.considered.extend(f"{cause}: no more than usual" for cause in sorted(usual))
         return replace(judged, findings=[each for each in likely if each.cause not in usual])
+
+    def _doubt(self, finding: Finding) -> str:
+        if finding.probability >= self.estimator.scales.named_from:
+            return UNDETERMINED
+        return "more likely something else" if finding.probability else LOSES
 
     def _without(self, fitted: Fitted, findings: Sequence[Finding]) -> Fitted:
         """Refits without the effects of ``findings``; changes of the baseline stay in the fit."""
@@ -400,7 +423,7 @@ class _Judge:
         effect, available = fitted.hypothesis.effects[place], self.estimator.motion.available()
         alike = lookalikes(effect, self.estimator.data.ratio)
         names = [
-            *self.search.as_well(fitted, without, effect.name),
+            *self.search.equal_alternatives(fitted, without, effect.name),
             *waves_alike(self.estimator, [effect], fitted.hypothesis.start),
             *(kind.name for kind, _ in alike if kind.channels - available),
             *(each.name for each in confounded(self.estimator, fitted, place)),

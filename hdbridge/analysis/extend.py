@@ -38,7 +38,7 @@ def supported(
             result[place] = old
         elif old.part is Part.ORDERS and len(old.coefficients()):
             change = new.fitted(new.coefficients() - old.coefficients())
-            seen = 0.5 * float(np.ptp(estimator.does(change, start)))
+            seen = 0.5 * float(np.ptp(estimator.contribution(change, start)))
             if change.largest_piece_arcsec() > estimator.scales.extrapolated * seen:
                 result[place] = old
     return tuple(result)

@@ -178,6 +178,12 @@ class Finding:
         """True if the cause does not predict held-out data."""
         return self.gain is not None and not (self.within or self.gain.predicts)
 
+    @property
+    def undetermined(self) -> bool:
+        """True if the 95 % intervals of all sizes include zero, and no alias could be meant instead."""
+        sizes = [each for each in self.parameters.values() if each.is_size]
+        return bool(sizes) and not self.aliases and all(each.low <= 0.0 <= each.high for each in sizes)
+
     def refusal(self) -> str:
         """Returns the reason why the finding is not offered as an improvement; empty if it is offered."""
         if self.cause == "unexplained":
@@ -191,10 +197,7 @@ class Finding:
                 f"no gain on held-out data, {self.gain.before_arcsec:.3g} to {self.gain.after_arcsec:.3g} "
                 "arcsec rms"
             )
-        sizes = [each for each in self.parameters.values() if each.is_size]
-        if sizes and not self.aliases and all(each.low <= 0.0 <= each.high for each in sizes):
-            return "the 95 % intervals of all its sizes include zero"
-        return ""
+        return "the 95 % intervals of all its sizes include zero" if self.undetermined else ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -44,6 +44,9 @@ class Gain:
     """Sum of squared errors without the tested part, or with the reference model."""
     after_arcsec2: FloatArray
     """Sum of squared errors with the tested part."""
+    weighted_fall: FloatArray | None = None
+    """Fall of the squared error of each stretch, each sample weighted by the variance of its noise; None if
+    all samples have the same noise. The figures in arcsec are not weighted, but all decisions are."""
 
     @property
     def before_arcsec(self) -> float:
@@ -61,9 +64,14 @@ class Gain:
         return 1.0 - (self.after_arcsec / max(self.before_arcsec, 1e-12)) ** 2
 
     @property
+    def _fall(self) -> FloatArray:
+        plain = self.before_arcsec2 - self.after_arcsec2
+        return plain if self.weighted_fall is None else self.weighted_fall
+
+    @property
     def sure(self) -> bool:
         """True if the fall of the squared error is significant, judged by its scatter between stretches."""
-        fall = self.before_arcsec2 - self.after_arcsec2
+        fall = self._fall
         if len(fall) < 2:
             return False
         return float(np.mean(fall)) > SURE * float(np.std(fall, ddof=1)) / math.sqrt(len(fall))
@@ -71,8 +79,7 @@ class Gain:
     @property
     def repeated(self) -> bool:
         """True if whole recordings were left out, and nearly all of them are predicted better."""
-        better = np.mean(self.after_arcsec2 < self.before_arcsec2)
-        return self.over == RECORDINGS and bool(better > NEARLY_ALL)
+        return self.over == RECORDINGS and bool(np.mean(self._fall > 0.0) > NEARLY_ALL)
 
     @property
     def predicts(self) -> bool:
@@ -81,9 +88,9 @@ class Gain:
         The effective number of stretches that contribute is the squared sum of their falls divided by the sum
         of the squared falls.
         """
-        fall = self.before_arcsec2 - self.after_arcsec2
+        fall = self._fall
         shared = float(np.sum(fall)) ** 2 > SHARED * float(fall @ fall)
-        return self.recovered > 0.0 and (self.repeated if self.over == RECORDINGS else shared)
+        return float(np.sum(fall)) > 0.0 and (self.repeated if self.over == RECORDINGS else shared)
 
     def as_dict(self) -> dict[str, float | str]:
         """Returns the entries for the provenance of a model file."""
@@ -154,7 +161,7 @@ def of_written(
             for at in range(len(effects))
             if at in places or at < len(given)
         ]
-        return parts.squares(estimator.left_by(used)[0])
+        return parts.squares(estimator.residual_with_nuisances(used))
 
     lost = parts.unseen(fitted) - parts.squares(fitted.residual / estimator.weight)
     after = squares(written) + lost
@@ -169,6 +176,8 @@ class _Parts:
     stretch: IntArray
     """Number of each point's repetition, shape (m,)."""
     over: str
+    weight: FloatArray
+    """Weight of each point's squared residual, by the variance of its noise; the mean is one, shape (m,)."""
 
     @classmethod
     def of(cls, estimator: Estimator, parameters: int) -> _Parts | None:
@@ -177,19 +186,24 @@ class _Parts:
         largest = np.max(np.bincount(stretch % FOLDS))
         if np.max(stretch) + 1 < REPEATS or len(stretch) - largest < parameters:
             return None
-        return cls(estimator, stretch, over)
+        precision = estimator.weight**2
+        return cls(estimator, stretch, over, precision / np.mean(precision))
 
     def squares(self, left_arcsec: FloatArray) -> FloatArray:
-        """Returns the sum of squared residuals of each repetition, arcsec2."""
-        return np.asarray(np.bincount(self.stretch, left_arcsec**2))
+        """Returns the sums of squared residuals of each repetition, arcsec2, plain and weighted, (2, k)."""
+        weights = np.ones_like(self.weight), self.weight
+        return np.stack([np.bincount(self.stretch, each * left_arcsec**2) for each in weights])
 
     def unseen(self, fitted: Fitted) -> FloatArray:
-        """Returns the sum of squared errors of each repetition, predicted by a fit without its fold.
+        """Returns the sums (2, k) of squared errors of each repetition, predicted by a fit without its fold.
 
         Nuisances, such as zeros and the elastic state at the start, belong to the record. They keep their
-        values, because no model predicts them.
+        values, because no model predicts them. Shape parameters keep theirs too, because a linearised fit
+        without a fold that alone shows a shape would change it without limit.
         """
-        predicted = np.arange(len(self.estimator.unknown.names), fitted.count())
+        known = len(self.estimator.unknown.names)
+        linear = [at for at, each in enumerate(fitted.parameters) if at >= known and not each.shape]
+        predicted = np.array(linear, dtype=np.intp)
         fit, fold = fitted.linearised.of(predicted), self.stretch % FOLDS
         left = fit.residual.copy()
         steps = steps_without(fit, fold, lambda rows: White(np.ones(np.count_nonzero(rows))))
@@ -198,6 +212,7 @@ class _Parts:
         return self.squares(left / self.estimator.weight)
 
     def gain(self, before: FloatArray, after: FloatArray) -> Gain:
-        """Returns the gain, from the sums of squares without and with the tested part."""
+        """Returns the gain, from the sums of squares (2, k) without and with the tested part."""
         samples = np.bincount(self.stretch).astype(np.float64)
-        return Gain(self.over, int(np.max(self.stretch % FOLDS)) + 1, samples, before, after)
+        fall = before[1] - after[1]
+        return Gain(self.over, int(np.max(self.stretch % FOLDS)) + 1, samples, before[0], after[0], fall)

@@ -25,6 +25,7 @@ from hdbridge.analysis.linear import (
     Prior,
     Terms,
     about_zeros,
+    solve_symmetric,
     unknown,
 )
 from hdbridge.analysis.noise import White
@@ -189,7 +190,7 @@ class Estimator:
         """Returns an effect's columns at the usable points (means over samples), arcsec, shape (m, p)."""
         return self._regressors.columns(effect, (start,))
 
-    def does(self, effect: Effect, start: Start) -> FloatArray:
+    def contribution(self, effect: Effect, start: Start) -> FloatArray:
         """Returns an effect's contribution to each usable sample, arcsec.
 
         Averages over points would reduce the apparent size of fast effects.
@@ -418,7 +419,7 @@ class Estimator:
         """Returns the transmission error due to the effects at the usable points, arcsec, shape (m,)."""
         return self._regressors.predict(effects, (start,))
 
-    def left_by(self, effects: Sequence[Effect]) -> tuple[FloatArray, Start]:
+    def residual_of(self, effects: Sequence[Effect]) -> tuple[FloatArray, Start]:
         """Returns the residual at the usable points, arcsec, (m,), and the initial elastic state.
 
         Zeros and initial state are those that fit best.
@@ -429,6 +430,21 @@ class Estimator:
         }
         best = min(left, key=lambda start: float(left[start] @ left[start]))
         return left[best], best
+
+    def residual_with_nuisances(self, effects: Sequence[Effect]) -> FloatArray:
+        """Returns the residual at the usable points, arcsec, (m,), after a fit of the nuisances alone."""
+        columns = self.weighted(self.unknown.columns)
+        information = np.diag([each.information for each in self.unknown.prior])
+        gram = columns.T @ columns + information
+        best: tuple[float, FloatArray] = (math.inf, np.empty(0))
+        for start in Start:
+            left = self.weight * (self.observed - self.level - self.predict(effects, start))
+            values = solve_symmetric(gram, columns.T @ left)
+            left = left - columns @ values
+            best = min(
+                best, (float(left @ left + values @ information @ values), left), key=lambda each: each[0]
+            )
+        return best[1] / self.weight
 
     def with_load_angle(self, load_deg: FloatArray) -> None:
         """Replaces the predicted load angle (n,), which the effects of the load encoder's lines use."""

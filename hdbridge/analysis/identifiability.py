@@ -167,12 +167,12 @@ def _before(estimator: Estimator, candidate: Effect, base: Sequence[Effect], sta
 def _injected(estimator: Estimator, fitted: Fitted, example: _Example, base: Sequence[Effect]) -> Gate:
     """Injects a cause with a peak of `WORST_ARCSEC` into the record, and runs its acceptance tests."""
     effect, start = example.effect, fitted.hypothesis.start
-    does = WORST_ARCSEC * (_columns(estimator, effect, base, start) @ example.per_arcsec)
+    contribution = WORST_ARCSEC * (_columns(estimator, effect, base, start) @ example.per_arcsec)
     if effect.changes is not None:
-        given = replace(fitted, residual=fitted.residual + estimator.weight * does)
+        given = replace(fitted, residual=fitted.residual + estimator.weight * contribution)
         return gate_of_change(estimator, fitted, given)
     record = copy(estimator)
-    record.observed = estimator.observed + does
+    record.observed = estimator.observed + contribution
     trial = record.fit(fitted.hypothesis.plus(effect), effort=Effort(steps=1))
     return gate(record, trial, len(fitted.hypothesis.effects))
 
@@ -193,7 +193,7 @@ def _usual_changes_arcsec(estimator: Estimator, base: Sequence[Effect], start: S
     scales = estimator.scales
     return {
         cause.name: 0.5
-        * float(np.ptp(estimator.does(given, start)))
+        * float(np.ptp(estimator.contribution(given, start)))
         * scales.calibrations
         * scales.calibrated
         for given in reversed(base)  # of several loops, the first one counts

@@ -254,7 +254,8 @@ class Search:
         """
         place = _last(trial, cause)
         effect = trial.hypothesis.effects[place]
-        reason = self.refusal(effect, as_alias)
+        reparametrised = effect.reparametrised(trial.hypothesis.effects, self._base, self.estimator.data)
+        reason = self.refusal(reparametrised[place] if reparametrised else effect, as_alias)
         if not reason and not as_alias and self._extrapolated(trial, place):
             reason = "the record shows too little of it to determine its size"
         elif (
@@ -270,12 +271,16 @@ class Search:
     def _extrapolated(self, trial: Fitted, place: int) -> bool:
         """Returns True if a piece of an effect is much larger than the visible sum of its kind of effects.
 
-        In the positions that the record covers, pieces of one effect, or two effects of a kind, can cancel.
+        In the positions that the record covers, pieces of one effect, two effects, or an effect and a change
+        of the model can cancel.
         """
-        effects = trial.hypothesis.effects
-        own = self.peak(trial, place)
+        effects, start = trial.hypothesis.effects, trial.hypothesis.start
+        contribution = [self.estimator.contribution(each, start) for each in effects]
+        for at, given in enumerate(self._base):
+            contribution[at] = contribution[at] - self.estimator.contribution(given, start)
         alike = [at for at in range(self.base, len(effects)) if effects[at].name == effects[place].name]
-        seen = self.peak(trial, *alike) if len(alike) > 1 else own
+        both = [np.sum([contribution[each] for each in {*alike, at}], axis=0) for at in range(len(effects))]
+        seen, own = min(map(self.estimator.half_span, both)), self.estimator.half_span(contribution[place])
         return max(effects[place].largest_piece_arcsec(), own) > self.scales.extrapolated * seen
 
     def refusal(self, effect: Effect, as_alias: bool = False) -> str:
@@ -310,7 +315,7 @@ class Search:
         """Returns half the peak-to-peak sum of the effects at ``places``, arcsec, excluding rare extremes."""
         effects, start = fitted.hypothesis.effects, fitted.hypothesis.start
         return self.estimator.half_span(
-            np.sum([self.estimator.does(effects[at], start) for at in places], axis=0)
+            np.sum([self.estimator.contribution(effects[at], start) for at in places], axis=0)
         )
 
     def _shortlist(self, fitted: Fitted, scores: Sequence[Score], left_out: str = "") -> list[Score]:
@@ -350,10 +355,10 @@ class Search:
         """Returns chi square plus the penalty for the free parameters."""
         return fitted.chi_square + self.scales.penalty * fitted.free()
 
-    def instead_of_change(self, fitted: Fitted, place: int, given: Effect) -> list[str]:
+    def alternatives_to_change(self, fitted: Fitted, place: int, given: Effect) -> list[str]:
         """Returns the causes that explain the data as well as a change of the model part at ``place``."""
         with self.held({place}):
-            return self.as_well(fitted, self.with_given(fitted, place, given), given.name)
+            return self.equal_alternatives(fitted, self.with_given(fitted, place, given), given.name)
 
     def with_given(self, fitted: Fitted, place: int, given: Effect) -> Fitted:
         """Refits with the model part at ``place`` fixed exactly as ``given``."""
@@ -370,7 +375,7 @@ class Search:
         finally:
             self.estimator.calibrated = known
 
-    def as_well(self, fitted: Fitted, without: Fitted, cause: str) -> list[str]:
+    def equal_alternatives(self, fitted: Fitted, without: Fitted, cause: str) -> list[str]:
         """Returns other causes that fit nearly as well as ``cause``, best first.
 
 
@@ -502,9 +507,9 @@ def waves_alike(estimator: Estimator, effects: Sequence[Effect], start: Start) -
         return orthonormal(np.hstack([estimator.columns(each, start) for each in near]))
 
     def alike(effect: Effect, seen: FloatArray) -> bool:
-        does = estimator.columns(effect, start) @ effect.coefficients()
-        does -= np.mean(does)
-        return float(np.sum((does @ seen) ** 2)) > most * float(does @ does)
+        contribution = estimator.columns(effect, start) @ effect.coefficients()
+        contribution -= np.mean(contribution)
+        return float(np.sum((contribution @ seen) ** 2)) > most * float(contribution @ contribution)
 
     for name in aliases_of(effects[0].name):
         kind = CATALOGUE.get(name)
@@ -546,16 +551,16 @@ def _share_in(effect: Effect, orders: Container[float]) -> float:
 
 
 def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:
-    """Chooses, among equivalent parametrisations (`Effect.retold`), the one that keeps the ``given`` model.
+    """Chooses the one of several equivalent parametrisations that keeps the ``given`` model.
 
-    Returns ``fitted`` unchanged without an equivalent one.
+    Returns ``fitted`` unchanged without an equivalent one. See `Effect.reparametrised`.
     """
     effects = fitted.hypothesis.effects
     for place in range(len(given), len(effects)):
-        told = effects[place].retold(effects, given, estimator.data)
-        if told is None:
+        reparametrised = effects[place].reparametrised(effects, given, estimator.data)
+        if reparametrised is None:
             continue
-        trial = estimator.fit(replace(fitted.hypothesis, effects=told))
+        trial = estimator.fit(replace(fitted.hypothesis, effects=reparametrised))
         if (
             trial.chi_square < fitted.chi_square + estimator.scales.enter
             and not trial.hypothesis.effects[place].violations()

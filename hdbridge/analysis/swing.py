@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 
 from hdbridge.analysis.driving import SETTLE_S
 from hdbridge.analysis.hypothesis import Estimator, Fitted
-from hdbridge.analysis.linear import Nuisances, Prior, about_zeros
+from hdbridge.analysis.linear import Nuisances, Prior, about_zeros, unknown
 from hdbridge.analysis.nuisances import zeros
 from hdbridge.analysis.prepared import Observed, Samples
 from hdbridge.analysis.scales import Scales
@@ -52,6 +52,8 @@ UNEVEN = 0.3
 LEAST_SEEN = 0.1
 """Minimum fraction of a residual's sum of squares that a swing must explain, because any oscillation explains
 a little."""
+SURE = 3.0
+"""Margin by which noise must be overestimated to be reduced, standard deviations of chi square."""
 CALMEST = 0.05
 """Minimum fraction of the samples that are used, those with the smallest uncertainty of the swing."""
 RESOLVED = 4.0
@@ -69,7 +71,7 @@ class Swing:
 
     frequency_hz: float
     damping: float
-    does_arcsec: FloatArray
+    contribution_arcsec: FloatArray
     """Transmission error due to the swing in each sample, shape (n,)."""
     waves_arcsec2: FloatArray
     """Squared amplitude of the swing due to waves that are too fast for the sampling, shape (n,)."""
@@ -89,7 +91,7 @@ class Swing:
         """Describes the swing for the report."""
         return (
             f"the load swings on its spring at {self.frequency_hz:.0f} Hz (damping ratio "
-            f"{self.damping:.2f}) by up to {np.max(np.abs(self.does_arcsec)):.2g} arcsec: "
+            f"{self.damping:.2f}) by up to {np.max(np.abs(self.contribution_arcsec)):.2g} arcsec: "
             + ("its ringing is allowed for" if self.soft else "ordinary dynamics, which are allowed for")
         )
 
@@ -230,10 +232,11 @@ def _seen(whole: float, rest: float, parameters: int, scales: Scales) -> bool:
     return whole - rest >= max(scales.enter + parameters * scales.penalty, LEAST_SEEN * whole)
 
 
-def seen_swing(base: Base, between: Nuisances, scales: Scales) -> Swing | None:
+def visible_swing(base: Base, between: Nuisances, scales: Scales) -> Swing | None:
     """Fits the swing to the residual of the base's effects; returns None if no swing is visible.
 
-    The swing must improve on a fit of ``between``, the columns of the motion between samples.
+    The swing must improve on a fit of ``between``, the columns of the motion between samples, and of an error
+    proportional to the speed. In similar moves, a damped swing resembles that error, which may be a cause.
     """
     full, residual = base.full, base.residual_arcsec
     step_s, parts = np.maximum(np.diff(full.time_s), 1e-9), [each.rows for each in full.chains]
@@ -243,14 +246,15 @@ def seen_swing(base: Base, between: Nuisances, scales: Scales) -> Swing | None:
     rows = slice(begin, min(begin + LONGEST, len(full)))
     first = [0, *(each.start - begin for each in parts if rows.start < each.start < rows.stop)]
     inside = [each.within(rows) for each in base.fast]
-    beside = _beside(full, between, rows)
+    skew = unknown(full.speed_deg_s[:, np.newaxis], ["skew"])
+    beside = _beside(full, between.and_also(skew), rows)
 
     def tried(hertz: float, damping: float) -> float:
         damping = min(damping, MOST_DAMPED)
         one = swing(bend[rows], step_s[rows.start : rows.stop - 1], first, hertz, damping)
         for each in inside:
-            one.does_arcsec[each.rows] += each.does(hertz, damping).real
-        return beside(residual[rows] - one.does_arcsec)[0]
+            one.contribution_arcsec[each.rows] += each.contribution(hertz, damping).real
+        return beside(residual[rows] - one.contribution_arcsec)[0]
 
     start = min(product(HERTZ.tolist(), DAMPING), key=lambda each: tried(*each))
     found = minimize(
@@ -262,9 +266,9 @@ def seen_swing(base: Base, between: Nuisances, scales: Scales) -> Swing | None:
     damping = min(damping, MOST_DAMPED)
     seen = swing(bend, step_s, [each.start for each in parts], hertz, damping)
     for each in base.fast:
-        does = each.does(hertz, damping)
-        seen.does_arcsec[each.rows] += does.real
-        seen.waves_arcsec2[each.rows] += np.abs(does) ** 2
+        contribution = each.contribution(hertz, damping)
+        seen.contribution_arcsec[each.rows] += contribution.real
+        seen.waves_arcsec2[each.rows] += np.abs(contribution) ** 2
     return seen
 
 
@@ -283,7 +287,7 @@ class _Fast(NamedTuple):
         part = slice(*np.searchsorted(self.rows, (rows.start, rows.stop)))
         return _Fast(self.rows[part] - rows.start, self.phasor[part], self.rad_s[part])
 
-    def does(self, frequency_hz: float, damping: float) -> NDArray[np.complex128]:
+    def contribution(self, frequency_hz: float, damping: float) -> NDArray[np.complex128]:
         """Returns the load's motion relative to its base as a phasor, arcsec, shape (k,)."""
         ratio = self.rad_s / (math.tau * frequency_hz)
         return np.asarray(ratio**2 / (1.0 - ratio**2 + 2j * damping * ratio) * self.phasor)
@@ -305,8 +309,10 @@ def _fast_waves(full: Samples, effects: Sequence[Effect], period_s: float) -> It
 def without(data: Observed, found: Swing) -> Observed:
     """Returns the data after subtraction of the swing; a soft load's wind-up remains, as a cause to find."""
     full = data.full
-    does = found.does_arcsec - found.wind_up_arcsec(full) if found.soft else found.does_arcsec
-    return data.having(replace(full, error_arcsec=full.error_arcsec - does))
+    contribution = (
+        found.contribution_arcsec - found.wind_up_arcsec(full) if found.soft else found.contribution_arcsec
+    )
+    return data.having(replace(full, error_arcsec=full.error_arcsec - contribution))
 
 
 def settled(estimator: Estimator, fitted: Fitted, effects: Sequence[Effect], found: Swing | None) -> Observed:
@@ -334,6 +340,20 @@ def settled(estimator: Estimator, fitted: Fitted, effects: Sequence[Effect], fou
     errors = (data.full.sigma_arcsec, unknown, turned, crept, estimator.first_branch(effects))
     sigma = np.sqrt(sum(each**2 for each in errors))
     return data.having(replace(data.full, usable=usable, sigma_arcsec=sigma))
+
+
+def noise_bounded(estimator: Estimator, fitted: Fitted) -> Observed:
+    """Returns the data with less noise if the residual of a fit is certainly smaller than the stated noise.
+
+    A residual contains all the noise. Differences of neighbouring samples may contain more, if the axis never
+    rests, and so may the uncertainty of the swing.
+    """
+    data, freedom = estimator.data, max(len(fitted.residual) - fitted.free(), 1)
+    most = fitted.chi_square / freedom * (1.0 + SURE * math.sqrt(2.0 / freedom))
+    if most >= 1.0:
+        return data
+    full = replace(data.full, sigma_arcsec=data.full.sigma_arcsec * math.sqrt(most))
+    return replace(data.having(full), noise_arcsec=data.noise_arcsec * math.sqrt(most))
 
 
 def _share(square: FloatArray, size: FloatArray) -> float:

@@ -198,9 +198,9 @@ def _seen(
     peak = max(count_arcsec, math.hypot(scales.plain_arcsec, *half_steps))
     laws = [each for each in fitted.hypothesis.effects if each.part is None]
     for law in laws:  # the law error of an effect grows with its contribution
-        does = estimator.columns(law, start)[rows] @ law.coefficients()
-        gain = max(gain, scales.alias * len(does) * float(np.var(weight * does)))
-        peak = max(peak, scales.plain_arcsec + math.sqrt(scales.alias) * estimator.half_span(does))
+        contribution = estimator.columns(law, start)[rows] @ law.coefficients()
+        gain = max(gain, scales.alias * len(contribution) * float(np.var(weight * contribution)))
+        peak = max(peak, scales.plain_arcsec + math.sqrt(scales.alias) * estimator.half_span(contribution))
     views = sorted((each for each in views if each.gain >= gain), key=lambda each: -each.gain)
     if not views:
         return [], ""
@@ -260,9 +260,9 @@ def unfitted(estimator: Estimator, effects: tuple[Effect, ...]) -> str:
     share = 1.0 - loose.chi_square / max(plain.chi_square, 1e-300)
     if share < MOST:
         return ""
-    does = (plain.residual - loose.residual) / estimator.weight
+    contribution = (plain.residual - loose.residual) / estimator.weight
     return (
-        f"the model has no elastic loop, and one of {estimator.half_span(does):.3g} arcsec to either side "
-        f"makes up {100.0 * share:.0f} % of the squares that it leaves: fit a model first (hdbridge fit), "
-        "then diagnose"
+        f"the model has no elastic loop, and one of {estimator.half_span(contribution):.3g} arcsec "
+        f"to either side makes up {100.0 * share:.0f} % of the squares that it leaves: fit a model first "
+        "(hdbridge fit), then diagnose"
     )

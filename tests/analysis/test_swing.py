@@ -43,8 +43,8 @@ def test_the_load_follows_its_base_according_to_the_equation(frequency_hz: float
     step_s = np.maximum(np.diff(times), 1e-9)
     bent = bend_of(both, step_s, [slice(0, 800), slice(800, 802)])
     found = swing(bent, step_s, [0, 800], frequency_hz, damping)
-    assert found.does_arcsec[:800] == pytest.approx(true, abs=0.01 * np.ptp(true))
-    assert not np.any(found.does_arcsec[800:])
+    assert found.contribution_arcsec[:800] == pytest.approx(true, abs=0.01 * np.ptp(true))
+    assert not np.any(found.contribution_arcsec[800:])
 
 
 def test_a_steady_acceleration_winds_the_load_up() -> None:
@@ -52,7 +52,7 @@ def test_a_steady_acceleration_winds_the_load_up() -> None:
     time_s = np.arange(2000) * 1e-3
     bent = bend_of(0.5 * 3600.0 * 100.0 * time_s**2, np.diff(time_s), [slice(0, 2000)])
     found = swing(bent, np.diff(time_s), [0], 40.0, 0.2)
-    assert found.does_arcsec[1500] == pytest.approx(-360_000.0 / (math.tau * 40.0) ** 2, rel=1e-3)
+    assert found.contribution_arcsec[1500] == pytest.approx(-360_000.0 / (math.tau * 40.0) ** 2, rel=1e-3)
 
 
 def test_a_quickly_changing_lag_is_not_encoder_noise() -> None:

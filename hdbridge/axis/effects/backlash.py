@@ -52,6 +52,7 @@ class Backlash(Linear):
         "motor has to cross the gap at each reversal",
     )
     shape = (Shape("crossing_deg", 0.02, 20.0, logarithmic=True),)
+    nonnegative = True
     ordinary_arcsec = 1.0
     """Peak of a gap of 2 arcsec. An elastic loop of another shape can leave such a residual."""
     linear = ("gap_arcsec",)

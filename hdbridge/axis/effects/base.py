@@ -275,7 +275,7 @@ class Effect(Law):
         """Returns the effect that this cause resembles if its channel is not measured, or None."""
         return None
 
-    def retold(
+    def reparametrised(
         self,
         now: Sequence[Effect],
         given: Sequence[Effect],
