@@ -146,8 +146,9 @@ def of_written(
     """Returns each finding's gain: that of the written model over the ``given`` one with the other findings.
 
     ``others`` contains the places of the other findings' effects for each finding, and ``written`` the places
-    of all changed effects. No model is refitted, so a fresh record can repeat the comparison. The squared
-    error of the written model includes the increase due to leaving out repetitions from its fit.
+    of all changed effects. No model is refitted, so a fresh record can repeat the comparison. Only the
+    record's nuisances are refitted, for the decision. The squared error of the written model includes the
+    increase due to leaving out repetitions from its fit.
     """
     others = [*others]
     parts = _Parts.of(estimator, fitted.count())
@@ -161,7 +162,8 @@ def of_written(
             for at in range(len(effects))
             if at in places or at < len(given)
         ]
-        return parts.squares(estimator.residual_with_nuisances(used))
+        plain, beside = estimator.residual_of(used)[0], estimator.residual_with_nuisances(used)
+        return np.stack([parts.squares(plain)[0], parts.squares(beside)[1]])
 
     lost = parts.unseen(fitted) - parts.squares(fitted.residual / estimator.weight)
     after = squares(written) + lost
