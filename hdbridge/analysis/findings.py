@@ -180,9 +180,9 @@ class Finding:
 
     @property
     def undetermined(self) -> bool:
-        """True if the 95 % intervals of all sizes include zero, and no alias could be meant instead."""
+        """True if the 95 % interval of the only size includes zero, and no alias could be meant instead."""
         sizes = [each for each in self.parameters.values() if each.is_size]
-        return bool(sizes) and not self.aliases and all(each.low <= 0.0 <= each.high for each in sizes)
+        return len(sizes) == 1 and not self.aliases and sizes[0].low <= 0.0 <= sizes[0].high
 
     def refusal(self) -> str:
         """Returns the reason why the finding is not offered as an improvement; empty if it is offered."""
@@ -197,7 +197,7 @@ class Finding:
                 f"no gain on held-out data, {self.gain.before_arcsec:.3g} to {self.gain.after_arcsec:.3g} "
                 "arcsec rms"
             )
-        return "the 95 % intervals of all its sizes include zero" if self.undetermined else ""
+        return "the 95 % interval of its size includes zero" if self.undetermined else ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -254,8 +254,10 @@ class Search:
         """
         place = _last(trial, cause)
         effect = trial.hypothesis.effects[place]
-        reparametrised = effect.reparametrised(trial.hypothesis.effects, self._base, self.estimator.data)
-        reason = self.refusal(reparametrised[place] if reparametrised else effect, as_alias)
+        other = effect.reparametrised(trial.hypothesis.effects, self._base, self.estimator.data)
+        trial = trial if other is None else trial.having(other)
+        effect = trial.hypothesis.effects[place]
+        reason = self.refusal(effect, as_alias)
         if not reason and not as_alias and self._extrapolated(trial, place):
             reason = "the record shows too little of it to determine its size"
         elif (
