@@ -25,7 +25,7 @@ Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
 
 
 class BusConfig(Strict):
-    """The CAN bus, in the terms of python-can."""
+    """CAN bus, with the parameters of python-can."""
 
     interface: str = Field(
         min_length=1, description="python-can interface: socketcan, virtual, udp_multicast, slcan, ..."
@@ -428,7 +428,7 @@ def _interpolation_period(cycle_ms: float) -> tuple[int, int] | None:
 
 
 def _teeth_for(ratio: float, difference: int, teeth: Teeth) -> str:
-    """Describes tooth counts that give a ratio with the stated output, if possible with this difference."""
+    """Describes tooth counts that give a ratio with the stated output; prefers the given ``difference``."""
     for more in (difference, 2, 1):
         held = round(ratio * more)
         if math.isclose(held, ratio * more, rel_tol=1e-9):

@@ -40,7 +40,7 @@ def extended(effects: Iterable[Effect], new: Effect) -> tuple[Effect, ...]:
 
 
 def refreshed(effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """Returns the effects with their copies of orders and loop updated to the present model.
+    """Returns the effects with their copies of orders and loop updated to those of the model.
 
     The orders are those of the synchronous part and of any added motor orders, because a change of the tooth
     error affects all of them. If the model has no synchronous part, the copies remain unchanged.

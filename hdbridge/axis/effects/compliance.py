@@ -123,7 +123,8 @@ class Compliance(Angleless, Linear):
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
         """Returns the effect with other compliances.
 
-        If their sum is negative, it is the sense that is reversed, because a torque's sign is a convention.
+        If the compliances have a negative sum, the sense is reversed instead, because the sign of a torque is
+        a convention.
         """
         values = np.asarray(coefficients, dtype=np.float64)
         turned = values.sum() < 0.0

@@ -68,7 +68,7 @@ class Creep(Effect):
     """``tau_s`` is the time constant of the first exponential; the others keep their ratio to it."""
 
     usual = 8
-    """Maximum number of exponentials, because a real relaxation is a sum of several."""
+    """Maximum number of exponentials; more than one, because a real relaxation is a sum of several."""
     typical = {
         "parts": tuple(Relaxation(amplitude_arcsec=2.0, tau_s=tau_s) for tau_s in (2.0, 20.0)),
         "build_up": 0.1,

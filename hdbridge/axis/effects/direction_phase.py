@@ -71,7 +71,7 @@ class DirectionPhase(Modulating):
         return Memoryless(lambda motor_deg, now: (now.direction or before) * orders.peek(motor_deg, now))
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error per degree of shift *at the present shift*, shape (n, 1).
+        """Returns the error per degree of shift *at the current shift*, shape (n, 1).
 
         The error is not exactly proportional to the shift, so the fit must be iterated.
         """

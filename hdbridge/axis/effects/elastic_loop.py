@@ -86,7 +86,7 @@ class ElasticLoop(Effect):
         return (Coefficient("offset_arcsec", (0,), ("offset_arcsec",)),)
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns the loop with another offset and, if given, another width and exponent."""
+        """Returns the loop with a new offset and, if given, a new width and exponent."""
         return self.model_copy(update={"offset_arcsec": float(coefficients[0]), **dict(shape or {})})
 
     def bound_arcsec(self) -> float:

@@ -90,7 +90,7 @@ class Hysteresis(ElasticLoop):
 class _HysteresisTracker(Tracker):
     """Tracker of a hysteresis loop.
 
-    The state consists of the present branch (initial angle and value, direction) and the last angle and
+    The state consists of the current branch (initial angle and value, direction) and the last angle and
     value. Values are those of a loop of unit offset.
     """
 

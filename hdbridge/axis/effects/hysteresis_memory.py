@@ -127,7 +127,7 @@ class _Segment(NamedTuple):
 class _Memory:
     """Remembered reversals of a loop of unit offset, outermost first.
 
-    ``_points`` contains pairs of angle and value. The last pair is the start of the present branch, and the
+    ``_points`` contains pairs of angle and value. The last pair is the start of the current branch, and the
     branch closes at the pair before it. If there are no pairs, the path is on the virgin curve through
     ``_origin`` in direction ``_sign``.
     """

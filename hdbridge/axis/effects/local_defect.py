@@ -93,7 +93,7 @@ class LocalDefect(Momentary, Linear):
         return both or float(np.max(fast)) > OTHER_SPEED * float(np.min(fast))
 
     def shows(self, motion: Motion) -> Stretch | None:
-        """Returns the samples away from reversals, where a loop of another shape leaves no bumps."""
+        """Returns the samples away from reversals, where a misfit of the loop's shape leaves no bumps."""
         return away_from_reversals(motion)
 
     def changing(self, motion: Motion) -> FloatArray:

@@ -126,7 +126,7 @@ class Motion:
     """Motor speed, if a better value is known than the differences of a quantised angle."""
     motor_acceleration_deg_s2: FloatArray | None = None
     load_deg: FloatArray | None = None
-    """Predicted load angle, degrees. Only the load encoder's subdivisional errors require its accuracy."""
+    """Predicted load angle, degrees. Only the load encoder's subdivisional error requires such accuracy."""
 
     def __len__(self) -> int:
         """Returns the number of samples."""

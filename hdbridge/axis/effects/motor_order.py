@@ -35,7 +35,7 @@ class MotorOrders(OrderSeries):
     part = Part.ORDERS
     searched = range(1, HIGHEST_MOTOR_ORDER + 1)
     usual = 4
-    """Maximum number of similar orders, because a worn wave-generator bearing causes several."""
+    """Maximum number of similar orders; a worn wave-generator bearing causes several."""
     drifting = ("orders",)
     """All orders drift, because wear of teeth and bearing changes them."""
 

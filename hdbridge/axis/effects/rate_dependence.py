@@ -74,9 +74,9 @@ class RateDependence(Modulating):
         return self._most() * abs(self.loop.offset_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Returns 0 for growth of a loop with leading load, because the error only rises along its path.
+        """Returns 0 if a leading loop grows or a lagging one shrinks: the change only rises along the path.
 
-        Otherwise returns infinity, because the error falls infinitely steeply after a reversal.
+        Otherwise returns infinity, because the change falls infinitely steeply after a reversal.
         """
         return 0.0 if self.growth_percent * self.loop.offset_arcsec >= 0.0 else math.inf
 

@@ -82,7 +82,7 @@ K = TypeVar("K", bound=Kept)
 
 @dataclass(frozen=True, slots=True)
 class Version(Generic[K]):
-    """A version in a store: its content, its place and its activations."""
+    """A version in a store: its content, its location and its activations."""
 
     number: int | None
     """Number in the history; None for the pending model, and for an active model copied or edited by hand."""
