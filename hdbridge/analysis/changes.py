@@ -101,7 +101,7 @@ def _finding(
 def _another_law(
     search: Search, fitted: Fitted, precise: Fitted, place: int, given: Effect, spread: FloatArray
 ) -> _Change | None:
-    """Returns a change if another hysteresis law fits better than the ``given`` one."""
+    """Returns a change if a different hysteresis law fits better than the ``given`` one."""
     estimator, now = search.estimator, precise.hypothesis.effects[place]
     scales = estimator.scales
     causes = causes_of(given, now)
@@ -131,7 +131,7 @@ def _loop(
     causes = causes_of(given, precise.hypothesis.effects[place])
     if (small and not lawless) or not causes:
         return None
-    # A loop that follows neither law exactly may follow the other one in part.
+    # A loop that follows neither law exactly may partly follow the alternative law.
     laws = [kind.name for kind in CATALOGUE.values() if kind.part is Part.LOOP and kind.changes is Part.LOOP]
     return _Change(
         causes[0],

@@ -25,7 +25,7 @@ MOST_COUNTS = 2**32
 TURNS_SEEN = 4.0
 """Minimum number of motor turns for testing whether the error repeats."""
 PLACES = 8
-"""Number of sectors into which a motor turn is divided for counting visited places."""
+"""Number of sectors into which a motor turn is divided, to count the visited ones."""
 REPEATS_SHARE = 0.5
 """Minimum fraction of the error's variance that repeats with each motor turn, for `TURNS_SEEN` turns. For
 more turns the minimum is smaller, because a chance repetition explains less."""
@@ -61,7 +61,7 @@ def check_records(records: Mapping[Path, Record], ratio: float) -> None:
 
 
 def zeros_apart_arcsec(records: Sequence[Record], ratio: float) -> float | None:
-    """Returns the spread of the zeros of records with the same direction of motion, arcsec.
+    """Returns the spread of the zero offsets of records with the same direction of motion, arcsec.
 
     Returns None if the spread does not exceed the variation within the records, or if each direction has at
     most one record. Directions are compared separately, because hysteresis shifts their mean errors.
@@ -228,7 +228,7 @@ def _check_turn(path: Path, record: Record, ratio: float) -> None:
     shown &= np.repeat(spans >= math.tau, np.diff(begins, append=len(motor)))  # keep runs over a whole period
     places = len(np.unique(np.floor(PLACES / math.tau * motor[shown])))
     if places < PLACES * TURNS_SEEN:
-        return  # too few places to distinguish the periods
+        return  # too few sectors to distinguish the periods
     base = np.column_stack([np.ones_like(motor), motor, np.sign(step)])
     error = record.transmission_error_arcsec(ratio)[shown]
 

@@ -210,7 +210,7 @@ def held_out(
         steps = steps_without(fit, fold, lambda rows: Precision(state.noise, blocks.picked(rows)))
         for number, step in enumerate(steps):
             out = fold == number
-            # Zeros are those of the other folds; a zero that occurs only in this fold is fitted here.
+            # Zero offsets are taken from the other folds; one that occurs only in this fold is fitted here.
             lost = ~np.isin(blocks.zero, blocks.zero[~out])
             left = fit.residual - columns @ step
             added[row, out] = about_zeros(left, blocks.zero, blocks.count * lost)[out]

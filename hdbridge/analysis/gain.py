@@ -18,8 +18,8 @@ from hdbridge.axis.effects.kinematics import direction_of
 SURE = 2.0
 """Minimum size of a significant gain, standard errors."""
 NEARLY_ALL = 0.75
-"""Lower limit of the fraction of recordings that a cause must predict better, itself excluded: all of three
-or four, four of five."""
+"""Exclusive lower limit of the fraction of recordings that a cause must predict better: all of three or four,
+four of five."""
 SHARED = 1.5
 """Minimum effective number of stretches that contribute to a gain. A single event contributes in one stretch
 or, at a border, unequally in two."""
@@ -138,9 +138,9 @@ def of_written(
 ) -> list[Gain | None]:
     """Returns each finding's gain: that of the written model over the ``given`` one with the other findings.
 
-    ``others`` contains the places of the other findings' effects for each finding, and ``written`` the places
-    of all changed effects. No model is refitted, so a fresh record can repeat the comparison. The squared
-    error of the written model includes the increase due to leaving out repetitions from its fit.
+    ``others`` contains the indices of the other findings' effects for each finding, and ``written`` the
+    indices of all changed effects. No model is refitted, so a fresh record can repeat the comparison. The
+    squared error of the written model includes the increase due to leaving out repetitions from its fit.
     """
     others = [*others]
     parts = _Parts.of(estimator, fitted.count())
@@ -186,8 +186,8 @@ class _Parts:
     def unseen(self, fitted: Fitted) -> FloatArray:
         """Returns the sum of squared errors of each repetition, predicted by a fit without its fold.
 
-        Nuisances, such as zeros and the elastic state at the start, belong to the record. They keep their
-        values, because no model predicts them.
+        Nuisances, such as zero offsets and the elastic state at the start, belong to the record. They keep
+        their values, because no model predicts them.
         """
         predicted = np.arange(len(self.estimator.unknown.names), fitted.count())
         fit, fold = fitted.linearised.of(predicted), self.stretch % FOLDS

@@ -63,7 +63,7 @@ nuisance is omitted."""
 
 
 def zeros(zero: IntArray, number: int) -> Nuisances:
-    """Returns a column for each of ``number`` absolute zeros; ``zero`` (b,) is the zero of each block."""
+    """Returns a zero-offset column for each encoder zero; ``zero`` (b,) is the zero number of each block."""
     return unknown(zero[:, np.newaxis] == np.arange(number), [f"zero {each}" for each in range(number)])
 
 
@@ -156,7 +156,7 @@ def nuisances_of(
     effects: Sequence[Effect],
     waves: Sequence[tuple[float, FloatArray, FloatArray]] = (),
 ) -> Nuisances:
-    """Returns the columns of the zeros and of the named nuisances; for ``waves`` see `swing`."""
+    """Returns the columns of the zero offsets and of the named nuisances; for ``waves`` see `swing`."""
     parts = [zeros(design.blocks.zero, design.samples.zeros)]
     if DELAY in nuisances:
         parts.append(unknown(delay_column(design), [DELAY]))
