@@ -61,7 +61,7 @@ class Cubic(NamedTuple):
         return self.end_s - self.begin_s
 
     def state(self, time_s: float) -> Kinematics:
-        """Returns the state at this time; before and after the cubic, that at its nearer end."""
+        """Returns the state at a time; for a time outside the cubic, the state at its nearer end."""
         period_s = self.end_s - self.begin_s
         s = 1.0 if time_s >= self.end_s else max(time_s - self.begin_s, 0.0) / period_s
         return Kinematics(
@@ -119,7 +119,8 @@ class Stream:
         """Number of periods since the last rest."""
         self._released = self._begun = False
         self.overrun_s: float | None = None
-        """Time since the stream ran out of knots in motion, at the state of the last knot; else None."""
+        """Time since the stream ran out of knots in motion; the state is then that of the last knot. Else
+        None."""
         self._state = Kinematics(begin_deg, 0.0, 0.0)
 
     @property

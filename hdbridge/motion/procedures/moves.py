@@ -76,7 +76,7 @@ class Move(Protocol):
         ...
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """Returns the path from the present load target."""
+        """Returns the path from the current load target."""
         ...
 
     def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
