@@ -47,7 +47,7 @@ _PLURALS: Final = {
 
 
 def remedy(times: float, ratio: float, exact: float, origin: Origin | None) -> str:
-    """Returns advice for a load that travels ``times`` as far as the ratio and the motor imply.
+    """Returns advice for a load that travels ``times`` times as far as ratio and motor imply.
 
     If the record is from a CSV file, the advice includes the option to pass. ``exact`` is the relative
     accuracy within which a ratio counts as right.
@@ -139,7 +139,7 @@ __all__ = ["MINIMUM_SAMPLES", "OPTIONAL", "REQUIRED", "Record", "concatenate", "
 MINIMUM_SAMPLES: Final = 2
 
 WRONG_RATIO: Final = 0.003
-"""Relative deviation of a ratio that indicates another gear; common ratios are at least 0.6 % apart."""
+"""Relative deviation of a ratio that indicates a different gear; common ratios are at least 0.6 % apart."""
 WRONG_RATIO_ARCSEC: Final = 900.0
 """Minimum effect of such a deviation over the travel, arcsec: several times the error of any gear."""
 
@@ -260,7 +260,7 @@ class Record:
     def transmission_error_arcsec(self, ratio: float) -> FloatArray:
         """Returns the measured transmission error theta_L - theta_M / N, arcsec at the load, shape (n,).
 
-        Its mean contains the difference between the zeros of the two encoders.
+        Its mean includes the offset between the zeros of the two encoders.
         """
         error: FloatArray = (self.load_position_deg - self.motor_position_deg / ratio) * ARCSEC_PER_DEG
         return error

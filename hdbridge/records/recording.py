@@ -84,7 +84,7 @@ class RecordingFile(Strict):
 
     @classmethod
     def made(cls, **values: Any) -> RecordingFile:
-        """Creates the content without validation, because a new recording has no files yet."""
+        """Creates the content without validation, which would reject a new recording without files."""
         return cls.model_construct(schema_="hdbridge.recording/1", **values)
 
     def write(self, folder: Path) -> None:
