@@ -214,7 +214,7 @@ def _spectrum(result: Calibration) -> Chart:
 
 
 def _alone(traces: Traces) -> tuple[FloatArray, FloatArray]:
-    """Returns orders and amplitudes of the error, by FFT over equal bins of the motor angle, for display.
+    """Returns orders and amplitudes of the error for display, from an FFT over equal bins of the motor angle.
 
     Empty bins count as zero, and the amplitudes are corrected for the fraction of filled bins.
     """
