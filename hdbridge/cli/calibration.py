@@ -356,7 +356,7 @@ def write_calibration_page(path: Path, result: Calibration) -> None:
 
 
 def print_next(offer: Offer | None, session: Session) -> None:
-    """Prints the next commands for a pending model; a daemon that lent its bus commits and uses it itself."""
+    """Prints the next commands for a pending model; a daemon that lent its bus commits the model itself."""
     if offer is not None and offer.made:
         folder = session.files.axis.parent
         daemon = f"hdbridge ctl model {session.axis.name} pending"

@@ -319,14 +319,14 @@ def lease(daemon: Daemon) -> None:
 
 
 def mark(text: Annotated[str, Argument(metavar="TEXT", help="One line.")], at: AtOption = None) -> None:
-    """Write a remark into the flight recorder, at the present cycle."""
+    """Write a remark into the flight recorder, at the current cycle."""
     with connected(at) as client:
         for each in client.mark(text):
             say(_event_line(each))
 
 
 def _looks(count: int | None, every_s: float) -> Iterator[int]:
-    """Yields 0, 1, 2, ..., pausing before each further number; ``count`` None is endless."""
+    """Yields 0, 1, 2, ... with a pause before each but the first; ``count`` numbers, or endlessly if None."""
     for number in itertools.count() if count is None else range(count):
         if number:
             time.sleep(every_s)
@@ -528,7 +528,7 @@ def model(
         ),
     ],
 ) -> None:
-    """Make another model of an axis the active one; the change is ramped, also in motion."""
+    """Make a different model of an axis the active one; the change is ramped, also in motion."""
     if version not in {"pending", "active"} and not (version.isascii() and version.isdigit()):
         raise InputError(f"VERSION: found {version!r}; expected a number, pending or active")
     with daemon.moving(axis) as moved:

@@ -359,7 +359,7 @@ def simulate(
 ) -> None:
     """Run the simulated drive of a profile on its bus, in real time, until Ctrl-C.
 
-    Another process masters it, for example over SocketCAN:
+    Another process acts as its master, for example over SocketCAN:
 
         hdbridge simulate article --interface socketcan --channel vcan0 &
 

@@ -123,7 +123,7 @@ def _learned(
         twin.before,
         twin.after,
         learned=_values(begun.truth, twin.truth) if verdict.kept else (),
-        # If the twin is no better, only its unexplained residual is reported.
+        # If the twin is no better than before, only its unexplained residual is reported.
         named=[*twin.findings, *twin.alike, *twin.unexplained] if verdict.kept else twin.unexplained,
         translated=begun.rows,
         facts=facts,
