@@ -59,8 +59,8 @@ NO_LOAD_ENCODER = (
     "encoder and model; path errors are not measured"
 )
 TRIALS = 3
-"""Maximum number of filters tried, each based on the runs of those before it. The first one explores,
-correcting orders beyond the known frequency range."""
+"""Maximum number of filters to try. Each is designed from the runs with the previous ones; the first is
+exploratory and also corrects orders beyond the known frequency range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,14 +231,14 @@ def motion_test(
     """Runs a booted drive's axis at several speeds and on paths, without and with the model's correction.
 
     With ``measure`` the response is measured, otherwise the model's own is tested. A filter is kept only if
-    neither the ripple at any speed nor the path error is larger than without correction.
-    InputError if no motor order of the model is large enough to measure, if the travel is too short, or if a
-    response to be tested was measured with another cycle time. Without an encoder at the load, the ripple is
-    that of the load angle predicted from the motor encoder, and no path is run.
+    neither the ripple at any speed nor the path error is larger than without correction. InputError if no
+    motor order of the model is large enough to measure, if the travel is too short, or if a response to be
+    tested was measured with a different cycle time. Without an encoder at the load, the ripple is that of the
+    load angle predicted from the motor encoder, and no path is run.
     """
     runner = _Runner(drive, model, progress, interrupted)
     if not measure:
-        compensation_for(drive.axis, model)  # rejects a response for another cycle time before any motion
+        compensation_for(drive.axis, model)  # rejects a response for a different cycle time before any motion
     gains = read_gains(drive.sdo) if isinstance(drive, Drive) else {}
     found = _ripple_test(runner, model, measure)
     if found.response is not None and measure:
