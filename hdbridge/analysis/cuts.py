@@ -50,7 +50,6 @@ class Observed:
 def observed(record: Record, ratio: float) -> Observed:
     """Cleans a record: spreads coarse time stamps evenly, drops misread samples and cuts at jumps.
 
-
     Returns an intact record unchanged.
     """
     remarks = []

@@ -2,10 +2,12 @@
 
 The noise has five parts:
 
-- white noise, which may differ between standing and moving; - a drift in time; - a drift over the motor's
-*travel*, because an axis rests anywhere within a count of its encoder; this error is constant during a stop
-and different at the next; - the misfit of the loop's shape, which decays over each branch and differs between
-branches; - the rounding error that is constant over a leg; its size follows from the count.
+- white noise, which may differ between standing and moving;
+- a drift in time;
+- a drift over the motor's *travel*, because an axis rests anywhere within a count of its encoder; this error
+  is constant during a stop, and different at the next one;
+- the misfit of the loop's shape, which decays over each branch and differs between branches;
+- the rounding error that is constant over a leg; its size follows from the count.
 
 Each drift is a first-order Markov process. The inverse of its covariance is therefore banded, and a fit takes
 no longer than one with white noise (Rybicki and Press 1995).

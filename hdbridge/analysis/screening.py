@@ -74,7 +74,6 @@ class Screen:
     def scores(self, fit: Linearised, causes: Linearised) -> list[Score]:
         """Returns the score of each candidate, in the order of the candidates.
 
-
         ``causes`` is the fit without the model's own parts.
         """
         matrix = self._matrix

@@ -373,7 +373,6 @@ class Search:
     def as_well(self, fitted: Fitted, without: Fitted, cause: str) -> list[str]:
         """Returns other causes that fit nearly as well as ``cause``, best first.
 
-
         ``without`` is the fit without that cause.
         """
         most = self.cost(fitted) + self.margin(fitted, without)

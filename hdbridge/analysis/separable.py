@@ -267,7 +267,7 @@ class Separable:
     def tangents(
         self, effects: Sequence[Effect], central: bool = False
     ) -> tuple[list[tuple[int, Shape]], FloatArray]:
-        """Returns the free shapes as (place, shape), and the derivatives with respect to them, (m, s)."""
+        """Returns the free shapes, each with its effect's index, and the derivatives by shape, (m, s)."""
         where = [
             (place, each)
             for place, effect in enumerate(effects)

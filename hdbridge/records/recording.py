@@ -279,7 +279,6 @@ def by_name(given: Given) -> dict[Path, Recording]:
 def agreed_ratio(recordings: Mapping[Path, Recording], said: Iterable[tuple[str, float | None]]) -> float:
     """Returns the gear ratio on which the recordings and ``said`` (pairs of source and value) agree.
 
-
     Raises `InputError` if they disagree, or if none of them states a ratio.
     """
     said = [*said, *((f"{name}", each.ratio) for name, each in recordings.items())]

@@ -3,7 +3,6 @@
 The law is the rolling-friction law of the literature on transmission error, with three points defined that
 are usually left open:
 
-
 * At a reversal the error is continuous: each branch starts from the last value of the one before, and
   rises by ``2 offset g(xi)`` along the new direction until it meets the offset.
 * It saturates only in the direction of travel. (Taken literally, "saturated when |error| >= offset" would

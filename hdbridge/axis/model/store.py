@@ -1,6 +1,5 @@
 """Storage of the models of a profile: the active one, a pending one, and all earlier ones.
 
-
     profiles/NAME/axis.yaml           written by the user
                   model.yaml          the active model, used by the commands
                   pending.yaml        proposed by a calibration or diagnosis, not yet committed
