@@ -123,12 +123,12 @@ def conflicts(effects: Iterable[Effect], ratio: float) -> tuple[str, ...]:
     names = {each.name for each in given}
     return (
         *(
-            f"'{each.name}' stands in place of '{each.replaces}': keep one of the two"
+            f"'{each.name}' replaces '{each.replaces}': keep only one of the two"
             for each in given
             if each.replaces in names
         ),
         *(
-            f"'{each.name}' was made for a gear of ratio {theirs:g}, the model's is {ratio:g}"
+            f"'{each.name}' was made for a gear of ratio {theirs:g}, but the model's ratio is {ratio:g}"
             for each in given
             if not math.isclose(theirs := getattr(each, "ratio", ratio), ratio, rel_tol=1e-9)
         ),

@@ -158,6 +158,6 @@ def missing_error(effect: str, channels: frozenset[Channel]) -> InputError:
     """Returns the `InputError` for channels that an effect needs and a record lacks."""
     names = ", ".join(sorted(each.value for each in channels))
     return InputError(
-        f"the effect '{effect}' needs the channel {names}, which is not there; "
+        f"the effect '{effect}' needs the channel {names}, which is missing; "
         "record it (a column of that name), or leave the effect out of the model"
     )

@@ -48,7 +48,7 @@ def beyond_limit(effects: Iterable[object], motion: Motion) -> tuple[str, ...]:
             share = 100.0 * float(np.mean(np.abs(torque) > limit_nm))
             lines.append(
                 f"{name} reaches {largest:.4g} Nm, beyond the limit_nm of {limit_nm:g} of the model's "
-                f"{getattr(each, 'name', 'effect')}, which is held there ({share:.2g} % of the samples): "
+                f"{getattr(each, 'name', 'effect')}, which is clamped there ({share:.2g} % of the samples): "
                 "raise limit_nm if the torque is right"
             )
     return tuple(lines)

@@ -79,7 +79,7 @@ class Response(Strict):
             raise ValueError("expected frequency_hz, gain, phase_deg and uncertainty of the same length")
         if {len(self.load_gain), len(self.load_phase_deg)} not in ({0}, {len(self.frequency_hz)}):
             raise ValueError(
-                "expected load_gain and load_phase_deg of the length of frequency_hz, or neither"
+                "expected load_gain and load_phase_deg of the same length as frequency_hz, or neither"
             )
         return self
 

@@ -242,7 +242,7 @@ class Store(Generic[K]):
             except (InputError, UnicodeDecodeError):  # damaged by a manual edit: saved, but not as a version
                 write_atomically(self._history_folder(profile) / "unreadable.yaml", before)
             else:
-                reason_found = "was there, but not in the history"
+                reason_found = "found as the active version, but not in the history"
                 activations.append(
                     Activation(
                         date=_iso(date),
