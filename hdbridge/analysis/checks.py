@@ -44,7 +44,7 @@ def check_records(records: Mapping[Path, Record], ratio: float) -> None:
     for path, record in records.items():
         if len(record) > 1 and float(np.ptp(record.time_s)) == 0.0:
             raise InputError(
-                f"{path}: time_s: {record.time_s[0]:g} in all {len(record)} rows; expected time that passes"
+                f"{path}: time_s: {record.time_s[0]:g} in all {len(record)} rows; expected increasing times"
             )
         _check_whole(path, record)
         _check_wrapped(path, record)
@@ -146,8 +146,8 @@ def _check_wrapped(path: Path, record: Record) -> None:
     raise InputError(
         f"{origin.place(row) if origin else path}: {name}: {_shown(after)} after {_shown(before)}, a jump of "
         f"{size} that the other angle does not make ({len(wraps.rows)} such jump"
-        f"{'s' * (len(wraps.rows) > 1)}); expected multi-turn "
-        f"angles, and this is {_counter(period, unit, angle)}: {_unwrapping(record, channel, found)}"
+        f"{'s' * (len(wraps.rows) > 1)}); expected a multi-turn angle, but this looks like "
+        f"{_counter(period, unit, angle)}: {_unwrapping(record, channel, found)}"
     )
 
 

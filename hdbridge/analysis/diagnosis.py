@@ -114,7 +114,7 @@ def diagnose(
         swing = swing or seen_swing(base, between, scales)
         if (between.names, swing) != before:
             search, found = _searched(data, model, scales, between, swing)
-    progress("judging what was found")
+    progress("assessing the findings")
     diagnosis = _Judge(search, model, prior).of(found)
     return replace(diagnosis, remarks=(*remarks, *diagnosis.remarks))
 
@@ -156,7 +156,7 @@ def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:
     if apart is None:
         return ()
     return (
-        f"the zeros of the records are {apart:.0f} arcsec apart, more than their own errors: if the "
+        f"the zero offsets of the records are {apart:.0f} arcsec apart, more than their own errors: if the "
         "encoders' zeros were lost between them, say so (on the command line: --independent-zeros)",
     )
 
@@ -430,13 +430,13 @@ class _Judge:
             experiment=FIT_FIRST if unfitted(self.estimator, self.model.effects) else for_unexplained(lives),
             peak_arcsec=size,
             lives_in=lives,
-            note=f"{figure(left.arcsec, 3)} arcsec rms beyond the noise are left",
+            note=f"{figure(left.arcsec, 3)} arcsec rms beyond the noise remain",
         )
         loops = [each for each in findings if each.effect is not None and each.effect.changes is Part.LOOP]
         if many is None and loops and of_the_loop(self.estimator, left):
             # Even the best hysteresis law is an approximation, so the residual is noted in the loop's
             # finding.
-            note = f"the loop has another shape than either law: {figure(left.arcsec, 3)} arcsec rms are left"
+            note = f"the loop's shape follows neither law: {figure(left.arcsec, 3)} arcsec rms remain"
             noted = replace(loops[0], note=note, lives_in=lives)
             return [noted if each is loops[0] else each for each in findings]
         if size < self.estimator.floor_arcsec:

@@ -263,6 +263,6 @@ def unfitted(estimator: Estimator, effects: tuple[Effect, ...]) -> str:
     does = (plain.residual - loose.residual) / estimator.weight
     return (
         f"the model has no elastic loop, and one of {estimator.half_span(does):.3g} arcsec to either side "
-        f"makes up {100.0 * share:.0f} % of the squares that it leaves: fit a model first (hdbridge fit), "
+        f"would explain {100.0 * share:.0f} % of its squared residual: fit a model first (hdbridge fit), "
         "then diagnose"
     )

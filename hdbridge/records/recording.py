@@ -183,7 +183,7 @@ class Recording:
         """
         folder = Path(folder)
         if (folder / ABOUT_NAME).exists():
-            raise InputError(f"{folder}: there is a recording already; expected a new folder")
+            raise InputError(f"{folder}: already contains a recording; expected a new folder")
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as problem:

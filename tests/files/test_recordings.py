@@ -44,7 +44,7 @@ def test_recordings_read_back_unchanged(tmp_path):
 
 def test_a_recording_is_never_overwritten(tmp_path):
     FULL.save(tmp_path / "one")
-    with pytest.raises(InputError, match=r"/one: there is a recording already; expected a new folder$"):
+    with pytest.raises(InputError, match=r"/one: already contains a recording; expected a new folder$"):
         FULL.save(tmp_path / "one")
 
 
