@@ -169,7 +169,7 @@ class SetPoint:
         """
         timeout = self._timeout(timeout_s)
         if not self.at_rest:
-            raise InputError("a stream begins at rest: stop the axis first")
+            raise InputError("a stream must begin at rest: stop the axis first")
         self._rest_at(self._position_deg)
         self._stream = Stream(self._position_deg, self._limits, self._bounds_here(), self._period_s)
         self._stream_timeout = timeout
@@ -180,7 +180,7 @@ class SetPoint:
     def follow(self) -> None:
         """Pursues the positions passed to `aim` until another command; raises `InputError` in motion."""
         if not self.at_rest:
-            raise InputError("an axis begins to follow another master at rest: stop the axis first")
+            raise InputError("following another master must begin at rest: stop the axis first")
         self._rest_at(self._position_deg)
         self._pursuit = Pursuit(self._position_deg, self._limits, self._bounds, self._period_s)
         self._aim = (self._position_deg, 0.0)
@@ -288,7 +288,7 @@ class SetPoint:
             if self.at_rest:
                 break
         raise InputError(
-            f"no way from {now.position_deg:.9g} deg at {now.velocity_deg_s:.4g} deg/s to {target_deg:.9g} "
+            f"no path from {now.position_deg:.9g} deg at {now.velocity_deg_s:.4g} deg/s to {target_deg:.9g} "
             "deg within the limits: check velocity and acceleration of the move and the limits in the axis "
             "file, or stop the axis first"
         )
@@ -341,7 +341,7 @@ class SetPoint:
 
     def _streaming(self) -> Stream:
         if self._stream is None:
-            raise InputError("no stream has been begun: begin one before its knots come")
+            raise InputError("no stream has been started; start one before sending knots")
         return self._stream
 
 
