@@ -264,7 +264,7 @@ def judge_channels(
         elif 2 * channel.every_cycles * axis.drive.cycle_s < waited_s:
             text += f"; no {name}"
             remedies.append(
-                f"{axis.where(key)}: nothing comes that can be believed (within {channel.scale.least:g} to "
+                f"{axis.where(key)}: no plausible reading (within {channel.scale.least:g} to "
                 f"{channel.scale.greatest:g} {BY_KEY[key].unit}); check the sensor, the object and its unit"
             )
     return failed(text, *remedies, **figures) if remedies else passed(text, **figures)
@@ -281,8 +281,8 @@ def judge_hold(axis: AxisConfig, before: Turned, readings: Sequence[Turned]) -> 
     if motor > max(3.0, 0.5 / 360.0 * counts):
         return failed(
             text,
-            "the axis jumps when power comes: check the drive's commutation and tuning, and that its brake "
-            "opens after it holds",
+            "the axis jumps when power is switched on: check the drive's commutation and tuning, and that "
+            "the brake opens only once the drive holds the axis",
             **figures,
         )
     return passed(text, **figures)
@@ -338,7 +338,7 @@ def judge_torque(axis: AxisConfig, torques_permille: Sequence[float], limit_perc
         return passed(text, **figures)
     return failed(
         text,
-        "a slow move needs all the torque that it may have: check brake, load and lubrication; or allow "
+        "a slow move needs all of the permitted torque: check brake, load and lubrication; or allow "
         f"more: --torque-percent, at most {axis.where('limits.torque_percent')}",
         **figures,
     )
@@ -392,8 +392,8 @@ def judge_stop(
         return passed(text, **figures)
     return failed(
         text,
-        f"the drive brakes more slowly than its ramp: {axis.where('drive.quick_stop_option')} (605Ah) says "
-        f"which ramp, {axis.where('limits.acceleration_deg_s2')} how steep it is (6085h); see the drive's "
+        f"the drive brakes more slowly than its ramp: {axis.where('drive.quick_stop_option')} (605Ah) "
+        f"selects the ramp, {axis.where('limits.acceleration_deg_s2')} its slope (6085h); see the drive's "
         "manual",
         **figures,
     )

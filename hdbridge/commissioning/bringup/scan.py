@@ -165,7 +165,7 @@ class _Hearing:
         if self.syncs:
             remarks.append(
                 f"{self.syncs} SYNC messages were heard: another master runs on this bus; stop it before you "
-                "master an axis here"
+                "control an axis here"
             )
         if self.commands:
             remarks.append(f"{self.commands} NMT commands of another master were heard")
