@@ -136,7 +136,7 @@ def _who_holds(at: str | None) -> str:
         number = daemon_of(raw)
         found.setdefault(number, f"the daemon is {process_words(number)}")
     if not found:
-        return "no process of this machine holds an interface"
+        return "no process on this computer holds an interface"
     what_to_do = ", ".join(f"'kill {number}'" for number in found)
     return f"{'; '.join(found.values())}; {what_to_do} stops its axes in order and ends it"
 
@@ -296,7 +296,7 @@ def events(
         write_json(json_file, document("ctl-events", found))
         while True:
             if found.lost:
-                say(f"{found.lost} older ones are kept no more")
+                say(f"{found.lost} older ones are no longer stored")
             for each in found.events:
                 say(_event_line(each))
             if not follow:

@@ -99,7 +99,9 @@ class Export:
         if _is_csv(out):
             check_writable(out)
             if out.exists():
-                raise InputError(f"{out}: there is a file already; expected a new one: raw data stay")
+                raise InputError(
+                    f"{out}: already exists; expected a new file: raw data are never overwritten"
+                )
         elif out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise InputError(f"{out}: is not an empty folder; expected a new or an empty one")
         return out
