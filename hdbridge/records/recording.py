@@ -57,7 +57,7 @@ class Segment(Strict):
 class RecordedFile(Strict):
     """A CSV file of the recording, with its checksum."""
 
-    name: str = Field(pattern=r"^[^/\\]+$", description="name in this folder")
+    name: str = Field(pattern=r"^[^/\\]+$", description="file name in this folder")
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="checksum")
     samples: int = Field(ge=0, description="rows")
 

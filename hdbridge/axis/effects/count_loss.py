@@ -28,7 +28,7 @@ NEAR_S, LEAST_NEAR = 1.0, 5
 class Step(Strict):
     """One step: from ``time_s`` on, the error is larger by ``size_arcsec``."""
 
-    time_s: float = Field(ge=-1e10, le=1e10, description="when it happened, on the record's clock")
+    time_s: float = Field(ge=-1e10, le=1e10, description="time of the step, on the record's clock")
     size_arcsec: float = Field(ge=-1e6, le=1e6, description="the step, at the load")
 
 

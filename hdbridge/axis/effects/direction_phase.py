@@ -44,7 +44,7 @@ class DirectionPhase(Modulating):
         source="phase of the kinematic error differs between the tooth flanks that carry",
         size="1-5 arcsec",
     )
-    compensable = Compensable(True, "the load really moves so; the direction is commanded")
+    compensable = Compensable(True, "the load really moves like this; the direction is commanded")
     carries = {Part.ORDERS: "orders"}
     curved = True
     linear = ("shift_deg",)

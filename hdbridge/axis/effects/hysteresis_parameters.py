@@ -43,7 +43,7 @@ class HysteresisParameters(Effect):
     shape = Hysteresis.shape
 
     base: Loop = Field(description="the model's loop")
-    offset_arcsec: float = Field(ge=-3600, le=3600, description="new offset; negative where the load lags")
+    offset_arcsec: float = Field(ge=-3600, le=3600, description="new offset; negative if the load lags")
     width_deg: float = Field(gt=0, le=3600, description="new width")
     exponent: float = Field(gt=1, le=6, description="new exponent")
 

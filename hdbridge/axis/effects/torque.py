@@ -11,14 +11,16 @@ from hdbridge.strictness import Strict
 
 TorqueChannel = Annotated[
     Literal["load_torque_nm", "motor_torque_nm"],
-    Field(description="the channel that the torque is taken from"),
+    Field(description="channel with the torque"),
 ]
 _SLOT = {each.value: slot for each, slot in SLOT.items()}
 
 TorqueLimit = Annotated[
     float,
     Field(
-        gt=0, le=1e5, description="torque beyond which the effect is held: no sensor fault moves the axis far"
+        gt=0,
+        le=1e5,
+        description="torque beyond which the effect stays constant; limits the motion due to a sensor fault",
     ),
 ]
 

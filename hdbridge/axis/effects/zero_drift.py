@@ -33,7 +33,7 @@ class ZeroDrift(Linear, Warmed):
         size="5-60 arcsec, tau 10-60 min",
         apart={
             "count_loss": Experiment(
-                4, "return to one reference pose every half minute: a step has happened, a drift goes on"
+                4, "return to one reference pose every half minute: a step is over, a drift continues"
             ),
             "creep": Experiment(
                 10,

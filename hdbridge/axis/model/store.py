@@ -47,7 +47,7 @@ class Activation(BaseModel):
     date: str = Field(description="date, ISO 8601")
     action: Action = Field(description="action")
     version: int = Field(ge=1, description="version number")
-    reason: str = Field("", description="why, in words")
+    reason: str = Field("", description="reason for the activation, in words")
 
 
 class LogFile(BaseModel):
