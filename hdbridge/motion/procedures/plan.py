@@ -207,7 +207,7 @@ class Plan(Strict):
         5.0,
         gt=0,
         le=1e7,
-        description="acceleration of the moves at the load, if the axis file allows it; gentle, against "
+        description="acceleration of the moves at the load, if the axis file allows it; low, to limit "
         "wind-up of the gear",
     )
     procedures: tuple[Entry, ...] = Field(min_length=1, max_length=1000, description="procedures, in order")
