@@ -418,7 +418,7 @@ def doctor(
             "--torque-percent",
             min=1.0,
             max=500.0,
-            help="Highest motor torque, of the rated one; never above limits.torque_percent.",
+            help="Highest motor torque, relative to the rated torque; never above limits.torque_percent.",
         ),
     ] = TORQUE_PERCENT,
     yes: Annotated[bool, Option("--yes", help="Move the axis without asking.")] = False,

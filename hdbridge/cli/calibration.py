@@ -38,7 +38,7 @@ class Measured:
         Option(
             "--plan",
             metavar="quick|full|dynamics|FILE",
-            help="Plan to measure: a bundled plan, or a file. A twin also needs dynamics.",
+            help="Plan to measure: a bundled plan, or a file. A twin also needs the plan dynamics.",
         ),
     ] = "quick"
     out: Annotated[

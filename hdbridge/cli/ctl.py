@@ -268,7 +268,7 @@ def watch(
         int | None, Option("--count", min=1, help="Number of updates; else until Ctrl-C.")
     ] = None,
     lines: Annotated[
-        bool, Option("--lines", help="Print a JSON object per line in place of a table.")
+        bool, Option("--lines", help="Print a JSON object per line instead of a table.")
     ] = False,
 ) -> None:
     """Show the state of a machine until Ctrl-C; nothing moves."""
@@ -485,7 +485,9 @@ def queue(
     velocity_deg_s: opt.Velocity = None,
     acceleration_deg_s2: opt.Acceleration = None,
     dwell_s: Annotated[float, Option("--dwell", min=0.0, max=86_400.0, help="Rest at each, s.")] = 0.0,
-    clear: Annotated[bool, Option("--clear", help="Remove the way points not yet begun; add none.")] = False,
+    clear: Annotated[
+        bool, Option("--clear", help="Remove the way points not yet started; add none.")
+    ] = False,
 ) -> None:
     """Append way points, and wait until the last one is reached. Ctrl-C stops the axis."""
     from hdbridge.client.messages import QueueItem

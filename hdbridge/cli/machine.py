@@ -44,7 +44,7 @@ _EXTRA = ("fastapi", "uvicorn", "websockets", "mcap", "prometheus_client")
 def run(
     machine: opt.Machine,
     simulate: Annotated[
-        bool, Option("--simulate", help="Control simulated drives in place of the bus.")
+        bool, Option("--simulate", help="Control simulated drives instead of those on the bus.")
     ] = False,
     speed: Annotated[
         float,
@@ -229,7 +229,7 @@ def doctor(
     log: Annotated[
         Path | None,
         Option(
-            "--log", metavar="FILE", help="Read a bus log (.log, .asc, .blf, .trc, .mf4) in place of the bus."
+            "--log", metavar="FILE", help="Read a bus log (.log, .asc, .blf, .trc, .mf4) instead of the bus."
         ),
     ] = None,
     json_file: opt.Json = None,

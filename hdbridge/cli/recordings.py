@@ -291,7 +291,12 @@ def import_(
     ],
     profile: Annotated[str, Argument(metavar="PROFILE", help="Axis that was on the bus.")],
     channel: Annotated[
-        str | None, Option("--channel", metavar="NAME", help="The bus, if the node is on several in the log.")
+        str | None,
+        Option(
+            "--channel",
+            metavar="NAME",
+            help="Channel of the node's bus, if the log has several with this node.",
+        ),
     ] = None,
 ) -> None:
     """Make a record of a bus log for `fit` and `diagnose`. Any master may have driven the axis.
