@@ -329,8 +329,8 @@ def _change(change: float, parameter: str) -> str:
 def _drift_text(result: Calibration) -> str:
     errors = [error for _, error in result.drift]
     return (
-        f"The axis returned to one pose {len(errors)} times, always from the same side: its zero moved by "
-        f"{max(errors) - min(errors):.2f} arcsec."
+        f"The axis returned to one pose {len(errors)} times, always from the same side: its zero position "
+        f"moved by {max(errors) - min(errors):.2f} arcsec."
     )
 
 

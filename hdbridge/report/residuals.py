@@ -212,7 +212,7 @@ def partial_residual_chart(partial_residual: PartialResidual) -> Chart:
 def _strength_chart(strength: Strength, home: Coordinate) -> Chart:
     series = [
         Series(
-            "measured, each bin by itself",
+            "measured, each bin separately",
             strength.place,
             strength.measured_percent,
             Mark.POINTS,
