@@ -420,7 +420,8 @@ def _describe_limits(state: State, lines: Sequence[Line], warnings: list[str]) -
         )
     for order in _not_the_motors(state):
         warnings.append(
-            f"{order} shows in this record; the model has no part for it; a diagnosis may find its cause"
+            f"{order} is visible in this record, but the model has no part for it; a diagnosis may find its "
+            "cause"
         )
 
 

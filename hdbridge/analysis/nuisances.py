@@ -32,9 +32,9 @@ TURNS = "turns"
 SWING = "swing_ms2"
 SWING_LAG = "swing_ms3"
 TEXTS = {
-    DELAY: "the load encoder is read later than the motor's by",
-    ROUNDING: "in the direction of its last motion the motor is behind what its encoder says, at rest, by",
-    SWING: "the load swings beyond the error that shakes it, by its own acceleration times",
+    DELAY: "delay of the load encoder's samples relative to the motor encoder's",
+    ROUNDING: "lag of the motor behind its reading at rest, in the direction of its last motion",
+    SWING: "swing of the load beyond the error that excites it, per acceleration of the load",
 }
 UNITS = {DELAY: "ms", ROUNDING: "counts", SWING: "ms\N{SUPERSCRIPT TWO}"}
 SWING_MS2 = 25.0

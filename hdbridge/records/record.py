@@ -77,7 +77,7 @@ def remedy(times: float, ratio: float, exact: float, origin: Origin | None) -> s
             if origin is not None:
                 pass_ = option("--units", {channel: f"counts:{_round(counts, exact)}"})
                 how = f"pass {pass_} with the counts per turn of its data sheet"
-            return f"the {channel}'s angle looks like counts, some {counts:.4g} to a turn: {how}"
+            return f"the {channel}'s angle looks like counts, about {counts:.4g} per turn: {how}"
     return "correct the ratio, or the counts per turn of an encoder" + _of_counts(times, exact, origin)
 
 
@@ -297,7 +297,7 @@ class Record:
             found = "the load stands still while the motor turns"
         else:
             found = f"the motor makes {1 / abs(slope):.5g} turns per turn of the load"
-            found += ", against it" if slope < 0.0 else ""
+            found += ", in the opposite direction" if slope < 0.0 else ""
         cure = remedy(slope * ratio, ratio, WRONG_RATIO, self.origin)
         name = f"{self.source}: " if self.source else ""
         over = f"measured over {travel_deg:.3g} deg of the load"

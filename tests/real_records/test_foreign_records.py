@@ -268,7 +268,7 @@ ADVISED: dict[str, tuple[str, str, str]] = {
     ),
     "motor in counts": (
         text(motor=MOTOR * 8000.0 / 360.0),
-        "the motor's angle looks like counts, some 8000 to a turn",
+        "the motor's angle looks like counts, about 8000 per turn",
         "--units motor=counts:8000",
     ),
     "motor at the output": (
