@@ -109,7 +109,7 @@ def test_a_node_that_another_client_talks_to_is_left_alone() -> None:
     assert node is not None
     assert node.busy
     assert node.device_type is None
-    assert "another SDO client is talking to node 1" in "".join(found.remarks)
+    assert "another SDO client is using node 1" in "".join(found.remarks)
     matches, lines = compare(AXIS, found)
     assert not matches
     assert "in use by another SDO client" in lines[0]

@@ -144,15 +144,15 @@ def eds(context: BringUpContext) -> Verdict:
         stated = getattr(information, name, None)
         found = drive.sdo.fetch(address)
         if isinstance(stated, int) and stated and stated != found:
-            wrong.append(f"the EDS is for {name.replace('_', ' ')} {stated:#x}, the drive says {found:#x}")
+            wrong.append(f"the EDS is for {name.replace('_', ' ')} {stated:#x}, the drive reports {found:#x}")
     if wrong:
         return failed(
-            f"{len(wrong)} of {looked_at} objects are not as {axis.drive.eds} says",
+            f"{len(wrong)} of {looked_at} objects do not agree with {axis.drive.eds}",
             f"{where}: found {axis.drive.eds}, expected the EDS file of this drive and firmware",
             *wrong,
             objects=looked_at,
         )
-    return passed(f"{looked_at} objects answer as {axis.drive.eds} says", objects=looked_at)
+    return passed(f"{looked_at} objects agree with {axis.drive.eds}", objects=looked_at)
 
 
 def _listed(context: BringUpContext) -> Iterator[tuple[int, int]]:

@@ -101,7 +101,7 @@ def judge_turn(
             f"{axis.where(SOURCE)}: object {_source(axis)} does not follow the load; check the encoder, its "
             "cable and supply, and that the object is the load encoder's",
             f"if it is the right object: {axis.where(LOAD_COUNTS)}: found "
-            f"{axis.load_encoder.counts_per_turn}, far too many for what it moves",
+            f"{axis.load_encoder.counts_per_turn}, far too many for its motion",
             **figures,
         )
     if math.isclose(abs(measured), 1.0, rel_tol=1e-3) and not math.isclose(abs(factor), 1.0, rel_tol=0.01):
@@ -118,7 +118,7 @@ def judge_turn(
         remedies += [each.text(axis) for each in accuse(axis, abs(factor), tolerance, confirmed)]
     elif lost > 4.0 + 0.05 * abs(load) / 2.0:
         remedies.append(
-            f"{axis.where(SOURCE)}: the load encoder came back {lost:.0f} counts from where it had been; "
+            f"{axis.where(SOURCE)}: the load encoder returned {lost:.0f} counts off its initial reading; "
             "check it for lost counts and the coupling for slip"
         )
     ratio = f"ratio {axis.gear.ratio / abs(factor):.4g} against {axis.gear.ratio:g}"
@@ -170,7 +170,7 @@ def _counts(key: str, found: int, wanted: float, tolerance: float, weight: float
     digits = len(str(tidy).rstrip("0"))
     if digits == 1 or tidy & (tidy - 1) == 0:
         return Accusation(key, found, tidy, weight + 2.0, "a round number")
-    return Accusation(key, found, tidy, weight + (1.0 if digits == 2 else 0.0), "it would explain it")
+    return Accusation(key, found, tidy, weight + (1.0 if digits == 2 else 0.0), "it would explain the travel")
 
 
 def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> Accusation:
@@ -190,7 +190,7 @@ def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> Accusation:
             return Accusation(RATIO, found, whole, 2.0 - less, "a usual ratio")
         return Accusation(RATIO, found, whole, 1.0 - less, "a whole number")
     return Accusation(
-        RATIO, found, float(f"{wanted:.5g}"), -2.0, "it would explain it, but is not a whole number"
+        RATIO, found, float(f"{wanted:.5g}"), -2.0, "it would explain the travel, but is not a whole number"
     )
 
 

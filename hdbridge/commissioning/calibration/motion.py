@@ -48,7 +48,7 @@ CHANCE = 1.05
 FADED = 0.5
 """Fraction of the required gain below which the filter counts as no longer correcting an order."""
 RETUNED = (
-    "the servo does not answer as it did when the response was measured (following lag {:.1f} ms then, "
+    "the servo does not respond as it did when the response was measured (following lag {:.1f} ms then, "
     "{:.1f} ms now; the response differs by {:.0f} %): it was retuned, or the load changed; measure the "
     "response again"
 )
@@ -363,8 +363,8 @@ class _Runner:
         self.orders = tuple(each.order for each in self.motor_orders)
         if not self.orders:
             raise InputError(
-                f"the model has no motor order of {LEAST_ARCSEC:g} arcsec or more: there is no ripple to "
-                "measure the response by; calibrate the axis first"
+                f"the model has no motor order of {LEAST_ARCSEC:g} arcsec or more: there is no ripple with "
+                "which to measure the response; calibrate the axis first"
             )
         self.lag_s = 0.0
         """Following lag of the axis, s, from the runs without correction."""
