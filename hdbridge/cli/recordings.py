@@ -118,7 +118,7 @@ def remarks(recording: Recording) -> Iterator[str]:
     """Yields remarks on a recording made of flight recordings or a bus log."""
     about = recording.notes
     if count := about.get("cycles_missing_within_parts"):
-        yield f"{count} cycles are missing within parts, and the times allow for them"
+        yield f"{count} cycles are missing within parts; the time stamps account for them"
     if count := about.get("parts_too_short"):
         yield f"{count} parts were too short and are left out"
     if about.get("zeros_may_differ"):
