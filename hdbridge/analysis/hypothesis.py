@@ -66,7 +66,7 @@ class Hypothesis:
     effects: tuple[Effect, ...]
     start: Start = Start.VIRGIN
     nuisances: Nuisances | None = None
-    """Columns at the usable points in addition to those of every hypothesis; compared by identity."""
+    """Columns at the usable points, in addition to those common to all hypotheses; compared by identity."""
 
     def plus(self, effect: Effect) -> Hypothesis:
         """Returns the hypothesis with an effect appended."""
@@ -157,7 +157,7 @@ class Estimator:
         self.calibrated: tuple[CalibratedPart, ...] = ()
         """Priors from the calibration for the first effects of each hypothesis."""
         self.unknown: Nuisances = zeros(self.zero, data.full.zeros)
-        """Nuisances of every hypothesis: zero offsets, motion between samples, initial elastic states."""
+        """Nuisances common to all hypotheses: zero offsets, motion between samples, initial states."""
 
     @property
     def motion(self) -> Motion:
@@ -399,7 +399,7 @@ class Estimator:
         )
 
     def _nuisances(self, hypothesis: Hypothesis) -> Nuisances:
-        """Returns the nuisances of every hypothesis, followed by those of this one."""
+        """Returns the nuisances common to all hypotheses, followed by those of this one."""
         own = hypothesis.nuisances
         return self.unknown if own is None else self.unknown.and_also(own)
 

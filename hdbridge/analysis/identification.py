@@ -51,7 +51,8 @@ class NoiseFigures:
     standing_arcsec: float | None
     """Rms of the load encoder at rest, about the mean of each rest; None without a long enough rest."""
     laps_arcsec: float | None
-    """Rms difference between passes over the same angles in one direction, divided by the root of 2."""
+    """Rms difference between passes over the same angles in one direction, divided by the square root of
+    2."""
     model: NoiseModel
     """Noise model of the residual, white and correlated, on which the intervals are based."""
     residual_arcsec: float

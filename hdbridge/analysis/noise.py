@@ -249,7 +249,7 @@ class Precision:
         return 0.5 * (self._log_determinant - float(residual @ self.apply(residual)))
 
     def score(self, residual: FloatArray) -> FloatArray:
-        """Returns the derivatives (8,) of `log_likelihood` by the logarithms of the noise model's fields.
+        """Returns the derivatives (8,) of `log_likelihood` with respect to the logarithms of the noise model.
 
         The model must have a drift. By Fisher's identity, the derivatives follow from the mean and covariance
         of the drifts, given the residual.

@@ -56,7 +56,8 @@ LEAD_CYCLES = 8
 LAG_CYCLES = 16
 """Number of past cycles in the filter, in addition to the following lag."""
 POLES = 2
-"""Number of poles of the filter. The ringing of a resonance or a servo notch exceeds the filter's length."""
+"""Number of poles of the filter, because the ringing of a resonance or servo notch outlasts the filter's
+length."""
 REFINEMENTS = 5
 """Number of iterations for the poles (Sanathanan and Koerner, 1963)."""
 FADE = 0.12

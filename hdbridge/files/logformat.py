@@ -32,7 +32,7 @@ class ForMachines(logging.Formatter):
 
 
 class LogFile(logging.FileHandler):
-    """Log file that stops at its first error, such as a full disk, because the axis must continue."""
+    """Log file that stops logging at the first error, such as a full disk, so that the axis continues."""
 
     failed = False
 

@@ -187,7 +187,7 @@ def _recordings(files: Mapping[str, str], described: Collection[str]) -> dict[st
 
 
 def _marks_of(paths: Collection[str], timeout_s: float) -> dict[str, str]:
-    """Returns the marks (size and times) of the recordings in a manifest, without those that are missing."""
+    """Returns the marks (size and times) of the recordings in a manifest; omits missing recordings."""
     files: dict[str, str] = {}
     for place in {posixpath.dirname(path) if "://" in path else path for path in paths}:
         with suppress(InputError):  # the worker that reads the recording reports the error

@@ -119,7 +119,7 @@ class Coefficient:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretch:
-    """Samples that by themselves must show an effect, because other effects may imitate it elsewhere."""
+    """Samples that alone must show an effect, because other effects may imitate it in other samples."""
 
     rows: BoolArray
     """Mask of the samples, shape (n,)."""

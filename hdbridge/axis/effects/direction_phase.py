@@ -1,4 +1,4 @@
-"""Shift of the synchronous part with the direction of motion, because other tooth flanks carry the load."""
+"""Shift of the synchronous part with the direction of motion, because the tooth flanks that carry differ."""
 
 import math
 from collections.abc import Iterator, Sequence
