@@ -46,13 +46,13 @@ def robust_chi_square(
     laws: FloatArray | None = None,
     free: bool = False,
 ) -> float:
-    """Returns the block-robust chi square of an effect's coefficients against zero.
+    """Returns the block-robust chi square of an effect's coefficients, for the hypothesis that they are zero.
 
     Omits incidental coefficients and refits all other parameters. The effect's shape has no meaning without
     the effect. It is refitted only if ``free`` is set, which tests whether the record determines the
     coefficients. ``nuisances`` are additional weighted columns. ``rows`` selects points, and ``only`` a
-    single coefficient. Each column of ``laws`` is a weighted error of another effect's law, one standard
-    deviation.
+    single coefficient. Each column of ``laws`` is one standard deviation of the law error of some other
+    effect, weighted.
     """
     own = fitted.places(place)
     shape = [i for i in own if fitted.parameters[i].shape and not free]
@@ -131,7 +131,7 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
 
 
 def gate_of_change(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gate:
-    """Tests a change of a part of the model; ``without`` is the fit with the part as given."""
+    """Tests a change of a part of the model; ``without`` is the fit with this part unchanged."""
     change = without.residual - fitted.residual
     columns = np.column_stack([without.tangent, change])
     known = np.vstack([without.linearised.known, np.zeros(2)])

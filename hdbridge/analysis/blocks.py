@@ -1,6 +1,5 @@
 """Averages samples over short blocks, which reduces a million rows to some ten thousand.
 
-
 Columns are averaged like the observations, so a linear model of the samples is the same linear model of the
 blocks. Only the variation within a block is lost. Blocks are short just after a reversal, where the
 hysteresis is steep, and never cross a turning point, a gap or unusable samples.
@@ -256,7 +255,6 @@ class Design:
 
     def blurred(self, effects: Sequence[Effect]) -> Design:
         """Returns the design with the variance that rounding of the motor angle adds to each block.
-
 
         Just after a turning point a hysteresis may be arbitrarily steep, so measurements there get little
         weight.

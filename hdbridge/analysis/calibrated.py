@@ -98,7 +98,7 @@ def variances(parts: Sequence[CalibratedPart], place: int, columns: Iterable[int
 
 
 def priors(parts: Sequence[CalibratedPart]) -> dict[tuple[int, str], Prior]:
-    """Returns the priors of all parameters of the parts, by place and name."""
+    """Returns the priors of all parameters of the parts, by index of the effect and name of the parameter."""
     return {
         (part.place, name): Prior(mean, deviation**-2)
         for part in parts

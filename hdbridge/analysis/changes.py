@@ -101,7 +101,7 @@ def _finding(
 def _another_law(
     search: Search, fitted: Fitted, precise: Fitted, place: int, given: Effect, spread: FloatArray
 ) -> _Change | None:
-    """Returns a change if another hysteresis law fits better than the ``given`` one."""
+    """Returns a change if a different hysteresis law fits better than the ``given`` one."""
     estimator, now = search.estimator, precise.hypothesis.effects[place]
     scales = estimator.scales
     causes = causes_of(given, now)
@@ -131,13 +131,13 @@ def _loop(
     causes = causes_of(given, precise.hypothesis.effects[place])
     if (small and not lawless) or not causes:
         return None
-    # A loop that follows neither law exactly may follow the other one in part.
+    # A loop that follows neither law exactly may partly follow the alternative law.
     laws = [kind.name for kind in CATALOGUE.values() if kind.part is Part.LOOP and kind.changes is Part.LOOP]
     return _Change(
         causes[0],
         max(peak, lawless),
         parameters_of(estimator, precise, place, spread),
-        "the baseline's own loop takes over the new parameters",
+        "the model's own loop receives the new parameters",
         tuple(laws) if lawless else (),
     )
 
@@ -198,7 +198,7 @@ def _orders(
         causes[0],
         difference.bound_arcsec(),
         named_parameters(difference, [Column(0, str(i)) for i in range(len(own))], apart),
-        "orders of the model have changed, or were wrong: its synchronous part takes the change over",
+        "orders of the model have changed, or were wrong: its synchronous part absorbs the change",
         tuple(each.name for each in causes[1:]),
     )
 
@@ -219,11 +219,11 @@ def _freed(
         precise.hypothesis.effects[place],
         peak,
         parameters_of(estimator, precise, place, spread),
-        "a change of what the model has: "
+        "a change of a part of the model: "
         + (
             "it is unchanged, because the record does not separate it from another cause"
             if aliases
-            else "its own parameters take it over"
+            else "its own parameters absorb the change"
         ),
         aliases,
         left_alone=bool(aliases),

@@ -25,7 +25,7 @@ MOST_COUNTS = 2**32
 TURNS_SEEN = 4.0
 """Minimum number of motor turns for testing whether the error repeats."""
 PLACES = 8
-"""Number of sectors into which a motor turn is divided for counting visited places."""
+"""Number of sectors into which a motor turn is divided, to count the visited ones."""
 REPEATS_SHARE = 0.5
 """Minimum fraction of the error's variance that repeats with each motor turn, for `TURNS_SEEN` turns. For
 more turns the minimum is smaller, because a chance repetition explains less."""
@@ -44,7 +44,7 @@ def check_records(records: Mapping[Path, Record], ratio: float) -> None:
     for path, record in records.items():
         if len(record) > 1 and float(np.ptp(record.time_s)) == 0.0:
             raise InputError(
-                f"{path}: time_s: {record.time_s[0]:g} in all {len(record)} rows; expected time that passes"
+                f"{path}: time_s: {record.time_s[0]:g} in all {len(record)} rows; expected increasing times"
             )
         _check_whole(path, record)
         _check_wrapped(path, record)
@@ -61,7 +61,7 @@ def check_records(records: Mapping[Path, Record], ratio: float) -> None:
 
 
 def zeros_apart_arcsec(records: Sequence[Record], ratio: float) -> float | None:
-    """Returns the spread of the zeros of records with the same direction of motion, arcsec.
+    """Returns the spread of the zero offsets of records with the same direction of motion, arcsec.
 
     Returns None if the spread does not exceed the variation within the records, or if each direction has at
     most one record. Directions are compared separately, because hysteresis shifts their mean errors.
@@ -146,8 +146,8 @@ def _check_wrapped(path: Path, record: Record) -> None:
     raise InputError(
         f"{origin.place(row) if origin else path}: {name}: {_shown(after)} after {_shown(before)}, a jump of "
         f"{size} that the other angle does not make ({len(wraps.rows)} such jump"
-        f"{'s' * (len(wraps.rows) > 1)}); expected multi-turn "
-        f"angles, and this is {_counter(period, unit, angle)}: {_unwrapping(record, channel, found)}"
+        f"{'s' * (len(wraps.rows) > 1)}); expected a multi-turn angle, but this looks like "
+        f"{_counter(period, unit, angle)}: {_unwrapping(record, channel, found)}"
     )
 
 
@@ -228,7 +228,7 @@ def _check_turn(path: Path, record: Record, ratio: float) -> None:
     shown &= np.repeat(spans >= math.tau, np.diff(begins, append=len(motor)))  # keep runs over a whole period
     places = len(np.unique(np.floor(PLACES / math.tau * motor[shown])))
     if places < PLACES * TURNS_SEEN:
-        return  # too few places to distinguish the periods
+        return  # too few sectors to distinguish the periods
     base = np.column_stack([np.ones_like(motor), motor, np.sign(step)])
     error = record.transmission_error_arcsec(ratio)[shown]
 

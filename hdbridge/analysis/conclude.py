@@ -126,7 +126,7 @@ def _orders(name: str, left: Sequence[Line]) -> ResidualTest:
     significant = [each for each in left if each.significant]
     worst = max(significant, key=lambda each: each.amplitude_arcsec, default=None)
     size = worst.amplitude_arcsec if worst else 0.0
-    text = f"{worst.order} of {size:.2f} arcsec is left" if worst else "no order is left"
+    text = f"{worst.order} of {size:.2f} arcsec remains" if worst else "no order remains"
     return ResidualTest(name, size < WORTH_ARCSEC, size, text)
 
 
@@ -172,9 +172,11 @@ def _whiteness(noise: NoiseModel) -> ResidualTest:
 def _level(figures: NoiseFigures) -> ResidualTest:
     rest = figures.standing_arcsec
     if rest is None:
-        return ResidualTest("noise_level", True, 0.0, "the axis never stood long enough to measure its noise")
+        return ResidualTest(
+            "noise_level", True, 0.0, "the axis never stood still long enough to measure its noise"
+        )
     size = math.sqrt(max(figures.fitted_arcsec**2 - rest**2, 0.0))
-    text = f"{figures.fitted_arcsec:.2f} arcsec is left, at rest the noise is {rest:.2f}"
+    text = f"{figures.fitted_arcsec:.2f} arcsec remains; the noise at rest is {rest:.2f}"
     return ResidualTest("noise_level", size < max(rest, 1.0), size, text)
 
 
@@ -210,7 +212,7 @@ def held_out(
         steps = steps_without(fit, fold, lambda rows: Precision(state.noise, blocks.picked(rows)))
         for number, step in enumerate(steps):
             out = fold == number
-            # Zeros are those of the other folds; a zero that occurs only in this fold is fitted here.
+            # Zero offsets are taken from the other folds; one that occurs only in this fold is fitted here.
             lost = ~np.isin(blocks.zero, blocks.zero[~out])
             left = fit.residual - columns @ step
             added[row, out] = about_zeros(left, blocks.zero, blocks.count * lost)[out]
@@ -404,7 +406,7 @@ def _describe_limits(state: State, lines: Sequence[Line], warnings: list[str]) -
     if load_turns < 0.95:
         warnings.append(
             f"the record spans {load_turns:.2f} load turns: errors that repeat with the "
-            "load turn cannot be seen and may bend the rest; sweep over two"
+            "load turn are not visible and may bias the other parameters; sweep over two"
         )
     if outliers.swinging:
         warnings.append(
@@ -418,7 +420,8 @@ def _describe_limits(state: State, lines: Sequence[Line], warnings: list[str]) -
         )
     for order in _not_the_motors(state):
         warnings.append(
-            f"{order} shows in this record; the model has no part for it; a diagnosis may find its cause"
+            f"{order} is visible in this record, but the model has no part for it; a diagnosis may find its "
+            "cause"
         )
 
 

@@ -50,15 +50,14 @@ class Observed:
 def observed(record: Record, ratio: float) -> Observed:
     """Cleans a record: spreads coarse time stamps evenly, drops misread samples and cuts at jumps.
 
-
     Returns an intact record unchanged.
     """
     remarks = []
     if repeated := sum(coarse(part.time_s, part.motor_position_deg) for part in record.parts()):
         remarks.append(
-            f"{_name(record)}{repeated} of {len(record)} samples have the time of the one before, though the "
-            "motor has moved on: a clock coarser than the sampling; the samples are spread evenly over its "
-            "ticks"
+            f"{_name(record)}{repeated} of {len(record)} samples have the time of the previous one, although "
+            "the motor has moved: the clock is coarser than the sampling; the samples are spread evenly over "
+            "its ticks"
         )
         times = np.concatenate([spread(part.time_s) for part in record.parts()])
         record = replace(record, columns={**record.columns, "time_s": times})
@@ -68,8 +67,8 @@ def observed(record: Record, ratio: float) -> Observed:
     if not np.all(kept):
         rows = np.flatnonzero(~kept)
         remarks.append(
-            f"{_name(record)}{len(rows)} of {len(record)} samples left out, as their angles jump there and "
-            f"back (the first is number {rows[0] + 1}, at {record.time_s[rows[0]]:g} s): misread"
+            f"{_name(record)}{len(rows)} of {len(record)} samples left out as misread, because their angles "
+            f"jump and return (the first is number {rows[0] + 1}, at {record.time_s[rows[0]]:g} s)"
         )
         record = _picked(record, kept)
     cuts = [int(row) + 1 for row in jumps(record.motor_position_deg, record.time_s)]
@@ -86,8 +85,8 @@ def observed(record: Record, ratio: float) -> Observed:
     period_s = float(np.median(steps)) if len(steps) else 0.0
     if period_s >= SLOWEST_S and float(np.ptp(record.motor_position_deg)) > 0.0:
         remarks.append(
-            f"{_name(record)}time_s goes on by {period_s:g} s from sample to sample, too slow to see a motor "
-            "turn: if these are milliseconds, divide them by 1000"
+            f"{_name(record)}time_s advances by {period_s:g} s per sample, too slow to see a motor turn: if "
+            "these are milliseconds, divide them by 1000"
         )
     return Observed(record, tuple(remarks), tuple(cuts))
 

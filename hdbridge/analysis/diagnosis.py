@@ -87,7 +87,7 @@ def diagnose(
 ) -> Diagnosis:
     """Finds the causes of the difference between a model and one or several recordings.
 
-    Set ``independent_zeros`` if the encoders' zeros were lost between recordings. ``progress`` receives a
+    Set ``independent_zeros`` if the encoders lost their zeros between recordings. ``progress`` receives a
     description of each step. ``scales`` overrides the decision thresholds, and ``prior`` is the fleet's prior
     for the causes. Raises InputError if a recording is too short, does not match the model's ratio, or lacks
     a channel that the model needs.
@@ -116,14 +116,15 @@ def diagnose(
     swing = visible_swing(base, between, scales)
     search, found = _searched(data, model, scales, between, swing)
     if swing is None or not between.names:  # a larger cause may mask them
-        # Inertial wind-up is the slow part of both, so it is excluded from the base.
+        # Inertial wind-up is the slow part of the swing and of the motion between samples, so the base
+        # excludes it.
         others = [each for each in found.hypothesis.effects if each.channels != {Channel.ACCELERATION}]
         base, before = Base.of(data, others), (between.names, swing)
         between = between if between.names else between_samples(base, scales)
         swing = swing or visible_swing(base, between, scales)
         if (between.names, swing) != before:
             search, found = _searched(data, model, scales, between, swing)
-    progress("judging what was found")
+    progress("assessing the findings")
     diagnosis = _Judge(search, model, prior).of(found)
     return replace(diagnosis, remarks=(*remarks, *diagnosis.remarks))
 
@@ -163,12 +164,12 @@ def _search(data: Observed, model: TransmissionModel, scales: Scales, between: N
 
 
 def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:
-    """Returns a remark if the zeros of the recordings differ by more than their own errors."""
+    """Returns a remark if the zero offsets of the recordings differ by more than their own errors."""
     apart = zeros_apart_arcsec(parts, ratio)
     if apart is None:
         return ()
     return (
-        f"the zeros of the records are {apart:.0f} arcsec apart, more than their own errors: if the "
+        f"the zero offsets of the records are {apart:.0f} arcsec apart, more than their own errors: if the "
         "encoders' zeros were lost between them, say so (on the command line: --independent-zeros)",
     )
 
@@ -314,7 +315,7 @@ class _Judge:
         return UNCALIBRATED if findings and len(self.estimator.data.full.kinds) == 1 else ""
 
     def _stopped(self, fitted: Fitted) -> tuple[int, str] | None:
-        """Returns the place of a rejected cause and the reason; None if all causes pass.
+        """Returns the index of the first cause to reject, and the reason; None if all causes pass.
 
         Causes that fail their acceptance tests come first, the weakest before the others, then causes that
         are implausible or not identifiable.
@@ -391,7 +392,7 @@ class _Judge:
         unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
         context = Context(left.arcsec, excess, unknown)
         findings = weighed(findings, context, estimator.scales, self.prior)
-        if estimator.data.reversals < 2:  # speed, torque, place and time are correlated
+        if estimator.data.reversals < 2:  # speed, torque, position and time are correlated
             findings = [self._one_way(each) for each in findings]
         return _Judged(whole, fitted, findings, left, context)
 
@@ -452,12 +453,13 @@ class _Judge:
             experiment=FIT_FIRST if unfitted(self.estimator, self.model.effects) else for_unexplained(lives),
             peak_arcsec=size,
             lives_in=lives,
-            note=f"{figure(left.arcsec, 3)} arcsec rms beyond the noise are left",
+            note=f"{figure(left.arcsec, 3)} arcsec rms beyond the noise remain",
         )
         loops = [each for each in findings if each.effect is not None and each.effect.changes is Part.LOOP]
         if many is None and loops and of_the_loop(self.estimator, left):
-            # The best hysteresis law is only an approximation. The residual is noted in that finding.
-            note = f"the loop has another shape than either law: {figure(left.arcsec, 3)} arcsec rms are left"
+            # Even the best hysteresis law is an approximation, so the residual is noted in the loop's
+            # finding.
+            note = f"the loop's shape follows neither law: {figure(left.arcsec, 3)} arcsec rms remain"
             noted = replace(loops[0], note=note, lives_in=lives)
             return [noted if each is loops[0] else each for each in findings]
         if size < self.estimator.floor_arcsec:

@@ -167,8 +167,8 @@ def _driving(
     noise = _noise(lag, target, count)
     if noise >= 0.5 * count and float(np.std(rest)) > 0.45 * count + 1e-6:
         line = line + uniform_filter1d(rest, 2 * window + 1, mode="nearest")
-    # If the fit misses the cell, it does not determine the position within the cell. The reading and the fit
-    # are averaged, weighted by their variances.
+    # If the fit misses the cell of the reading (about a count wide), it does not determine the position
+    # within the cell. Reading and fit are averaged, with weights from their variances.
     read = noise**2 + count**2 / 12.0
     cell = max(0.5 * count, 3.0 * noise)
     outside = np.abs(lag - line) > cell
@@ -177,7 +177,7 @@ def _driving(
     # The reading takes precedence if a motor sticks at a reversal or overshoots a stop.
     line = np.clip(line, lag - cell, lag + cell)
     line = _averaged_at_rest(line, lag, _resting(target, window), window, count, math.sqrt(read))
-    # The path may cross its cell without a reversal, and the cell moves with a noisy reading.
+    # Within its cell, the path may move back without a true reversal, and noise moves the cell itself.
     band = max(CHATTER_COUNTS * reading.resolution_deg, 4.0 * cell)
     return steadied(target + line, target + line, band)
 

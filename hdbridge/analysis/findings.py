@@ -205,7 +205,7 @@ class Traces:
     """Plot data of model and measurement on the same trajectory; arrays of equal length."""
 
     measured_arcsec: FloatArray
-    """Measured transmission error, relative to the zero of the fit."""
+    """Measured transmission error, relative to the fitted zero offset."""
     model_arcsec: FloatArray
     """Transmission error predicted by the given model."""
     extended_arcsec: FloatArray

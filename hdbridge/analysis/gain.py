@@ -18,8 +18,8 @@ from hdbridge.axis.effects.kinematics import direction_of
 SURE = 2.0
 """Minimum size of a significant gain, standard errors."""
 NEARLY_ALL = 0.75
-"""Lower limit of the fraction of recordings that a cause must predict better, itself excluded: all of three
-or four, four of five."""
+"""Exclusive lower limit of the fraction of recordings that a cause must predict better: all of three or four,
+four of five."""
 SHARED = 1.5
 """Minimum effective number of stretches that contribute to a gain. A single event contributes in one stretch
 or, at a border, unequally in two."""

@@ -1,4 +1,4 @@
-"""Hypotheses (effects and zeros) and their joint fit with all free parameters (`separable`).
+"""Hypotheses (effects and zero offsets) and the joint fit of all their free parameters (`separable`).
 
 The baseline is refitted with every candidate, so an error that the baseline can absorb does not become a
 finding.
@@ -67,7 +67,7 @@ class Hypothesis:
     effects: tuple[Effect, ...]
     start: Start = Start.VIRGIN
     nuisances: Nuisances | None = None
-    """Columns at the usable points in addition to those of every hypothesis; compared by identity."""
+    """Columns at the usable points, in addition to those common to all hypotheses; compared by identity."""
 
     def plus(self, effect: Effect) -> Hypothesis:
         """Returns the hypothesis with an effect appended."""
@@ -97,7 +97,7 @@ class Fitted:
     _weight: FloatArray = field(repr=False)
 
     def having(self, effects: tuple[Effect, ...]) -> Fitted:
-        """Returns the fit with its effects replaced, place by place, and all else unchanged."""
+        """Returns the fit with its effects replaced one by one, and all else unchanged."""
         return replace(self, hypothesis=replace(self.hypothesis, effects=effects))
 
     @cached_property
@@ -158,7 +158,7 @@ class Estimator:
         self.calibrated: tuple[CalibratedPart, ...] = ()
         """Priors from the calibration for the first effects of each hypothesis."""
         self.unknown: Nuisances = zeros(self.zero, data.full.zeros)
-        """Nuisances of every hypothesis: zeros, motion between samples, initial elastic states."""
+        """Nuisances common to all hypotheses: zero offsets, motion between samples, initial states."""
 
     @property
     def motion(self) -> Motion:
@@ -318,7 +318,7 @@ class Estimator:
         return self._free_loops[start]
 
     def fit(self, hypothesis: Hypothesis, moves: frozenset[Moves] = LOCAL, effort: Effort = ENOUGH) -> Fitted:
-        """Fits a hypothesis, starting from its present parameters; the result is never worse than the start.
+        """Fits a hypothesis, starting from its own parameters; the result is never worse than the start.
 
         ``moves`` selects the shape parameters to fit. Initially all calibrated parts have their priors. Parts
         whose deviation (`strain`) exceeds the cost of a change are freed one by one.
@@ -352,8 +352,8 @@ class Estimator:
         """Returns the weighted sum of squares that channel noise adds to each column of an effect, (p,).
 
         With errors in variables, a fit improves spuriously as the coefficient of a noisy column shrinks. The
-        correction (Fuller 1987, 2.2) applies to calibrated coefficients only. Any other coefficient, if its
-        column contained little but noise, could take any size.
+        correction (Fuller 1987, 2.2) applies to calibrated coefficients only. With it, any other coefficient
+        could take any size if its column contained little but noise.
         """
         motion = self.data.full.motion
         channels = sorted(effect.needs() & NOISY & motion.measured.keys(), key=lambda each: each.value)
@@ -400,7 +400,7 @@ class Estimator:
         )
 
     def _nuisances(self, hypothesis: Hypothesis) -> Nuisances:
-        """Returns the nuisances of every hypothesis, followed by those of this one."""
+        """Returns the nuisances common to all hypotheses, followed by those of this one."""
         own = hypothesis.nuisances
         return self.unknown if own is None else self.unknown.and_also(own)
 
@@ -411,7 +411,7 @@ class Estimator:
         return 1.0 if effect.nonnegative else 0.0
 
     def predicted(self, fitted: Fitted) -> FloatArray:
-        """Returns the prediction for each sample, zeros included, arcsec, shape (n,)."""
+        """Returns the prediction for each sample, including the zero offset, arcsec, shape (n,)."""
         effects, start = fitted.hypothesis.effects, fitted.hypothesis.start
         return fitted.zeros[self.data.full.zero] + self.level + self._regressors.predicted(effects, (start,))
 
@@ -422,7 +422,7 @@ class Estimator:
     def residual_of(self, effects: Sequence[Effect]) -> tuple[FloatArray, Start]:
         """Returns the residual at the usable points, arcsec, (m,), and the initial elastic state.
 
-        Zeros and initial state are those that fit best.
+        Zero offsets and initial state are those that fit best.
         """
         left = {
             start: about_zeros(self.observed - self.predict(effects, start), self.zero, self.weight**2)

@@ -63,7 +63,7 @@ def identifiability(
         example = best[cause]
         share, strength = example.share, example.strength
         if share < SHARE_LEFT or strength <= 0.0:
-            result[cause] = Identifiability(False, None, (), share, "the model's own parameters take it over")
+            result[cause] = Identifiability(False, None, (), share, "the model's own parameters absorb it")
             continue
         limit = max(
             (math.sqrt(scales.penalty * example.rest.shape[1] + scales.enter) + POWER) / strength,

@@ -51,17 +51,18 @@ class NoiseFigures:
     standing_arcsec: float | None
     """Rms of the load encoder at rest, about the mean of each rest; None without a long enough rest."""
     laps_arcsec: float | None
-    """Rms difference between passes over the same angles in one direction, divided by the root of 2."""
+    """Rms difference between passes over the same angles in one direction, divided by the square root of
+    2."""
     model: NoiseModel
     """Noise model of the residual, white and correlated, on which the intervals are based."""
     residual_arcsec: float
-    """Rms residual of the samples with the model to be stored, about each zero."""
+    """Rms residual of the samples with the model to be stored, after subtraction of each zero offset."""
     fitted_arcsec: float
     """Rms residual of the samples if the nuisances (delay, rounding, other orders) are subtracted too."""
     samples: int
     """Number of samples in the fit."""
     effective_samples: float
-    """Number of independent samples with the same rms that would determine the zero equally accurately."""
+    """Number of independent samples of the same rms that would determine the zero offset equally well."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +93,7 @@ class HeldOut:
     """Prediction error on held-out parts of the record."""
 
     gain: Gain | None
-    """Gain over the active model (or no model), with each residual about its zero; None without held-out
+    """Gain over the active model (or no model), each residual without its zero offset; None without held-out
     data."""
     in_addition: Gain | None
     """Same gain with the nuisances (delay, load orders) subtracted for both models."""
@@ -145,13 +146,13 @@ class Traces:
     """Kinds of legs, indexed by ``kind_index``."""
     kind_index: np.ndarray[Any, np.dtype[np.intp]]
     error_arcsec: FloatArray
-    """Observed transmission error minus its zero."""
+    """Observed transmission error minus its zero offset."""
     predicted_arcsec: FloatArray
     """Transmission error predicted by the fit, the sum of its effects."""
     residual_arcsec: FloatArray
-    """Observed error minus model, about the best-fitting zeros."""
+    """Observed error minus model, with the best-fitting zero offsets subtracted."""
     orders_arcsec: FloatArray
-    """Observed error minus all effects except the motor orders, minus zero and nuisances."""
+    """Observed error minus all effects except the motor orders, minus zero offset and nuisances."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +163,8 @@ class FitResult:
     """Fitted model. Its ``uncertainty`` contains 95 % half widths, nested like the parameters."""
     intervals: tuple[Interval, ...]
     zeros_arcsec: tuple[float, ...]
-    """Fitted offset of each absolute zero from the median error of its samples."""
+    """Fitted zero offsets, one per encoder zero, relative to the median error of the samples with that
+    zero."""
     nuisances: tuple[Nuisance, ...]
     noise: NoiseFigures
     outliers: Outliers
@@ -256,8 +258,8 @@ def outlying(
     Outliers are far from the median of their neighbours. The comparison is with neighbours rather than with
     the model, so effects that the model lacks and lasting steps (lost counts) are kept. ``swings`` is the
     mask of `swinging`, shape (n,). ``count_arcsec`` is one count of the motor encoder at the load. The
-    threshold is larger by this, because the reading of a motor between two counts alternates, and only its
-    mean is right.
+    threshold is increased by this count, because the reading of a motor between two counts alternates, and
+    only its mean is right.
     """
     weight = np.ones(len(residual))
     index = np.flatnonzero(np.isfinite(residual))
@@ -305,7 +307,7 @@ KNOWN = (*RESTING, *ON_THE_WAY, *SLOW)
 
 
 def usable_samples(measured: Measured, ratio: float, slow_deg_s: float | None = None) -> Samples:
-    """Prepares the samples of a calibration: centres the errors of each zero, and marks the usable samples.
+    """Prepares the samples of a calibration: centres the errors per encoder zero, and marks usable samples.
 
     ``slow_deg_s`` is the maximum load speed of usable samples, by default that of the slow legs. Raises
     InputError if there are too few samples or the ratio does not match the record.
@@ -441,7 +443,7 @@ class State(NamedTuple):
         return Precision(self.noise, self.design.blocks)
 
     def in_addition(self) -> Nuisances:
-        """Returns the columns of the zeros and of the nuisances."""
+        """Returns the columns of the zero offsets and of the nuisances."""
         waves = []
         for order, amplitude_arcsec, phase_deg in self.ripple.waves() if self.ripple else ():
             at = 2 * self.candidates.index(Order.motor(round(order)))
@@ -455,7 +457,7 @@ class State(NamedTuple):
         return unknown(self.waves, [f"{each} {part}" for each in self.candidates for part in PARTS])
 
     def columns(self) -> Nuisances:
-        """Returns the columns of zeros, nuisances and the selected orders of load and flexspline."""
+        """Returns the columns of zero offsets, nuisances and the selected orders of load and flexspline."""
         others = [
             (f"{order} {part}", 2 * at + number)
             for at, order in enumerate(self.candidates)
@@ -479,7 +481,7 @@ class State(NamedTuple):
         return self.under(self.precision(), self.columns()).fit(self.model())
 
     def information(self) -> System:
-        """Returns the normal equations of [candidates | zeros and nuisances | effects and their tangents].
+        """Returns the normal equations of [candidates | zero offsets, nuisances | effects, their tangents].
 
         The tangents allow for a refit of the shape parameters with every candidate order.
         """
@@ -539,7 +541,7 @@ def candidate_orders(design: Design, options: FitOptions) -> tuple[Order, ...]:
 
 
 def turns_covered(design: Design) -> float:
-    """Returns the range of distinct motor angles covered by one zero, turns; the maximum over all zeros."""
+    """Returns the range of motor angles covered with one encoder zero, turns; the maximum over all zeros."""
     blocks = design.blocks
     cell = np.floor(blocks.motor_deg / COVERED_DEG).astype(np.intp)
     seen = (len(np.unique(cell[blocks.zero == zero])) for zero in range(design.samples.zeros))

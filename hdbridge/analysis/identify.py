@@ -47,7 +47,7 @@ NO_DEGREES = "where the axis went further, both angles are in radians or turns: 
 """Hint about units. If both angles are in the same wrong unit, their ratio is still right, and only the short
 travel reveals the error."""
 EFFECT_SHARE = 1e-3
-"""Minimum fraction of a visible effect's sum of squares that zeros and orders do not explain."""
+"""Minimum fraction of a visible effect's sum of squares that zero offsets and orders do not explain."""
 ROUNDS = 3
 
 
@@ -192,8 +192,8 @@ def _settle(state: State) -> tuple[State, Solution, System]:
             break
     solution = state.fitted()
     if _value(solution, SWING) < 0.0:
-        # Below its resonance a load amplifies the error. A negative swing thus has another speed-dependent
-        # cause.
+        # Below its resonance a load amplifies the error. A negative swing therefore has a different
+        # speed-dependent cause.
         state = state._replace(nuisances=tuple(each for each in state.nuisances if each != SWING))
         solution = state.fitted()
         system = state.information()

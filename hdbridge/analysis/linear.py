@@ -121,7 +121,7 @@ def sandwich(influence: FloatArray, number: IntArray) -> FloatArray:
 
 
 def about_zeros(left_arcsec: FloatArray, zero: IntArray, weight: FloatArray) -> FloatArray:
-    """Subtracts from a residual (n,) its weighted mean at each absolute zero, or 0 if the weights are 0."""
+    """Subtracts from a residual (n,) its weighted mean for each encoder zero, or 0 if the weights are 0."""
     total, weights = np.bincount(zero, weight * left_arcsec), np.bincount(zero, weight)
     return np.asarray(left_arcsec - (total / np.maximum(weights, 1e-300))[zero])
 

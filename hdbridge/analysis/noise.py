@@ -2,10 +2,12 @@
 
 The noise has five parts:
 
-- white noise, which may differ between standing and moving; - a drift in time; - a drift over the motor's
-*travel*, because an axis rests anywhere within a count of its encoder; this error is constant during a stop
-and different at the next; - the misfit of the loop's shape, which decays over each branch and differs between
-branches; - the rounding error that is constant over a leg; its size follows from the count.
+- white noise, which may differ between standing and moving;
+- a drift in time;
+- a drift over the motor's *travel*, because an axis rests anywhere within a count of its encoder; this error
+  is constant during a stop, and different at the next one;
+- the misfit of the loop's shape, which decays over each branch and differs between branches;
+- the rounding error that is constant over a leg; its size follows from the count.
 
 Each drift is a first-order Markov process. The inverse of its covariance is therefore banded, and a fit takes
 no longer than one with white noise (Rybicki and Press 1995).
@@ -247,7 +249,7 @@ class Precision:
         return 0.5 * (self._log_determinant - float(residual @ self.apply(residual)))
 
     def score(self, residual: FloatArray) -> FloatArray:
-        """Returns the derivatives (8,) of `log_likelihood` by the logarithms of the noise model's fields.
+        """Returns the derivatives (8,) of `log_likelihood` with respect to the logarithms of the noise model.
 
         The model must have a drift. By Fisher's identity, the derivatives follow from the mean and covariance
         of the drifts, given the residual.

@@ -32,9 +32,9 @@ TURNS = "turns"
 SWING = "swing_ms2"
 SWING_LAG = "swing_ms3"
 TEXTS = {
-    DELAY: "the load encoder is read later than the motor's by",
-    ROUNDING: "in the direction of its last motion the motor is behind what its encoder says, at rest, by",
-    SWING: "the load swings beyond the error that shakes it, by its own acceleration times",
+    DELAY: "delay of the load encoder's samples relative to the motor encoder's",
+    ROUNDING: "lag of the motor behind its reading at rest, in the direction of its last motion",
+    SWING: "swing of the load beyond the error that excites it, per acceleration of the load",
 }
 UNITS = {DELAY: "ms", ROUNDING: "counts", SWING: "ms\N{SUPERSCRIPT TWO}"}
 SWING_MS2 = 25.0
@@ -63,7 +63,7 @@ nuisance is omitted."""
 
 
 def zeros(zero: IntArray, number: int) -> Nuisances:
-    """Returns a column for each of ``number`` absolute zeros; ``zero`` (b,) is the zero of each block."""
+    """Returns a zero-offset column for each encoder zero; ``zero`` (b,) is the zero number of each block."""
     return unknown(zero[:, np.newaxis] == np.arange(number), [f"zero {each}" for each in range(number)])
 
 
@@ -156,7 +156,7 @@ def nuisances_of(
     effects: Sequence[Effect],
     waves: Sequence[tuple[float, FloatArray, FloatArray]] = (),
 ) -> Nuisances:
-    """Returns the columns of the zeros and of the named nuisances; for ``waves`` see `swing`."""
+    """Returns the columns of the zero offsets and of the named nuisances; for ``waves`` see `swing`."""
     parts = [zeros(design.blocks.zero, design.samples.zeros)]
     if DELAY in nuisances:
         parts.append(unknown(delay_column(design), [DELAY]))

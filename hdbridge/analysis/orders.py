@@ -32,9 +32,10 @@ class System(NamedTuple):
     right: FloatArray
     """J' K^-1 y, shape (c,)."""
     limited: IntArray
-    """Columns that are limited by a prior. They make an order less certain, but cannot take its place."""
+    """Columns whose coefficients a prior limits. They increase the uncertainty of an order, but are ignored
+    in deciding whether the order is separable."""
     zeros: IntArray
-    """Columns of the absolute zeros."""
+    """Columns of the zero offsets."""
 
 
 class Family(Enum):
@@ -81,7 +82,7 @@ class Selection:
 
     chosen: tuple[Order, ...]
     unresolved: tuple[Order, ...]
-    """Candidates that are not separable from the zero, the hysteresis or a selected order in this record."""
+    """Candidates that are not separable from zero offset, hysteresis or a selected order in this record."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +155,7 @@ class _Candidates:
         self._information, explained = _eliminated(information, own, rest)
         self._right = right[own] - explained.T @ right[rest]
         self._if_limited_known, _ = _eliminated(information, own, np.setdiff1d(rest, limited))
-        # About the zeros, because a long standstill at one angle does not determine any order.
+        # Relative to the zero offsets, because a long standstill at one angle does not determine any order.
         centred, _ = _eliminated(information, own, zeros)
         self._alone = np.maximum(np.diag(centred), 1e-9 * np.diag(information)[own])
         self.number = number
@@ -175,7 +176,11 @@ class _Candidates:
 
 
 def _eliminated(information: FloatArray, own: IntArray, others: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Returns the information of ``own`` columns beyond the ``others``, and their coefficients by these."""
+    """Eliminates the ``others`` from an information matrix.
+
+    Returns the information that remains in the ``own`` columns, and the coefficients of their regression on
+    the ``others``.
+    """
     cross = information[np.ix_(others, own)]
     explained = solve_symmetric(information[np.ix_(others, others)], cross)
     return information[np.ix_(own, own)] - cross.T @ explained, explained

@@ -112,7 +112,8 @@ class Measured:
     kind: IntArray
     """Index into ``kinds`` of each sample."""
     zero: IntArray
-    """Index of each sample's absolute zero, 0 .. zeros - 1."""
+    """Number of the encoder zero to which each sample refers. It changes wherever the encoders may have lost
+    their zeros, and the transmission error then has a new zero offset."""
     states: Mapping[int, Start] = field(default_factory=dict)
     """Known elastic states by sample index."""
 
@@ -134,11 +135,11 @@ class Samples:
     motion: Motion
     """Motor angle, time, speed, acceleration and the recorded channels."""
     rested_deg: FloatArray
-    """Motor angle under another assumption about its position at rest (`Driven`)."""
+    """Motor angle under a different assumption about its position at rest (`Driven`)."""
     load_deg: FloatArray
     """Measured load angle."""
     error_arcsec: FloatArray
-    """Observed transmission error, relative to an arbitrary zero."""
+    """Observed transmission error, with an arbitrary zero offset."""
     sigma_arcsec: FloatArray
     """Standard deviation of the white noise of each sample."""
     usable: BoolArray
@@ -146,7 +147,7 @@ class Samples:
     kind: IntArray
     """Index into ``kinds`` of each sample."""
     zero: IntArray
-    """Index of each sample's absolute zero, 0 .. zeros - 1."""
+    """Number of the encoder zero to which each sample refers (`Measured`), 0 .. zeros - 1."""
     chains: tuple[Chain, ...]
     """Chains of samples with a known motion between them; rows are those of the full record."""
     reading: Reading
@@ -159,7 +160,7 @@ class Samples:
 
     @property
     def zeros(self) -> int:
-        """Number of absolute zeros."""
+        """Number of encoder zeros."""
         return int(self.zero[-1]) + 1
 
     @property

@@ -56,7 +56,8 @@ LEAD_CYCLES = 8
 LAG_CYCLES = 16
 """Number of past cycles in the filter, in addition to the following lag."""
 POLES = 2
-"""Number of poles of the filter. The ringing of a resonance or a servo notch exceeds the filter's length."""
+"""Number of poles of the filter, because the ringing of a resonance or servo notch outlasts the filter's
+length."""
 REFINEMENTS = 5
 """Number of iterations for the poles (Sanathanan and Koerner, 1963)."""
 FADE = 0.12
@@ -75,7 +76,7 @@ half of `DIFFERENT`."""
 SHARE_NOISE = 0.02
 ERROR_CHANGE = 0.5
 """Standard deviations of the remainder (`SHARE_NOISE`) and of the change of the uncorrected error due to
-another servo (`ERROR_CHANGE`), relative to the uncorrected error."""
+different servo settings (`ERROR_CHANGE`), relative to the uncorrected error."""
 FIRST_STEP = 0.5
 """Fraction of a filter's change that is applied in the first step."""
 MAX_RUNS = 12
@@ -183,7 +184,7 @@ def samples_needed(orders: int) -> int:
 def harmonics_of(
     speed_deg_s: float, target: FloatArray, error: FloatArray, orders: Sequence[int], ratio: float
 ) -> Harmonics:
-    """Fits orders of the load target (n,), degrees, to an error (n,), arcsec."""
+    """Fits motor orders to a load error (n,), arcsec; ``target`` (n,) is the load target, degrees."""
     line = np.linspace(-1.0, 1.0, len(target))
     angle = np.radians(ratio * target)[:, None] * np.array(orders, dtype=float)
     design = np.column_stack([np.ones_like(line), line, np.cos(angle), -np.sin(angle)])
@@ -382,7 +383,7 @@ class Answers:
         ratio: float,
         earlier: Answers | None = None,
     ) -> None:
-        """``earlier`` contains runs with another filter and the same servo settings."""
+        """``earlier`` contains runs with a different filter and the same servo settings."""
         self.lags_ms: deque[float] = deque(maxlen=MAX_RUNS)
         """Time lag of the motor behind its set-points in each of the last runs."""
         self._response, self._orders, self._ratio = response, orders, ratio
@@ -482,9 +483,9 @@ class Answers:
         """Returns the response whose filter removes the remaining load error; None without an improvement.
 
         The remainder E - G F c is linear in the filter's gain F, which must be multiplied by E / (E -
-        remainder). This factor is interpolated between the frequencies. E with the present servo settings is
-        known only after runs with another filter. Until then, E is that of the calibration, and the step is
-        shorter. Unless the servo is known to have been ``retuned``, the factor at each frequency must be
+        remainder). This factor is interpolated between the frequencies. E with the current servo settings is
+        known only after runs with a different filter. Until then, E is that of the calibration, and the step
+        is shorter. Unless the servo is known to have been ``retuned``, the factor at each frequency must be
         predictable from the others, because with an unchanged servo the remainder varies irregularly with
         frequency. ``bound`` limits the relative deviation from the committed response.
         """
@@ -540,10 +541,10 @@ def _merged_seen(group: Sequence[_Seen]) -> _Seen:
 def _error(now: _Seen, earlier: _Seen) -> complex:
     """Returns an order's error without correction, relative to that in the calibration, at one frequency.
 
-    The remainder is linear in the gain of the filter, and remainders with two filters determine the line. The
-    fit weighs them against the calibration, by the noise of a remainder and the change of the error due to
-    another servo. Both remainders are of one order, because different orders at the same frequency differ by
-    more than two filters do.
+    The remainder is linear in the gain of the filter, and the remainders with two filters determine the line.
+    The fit weighs them against the calibration, by the noise of a remainder and the change of the error due
+    to different servo settings. Both remainders belong to one order, because the difference between two
+    orders at the same frequency is larger than that between two filters.
     """
     rows = np.array([[1.0, now.gain], [1.0, earlier.gain], [SHARE_NOISE / ERROR_CHANGE, 0.0]])
     wanted = np.array([now.share, earlier.share, SHARE_NOISE / ERROR_CHANGE])

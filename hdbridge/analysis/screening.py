@@ -1,4 +1,4 @@
-"""Screens all candidates: scores them on the residual, with the present hypothesis projected out.
+"""Screens all candidates: scores them on the residual, with the current hypothesis projected out.
 
 The score is the predicted fall in chi square. With Q an orthonormal basis of the hypothesis's tangent and C a
 candidate's columns, C'C - (Q'C)'(Q'C) is the remaining Gram matrix. One matrix product serves all columns, so
@@ -74,7 +74,6 @@ class Screen:
     def scores(self, fit: Linearised, causes: Linearised) -> list[Score]:
         """Returns the score of each candidate, in the order of the candidates.
 
-
         ``causes`` is the fit without the model's own parts.
         """
         matrix = self._matrix
@@ -115,7 +114,7 @@ def _score(
     return Score(effect, float(np.sum(inner**2 / values[kept])), int(np.count_nonzero(kept)), share)
 
 
-# Matched filters for effects that can be at any place (`Sought`), evaluated at all places at once.
+# Matched filters for effects that can be at any location (`Sought`), evaluated at all locations at once.
 
 
 BINS = 1 << 17
@@ -248,8 +247,8 @@ def tones(estimator: Estimator, residual: FloatArray) -> Iterator[tuple[float]]:
     grid = np.bincount(slot, residual, length)
     power = np.abs(np.fft.rfft(grid, size)) ** 2
     frequency = np.arange(len(power)) / (size * data.period_s)
-    # At least two periods are needed; fewer are only curvature. Similar moves have similar curvature, so
-    # the length of the data of one zero is decisive.
+    # At least two periods are needed; fewer are only curvature. Similar moves have similar curvature, so the
+    # duration of the data with one encoder zero is decisive.
     unbroken = min(length, int(np.max(np.bincount(data.full.zero))))
     power[frequency < max(LOWEST_HZ, 2.0 / (unbroken * data.period_s))] = 0.0
     lobe = max(4, size // length * 4)

@@ -34,7 +34,7 @@ from hdbridge.units import DEG_PER_TURN
 
 MOST = 6
 BEST = 3
-"""Limits of the run time: maximum number of additions (`MOST`), and of causes fitted for each (`BEST`)."""
+"""Limits on the run time: at most `MOST` additions, and at most `BEST` causes fitted for each addition."""
 LAW_ROUNDS = 3
 """Number of initial additions after each of which the hysteresis law is chosen again."""
 
@@ -171,7 +171,7 @@ class Search:
     ) -> Fitted:
         """Removes causes one by one, with a refit after each, until ``worst`` returns None.
 
-        ``worst`` returns the place of the cause to remove and the reason. The reason is appended to
+        ``worst`` returns the index of the cause to remove and the reason. The reason is appended to
         ``reasons``.
         """
         while len(fitted.hypothesis.effects) > self.base and (found := worst(fitted)) is not None:
@@ -263,8 +263,8 @@ class Search:
         elif (
             not reason and Channel.TIME in effect.needs() and effect.shows(self.estimator.motion) is not None
         ):
-            # An effect in time can be at any place. If it does not pass its acceptance tests, it imitates
-            # another cause, which would not be found with this one in the fit.
+            # A time-dependent effect can occur at any time. If it fails its acceptance tests, it imitates
+            # some other cause, which would not be found with this one in the fit.
             reason = gate(self.estimator, trial, place).reason
             if not reason and not all_pieces_seen(self.estimator, trial, place):
                 reason = "part of it may be an error of a larger one"
@@ -380,7 +380,6 @@ class Search:
     def equal_alternatives(self, fitted: Fitted, without: Fitted, cause: str) -> list[str]:
         """Returns other causes that fit nearly as well as ``cause``, best first.
 
-
         ``without`` is the fit without that cause.
         """
         most = self.cost(fitted) + self.margin(fitted, without)
@@ -397,10 +396,11 @@ class Search:
         return sorted(best, key=lambda each: best[each].chi_square)
 
     def margin(self, fitted: Fitted, without: Fitted) -> float:
-        """Returns the additional cost up to which another cause fits as well as the one left out in
-        ``without``.
+        """Returns the margin of cost within which an alternative counts as fitting as well as ``fitted``.
+
+        ``without`` is the fit without the cause to be replaced.
         """
-        # A residual above the noise means that neither is complete, so the margin is wider.
+        # A residual above the noise means that neither fit is complete, so the margin is wider.
         excess = max(fitted.chi_square / max(len(fitted.residual) - fitted.free(), 1), 1.0)
         return self.scales.enter * excess + self.scales.alias * (without.chi_square - fitted.chi_square)
 
@@ -418,7 +418,7 @@ def joined(hypothesis: Hypothesis, effect: Effect, base: int) -> Hypothesis:
 
 
 def _last(fitted: Fitted, cause: str) -> int:
-    """Returns the place of the last effect of this cause."""
+    """Returns the index of the last effect of this cause."""
     effects = fitted.hypothesis.effects
     return next(i for i in range(len(effects) - 1, -1, -1) if effects[i].name == cause)
 

@@ -150,7 +150,7 @@ class _Point:
     """Same effects with fitted coefficients."""
     fixed: _Fixed
     moving: tuple[int, ...]
-    """Places of the effects whose columns form ``matrix``, in the same order."""
+    """Indices of the effects whose columns form ``matrix``, in the same order."""
     matrix: FloatArray
     gram: FloatArray
     """Gram matrix of all linear columns (fixed ones first) plus the prior information."""
@@ -174,7 +174,7 @@ class Solution:
     residual: FloatArray
     """Observation minus fit, shape (m,)."""
     at_bound: tuple[tuple[int, str], ...]
-    """Shapes that ended at a bound, as place of the effect and name of the shape."""
+    """Shapes that ended at a bound, as index of the effect and name of the shape."""
     _fit: Separable
     _point: _Point
 
@@ -229,7 +229,7 @@ class Separable:
         self._fixed: _Fixed | None = None
 
     def fit(self, effects: Sequence[Effect], effort: Effort | None = None) -> Solution:
-        """Fits effects, starting from their present parameters; the result is never worse than the start."""
+        """Fits effects, starting from their own parameters; the result is never worse than the start."""
         effort = effort or Effort()
         here = best = self._at(refreshed(effects))
         damping, exchanged = DAMPING, 0
@@ -267,7 +267,7 @@ class Separable:
     def tangents(
         self, effects: Sequence[Effect], central: bool = False
     ) -> tuple[list[tuple[int, Shape]], FloatArray]:
-        """Returns the free shapes as (place, shape), and the derivatives with respect to them, (m, s)."""
+        """Returns the free shapes, each with its effect's index, and the derivatives by shape, (m, s)."""
         where = [
             (place, each)
             for place, effect in enumerate(effects)
@@ -416,7 +416,7 @@ class Separable:
         return step, float(slope @ step)
 
     def _stands(self, here: _Point, effects: Sequence[Effect]) -> bool:
-        """Returns True if the copies of other effects that effects contain agree with the fit."""
+        """Returns True if the copies of model parts that the effects contain agree with the fit."""
         return all(unit(one) == unit(other) for one, other in zip(here.given, effects, strict=True))
 
     def _solution(self, here: _Point) -> Solution:

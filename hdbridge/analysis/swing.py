@@ -179,9 +179,9 @@ def between_samples(base: Base, scales: Scales) -> Nuisances:
 
     A drive may follow its command in straight lines, or with a ripple of its own. Its acceleration between
     samples is then not visible in a spline through them. The load's response is modelled as a filter of the
-    samples' second differences. One column is for a constant acceleration; each other one is the difference
-    between another of `LAGS` and lag 0. There are no columns if they explain little of the residual, or more
-    than such a load can.
+    samples' second differences. One column is for a constant acceleration; each of the others is the
+    difference between one of the remaining `LAGS` and lag 0. There are no columns if they explain little of
+    the residual, or more than such a load can.
     """
     full = base.full
     even = np.abs(np.diff(full.time_s) / base.period_s - 1.0) < UNEVEN
@@ -206,10 +206,10 @@ def between_samples(base: Base, scales: Scales) -> Nuisances:
 def _beside(
     full: Samples, nuisances: Nuisances, rows: slice
 ) -> Callable[[FloatArray], tuple[float, FloatArray]]:
-    """Returns a function that fits zeros and ``nuisances`` to a residual in some rows.
+    """Returns a function that fits zero offsets and ``nuisances`` to a residual in some rows.
 
-    The function returns the remaining chi square and the nuisances' values. Zeros without a usable sample in
-    these rows are omitted.
+    The function returns the remaining chi square and the nuisances' values. Zero offsets without a usable
+    sample in these rows are omitted.
     """
     root = np.sqrt(full.usable[rows]) / full.sigma_arcsec[rows]
     columns = zeros(full.zero[rows], full.zeros).and_also(replace(nuisances, columns=nuisances.columns[rows]))
@@ -316,7 +316,7 @@ def without(data: Observed, found: Swing) -> Observed:
 
 
 def settled(estimator: Estimator, fitted: Fitted, effects: Sequence[Effect], found: Swing | None) -> Observed:
-    """Excludes the samples in which the uncertainty of the swing is too large, and adds other uncertainties.
+    """Excludes samples in which the uncertainty of the swing is too large, and increases the others' noise.
 
     The error of a ``found`` swing is proportional to the wind-up and to waves that are too fast for the
     sampling. The factor is found by regression on the squared residuals in motion. The noise of each sample

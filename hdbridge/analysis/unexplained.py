@@ -165,7 +165,7 @@ def _angle_step_arcsec(estimator: Estimator) -> float:
 
 
 def near_reversals(estimator: Estimator, fitted: Fitted) -> BoolArray:
-    """Returns a mask (m,) of the points within a loop's memory of the last reversal; all True if none is."""
+    """Returns a mask (m,) of the points within a loop's memory of the last reversal; all True without any."""
     memory_deg = max((each.tracker().memory_deg for each in fitted.hypothesis.effects), default=0.0)
     near = (since_reversal(estimator.motion).values <= TAIL * memory_deg)[estimator.index]
     return np.asarray(near if np.any(near) else np.ones_like(near))

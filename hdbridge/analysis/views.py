@@ -41,7 +41,7 @@ class ResidualViews:
     def shares(self) -> dict[str, tuple[float, float]]:
         """Returns the fractions of the mean square, 0 to 1, that bin means predict, by coordinate.
 
-        The first fraction is for the given model, the second for the extended model. For noise it is zero.
+        The first fraction is for the given model, the second for the extended model. It is 0 for noise.
         """
         fold = folds(self.time_s)
 

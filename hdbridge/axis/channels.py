@@ -44,7 +44,7 @@ class LoadTorque(Strict):
 
     source: ChannelSource = Field(description="object with the reading")
     newton_metres_per_count: float = Field(gt=0, le=1e6, description="torque at the load per count")
-    direction: Literal[1, -1] = Field(1, description="-1 if it counts down when the torque pushes forward")
+    direction: Literal[1, -1] = Field(1, description="-1 if the count falls when the torque pushes forward")
     maximum_nm: float = Field(1000.0, gt=0, le=1e6, description="largest plausible torque, either direction")
     every_cycles: EveryCycles = 1
     hold_ms: HoldMs = 100.0

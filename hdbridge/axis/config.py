@@ -25,7 +25,7 @@ Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
 
 
 class BusConfig(Strict):
-    """The CAN bus, in the terms of python-can."""
+    """CAN bus, with the parameters of python-can."""
 
     interface: str = Field(
         min_length=1, description="python-can interface: socketcan, virtual, udp_multicast, slcan, ..."
@@ -65,7 +65,7 @@ class DriveConfig(Strict):
 
     node_id: NodeId = Field(description="CANopen node id of the drive")
     eds: str = Field(min_length=1, description="EDS file, relative to this file, or a bundled one")
-    identity: Identity = Field(description="identity of the drive; what is left out is not compared")
+    identity: Identity = Field(description="identity of the drive; omitted values are not compared")
     mode: Literal["csp", "ip"] = Field(
         "csp",
         description="cyclic synchronous position (8) or interpolated position (7)",
@@ -160,7 +160,7 @@ class Teeth(Strict):
     flexspline: int = Field(ge=10, le=10_000, description="teeth of the flexspline, zf")
     circular_spline: int = Field(ge=11, le=10_000, description="teeth of the circular spline, zc")
     output: Literal["flexspline", "circular_spline"] = Field(
-        "flexspline", description="the one that turns the load"
+        "flexspline", description="spline that drives the load"
     )
 
     @model_validator(mode="after")
@@ -210,7 +210,9 @@ class Limits(Strict):
     velocity_deg_s: float = Field(gt=0, le=100_000, description="highest speed")
     acceleration_deg_s2: float = Field(gt=0, le=1e7, description="highest acceleration")
     jerk_deg_s3: float = Field(gt=0, le=1e9, description="highest jerk")
-    torque_percent: float = Field(gt=0, le=500, description="highest motor torque (6072h), of the rated one")
+    torque_percent: float = Field(
+        gt=0, le=500, description="highest motor torque (6072h), relative to the rated torque"
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -234,7 +236,7 @@ class CompensationConfig(Strict):
     slew_arcsec_s: float = Field(
         20_000.0, gt=0, le=1e7, description="fastest change of the correction, at the load"
     )
-    ramp_s: float = Field(0.5, gt=0, le=60, description="time of switching it on or off")
+    ramp_s: float = Field(0.5, gt=0, le=60, description="time for ramping the correction in or out")
 
 
 class RealtimeConfig(Strict):
@@ -299,8 +301,8 @@ class AxisConfig(OtherChannels):
         if found is None:
             raise document.error(
                 ("drive", "eds"),
-                f"there is no '{axis.drive.eds}' in {places[0].parent} nor among the bundled EDS files in "
-                f"{bundled_folder('eds')}; expected an EDS file there, or another name here",
+                f"'{axis.drive.eds}' is neither in {places[0].parent} nor among the bundled EDS files in "
+                f"{bundled_folder('eds')}; expected an EDS file there, or a different name here",
             )
         axis._document = document
         axis._eds_path = found.resolve()
@@ -428,7 +430,7 @@ def _interpolation_period(cycle_ms: float) -> tuple[int, int] | None:
 
 
 def _teeth_for(ratio: float, difference: int, teeth: Teeth) -> str:
-    """Describes tooth counts that give a ratio with the stated output, if possible with this difference."""
+    """Describes tooth counts that give a ratio with the stated output; prefers the given ``difference``."""
     for more in (difference, 2, 1):
         held = round(ratio * more)
         if math.isclose(held, ratio * more, rel_tol=1e-9):

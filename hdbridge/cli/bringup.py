@@ -138,7 +138,9 @@ def check(profile: CheckedArgument, model: opt.Model = None, json_file: opt.Json
         reports = [_Report(axis, model or _existing(files.model))]
         document: dict[str, Any] = {"schema": "hdbridge.check/1", **reports[0].document()}
     elif model is not None:
-        raise InputError("--model goes with one axis: a machine's axes have their models in their profiles")
+        raise InputError(
+            "--model applies to a single axis: a machine's axes have their models in their profiles"
+        )
     else:
         machine = Machine.load(path)
         check_interface(machine.bus.interface, machine.axes[0].config.where("bus.interface"))
@@ -418,7 +420,7 @@ def doctor(
             "--torque-percent",
             min=1.0,
             max=500.0,
-            help="Highest motor torque, of the rated one; never above limits.torque_percent.",
+            help="Highest motor torque, relative to the rated torque; never above limits.torque_percent.",
         ),
     ] = TORQUE_PERCENT,
     yes: Annotated[bool, Option("--yes", help="Move the axis without asking.")] = False,

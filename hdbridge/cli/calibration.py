@@ -38,7 +38,7 @@ class Measured:
         Option(
             "--plan",
             metavar="quick|full|dynamics|FILE",
-            help="Plan to measure: a bundled plan, or a file. A twin also needs dynamics.",
+            help="Plan to measure: a bundled plan, or a file. A twin also needs the plan dynamics.",
         ),
     ] = "quick"
     out: Annotated[
@@ -356,7 +356,7 @@ def write_calibration_page(path: Path, result: Calibration) -> None:
 
 
 def print_next(offer: Offer | None, session: Session) -> None:
-    """Prints the next commands for a pending model; a daemon that lent its bus commits and uses it itself."""
+    """Prints the next commands for a pending model; a daemon that lent its bus commits the model itself."""
     if offer is not None and offer.made:
         folder = session.files.axis.parent
         daemon = f"hdbridge ctl model {session.axis.name} pending"

@@ -63,7 +63,7 @@ def conform(
         list[str] | None, Option("--only", metavar="ID", help="Only checks whose id begins with this.")
     ] = None,
     timeout_ms: Annotated[
-        float, Option("--timeout-ms", min=1.0, max=60_000.0, help="Longest time to an SDO answer.")
+        float, Option("--timeout-ms", min=1.0, max=60_000.0, help="Time-out for an SDO answer.")
     ] = 500.0,
     list_checks: Annotated[bool, Option("--list", help="List the checks and exit.")] = False,
     json_file: opt.Json = None,

@@ -136,7 +136,7 @@ def _who_holds(at: str | None) -> str:
         number = daemon_of(raw)
         found.setdefault(number, f"the daemon is {process_words(number)}")
     if not found:
-        return "no process of this machine holds an interface"
+        return "no process on this computer holds an interface"
     what_to_do = ", ".join(f"'kill {number}'" for number in found)
     return f"{'; '.join(found.values())}; {what_to_do} stops its axes in order and ends it"
 
@@ -268,7 +268,7 @@ def watch(
         int | None, Option("--count", min=1, help="Number of updates; else until Ctrl-C.")
     ] = None,
     lines: Annotated[
-        bool, Option("--lines", help="Print a JSON object per line in place of a table.")
+        bool, Option("--lines", help="Print a JSON object per line instead of a table.")
     ] = False,
 ) -> None:
     """Show the state of a machine until Ctrl-C; nothing moves."""
@@ -296,7 +296,7 @@ def events(
         write_json(json_file, document("ctl-events", found))
         while True:
             if found.lost:
-                say(f"{found.lost} older ones are kept no more")
+                say(f"{found.lost} older ones are no longer stored")
             for each in found.events:
                 say(_event_line(each))
             if not follow:
@@ -319,14 +319,14 @@ def lease(daemon: Daemon) -> None:
 
 
 def mark(text: Annotated[str, Argument(metavar="TEXT", help="One line.")], at: AtOption = None) -> None:
-    """Write a remark into the flight recorder, at the present cycle."""
+    """Write a remark into the flight recorder, at the current cycle."""
     with connected(at) as client:
         for each in client.mark(text):
             say(_event_line(each))
 
 
 def _looks(count: int | None, every_s: float) -> Iterator[int]:
-    """Yields 0, 1, 2, ..., pausing before each further number; ``count`` None is endless."""
+    """Yields 0, 1, 2, ... with a pause before each but the first; ``count`` numbers, or endlessly if None."""
     for number in itertools.count() if count is None else range(count):
         if number:
             time.sleep(every_s)
@@ -337,7 +337,7 @@ def _machine_lines(state: MachineState) -> list[str]:
     simulated = ", simulated" if state.simulated else ""
     load = "" if state.bus.load is None else f", load {100 * state.bus.load:.0f} %"
     bus = f"{state.bus.interface} {state.bus.channel} is {'up' if state.bus.up else 'DOWN'}{load}"
-    turning = "" if state.cycle.alive else ", which does NOT turn"
+    turning = "" if state.cycle.alive else ", which does NOT run"
     skipped = f", {state.cycle.skipped} periods skipped" if state.cycle.skipped else ""
     cycle = f"cycle of {1e3 * state.cycle.period_s:g} ms{turning}{skipped}"
     return [f"machine '{state.name}'{simulated}; {bus}; {cycle}", _lease_line(state.lease)]
@@ -485,7 +485,9 @@ def queue(
     velocity_deg_s: opt.Velocity = None,
     acceleration_deg_s2: opt.Acceleration = None,
     dwell_s: Annotated[float, Option("--dwell", min=0.0, max=86_400.0, help="Rest at each, s.")] = 0.0,
-    clear: Annotated[bool, Option("--clear", help="Remove the way points not yet begun; add none.")] = False,
+    clear: Annotated[
+        bool, Option("--clear", help="Remove the way points not yet started; add none.")
+    ] = False,
 ) -> None:
     """Append way points, and wait until the last one is reached. Ctrl-C stops the axis."""
     from hdbridge.client.messages import QueueItem
@@ -528,7 +530,7 @@ def model(
         ),
     ],
 ) -> None:
-    """Make another model of an axis the active one; the change is ramped, also in motion."""
+    """Make a different model of an axis the active one; the change is ramped, also in motion."""
     if version not in {"pending", "active"} and not (version.isascii() and version.isdigit()):
         raise InputError(f"VERSION: found {version!r}; expected a number, pending or active")
     with daemon.moving(axis) as moved:

@@ -315,7 +315,7 @@ def improve(
     test_min = trial_s(work.plan, axis, active) / 60
     trial = f"{test_min:.1f} min to step with both models, if something is found"
     if recordings:
-        note(f"nothing is measured first; {trial}")
+        note(f"no measurement first; {trial}")
     else:
         work.announce(trial)
     with work.booted() as (drive, progress, interrupted):
@@ -361,7 +361,7 @@ def _conclude(
         print_worse("small steps", worse_ways(*result.trial.small))
         if result.trial.of_floor > LEFT_OF_FLOOR:
             say(
-                f"stepping is still {result.trial.of_floor:.1f} times the floor: something is left that "
+                f"stepping is still {result.trial.of_floor:.1f} times the floor: something remains that "
                 "these data do not show; --auto, or a plan with two load turns, shows more"
             )
     say(result.offer.reason, style=None if result.offer.made else "bold")

@@ -37,7 +37,7 @@ LimitOption = Annotated[
         metavar="ARCSEC",
         min=0.1,
         max=3600.0,
-        help="Limit on the peak of a cause; the page predicts the hours until then.",
+        help="Limit on the peak of a cause; the page predicts the hours until it is reached.",
     ),
 ]
 PagesOption = Annotated[
@@ -84,7 +84,7 @@ class Fleet:
             metavar="SECONDS",
             min=0.1,
             max=3600.0,
-            help="Longest wait for a server of SOURCE, s.",
+            help="Time-out for a server of SOURCE, s.",
         ),
     ] = 20.0
 

@@ -44,7 +44,7 @@ _EXTRA = ("fastapi", "uvicorn", "websockets", "mcap", "prometheus_client")
 def run(
     machine: opt.Machine,
     simulate: Annotated[
-        bool, Option("--simulate", help="Control simulated drives in place of the bus.")
+        bool, Option("--simulate", help="Control simulated drives instead of those on the bus.")
     ] = False,
     speed: Annotated[
         float,
@@ -229,7 +229,7 @@ def doctor(
     log: Annotated[
         Path | None,
         Option(
-            "--log", metavar="FILE", help="Read a bus log (.log, .asc, .blf, .trc, .mf4) in place of the bus."
+            "--log", metavar="FILE", help="Read a bus log (.log, .asc, .blf, .trc, .mf4) instead of the bus."
         ),
     ] = None,
     json_file: opt.Json = None,
@@ -359,7 +359,7 @@ def simulate(
 ) -> None:
     """Run the simulated drive of a profile on its bus, in real time, until Ctrl-C.
 
-    Another process masters it, for example over SocketCAN:
+    Another process acts as its master, for example over SocketCAN:
 
         hdbridge simulate article --interface socketcan --channel vcan0 &
 

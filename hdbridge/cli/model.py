@@ -105,7 +105,7 @@ def discard(profile: opt.Profile, twin: TwinOption = False) -> None:
     """Discard the pending model; its recording stays."""
     store = _store(twin)
     store.discard(_folder(profile))
-    say(f"the pending {store.noun} is gone; its recording is kept")
+    say(f"the pending {store.noun} is discarded; its recording is kept")
 
 
 def _store(twin: bool) -> Store[Any]:

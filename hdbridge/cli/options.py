@@ -133,7 +133,7 @@ class Homing:
     ] = None
     acceleration_deg_s2: Acceleration = None
     offset_deg: Annotated[float, Option("--offset", help="Load angle of the home position (607Ch).")] = 0.0
-    timeout_s: Annotated[float, Option("--timeout", min=0.1, max=3600.0, help="Longest time, s.")] = 60.0
+    timeout_s: Annotated[float, Option("--timeout", min=0.1, max=3600.0, help="Time-out, s.")] = 60.0
 
 
 @dataclass(frozen=True)

@@ -396,7 +396,7 @@ def motion(
     files, axis = session.files, session.axis
     chosen = compensating_model(files, session.profile, model)
     if propose and not measure:
-        raise InputError("--propose needs a measured response: leave --no-measure out")
+        raise InputError("--propose needs a measured response: leave out --no-measure")
     used = TransmissionModel.load(chosen)
     used.check_bound_to(axis)
     note(f"motion test: {motion_test_s(axis) / 60.0:.1f} min at most")

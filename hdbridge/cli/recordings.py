@@ -99,7 +99,9 @@ class Export:
         if _is_csv(out):
             check_writable(out)
             if out.exists():
-                raise InputError(f"{out}: there is a file already; expected a new one: raw data stay")
+                raise InputError(
+                    f"{out}: already exists; expected a new file: raw data are never overwritten"
+                )
         elif out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise InputError(f"{out}: is not an empty folder; expected a new or an empty one")
         return out
@@ -116,7 +118,7 @@ def remarks(recording: Recording) -> Iterator[str]:
     """Yields remarks on a recording made of flight recordings or a bus log."""
     about = recording.notes
     if count := about.get("cycles_missing_within_parts"):
-        yield f"{count} cycles are missing within parts, and the times allow for them"
+        yield f"{count} cycles are missing within parts; the time stamps account for them"
     if count := about.get("parts_too_short"):
         yield f"{count} parts were too short and are left out"
     if about.get("zeros_may_differ"):
@@ -289,7 +291,12 @@ def import_(
     ],
     profile: Annotated[str, Argument(metavar="PROFILE", help="Axis that was on the bus.")],
     channel: Annotated[
-        str | None, Option("--channel", metavar="NAME", help="The bus, if the node is on several in the log.")
+        str | None,
+        Option(
+            "--channel",
+            metavar="NAME",
+            help="Channel of the node's bus, if the log has several with this node.",
+        ),
     ] = None,
 ) -> None:
     """Make a record of a bus log for `fit` and `diagnose`. Any master may have driven the axis.

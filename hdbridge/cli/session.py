@@ -50,7 +50,7 @@ class BusOptions:
     def bare(self, settings: BusConfig) -> Iterator[tuple[can.BusABC, Clock]]:
         """Yields a bus without an axis, and the monotonic clock.
 
-        With ``force``, the bus is opened even if another process on this computer masters it.
+        With ``force``, the bus is opened even if another process on this computer acts as its master.
         """
         from hdbridge.drive.link import check_interface, open_bus
 
@@ -96,7 +96,7 @@ class Session(BusOptions):
     def connected(self) -> Iterator[tuple[can.BusABC, Clock]]:
         """Yields the real or simulated bus of the axis, and its clock.
 
-        With ``force``, the bus is opened even if another process on this computer masters it.
+        With ``force``, the bus is opened even if another process on this computer acts as its master.
         """
         from hdbridge.control.realtime import prepare_realtime
         from hdbridge.drive.link import open_bus

@@ -194,7 +194,7 @@ class _Setup:
             recording = self._folder / RECORDING
             raise InputError(
                 f"{self._folder}: the calibration offers no model; {recording / 'report.html'} says why. "
-                f"Mend the axis, delete {recording} and {self._path}, and begin again"
+                f"Repair the axis, delete {recording} and {self._path}, and begin again"
             )
         self._run("model", "diff", self._folder)
         self._confirm("Make this the active model?")
@@ -216,7 +216,7 @@ class _Setup:
         self._finish("move")
 
     def print_next(self) -> None:
-        """Prints the page of the calibration and the commands for daily use."""
+        """Prints the path of the calibration's page and the commands for daily use."""
         how = " --simulate" if self._state.simulated else ""
         say(
             f"\nthe axis is set up. Its page: {self._folder / RECORDING / 'report.html'}\n"
@@ -224,7 +224,7 @@ class _Setup:
             f"by hand:   hdbridge move {self._folder} ANGLE{how}"
         )
 
-    # ---------------------------------------------------------------- parts of them
+    # ---------------------------------------------------------------- parts of the steps
 
     @property
     def _how(self) -> tuple[str, ...]:
@@ -257,7 +257,7 @@ class _Setup:
             raise typer.Exit(130)
 
     def _mended(self) -> bool:
-        """Changes the first key that `doctor` suspects if the user agrees; returns True if so."""
+        """Offers to change the first key that `doctor` suspects; returns True if the user agrees."""
         checks = json.loads((self._folder / DOCTOR).read_text(encoding="utf-8"))["checks"]
         remedies = [remedy for check in checks for remedy in check.get("remedies", ())]
         match = next(filter(None, map(_REMEDY.search, remedies)), None)

@@ -33,7 +33,7 @@ def twin(
         bool, Option("--check", help="Only report changes since the profile's twin was made.")
     ] = False,
     compare: Annotated[
-        bool, Option("--compare", help="Only compare the present simulation with the recordings.")
+        bool, Option("--compare", help="Only compare the current simulation with the recordings.")
     ] = False,
     truth: opt.Truth = None,
     afresh: Annotated[bool, Option("--afresh", help="Start from typical values.")] = False,
@@ -51,7 +51,7 @@ def twin(
     files = Profile.find(profile)
     if check and (compare or afresh or truth is not None):
         raise InputError(
-            "--check holds the recordings against the profile's twin: leave out the other options"
+            "--check compares the recordings with the profile's twin: leave out the other options"
         )
     axis = AxisConfig.load(files.axis)
     recording = _joined(axis, csv.load(recordings))
@@ -123,7 +123,7 @@ def _learned(
         twin.before,
         twin.after,
         learned=_values(begun.truth, twin.truth) if verdict.kept else (),
-        # If the twin is no better, only its unexplained residual is reported.
+        # If the twin is no better than before, only its unexplained residual is reported.
         named=[*twin.findings, *twin.alike, *twin.unexplained] if verdict.kept else twin.unexplained,
         translated=begun.rows,
         facts=facts,
@@ -195,14 +195,14 @@ def _joined(axis: AxisConfig, recordings: dict[Path, Recording]) -> Recording:
     for path, each in recordings.items():
         if each.axis is not None and each.axis != axis.name:
             raise InputError(
-                f"{path}: a recording of axis '{each.axis}', but {axis.path} is of '{axis.name}'; expected "
-                "the recordings of one axis"
+                f"{path}: a recording of axis '{each.axis}', but {axis.path} describes '{axis.name}'; "
+                "expected the recordings of one axis"
             )
         if each.record.motor_target_deg is None:
             name = "; pass --columns target=COLUMN" if each.record.origin is not None else ""
             raise InputError(
-                f"{path}: no column motor_target_deg; expected the commanded motor angle in each row, which "
-                f"the simulated drive is given as the real one was{name}"
+                f"{path}: no column motor_target_deg; expected the commanded motor angle in each row, "
+                f"because the simulated drive receives the same commands as the real one{name}"
             )
     check_records({path: each.record for path, each in recordings.items()}, axis.gear.ratio)
     return Recording.joined(list(recordings.values()))
@@ -215,7 +215,7 @@ def _beginning(files: Profile, axis: AxisConfig, truth: Path | None, *, afresh: 
     from hdbridge.twin.translate import translate
 
     if truth is not None and afresh:
-        raise InputError("--afresh begins from usual values: leave out --truth")
+        raise InputError("--afresh starts from typical values: leave out --truth")
     plant = truth or (files.simulated if files.simulated.is_file() and not afresh else None)
     model = TransmissionModel.load(files.model) if files.model.is_file() else None
     if model is not None:
@@ -223,8 +223,8 @@ def _beginning(files: Profile, axis: AxisConfig, truth: Path | None, *, afresh: 
     begun = translate(axis, model, Truth.load(plant) if plant is not None else None)
     if not (begun.truth.gear.hysteresis or begun.truth.gear.motor_orders):
         note(
-            "no transmission error is simulated: neither a model nor the plant's file has it. What it does "
-            "to torque and following error may be taken for motor or loops; calibrate first "
+            "no transmission error is simulated: neither a model nor the plant's file has one. Its effect on "
+            "torque and following error may be attributed to motor or loops; calibrate first "
             f"(hdbridge calibrate {files.folder})"
         )
     return begun

@@ -32,7 +32,7 @@ class ForMachines(logging.Formatter):
 
 
 class LogFile(logging.FileHandler):
-    """Log file that reports one message and stops on a full disk, because the axis must continue."""
+    """Log file that stops logging at the first error, such as a full disk, so that the axis continues."""
 
     failed = False
 

@@ -132,14 +132,14 @@ def _check_belongs_to_no_folder(output: Output) -> None:
                 f"{folder / 'pending.yaml'}, then use it: hdbridge model commit {folder}"
             )
         raise InputError(
-            f"{output.path}: {output.option} would write in place of a file of the profile {profile}; "
+            f"{output.path}: {output.option} would overwrite a file of the profile {profile}; "
             "expected another file"
         )
     if (folder / "recording.yaml").exists() and (
         name in _RECORDING or (path.exists() and name.endswith(_SAMPLES))
     ):
         raise InputError(
-            f"{output.path}: {output.option} would write in place of a file of the recording {folder}; "
+            f"{output.path}: {output.option} would overwrite a file of the recording {folder}; "
             "expected another file"
         )
 
@@ -151,7 +151,7 @@ def _check_folder(output: Output, inputs: Sequence[Path]) -> None:
         if folder.is_dir():
             first = min((each.name for each in folder.iterdir()), default=None)
             if first is not None:
-                begun = "; go on with what was begun there by --resume" * (folder / "recording.yaml").exists()
+                begun = "; or --resume to continue its measurement" * (folder / "recording.yaml").exists()
                 raise InputError(
                     f"{folder}: {output.option} would write into a folder that is not empty (it has "
                     f"{first}); expected a new or an empty one{begun}"

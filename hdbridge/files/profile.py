@@ -11,7 +11,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def bundled_folder(kind: Literal["eds", "profiles"], package: Path = _PACKAGE) -> Path:
-    """Returns the folder of bundled EDS files or profiles, which a broken installation may lack."""
+    """Returns the folder of bundled EDS files or profiles; it may be missing in a broken installation."""
     installed = package / "_bundled" / kind
     beside = package.parent / kind
     working_copy = (package.parent / "pyproject.toml").is_file() and beside.is_dir()

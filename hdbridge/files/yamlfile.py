@@ -373,7 +373,7 @@ class Line(list[Any]):
 
 
 class _Dumper(yaml.SafeDumper):
-    """YAML dumper that quotes any text that YAML 1.1 or 1.2 would read as another type."""
+    """YAML dumper that quotes any text that YAML 1.1 or 1.2 would read as a different type."""
 
     def ignore_aliases(self, data: Any) -> bool:
         """Disables aliases, which the reader refuses."""
@@ -399,7 +399,7 @@ _Dumper.add_representer(
 
 
 def _text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
-    """Writes a text, in double quotes if another style would fold it or lose control characters."""
+    """Writes a text, in double quotes if other styles would fold it or lose control characters."""
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"' if _BREAKS.search(text) else None)
 
 

@@ -197,8 +197,8 @@ class Dataset:
     def compact(self, present: Collection[tuple[str, str]] = ()) -> None:
         """Merges the increments into the parts, marks duplicates and sorts the rows.
 
-        ``present`` contains key and path of each recording of the last run. Rows with the same path but
-        another key belong to an older file, model or version, and are dropped.
+        ``present`` contains key and path of each recording of the last run. Rows with the same path but a
+        different key belong to an older file, model or version, and are dropped.
         """
         current: dict[str, set[str]] = defaultdict(set)
         for key, path in present:

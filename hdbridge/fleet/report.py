@@ -87,9 +87,9 @@ def _verdict(summary: Summary) -> str:
 def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
     """Yields the sections that have rows, and always the list of joints."""
     text = (
-        "Joints with a cause that appeared after the first recording and repeats, or that grows: more often "
-        "than the fleet's rate of wrong names explains. No more than 1 in 100 of these lines is expected to "
-        f"be wrong. Limit: a peak of {summary.limit_arcsec:g} arcsec."
+        "Joints with a cause that appeared after the first recording and repeats, or that grows, more often "
+        "than the fleet's rate of false findings explains. No more than 1 in 100 of these lines is expected "
+        f"to be wrong. Limit: a peak of {summary.limit_arcsec:g} arcsec."
     )
     yield from _table(
         "Inspect first",
@@ -103,7 +103,7 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
         yield from _table(
             f"Causes by {attribute}",
             "Joints in which the cause was named at least twice and is more likely there than not. The share "
-            "is partially pooled: a small group is drawn to the others.",
+            "is partially pooled: a small group is drawn towards the others.",
             [f"cause and {attribute}", "joints", *(Heading(each, "") for each in ("share", "from", "to"))],
             [
                 [f"{_words(cause)}: {group}", f"{cases} of {joints}",
@@ -129,7 +129,7 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
     yield from _table(
         "Unlike their gear type",
         "The median over a joint's recordings is outside what 95 % of the joints of its type have, with a "
-        "false discovery rate of 5 %. That alone is not a fault: a joint may be so from the beginning.",
+        "false discovery rate of 5 %. That alone is not a fault: a joint may be so from the start.",
         ["joint", "gear", "figure", *(Heading(each, "") for each in ("value", "normal from", "to"))],
         [
             [joint(each.joint), each.gear, _words(each.figure), each.value, each.normal.low, each.normal.high]

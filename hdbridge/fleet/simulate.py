@@ -56,7 +56,7 @@ class Joint:
     """Growth rate of the cause's peak, which is zero at 0 operating hours."""
     odd: bool = False
     swapped_with: str | None = None
-    """Joint under whose name its recordings are filed from number ``swapped_at`` on."""
+    """Joint under whose name the recordings of this joint are filed, from number ``swapped_at`` on."""
     swapped_at: int | None = None
     turned_at: int | None = None
     """Number of the first recording after an exchange of the motor encoder."""
@@ -92,7 +92,7 @@ def _loop(data: dict[str, Any], size: float) -> None:
 
 
 def peak_at_0_hours_arcsec(cause: str, arcsec_per_1000_hours: float, first_hours: float) -> float:
-    """Returns the cause's peak that a diagnosis sees, extrapolated along its straight line to 0 hours.
+    """Returns the peak of a cause as a diagnosis sees it, extrapolated along a straight line to 0 hours.
 
     A model fitted to the first recording contains the motor orders and the loop of that recording, so only
     their later growth is seen. The load friction of a joint with backlash winds up the gear, which looks like

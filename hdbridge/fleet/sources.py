@@ -1,7 +1,7 @@
 """Recordings of a fleet: folders, globs, fsspec URLs, and the manifest that describes them.
 
 A source is one recording of one joint that has not been read yet. Errors in a single recording are found
-later, by the worker that reads it; an invalid manifest or a place without recordings is an InputError.
+later, by the worker that reads it; an invalid manifest or a location without recordings is an InputError.
 """
 
 import csv
@@ -130,10 +130,10 @@ def find_sources(
     timeout_s: float = TIMEOUT_S,
     report: Callable[[str], None] = lambda _: None,
 ) -> list[Source]:
-    """Returns all recordings at the given places and in the manifest, without repetition, sorted by path.
+    """Returns all recordings at the given locations and in the manifest, without repetition, sorted by path.
 
-    InputError for a place that does not exist or has no recording (unless it ``may_be_empty``), for an
-    invalid manifest, and for a manifest that is given as a place. Recordings unchanged since they were
+    InputError for a location that does not exist or has no recording (unless it ``may_be_empty``), for an
+    invalid manifest, and for a manifest that is given as a location. Recordings unchanged since they were
     ``stored`` are not opened. ``timeout_s`` limits the wait for a server's first response. Ignored parts of
     the manifest are passed to ``report``.
     """
@@ -172,7 +172,7 @@ def find_sources(
 
 
 def _advice(manifest: str) -> str:
-    """Returns how to pass a manifest that was found among recordings; ``--manifest`` takes a local file."""
+    """Describes how to pass a manifest found among recordings; ``--manifest`` requires a local file."""
     if "://" not in manifest:
         return f"pass it as well: --manifest {manifest}"
     name = posixpath.basename(manifest)
@@ -187,7 +187,7 @@ def _recordings(files: Mapping[str, str], described: Collection[str]) -> dict[st
 
 
 def _marks_of(paths: Collection[str], timeout_s: float) -> dict[str, str]:
-    """Returns the marks (size and times) of the recordings in a manifest, without those that are missing."""
+    """Returns the marks (size and times) of the recordings in a manifest; omits missing recordings."""
     files: dict[str, str] = {}
     for place in {posixpath.dirname(path) if "://" in path else path for path in paths}:
         with suppress(InputError):  # the worker that reads the recording reports the error
@@ -196,7 +196,7 @@ def _marks_of(paths: Collection[str], timeout_s: float) -> dict[str, str]:
 
 
 def _listing(place: str, timeout_s: float) -> dict[str, str]:
-    """Returns all files at or below a place (folder, glob, file or URL), each with its mark: size and times.
+    """Returns all files at or below a folder, glob, file or URL, each with its mark: size and times.
 
     InputError if no file is found.
     """

@@ -262,7 +262,8 @@ def trends(series: Sequence[Series]) -> list[Trend | None]:
 
     The trends are straight lines; the errors are those of the values plus a scatter between recordings that
     is common to all joints. The prior of the slopes is a normal mixture of joints that change and joints that
-    do not, fitted to the fleet; it draws the slope of three noisy recordings to zero, unlike a steep slope.
+    do not, fitted to the fleet; it shrinks an uncertain slope from three noisy recordings to zero, but hardly
+    a steep one.
     """
     usable = [place for place, each in enumerate(series) if len(np.unique(each.hours)) > 1]
     if not usable:
@@ -310,7 +311,8 @@ def _line(each: Series, scatter: float) -> tuple[FloatArray, FloatArray]:
 def _scatter(series: Sequence[Series]) -> float:
     """Estimates the common scatter between recordings by restricted maximum likelihood (REML).
 
-    A fraction `OWN_SCATTER` of the series has its own scatter, so that one step does not affect the others.
+    Each series has a scatter of its own with the probability `OWN_SCATTER`, so that a step in one series does
+    not affect the common scatter.
     """
     chosen = [each for each in series if len(each.hours) > _design(each).shape[1]]
     chosen = chosen[:: max(1, math.ceil(len(chosen) / SCATTER_SERIES))]
@@ -335,8 +337,8 @@ def _scatter(series: Sequence[Series]) -> float:
 
 
 def _two_kinds(slopes: FloatArray, errors: FloatArray) -> tuple[float, tuple[float, float], float]:
-    """Fits the mixture of slopes; returns the deviation of unchanging joints, and of changing joints the mean
-    with the deviation, and the fraction.
+    """Fits the mixture of slopes. Returns the standard deviation of unchanging joints, mean and standard
+    deviation of changing joints, and the fraction of changing joints.
     """
     middle = float(np.median(np.abs(slopes)))
     stay = 0.3 * max(middle, float(np.median(errors)))

@@ -5,7 +5,7 @@ exactly. A plan must be computed outside the control loop, because this takes mi
 
 Ruckig's free version does not plan paths through intermediate points (it would call a server on the
 internet). A path through way points therefore comes to rest at each change of direction. It passes points on
-a straight line without stopping. To round a corner without a stop, the caller must choose other points.
+a straight line without stopping. To avoid a stop at a corner, the caller must stream its own knots.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Computes jerk-limited plans of one axis from any present state, on line, by ruckig.
+"""Computes jerk-limited plans of one axis from any current state, on line, with ruckig.
 
 A plan is checked before it is returned: it ends at its target, in finite time, and stays within the bounds
 and the axis's velocity limit. The result is None if ruckig finds no solution within the bounds. The caller
@@ -44,7 +44,7 @@ class Bounds(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Path from the present state to rest, as a function of the time since its start."""
+    """Path from the current state to rest, as a function of the time since its start."""
 
     begin_deg: float
     end_deg: float
@@ -99,11 +99,11 @@ class Generator:
     ) -> Plan | None:
         """Returns the fastest path to rest at a position, or None.
 
-        The axis's limits apply even if higher values are requested. Present velocity and acceleration above
-        the requested values are reduced first.
+        The axis's limits apply even if higher values are requested. If the current velocity or acceleration
+        exceeds the requested one, it is reduced first.
         """
         self._demand.control_interface = ControlInterface.Position
-        # Positions are relative to the present one, so that rounding does not depend on the distance from
+        # Positions are relative to the current one, so that rounding does not depend on the distance from
         # zero.
         self._demand.target_position = [target_deg - now.position_deg]
         plan = self._plan(now, velocity_deg_s, acceleration_deg_s2, bounds)

@@ -4,7 +4,7 @@ from enum import IntEnum
 
 
 class MotionMode(IntEnum):
-    """Kind of the present motion.
+    """Kind of the current motion.
 
     The numbers are used in the daemon's shared memory. New ones may be added, but existing ones must not
     change.

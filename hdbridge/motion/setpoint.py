@@ -1,7 +1,7 @@
 """Set-point of one axis in each control period, with commands accepted at any time.
 
-Every motion continues from the present position, velocity and acceleration, so a new target does not require
-rest. An impossible command is refused (`InputError`) without any change, and the present motion continues.
+Every motion continues from the current position, velocity and acceleration, so a new target does not require
+rest. An impossible command is refused (`InputError`) without any change, and the current motion continues.
 
 The set-point always stays within the position limits. A plan is accepted only if its extremes are within
 them, and braking has a fallback that is always possible (`SetPoint._brake`). Rounding errors are clipped.
@@ -28,7 +28,7 @@ class SetPoint:
     """
 
     def __init__(self, limits: MotionLimits, period_s: float) -> None:
-        """Creates a set-point at zero, until `reset`; ``period_s`` is the time between two calls of `step`.
+        """Creates a set-point at 0 deg (see `reset`); ``period_s`` is the time between two calls of `step`.
 
         Raises `InputError` for limits that are not finite or leave no range.
         """
@@ -50,7 +50,7 @@ class SetPoint:
         self._path: Plan | Cubic | None = None
         """Path in progress; None at rest, in a stream and in a pursuit."""
         self._steps = 0
-        """Number of periods since ``_path`` was set, ``_since_s`` after the start of the path."""
+        """Number of periods since ``_path`` was set; ``_since_s`` of the path had elapsed then."""
         self._since_s = 0.0
         self._left = self._stream_timeout = 0
         """Remaining periods before a jog or a resting stream times out, and time-out of a stream, periods."""
@@ -161,7 +161,7 @@ class SetPoint:
             self._brake(0.0)
 
     def stream(self, timeout_s: float) -> None:
-        """Starts a stream, which follows knots (`knot`) from the present position.
+        """Starts a stream, which follows knots (`knot`) from the current position.
 
         The time of the knots starts with the first `step` after `begin_stream`. If the axis rests for the
         time-out without a new knot, the stream ends with a hold. Raises `InputError` in motion, and for a
@@ -169,7 +169,7 @@ class SetPoint:
         """
         timeout = self._timeout(timeout_s)
         if not self.at_rest:
-            raise InputError("a stream begins at rest: stop the axis first")
+            raise InputError("a stream must begin at rest: stop the axis first")
         self._rest_at(self._position_deg)
         self._stream = Stream(self._position_deg, self._limits, self._bounds_here(), self._period_s)
         self._stream_timeout = timeout
@@ -180,7 +180,7 @@ class SetPoint:
     def follow(self) -> None:
         """Pursues the positions passed to `aim` until another command; raises `InputError` in motion."""
         if not self.at_rest:
-            raise InputError("an axis begins to follow another master at rest: stop the axis first")
+            raise InputError("following another master must begin at rest: stop the axis first")
         self._rest_at(self._position_deg)
         self._pursuit = Pursuit(self._position_deg, self._limits, self._bounds, self._period_s)
         self._aim = (self._position_deg, 0.0)
@@ -266,7 +266,7 @@ class SetPoint:
         self._bounds = self._bounds_here()
 
     def _bounds_here(self) -> Bounds:
-        """Returns the position limits, extended to the present position if that is outside."""
+        """Returns the position limits, extended to the current position if that is outside."""
         limits, here = self._limits, self._position_deg
         return Bounds(min(limits.position_min_deg, here), max(limits.position_max_deg, here))
 
@@ -288,7 +288,7 @@ class SetPoint:
             if self.at_rest:
                 break
         raise InputError(
-            f"no way from {now.position_deg:.9g} deg at {now.velocity_deg_s:.4g} deg/s to {target_deg:.9g} "
+            f"no path from {now.position_deg:.9g} deg at {now.velocity_deg_s:.4g} deg/s to {target_deg:.9g} "
             "deg within the limits: check velocity and acceleration of the move and the limits in the axis "
             "file, or stop the axis first"
         )
@@ -296,7 +296,7 @@ class SetPoint:
     def _brake(self, since_s: float) -> None:
         """Brakes to rest by the first of three paths that stays within the position limits.
 
-        The first path stops as fast as the jerk limit permits. The second returns to the present position; it
+        The first path stops as fast as the jerk limit permits. The second returns to the current position; it
         brakes equally hard but reduces the deceleration later. The third has constant deceleration. It needs
         no more travel than any path within the limits, and is always possible. It is required only if the
         knots of a stream brake towards a position limit with more than the axis's jerk.
@@ -341,7 +341,7 @@ class SetPoint:
 
     def _streaming(self) -> Stream:
         if self._stream is None:
-            raise InputError("no stream has been begun: begin one before its knots come")
+            raise InputError("no stream has been started; start one before sending knots")
         return self._stream
 
 

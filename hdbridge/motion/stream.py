@@ -61,7 +61,7 @@ class Cubic(NamedTuple):
         return self.end_s - self.begin_s
 
     def state(self, time_s: float) -> Kinematics:
-        """Returns the state at this time; before and after the cubic, that at its nearer end."""
+        """Returns the state at a time; for a time outside the cubic, the state at its nearer end."""
         period_s = self.end_s - self.begin_s
         s = 1.0 if time_s >= self.end_s else max(time_s - self.begin_s, 0.0) / period_s
         return Kinematics(
@@ -119,7 +119,8 @@ class Stream:
         """Number of periods since the last rest."""
         self._released = self._begun = False
         self.overrun_s: float | None = None
-        """Time since the stream ran out of knots in motion, at the state of the last knot; else None."""
+        """Time since the stream ran out of knots in motion; the state is then that of the last knot. Else
+        None."""
         self._state = Kinematics(begin_deg, 0.0, 0.0)
 
     @property
@@ -144,7 +145,9 @@ class Stream:
                 "finite numbers"
             )
         if not self.room:
-            raise InputError(f"{MOST_KNOTS} knots are waiting; send the next ones as the axis runs them")
+            raise InputError(
+                f"{MOST_KNOTS} knots are in the buffer; send the next ones as the axis passes these"
+            )
         if abs(velocity_deg_s) < _REST_DEG_S:
             velocity_deg_s = 0.0
         if self._last is None:
@@ -153,7 +156,7 @@ class Stream:
         last_s, last_deg, last_deg_s = self._last
         if time_s - last_s <= 10.0 * self._grid_s:
             raise InputError(
-                f"a knot at {time_s:.9g} s after one at {last_s:.9g} s: times must rise from knot to knot"
+                f"the knot at {time_s:.9g} s follows one at {last_s:.9g} s; expected increasing times"
             )
         cubic = Cubic.between(last_s, last_deg, last_deg_s, time_s, position_deg, velocity_deg_s)
         self._check(cubic, time_s, position_deg, velocity_deg_s)
@@ -175,7 +178,7 @@ class Stream:
 
     def _check(self, cubic: Cubic, time_s: float, position_deg: float, velocity_deg_s: float) -> None:
         limits, bounds = self._limits, self._bounds
-        where = f"the way to the knot at {time_s:.6g} s"
+        where = f"the path to the knot at {time_s:.6g} s"
         fastest, hardest = cubic.fastest_deg_s(), cubic.hardest_deg_s2()
         lowest, highest = cubic.extremes_deg()
         # Velocity error due to rounding of the positions.

@@ -142,7 +142,7 @@ class Unit:
     per: float | None = None
     """Counts per turn, or rated torque in Nm, if the unit requires it."""
     times: float = 1.0
-    """Number of units that correspond to 1 in the column; negative for the opposite direction."""
+    """Number of units that correspond to a value of 1 in the column; negative for the opposite direction."""
 
     @classmethod
     def parse(cls, text: str, channel: str, where: str = "--units") -> Self:

@@ -47,7 +47,7 @@ _PLURALS: Final = {
 
 
 def remedy(times: float, ratio: float, exact: float, origin: Origin | None) -> str:
-    """Returns advice for a load that travels ``times`` as far as the ratio and the motor imply.
+    """Returns advice for a load that travels ``times`` times as far as ratio and motor imply.
 
     If the record is from a CSV file, the advice includes the option to pass. ``exact`` is the relative
     accuracy within which a ratio counts as right.
@@ -61,7 +61,7 @@ def remedy(times: float, ratio: float, exact: float, origin: Origin | None) -> s
         return f"look at the load encoder's column{column}"
     if times < 0.0:
         how = f": pass {origin.scaled('load', -1.0)}, or {origin.scaled('motor', -1.0)}" if origin else ""
-        return f"turn the direction of one encoder round{how}"
+        return f"reverse the direction of one encoder{how}"
     found = [
         (abs(times * change - 1.0), words, how)
         for change, words, how in (*_other_units(origin), *_other_places(ratio, origin))
@@ -77,7 +77,7 @@ def remedy(times: float, ratio: float, exact: float, origin: Origin | None) -> s
             if origin is not None:
                 pass_ = option("--units", {channel: f"counts:{_round(counts, exact)}"})
                 how = f"pass {pass_} with the counts per turn of its data sheet"
-            return f"the {channel}'s angle looks like counts, some {counts:.4g} to a turn: {how}"
+            return f"the {channel}'s angle looks like counts, about {counts:.4g} per turn: {how}"
     return "correct the ratio, or the counts per turn of an encoder" + _of_counts(times, exact, origin)
 
 
@@ -139,7 +139,7 @@ __all__ = ["MINIMUM_SAMPLES", "OPTIONAL", "REQUIRED", "Record", "concatenate", "
 MINIMUM_SAMPLES: Final = 2
 
 WRONG_RATIO: Final = 0.003
-"""Relative deviation of a ratio that indicates another gear; common ratios are at least 0.6 % apart."""
+"""Relative deviation of a ratio that indicates a different gear; common ratios are at least 0.6 % apart."""
 WRONG_RATIO_ARCSEC: Final = 900.0
 """Minimum effect of such a deviation over the travel, arcsec: several times the error of any gear."""
 
@@ -260,7 +260,7 @@ class Record:
     def transmission_error_arcsec(self, ratio: float) -> FloatArray:
         """Returns the measured transmission error theta_L - theta_M / N, arcsec at the load, shape (n,).
 
-        Its mean contains the difference between the zeros of the two encoders.
+        Its mean includes the offset between the zeros of the two encoders.
         """
         error: FloatArray = (self.load_position_deg - self.motor_position_deg / ratio) * ARCSEC_PER_DEG
         return error
@@ -297,7 +297,7 @@ class Record:
             found = "the load stands still while the motor turns"
         else:
             found = f"the motor makes {1 / abs(slope):.5g} turns per turn of the load"
-            found += ", against it" if slope < 0.0 else ""
+            found += ", in the opposite direction" if slope < 0.0 else ""
         cure = remedy(slope * ratio, ratio, WRONG_RATIO, self.origin)
         name = f"{self.source}: " if self.source else ""
         over = f"measured over {travel_deg:.3g} deg of the load"

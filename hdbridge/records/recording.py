@@ -57,7 +57,7 @@ class Segment(Strict):
 class RecordedFile(Strict):
     """A CSV file of the recording, with its checksum."""
 
-    name: str = Field(pattern=r"^[^/\\]+$", description="name in this folder")
+    name: str = Field(pattern=r"^[^/\\]+$", description="file name in this folder")
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="checksum")
     samples: int = Field(ge=0, description="rows")
 
@@ -84,7 +84,7 @@ class RecordingFile(Strict):
 
     @classmethod
     def made(cls, **values: Any) -> RecordingFile:
-        """Creates the content without validation, because a new recording has no files yet."""
+        """Creates the content without validation, which would reject a new recording without files."""
         return cls.model_construct(schema_="hdbridge.recording/1", **values)
 
     def write(self, folder: Path) -> None:
@@ -183,7 +183,7 @@ class Recording:
         """
         folder = Path(folder)
         if (folder / ABOUT_NAME).exists():
-            raise InputError(f"{folder}: there is a recording already; expected a new folder")
+            raise InputError(f"{folder}: already contains a recording; expected a new folder")
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as problem:
@@ -278,7 +278,6 @@ def by_name(given: Given) -> dict[Path, Recording]:
 
 def agreed_ratio(recordings: Mapping[Path, Recording], said: Iterable[tuple[str, float | None]]) -> float:
     """Returns the gear ratio on which the recordings and ``said`` (pairs of source and value) agree.
-
 
     Raises `InputError` if they disagree, or if none of them states a ratio.
     """

@@ -59,8 +59,8 @@ def calibration_page(result: Calibration) -> Page:
         Section("Parameters", _parameters_text(result), [*_parameters(result)]),
         Section(
             "Transmission error",
-            "Load encoder angle minus motor angle over the ratio, with the zero removed; dots are means over "
-            "short stretches.",
+            "Load encoder angle minus motor angle divided by the ratio, without the zero offset; dots are "
+            "means over short stretches.",
             [Grid([*_by_angle(traces, result.model.ratio)])],
         ),
     ]
@@ -68,16 +68,16 @@ def calibration_page(result: Calibration) -> Page:
         sections.append(
             Section(
                 "Hysteresis loops",
-                "The error over the motor angle as it goes back and forth, measured and by the model.",
+                "The error over the motor angle in back-and-forth motion, measured and from the model.",
                 [Grid(loops, columns=3 if len(loops) > 2 else 2)],
             )
         )
     sections += [
         Section(
             "Spectrum",
-            "Amplitudes by least squares at the true angles, without hysteresis and zero. Bars: the orders "
-            "fitted together; those below the threshold cannot be distinguished from noise. Line: each order "
-            "alone, which shows the side lobes of its neighbours too.",
+            "Amplitudes by least squares at the true angles, without hysteresis and zero offset. Bars: the "
+            "orders fitted together; those below the threshold cannot be distinguished from noise. Line: "
+            "each order fitted alone, which also shows the side lobes of its neighbours.",
             [_spectrum(result)],
         ),
         Section("Residual of the model", sentence(result.fit.held_out.text), [*_residual(result)]),
@@ -214,7 +214,7 @@ def _spectrum(result: Calibration) -> Chart:
 
 
 def _alone(traces: Traces) -> tuple[FloatArray, FloatArray]:
-    """Returns orders and amplitudes of the error, by FFT over equal bins of the motor angle, for display.
+    """Returns orders and amplitudes of the error for display, from an FFT over equal bins of the motor angle.
 
     Empty bins count as zero, and the amplitudes are corrected for the fraction of filled bins.
     """
@@ -329,8 +329,8 @@ def _change(change: float, parameter: str) -> str:
 def _drift_text(result: Calibration) -> str:
     errors = [error for _, error in result.drift]
     return (
-        f"The axis returned to one pose {len(errors)} times, always from the same side: its zero moved by "
-        f"{max(errors) - min(errors):.2f} arcsec."
+        f"The axis returned to one pose {len(errors)} times, always from the same side: its zero position "
+        f"moved by {max(errors) - min(errors):.2f} arcsec."
     )
 
 

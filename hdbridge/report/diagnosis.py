@@ -62,8 +62,8 @@ def diagnosis_page(
         _figures(diagnosis),
         Section(
             "Model and measurement",
-            "The transmission error on the same trajectory: load encoder minus motor angle over the ratio, "
-            "without the zero.",
+            "The transmission error on the same trajectory: load encoder minus motor angle divided by the "
+            "ratio, without the zero offset.",
             [Grid([*beside_charts(diagnosis.traces)], columns=1)],
         ),
         _over(seen),

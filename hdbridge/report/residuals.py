@@ -51,7 +51,8 @@ def binned(
 
 
 LEAST_POINTS: Final = 200
-"""Minimum number of points that show only the finding. With fewer, all points are drawn."""
+"""Minimum number of points in the stretch that shows the finding for drawing only these; else all are
+drawn."""
 SEEN_BINS: Final = 20
 
 
@@ -211,7 +212,7 @@ def partial_residual_chart(partial_residual: PartialResidual) -> Chart:
 def _strength_chart(strength: Strength, home: Coordinate) -> Chart:
     series = [
         Series(
-            "measured, each bin by itself",
+            "measured, each bin separately",
             strength.place,
             strength.measured_percent,
             Mark.POINTS,

@@ -166,8 +166,8 @@ def stepping_page(
             Section("Figures", blocks=[_table(results, with_article)]),
             Section(
                 "Load error at rest",
-                "Each point is one step: what the load encoder read at rest, minus the target. The two "
-                "directions are apart where the gear's hysteresis is not compensated; the wave along the "
+                "Each point is one step: the load encoder's reading at rest, minus the target. The two "
+                "directions are apart if the gear's hysteresis is not compensated; the wave along the "
                 "angle is the synchronous error. All schemes are drawn to one scale.",
                 [Grid([_errors(scheme, result, range_) for scheme, result in results.items()])],
             ),

@@ -72,7 +72,7 @@ class TwinReport:
     values: str = ""
     """Origin of the values (`hdbridge.twin.twin.Values`); empty without a fit."""
     left: Sequence[Left] = ()
-    """Remaining difference of each channel."""
+    """Residual of the fitted simulation, for each channel."""
     commands: Sequence[Command] = ()
     status: Status = Status.MEASURED
 

@@ -247,7 +247,7 @@ def test_a_torque_sensor_that_is_not_connected(case: Callable[..., Any]) -> None
     verdicts = case(axis=CHANNELS, spoil=unplug).run(until="hold")
     assert failures(verdicts) == ["rest"]
     assert "; no load torque; temperature 22 \N{DEGREE SIGN}C" in verdicts["rest"].measured
-    assert "axis.yaml:42:1: load_torque: nothing comes that can be believed" in verdicts["rest"].remedies[0]
+    assert "axis.yaml:42:1: load_torque: no plausible reading" in verdicts["rest"].remedies[0]
     assert verdicts["hold"].outcome is NOT_POSSIBLE
 
 
@@ -282,7 +282,7 @@ def test_a_drive_that_ignores_a_lost_heartbeat(case: Callable[..., Any]) -> None
     examined = case(spoil=deaf)
     verdicts = examined.run()
     assert failures(verdicts) == ["heartbeat"]
-    assert "the drive goes on" in verdicts["heartbeat"].measured
+    assert "the drive continues" in verdicts["heartbeat"].measured
     assert "drive.heartbeat_ms (50 ms) was written to 1016h" in verdicts["heartbeat"].remedies[0]
     assert verdicts["set_points"].outcome is PASS
     assert decode(examined.node.firmware.statusword()) is State.SWITCH_ON_DISABLED

@@ -109,7 +109,7 @@ def test_a_node_that_another_client_talks_to_is_left_alone() -> None:
     assert node is not None
     assert node.busy
     assert node.device_type is None
-    assert "another SDO client is talking to node 1" in "".join(found.remarks)
+    assert "another SDO client is using node 1" in "".join(found.remarks)
     matches, lines = compare(AXIS, found)
     assert not matches
     assert "in use by another SDO client" in lines[0]
@@ -151,7 +151,7 @@ def test_the_drive_of_the_axis_file_is_recognised() -> None:
     [
         ((), "drive.node_id: nothing answers as node 1"),
         ((drive_node(4),), "drive.node_id: found 1; the drive with this identity is node 4"),
-        ((drive_node(revision=2),), "drive.identity.revision: found 0x10000; node 1 says 0x2"),
+        ((drive_node(revision=2),), "drive.identity.revision: found 0x10000; node 1 reports 0x2"),
         ((Node(1, 4),), "a stopped node"),
         ((Node(1, answers=True, device_type=401),), "input/output module"),
     ],

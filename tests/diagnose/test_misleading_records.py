@@ -64,7 +64,9 @@ def test_noisy_samples_do_not_decide_about_a_gain(seed: int) -> None:
     effects = (*MODEL.effects, RatioError(ramp_arcsec_per_turn=0.1))
     before, after = (estimator.fit(Hypothesis(each, Start.FORWARD)) for each in (MODEL.effects, effects))
     gain = held_out(estimator, before, after)
-    assert gain is not None and gain.sure and gain.predicts
+    assert gain is not None
+    assert gain.sure
+    assert gain.predicts
 
 
 def test_a_ripple_that_falls_to_a_fifth_is_a_drift() -> None:

@@ -118,7 +118,7 @@ def test_incompatible_effects_are_reported():
     assert "load_order" in conflict
     assert "80" in conflict
     (conflict,) = conflicts([*BASE, HysteresisMemory.candidate(RATIO, BASE)], RATIO)
-    assert conflict.startswith("'hysteresis_memory' stands in place of 'hysteresis'")
+    assert conflict.startswith("'hysteresis_memory' replaces 'hysteresis'")
 
 
 def test_the_hysteresis_scheme_uses_the_substituted_law():

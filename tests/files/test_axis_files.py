@@ -97,7 +97,7 @@ def test_a_valid_file_gives_nested_values_and_defaults(folder):
         ("ratio: 50", "ratio: 50\n  teeth: {flexspline: 80, circular_spline: 82, output: circular_spline}", "15:10: gear.teeth: 80 and 82 teeth do not give a ratio of 50: zf/(zc-zf) = 40 with flexspline output, 41 with circular-spline output; 50 needs 98 and 100"),
         ("ratio: 50", "ratio: 50.3\n  teeth: {flexspline: 100, circular_spline: 102}", "15:10: gear.teeth: 100 and 102 teeth do not give a ratio of 50.3: zf/(zc-zf) = 50 with flexspline output, 51 with circular-spline output; 50.3 needs other teeth"),
         ("ratio: 50", "ratio: 50\n  teeth: {flexspline: 102, circular_spline: 100}", "15:45: gear.teeth.circular_spline: 100 is not more than the flexspline's 102; expected the flexspline's teeth and (as a rule) two more"),
-        ("ratio: 50", "ratio: 50\n  teeth: {flexspline: 100, circular_spline: 102, output: flexsplin}", "15:58: gear.teeth.output: found 'flexsplin'; expected 'flexspline' or 'circular_spline' (the one that turns the load); did you mean 'flexspline'?"),
+        ("ratio: 50", "ratio: 50\n  teeth: {flexspline: 100, circular_spline: 102, output: flexsplin}", "15:58: gear.teeth.output: found 'flexsplin'; expected 'flexspline' or 'circular_spline' (spline that drives the load); did you mean 'flexspline'?"),
         ("position_min_deg: -400", "position_min_deg: 400", "17:21: limits.position_max_deg: found 400; expected more than position_min_deg, 400"),
         ("position_max_deg: 400", "position_max_deg: 2.0e+6", "17:21: limits.position_max_deg: 2e+06 deg is 2.22e+09 motor counts, more than 607Ah can hold (2147483647); expected a smaller range"),
         ("position_max_deg: 400", "position_max_deg: .nan", "17:21: limits.position_max_deg: found .nan; expected a number (highest position)"),
@@ -138,8 +138,8 @@ def test_a_missing_eds_is_one_line_with_both_places(folder):
     with pytest.raises(InputError) as caught:
         load(folder, GOOD.replace("test.eds", "other.eds"))
     assert str(caught.value) == (
-        f"{folder / 'axis.yaml'}:6:8: drive.eds: there is no 'other.eds' in {folder} nor among the bundled EDS files "
-        f"in {bundled_folder('eds')}; expected an EDS file there, or another name here"
+        f"{folder / 'axis.yaml'}:6:8: drive.eds: 'other.eds' is neither in {folder} nor among the bundled EDS files "
+        f"in {bundled_folder('eds')}; expected an EDS file there, or a different name here"
     )
 
 

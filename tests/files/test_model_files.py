@@ -211,7 +211,5 @@ def test_mutually_exclusive_effects_are_refused():
         "- effect: hysteresis\n  parameters: {offset_arcsec: 40, width_deg: 20, exponent: 1.6}\n"
         "- effect: hysteresis_memory\n  parameters: {offset_arcsec: 40, width_deg: 20, exponent: 1.6}\n"
     )
-    with pytest.raises(
-        InputError, match=r"model\.yaml:4:1: .*'hysteresis_memory' stands in place of 'hysteresis'"
-    ):
+    with pytest.raises(InputError, match=r"model\.yaml:4:1: .*'hysteresis_memory' replaces 'hysteresis'"):
         TransmissionModel.from_text(text, "model.yaml")

@@ -44,7 +44,7 @@ def test_recordings_read_back_unchanged(tmp_path):
 
 def test_a_recording_is_never_overwritten(tmp_path):
     FULL.save(tmp_path / "one")
-    with pytest.raises(InputError, match=r"/one: there is a recording already; expected a new folder$"):
+    with pytest.raises(InputError, match=r"/one: already contains a recording; expected a new folder$"):
         FULL.save(tmp_path / "one")
 
 
@@ -68,7 +68,7 @@ def test_a_modified_record_is_detected(tmp_path):
         ("ratio: 50.0", "ratio: -50", ":4:8: ratio: found -50; expected a number above 0, at most 1000 "
                                        "(N: motor turns per load turn)"),
         ("name: record.csv.gz", "name: ../a.csv", ":15:11: files[0].name: found '../a.csv'; expected text "
-                                                   "(name in this folder)"),
+                                                   "(file name in this folder)"),
     ],
 )  # fmt: skip
 def test_a_wrong_recording_file_gets_one_exact_line(tmp_path, wanted, given, expected):

@@ -89,7 +89,7 @@ def test_from_a_recording_nothing_is_measured_first(improved):
     assert causes(result) == ["motor_order"]
     assert result["offered"] is True
     assert result["recordings"] == ["rec"]
-    assert "nothing is measured first" in err
+    assert "no measurement first" in err
     assert not (improved.folder / "again" / "recording.yaml").exists()
     assert (improved.folder / "again" / "stepping-1-after.csv.gz").exists()
 

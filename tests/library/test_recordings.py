@@ -42,7 +42,7 @@ def test_a_diagnosis_of_a_run_is_the_document_of_the_command(run, fitted):
 @pytest.mark.parametrize(
     ("spoil", "complaint"),
     [
-        (lambda record: changed(record, time_s=np.zeros(len(record))), "time that passes"),
+        (lambda record: changed(record, time_s=np.zeros(len(record))), "expected increasing times"),
         (lambda record: changed(record, load_position_deg=np.radians(record.load_position_deg)), "radians"),
         (lambda record: changed(record, motor_position_deg=np.zeros(len(record))), "never moves"),
         (

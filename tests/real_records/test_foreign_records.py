@@ -46,7 +46,7 @@ WRONG = {
     "not a number": (text().replace("0.500000000,", "nan,"), ":52: time_s: nan; expected a finite number"),
     "a hole": (text().replace("0.500000000,", ","), ":52: time_s: no value; expected a number"),
     "time backwards": (text(time=np.r_[TIME[:100], TIME[90:190]]), ":102: time_s: 0.9 after 0.99; expected"),
-    "time that stands": (text(time=0.0 * TIME), ": time_s: 0 in all 200 rows; expected time that passes"),
+    "time that stands": (text(time=0.0 * TIME), ": time_s: 0 in all 200 rows; expected increasing times"),
     "another gear": (text(motor=1.02 * MOTOR), "the motor makes 51.001 turns per turn of the load"),
     "a load that stands": (text(load=0.0 * LOAD), "the load stands still while the motor turns"),
     "no motion": (text(motor=0.0 * MOTOR, load=0.0 * LOAD), ": the motor never moves in 200 samples"),
@@ -193,7 +193,7 @@ ADVISED: dict[str, tuple[str, str, str]] = {
     "a load angle of one turn": (
         text(load=(LOAD + 350.0) % 360.0),
         ":72: load_position_deg: 0.129375 after 359.985, a jump of 360 that the other angle does not make "
-        "(1 such jump); expected multi-turn angles, and this is an angle that wraps after a turn",
+        "(1 such jump); expected a multi-turn angle, but this looks like an angle that wraps after a turn",
         "--unwrap load=360",
     ),
     "a motor angle of one turn": (
@@ -208,7 +208,7 @@ ADVISED: dict[str, tuple[str, str, str]] = {
     ),
     "a motor of one turn, backwards": (
         text(motor=-MOTOR % 360.0, load=-LOAD),
-        "this is an angle that wraps after a turn",
+        "this looks like an angle that wraps after a turn",
         "--unwrap motor=360",
     ),
     "milliseconds by name": (
@@ -248,7 +248,7 @@ ADVISED: dict[str, tuple[str, str, str]] = {
     ),
     "a motor of one turn that reverses where it wraps": (
         text(motor=TURNED % 360.0, load=TURNED / RATIO),
-        "this is an angle that wraps after a turn",
+        "this looks like an angle that wraps after a turn",
         "--unwrap motor=360",
     ),
     "a motor of one turn around zero": (
@@ -268,7 +268,7 @@ ADVISED: dict[str, tuple[str, str, str]] = {
     ),
     "motor in counts": (
         text(motor=MOTOR * 8000.0 / 360.0),
-        "the motor's angle looks like counts, some 8000 to a turn",
+        "the motor's angle looks like counts, about 8000 per turn",
         "--units motor=counts:8000",
     ),
     "motor at the output": (
@@ -283,7 +283,7 @@ ADVISED: dict[str, tuple[str, str, str]] = {
     ),
     "against each other": (
         text(load=-LOAD),
-        "turn the direction of one encoder round",
+        "reverse the direction of one encoder",
         "--units load=-deg",
     ),
 }
@@ -327,7 +327,7 @@ def test_a_wrapped_counter_is_reported_with_its_size_and_unwrapped(
     record = Record.read_csv(path, **said)
     with pytest.raises(InputError) as caught:
         check_records({path: record}, RATIO)
-    assert f"this is a counter of {2**bits} counts that wraps" in str(caught.value)
+    assert f"this looks like a counter of {2**bits} counts that wraps" in str(caught.value)
     assert f"pass --unwrap motor={2**bits}" in str(caught.value)
     unwrapped = Record.read_csv(path, **said, unwrap={"motor": 2**bits})
     check_records({path: unwrapped}, RATIO)
@@ -339,7 +339,9 @@ def test_a_multi_turn_counter_is_reported_with_its_size(tmp_path: Path) -> None:
     counts = np.round(LOAD * 2.0**26 / 360.0) + 2.0**31 - 2.0**20
     path.write_text(text(load=signed(32, counts)))
     record = Record.read_csv(path, units=f"load=counts:{2**26}")
-    with pytest.raises(InputError, match=r"this is a counter of 4294967296 counts that wraps: pass --unwrap"):
+    with pytest.raises(
+        InputError, match=r"this looks like a counter of 4294967296 counts that wraps: pass --unwrap"
+    ):
         check_records({path: record}, RATIO)
     unwrapped = Record.read_csv(path, units=f"load=counts:{2**26}", unwrap=f"load={2**32}")
     np.testing.assert_allclose(np.diff(unwrapped.load_position_deg), np.diff(LOAD), atol=1e-5)

@@ -82,7 +82,7 @@ def fitted():
         outliers=Outliers(3, 0, 1),
         orders=(Line(second, 5.0, 170.0, 0.01, 0.05),),
         spectrum=(Line(Order.motor(3), 0.02, 0.0, 0.01, 0.05), Line(second, 5.0, 170.0, 0.01, 0.05)),
-        residual_tests=(ResidualTest("motor_angle", True, 0.0, "no order is left"),),
+        residual_tests=(ResidualTest("motor_angle", True, 0.0, "no order remains"),),
         held_out=HeldOut(
             *[Gain("motor turns", 2, np.ones(8), np.full(8, 400.0), np.ones(8))] * 2,
             1.0,

@@ -74,7 +74,7 @@ def register(kind: type[Effect]) -> type[Effect]:
     """Adds a kind of effect to the catalogue of this process; usable as a decorator for custom effects.
 
     Model files may then contain the effect, fits and compensation use it, and a diagnosis can find it. Raises
-    `InputError` if another kind has the same name.
+    `InputError` if a different kind already has this name.
     """
     if CATALOGUE.get(kind.name, kind) is not kind:
         raise InputError(

@@ -41,7 +41,7 @@ REACH_K: Final = 30.0
 
 @dataclass(frozen=True, slots=True)
 class Reparametrised:
-    """A model expressed relative to another reference temperature."""
+    """A model expressed relative to a different reference temperature."""
 
     warmer_k: float
     """New reference temperature minus the former one, K."""
@@ -54,7 +54,11 @@ class Reparametrised:
     """Factors that convert growth relative to the former ripple or loop to growth relative to the new one."""
 
     def counted(self, effect: Effect) -> Effect:
-        """Converts an effect that is a part of the model, or that is relative to a part of the model."""
+        """Converts the parameters of an effect to the new reference temperature.
+
+        Only ripple, loop and growth of the loop with speed depend on it; other effects are returned as they
+        are.
+        """
         if isinstance(effect, Synchronous):
             return effect.fitted(self.orders)
         if isinstance(effect, Hysteresis | HysteresisMemory):
@@ -210,7 +214,7 @@ class AmplitudeDrift(Modulating, Warmed):
         return _Tracker(self, self.loop.law().tracker(start))
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """Returns a tracker whose total fall is limited to this at the highest warmth.
+        """Returns a tracker whose total fall at the highest warmth is at most ``fall_arcsec_per_deg``.
 
         Returns None if the effect does not change the loop, if the load leads, or if the ripple alone exceeds
         the limit.
@@ -240,7 +244,7 @@ class AmplitudeDrift(Modulating, Warmed):
         return 0.01 * self.limit_k * RAD_PER_DEG * abs(self.ripple_percent_per_k) * slope * self._most()
 
     def loop_share(self) -> float:
-        """Returns the largest fraction of the loop by which the effect can change the loop."""
+        """Returns the largest change that the effect can make to the loop, as a fraction of the loop."""
         return 0.01 * abs(self.friction_percent_per_k) * self.limit_k
 
     def _most(self) -> float:

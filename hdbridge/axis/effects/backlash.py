@@ -54,7 +54,7 @@ class Backlash(Linear):
     shape = (Shape("crossing_deg", 0.02, 20.0, logarithmic=True),)
     nonnegative = True
     ordinary_arcsec = 1.0
-    """Peak of a gap of 2 arcsec. An elastic loop of another shape can leave such a residual."""
+    """Peak of a gap of 2 arcsec. A misfit of the elastic loop's shape can leave such a residual."""
     linear = ("gap_arcsec",)
     typical = {"gap_arcsec": 10.0, "crossing_deg": 0.02}
 

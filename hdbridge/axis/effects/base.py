@@ -47,7 +47,7 @@ GRID: Final[Mapping[int, int]] = {1: 6, 2: 4, 3: 3}
 
 
 class Law(Strict, ABC):
-    """Law of an effect, which each model needs: its equation, in batch and on line, and its bounds."""
+    """Law of an effect, as needed by a model: the equation, in batch and on line, and its bounds."""
 
     name: ClassVar[str]
     """Canonical name, used in model files, findings and tests."""
@@ -55,7 +55,7 @@ class Law(Strict, ABC):
     channels: ClassVar[frozenset[Channel]] = frozenset()
     """Channels usually required in addition to the motor angle; for those of an instance see `needs`."""
     compensable: ClassVar[Compensable]
-    """Statement of whether the effect is compensated, with the reason; see `is_compensable`."""
+    """States whether the effect is compensated, and why; see `is_compensable`."""
     shape: ClassVar[tuple[Shape, ...]] = ()
     """Shape parameters, in which the error is non-linear; `columns` covers the linear parameters."""
 
@@ -70,7 +70,7 @@ class Law(Strict, ABC):
 
     @abstractmethod
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the design-matrix columns at the present shape parameters, shape (n, p).
+        """Returns the design-matrix columns at the current shape parameters, shape (n, p).
 
         The prediction is ``columns @ coefficients``.
         """
@@ -137,8 +137,8 @@ class Effect(Law):
     curved: ClassVar[bool] = False
     """True if the columns depend on the coefficients, so that a linear fit must be iterated."""
     sought: ClassVar[Sought | None] = None
-    """Form of the matched filter that searches for the first shape parameters, if the possible locations are
-    too many for a grid."""
+    """Form of the matched filter that finds initial shape parameters, for effects with too many possible
+    locations for a grid."""
     ordinary_arcsec: ClassVar[float] = 0.0
     """Peak error that this cause, or an indistinguishable one, has on a healthy axis."""
     incidental: ClassVar[frozenset[str]] = frozenset()
@@ -147,8 +147,8 @@ class Effect(Law):
     """Fraction of the effect's mean square that may appear as a smaller instance, because a real effect
     deviates from its law."""
     drifting: ClassVar[tuple[str, ...]] = ()
-    """Parameters that change over months with wear and temperature, if no fault of the load encoder alone
-    imitates such a change: either all parameters covered by `columns`, or none."""
+    """Parameters that drift over months with wear and temperature: either all parameters covered by
+    `columns`, or none. Empty also if a fault of the load encoder alone could imitate such a drift."""
 
     @classmethod
     def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:
@@ -220,15 +220,15 @@ class Effect(Law):
         return over.since_reversal(motion) if self.tracker().memory_deg else over.motor_angle(motion)
 
     def shows(self, motion: Motion) -> Stretch | None:
-        """Returns the samples that by themselves must show the effect; None without this requirement."""
+        """Returns the samples that alone must show the effect; None if all samples may count."""
         return None
 
     def changing(self, motion: Motion) -> FloatArray | None:
         """Returns test columns that must have zero coefficients if the effect is as its law states, (n, k).
 
-        Each column is the change of the prediction if the coefficient changed by one at one location along
-        the record, or is a similar effect nearby. The effect must have one piece. Returns None if such
-        changes do not contradict the effect.
+        Each column is either the change of the prediction if the coefficient changes by one from some
+        location of the record on, or a similar effect nearby. The effect must consist of one piece. Returns
+        None if such changes do not contradict the effect.
         """
         return None
 

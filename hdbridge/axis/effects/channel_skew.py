@@ -41,7 +41,7 @@ class ChannelSkew(Angleless, Linear):
                 2, "sweep three motor turns both ways at three speeds: skew is a straight line, drag bends"
             ),
             "inertial_windup": Experiment(
-                2, "sweep at constant speed both ways: a skew stays, inertia is silent"
+                2, "sweep at constant speed both ways: a skew remains, inertia has no effect"
             ),
         },
     )
@@ -55,7 +55,7 @@ class ChannelSkew(Angleless, Linear):
 
     ratio: Ratio
     delay_ms: float = Field(
-        ge=-1000, le=1000, description="how much later the load encoder is sampled than the motor's"
+        ge=-1000, le=1000, description="delay of the load encoder's samples relative to the motor encoder's"
     )
     second_order_ms2: float = Field(
         0.0,
@@ -63,8 +63,12 @@ class ChannelSkew(Angleless, Linear):
         le=1e6,
         description="coefficient of half the acceleration; delay squared for a pure delay",
     )
-    limit_deg_s: float = Field(1e5, gt=0, le=1e6, description="motor speed beyond which it is held")
-    limit_deg_s2: float = Field(1e6, gt=0, le=1e8, description="motor acceleration beyond which it is held")
+    limit_deg_s: float = Field(
+        1e5, gt=0, le=1e6, description="motor speed beyond which the effect stays constant"
+    )
+    limit_deg_s2: float = Field(
+        1e6, gt=0, le=1e8, description="motor acceleration beyond which the effect stays constant"
+    )
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:

@@ -40,7 +40,7 @@ def extended(effects: Iterable[Effect], new: Effect) -> tuple[Effect, ...]:
 
 
 def refreshed(effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """Returns the effects with their copies of orders and loop updated to the present model.
+    """Returns the effects with their copies of orders and loop updated to those of the model.
 
     The orders are those of the synchronous part and of any added motor orders, because a change of the tooth
     error affects all of them. If the model has no synchronous part, the copies remain unchanged.
@@ -123,12 +123,12 @@ def conflicts(effects: Iterable[Effect], ratio: float) -> tuple[str, ...]:
     names = {each.name for each in given}
     return (
         *(
-            f"'{each.name}' stands in place of '{each.replaces}': keep one of the two"
+            f"'{each.name}' replaces '{each.replaces}': keep only one of the two"
             for each in given
             if each.replaces in names
         ),
         *(
-            f"'{each.name}' was made for a gear of ratio {theirs:g}, the model's is {ratio:g}"
+            f"'{each.name}' was made for a gear of ratio {theirs:g}, but the model's ratio is {ratio:g}"
             for each in given
             if not math.isclose(theirs := getattr(each, "ratio", ratio), ratio, rel_tol=1e-9)
         ),

@@ -37,15 +37,15 @@ class Compliance(Angleless, Linear):
         signature="the error follows the torque; a mass off centre looks like a load order 1",
         consequence="the load sags under its weight and yields to process forces",
         remedy="measure the torque and compensate it; balance the load; a larger or stiffer gear",
-        experiment="move or remove the mass: the wind-up changes, a load order stays",
+        experiment="move or remove the mass: the wind-up changes, a load order remains",
         aliases=("load_order", "inertial_windup", "velocity_windup"),
         source="catalogue stiffness K1, K2, K3 of strain wave gears with torques T1, T2",
         size="about 16 arcsec/Nm in a size 20; 10-100 arcsec",
     )
     compensable = Compensable(
         True,
-        "the load really moves so, where the torque is known on line (a torque sensor, or gravity from a "
-        "model)",
+        "the load really moves like this, if the torque is known on line (from a torque sensor, or gravity "
+        "from a model)",
     )
     shape = (
         Shape("torque1_nm", 0.1, 1e5, logarithmic=True),
@@ -123,7 +123,8 @@ class Compliance(Angleless, Linear):
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
         """Returns the effect with other compliances.
 
-        If their sum is negative, it is the sense that is reversed, because a torque's sign is a convention.
+        If the compliances have a negative sum, the sense is reversed instead, because the sign of a torque is
+        a convention.
         """
         values = np.asarray(coefficients, dtype=np.float64)
         turned = values.sum() < 0.0

@@ -42,7 +42,7 @@ class Coordinate:
     """True if forward and backward motion are shown separately."""
     spacing: Spacing = Spacing.EVEN
     bins: int = 72
-    """Maximum number of bins; fewer if there would be less than `POINTS_PER_BIN` points per bin."""
+    """Maximum number of bins; reduced to keep at least `POINTS_PER_BIN` points per bin."""
 
     @property
     def label(self) -> str:

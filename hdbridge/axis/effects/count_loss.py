@@ -28,7 +28,7 @@ NEAR_S, LEAST_NEAR = 1.0, 5
 class Step(Strict):
     """One step: from ``time_s`` on, the error is larger by ``size_arcsec``."""
 
-    time_s: float = Field(ge=-1e10, le=1e10, description="when it happened, on the record's clock")
+    time_s: float = Field(ge=-1e10, le=1e10, description="time of the step, on the record's clock")
     size_arcsec: float = Field(ge=-1e6, le=1e6, description="the step, at the load")
 
 
@@ -78,11 +78,11 @@ class CountLoss(Angleless):
         return "" if observations.reversals >= 2 else "a step in time may as well be one at a place"
 
     def shows(self, motion: Motion) -> Stretch | None:
-        """Returns the samples away from reversals, where a loop of another shape leaves no steps."""
+        """Returns the samples away from reversals, where a misfit of the loop's shape leaves no steps."""
         return away_from_reversals(motion)
 
     def changing(self, motion: Motion) -> FloatArray:
-        """Returns steps shortly before and after the real one, which a slow change would need."""
+        """Returns steps shortly before and after the real one, which a slow change would need in addition."""
         time_s = motion.channel(Channel.TIME, self.name)
         first = int(np.searchsorted(time_s, self.steps[0].time_s))
         near = max(LEAST_NEAR, round(NEAR_S / float(np.median(np.diff(time_s)))))

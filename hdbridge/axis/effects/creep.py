@@ -60,7 +60,7 @@ class Creep(Effect):
         source="generalised Kelvin-Voigt element: a sum of exponentials",
         size="1-10 arcsec",
     )
-    compensable = Compensable(True, "the load really moves so, and the command says when it stopped")
+    compensable = Compensable(True, "the load really moves like this, and the command says when it stopped")
     shape = (
         Shape("tau_s", 0.05, 3600.0, logarithmic=True),
         Shape("build_up", 0.01, 1.0, logarithmic=True),
@@ -68,7 +68,7 @@ class Creep(Effect):
     """``tau_s`` is the time constant of the first exponential; the others keep their ratio to it."""
 
     usual = 8
-    """Maximum number of exponentials, because a real relaxation is a sum of several."""
+    """Maximum number of exponentials; more than one, because a real relaxation is a sum of several."""
     typical = {
         "parts": tuple(Relaxation(amplitude_arcsec=2.0, tau_s=tau_s) for tau_s in (2.0, 20.0)),
         "build_up": 0.1,

@@ -99,7 +99,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class Compensable:
-    """Statement of whether an effect is compensated, with the reason."""
+    """States whether an effect is compensated, and why."""
 
     possible: bool
     why: str
@@ -119,7 +119,7 @@ class Coefficient:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretch:
-    """Samples that by themselves must show an effect, because other effects may imitate it elsewhere."""
+    """Samples that alone must show an effect, because other effects may imitate it in other samples."""
 
     rows: BoolArray
     """Mask of the samples, shape (n,)."""
@@ -157,7 +157,7 @@ class Observations(Protocol):
 class Tracker(ABC):
     """On-line state of an effect.
 
-    `peek` returns the error after a move from the present state to a motor angle, and may be called
+    `peek` returns the error after a move from the current state to a motor angle, and may be called
     repeatedly. Only `advance` changes the state.
     """
 

@@ -1,4 +1,4 @@
-"""Shift of the synchronous part with the direction of motion, because other tooth flanks carry the load."""
+"""Shift of the synchronous part with the direction of motion, because the tooth flanks that carry differ."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -44,7 +44,7 @@ class DirectionPhase(Modulating):
         source="phase of the kinematic error differs between the tooth flanks that carry",
         size="1-5 arcsec",
     )
-    compensable = Compensable(True, "the load really moves so; the direction is commanded")
+    compensable = Compensable(True, "the load really moves like this; the direction is commanded")
     carries = {Part.ORDERS: "orders"}
     curved = True
     linear = ("shift_deg",)
@@ -71,7 +71,7 @@ class DirectionPhase(Modulating):
         return Memoryless(lambda motor_deg, now: (now.direction or before) * orders.peek(motor_deg, now))
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error per degree of shift *at the present shift*, shape (n, 1).
+        """Returns the error per degree of shift *at the current shift*, shape (n, 1).
 
         The error is not exactly proportional to the shift, so the fit must be iterated.
         """

@@ -54,7 +54,7 @@ def rise_at(xi: float, n: float, steepest: float = math.inf) -> float:
 class ElasticLoop(Effect):
     """Base class of hysteresis laws: a loop between plus and minus the offset, proportional to the offset."""
 
-    compensable = Compensable(True, "the load really moves so, and the command says where it reverses")
+    compensable = Compensable(True, "the load really moves like this, and the command says where it reverses")
     shape = (
         Shape("width_deg", 0.5, 120.0, logarithmic=True),
         Shape("exponent", 1.02, 4.0),
@@ -68,7 +68,7 @@ class ElasticLoop(Effect):
     offset_arcsec: float = Field(
         ge=-3600,
         le=3600,
-        description="half the height of the loop, at the load; negative where the load lags",
+        description="half the height of the loop, at the load; negative if the load lags",
     )
     width_deg: float = Field(gt=0, le=3600, description="motor angle that a full crossing takes")
     exponent: float = Field(gt=1, le=6, description="shape n of the branch")
@@ -86,7 +86,7 @@ class ElasticLoop(Effect):
         return (Coefficient("offset_arcsec", (0,), ("offset_arcsec",)),)
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns the loop with another offset and, if given, another width and exponent."""
+        """Returns the loop with a new offset and, if given, a new width and exponent."""
         return self.model_copy(update={"offset_arcsec": float(coefficients[0]), **dict(shape or {})})
 
     def bound_arcsec(self) -> float:

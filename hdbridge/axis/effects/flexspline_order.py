@@ -22,13 +22,13 @@ class FlexsplineOrders(OrderSeries):
         consequence="a model of motor orders compensates the ripple at one load angle and doubles it at "
         "another",
         remedy="add it to the model",
-        experiment="a slow sweep over one load turn, better two: over less it looks like a motor order",
+        experiment="a slow sweep over one load turn, preferably two: over less it looks like a motor order",
         aliases=("motor_order", "synchronous"),
         source="kinematics of a strain wave gear: the flexspline turns by -theta_M / N under the wave "
         "generator",
         size="1-10 arcsec",
     )
-    compensable = Compensable(True, "the load really moves so, and it repeats")
+    compensable = Compensable(True, "the load really moves like this, and it repeats")
     typical = {"orders": orders_from((1, 2, 4), 2.0)}
     searched = range(1, 9)
 

@@ -3,7 +3,6 @@
 The law is the rolling-friction law of the literature on transmission error, with three points defined that
 are usually left open:
 
-
 * At a reversal the error is continuous: each branch starts from the last value of the one before, and
   rises by ``2 offset g(xi)`` along the new direction until it meets the offset.
 * It saturates only in the direction of travel. (Taken literally, "saturated when |error| >= offset" would
@@ -90,7 +89,7 @@ class Hysteresis(ElasticLoop):
 class _HysteresisTracker(Tracker):
     """Tracker of a hysteresis loop.
 
-    The state consists of the present branch (initial angle and value, direction) and the last angle and
+    The state consists of the current branch (initial angle and value, direction) and the last angle and
     value. Values are those of a loop of unit offset.
     """
 

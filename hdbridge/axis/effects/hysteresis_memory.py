@@ -46,10 +46,10 @@ class HysteresisMemory(ElasticLoop):
         title="hysteresis with return-point memory",
         subject="hysteresis",
         equation="theta_rev + sgn(omega) 2 offset g(|theta_M - theta_M,rev| / width) from each reversal; "
-        "back at the angle of the reversal before, both are forgotten and the outer branch goes on",
+        "on return to the angle of the previous reversal, both are forgotten and the outer branch continues",
         signature="nested loops close; the plain law misses by 10 to 30 arcsec after small back-steps",
-        consequence="after a small move back and forth the plain law predicts another position",
-        remedy="use this law in place of the plain one",
+        consequence="after a small move back and forth the plain law predicts a different position",
+        remedy="use this law instead of the plain one",
         experiment="first-order reversal curves: back-steps of growing size, each undone",
         aliases=("hysteresis_parameters", "backlash"),
         source="G. Masing 1926; return-point memory of Prandtl-Ishlinskii and Preisach operators",
@@ -127,7 +127,7 @@ class _Segment(NamedTuple):
 class _Memory:
     """Remembered reversals of a loop of unit offset, outermost first.
 
-    ``_points`` contains pairs of angle and value. The last pair is the start of the present branch, and the
+    ``_points`` contains pairs of angle and value. The last pair is the start of the current branch, and the
     branch closes at the pair before it. If there are no pairs, the path is on the virgin curve through
     ``_origin`` in direction ``_sign``.
     """

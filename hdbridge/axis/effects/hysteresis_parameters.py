@@ -43,7 +43,7 @@ class HysteresisParameters(Effect):
     shape = Hysteresis.shape
 
     base: Loop = Field(description="the model's loop")
-    offset_arcsec: float = Field(ge=-3600, le=3600, description="new offset; negative where the load lags")
+    offset_arcsec: float = Field(ge=-3600, le=3600, description="new offset; negative if the load lags")
     width_deg: float = Field(gt=0, le=3600, description="new width")
     exponent: float = Field(gt=1, le=6, description="new exponent")
 
@@ -87,7 +87,7 @@ class HysteresisParameters(Effect):
         return np.array([self.offset_arcsec, -self.base.offset_arcsec])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns the effect with other offsets and, if given, another new width and exponent."""
+        """Returns the effect with other offsets and, if given, other values of the new width and exponent."""
         base = self.base.model_copy(update={"offset_arcsec": -float(coefficients[1])})
         update = {"offset_arcsec": float(coefficients[0]), "base": base, **dict(shape or {})}
         return self.model_copy(update=update)

@@ -2,7 +2,6 @@
 
 They are backward differences over the actual time steps:
 
-
     v[i] = (theta[i] - theta[i-1]) / (t[i] - t[i-1])        v[0] = 0
     a[i] = (v[i] - v[i-1]) / (t[i] - t[i-1])                a[0] = a[1] = 0
     d[i] = sign(theta[i] - theta[i-1]), held at rest

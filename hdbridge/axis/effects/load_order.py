@@ -38,7 +38,7 @@ class LoadOrders(OrderSeries):
                 "with it",
             ),
             "ratio_error": Experiment(
-                6, "sweep two whole load turns both ways: a ramp goes on, a load order comes back"
+                6, "sweep two whole load turns both ways: a ramp continues, a load order repeats"
             ),
         },
     )
@@ -52,7 +52,7 @@ class LoadOrders(OrderSeries):
 
     ratio: Ratio
     origin: Literal["unknown", "gear", "load_encoder"] = Field(
-        "unknown", description="where it comes from; only the gear's is compensated"
+        "unknown", description="origin of the error; only that of the gear is compensated"
     )
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:

@@ -46,7 +46,7 @@ class LocalDefect(Momentary, Linear):
         size="1-20 arcsec",
     )
     compensable = Compensable(
-        True, "the load really moves so, if it is a tooth and not a mark on the encoder's disc"
+        True, "the load really moves like this, if it is a tooth and not a mark on the encoder's disc"
     )
     shape = (
         Shape("centre_deg", 0.0, 360.0),
@@ -93,7 +93,7 @@ class LocalDefect(Momentary, Linear):
         return both or float(np.max(fast)) > OTHER_SPEED * float(np.min(fast))
 
     def shows(self, motion: Motion) -> Stretch | None:
-        """Returns the samples away from reversals, where a loop of another shape leaves no bumps."""
+        """Returns the samples away from reversals, where a misfit of the loop's shape leaves no bumps."""
         return away_from_reversals(motion)
 
     def changing(self, motion: Motion) -> FloatArray:

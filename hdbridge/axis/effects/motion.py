@@ -126,7 +126,7 @@ class Motion:
     """Motor speed, if a better value is known than the differences of a quantised angle."""
     motor_acceleration_deg_s2: FloatArray | None = None
     load_deg: FloatArray | None = None
-    """Predicted load angle, degrees. Only the load encoder's subdivisional errors require its accuracy."""
+    """Predicted load angle, degrees. Only the load encoder's subdivisional error requires such accuracy."""
 
     def __len__(self) -> int:
         """Returns the number of samples."""
@@ -158,6 +158,6 @@ def missing_error(effect: str, channels: frozenset[Channel]) -> InputError:
     """Returns the `InputError` for channels that an effect needs and a record lacks."""
     names = ", ".join(sorted(each.value for each in channels))
     return InputError(
-        f"the effect '{effect}' needs the channel {names}, which is not there; "
+        f"the effect '{effect}' needs the channel {names}, which is missing; "
         "record it (a column of that name), or leave the effect out of the model"
     )

@@ -31,11 +31,11 @@ class MotorOrders(OrderSeries):
             )
         },
     )
-    compensable = Compensable(True, "the load really moves so, and it repeats")
+    compensable = Compensable(True, "the load really moves like this, and it repeats")
     part = Part.ORDERS
     searched = range(1, HIGHEST_MOTOR_ORDER + 1)
     usual = 4
-    """Maximum number of similar orders, because a worn wave-generator bearing causes several."""
+    """Maximum number of similar orders; a worn wave-generator bearing causes several."""
     drifting = ("orders",)
     """All orders drift, because wear of teeth and bearing changes them."""
 

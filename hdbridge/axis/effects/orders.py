@@ -82,7 +82,7 @@ class HarmonicSum(Effect):
         return sum(each.amplitude_arcsec for each in self.orders)
 
     def shows(self, motion: Motion) -> Stretch | None:
-        """Returns the samples away from reversals, where a loop of another shape leaves no periodic bumps."""
+        """Returns the samples away from reversals, where a misfit of the loop's shape leaves no waves."""
         return away_from_reversals(motion)
 
     def largest_piece_arcsec(self) -> float:

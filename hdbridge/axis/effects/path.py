@@ -1,4 +1,4 @@
-"""Motor path divided at its reversals, which loops, dead zones and memory are computed from."""
+"""Motor path divided at its reversals, from which loops, dead zones and memory are computed."""
 
 import weakref
 from collections.abc import Callable
@@ -11,8 +11,8 @@ from hdbridge.axis.effects.described import Stretch
 from hdbridge.axis.effects.motion import FloatArray, IntArray, Motion, Start
 
 LOOP_DEG: Final = 60.0
-"""Motor travel after a reversal within which an elastic loop is noticeable, three times the loop width of a
-published gear."""
+"""Motor travel after a reversal beyond which any elastic loop counts as saturated: three times the loop width
+of a published gear."""
 
 KEPT_BYTES: Final = 24_000_000
 """Memory for cached per-sample quantities of a path, bytes: three arrays of a million samples."""
@@ -115,7 +115,7 @@ def since_reversal_deg(motor_deg: FloatArray) -> FloatArray:
 
 
 def away_from_reversals(motion: Motion) -> Stretch:
-    """Returns the samples at which no elastic loop, whatever its shape, is noticeable."""
+    """Returns the samples so far from a reversal that an elastic loop of any shape is saturated."""
     rows = since_reversal_deg(motion.motor_deg) > LOOP_DEG
     return Stretch(rows, "seen only where the axis reverses")
 

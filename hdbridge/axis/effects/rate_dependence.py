@@ -32,7 +32,7 @@ class RateDependence(Modulating):
         source="rate-dependent friction, logarithmic in the rate (rate-and-state laws)",
         size="5-30 % of the loop",
     )
-    compensable = Compensable(True, "the load really moves so; the speed is commanded")
+    compensable = Compensable(True, "the load really moves like this; the speed is commanded")
     shape = (Shape("reference_deg_s", 1.0, 1000.0, logarithmic=True),)
     carries = {Part.LOOP: "loop"}
     linear = ("growth_percent",)
@@ -40,8 +40,10 @@ class RateDependence(Modulating):
 
     loop: Loop = Field(description="the model's loop")
     growth_percent: float = Field(ge=0, le=200, description="growth per decade of speed")
-    reference_deg_s: float = Field(gt=0, le=1e5, description="motor speed from which on it grows")
-    limit_deg_s: float = Field(20_000.0, gt=0, le=1e6, description="motor speed beyond which it is held")
+    reference_deg_s: float = Field(gt=0, le=1e5, description="motor speed above which the loop grows")
+    limit_deg_s: float = Field(
+        20_000.0, gt=0, le=1e6, description="motor speed beyond which the effect stays constant"
+    )
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
@@ -74,9 +76,9 @@ class RateDependence(Modulating):
         return self._most() * abs(self.loop.offset_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Returns 0 for growth of a loop with leading load, because the error only rises along its path.
+        """Returns 0 if a leading loop grows or a lagging one shrinks: the change only rises along the path.
 
-        Otherwise returns infinity, because the error falls infinitely steeply after a reversal.
+        Otherwise returns infinity, because the change falls infinitely steeply after a reversal.
         """
         return 0.0 if self.growth_percent * self.loop.offset_arcsec >= 0.0 else math.inf
 

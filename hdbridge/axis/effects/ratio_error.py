@@ -41,17 +41,19 @@ class RatioError(Momentary, Linear):
     )
     compensable = Compensable(
         True,
-        "the load really moves so (unless the load encoder's scale is wrong), but correct the axis file "
-        "instead",
+        "the load really moves like this (unless the load encoder's scale is wrong), but correct the axis "
+        "file instead",
     )
     linear = ("ramp_arcsec_per_turn",)
     typical = {"ramp_arcsec_per_turn": 2.592}
 
     ramp_arcsec_per_turn: float = Field(ge=-1e6, le=1e6, description="ramp per motor turn")
-    limit_deg: float = Field(1e6, gt=0, le=1e9, description="motor angle beyond which it is held")
+    limit_deg: float = Field(
+        1e6, gt=0, le=1e9, description="motor angle beyond which the effect stays constant"
+    )
 
     def true_ratio(self, ratio: float) -> float:
-        """Returns the true gear ratio, for which a model with ``ratio`` has this ramp."""
+        """Returns the true gear ratio if a model with ``ratio`` has this ramp as its error."""
         return 1.0 / (1.0 / ratio + self.ramp_arcsec_per_turn / (DEG_PER_TURN * ARCSEC_PER_DEG))
 
     @classmethod
@@ -59,10 +61,10 @@ class RatioError(Momentary, Linear):
         yield cls(ramp_arcsec_per_turn=1.0)
 
     def implausible(self, observations: Observations) -> str:
-        """Requires a ratio of whole tooth counts, a whole load turn, or an encoder's small scale error.
+        """Accepts a record of a whole load turn, a ratio of whole tooth counts, or a small scale error.
 
-        The ratio of a strain wave gear is half the tooth count of its flexspline, or one more. Within a load
-        turn, any other ramp may be a part of a periodic error.
+        The ratio of a strain wave gear is half the tooth count of its flexspline, or one more. In less than a
+        load turn, any other ramp may be a part of a periodic error.
         """
         ratio = self.true_ratio(observations.ratio)
         teeth = TEETH_PER_TURN * ratio

@@ -21,8 +21,8 @@ LEAST_LINES = 256
 RESOLVED = 0.05
 """Minimum fraction of the moving samples that must be less than half a line apart to show a line."""
 IN_STEP = 0.85
-"""Mean resultant length of the sampling steps, as phases within a line, from which a slow wave has nearly the
-same values. The wave explains the square of it, 0.72, of the line's power."""
+"""Mean resultant length of the sampling steps, as phases within a line, above which a slow wave has nearly
+the same values. The wave then explains the square of this length, 0.72, of the line's power."""
 
 
 class SubdivisionalError(HarmonicSum):
@@ -81,7 +81,7 @@ class SubdivisionalError(HarmonicSum):
     def unidentifiable(self, observations: Observations) -> str:
         """Requires samples denser than the lines, or different speeds.
 
-        Otherwise the samples are equal steps over many lines, and a slow wave has the same values at them.
+        Otherwise the samples are evenly spaced over many lines, and a slow wave has the same values there.
         """
         speed = observations.motion.motor_speed_deg_s
         if speed is None or not np.any(speed):

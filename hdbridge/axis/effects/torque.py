@@ -11,14 +11,16 @@ from hdbridge.strictness import Strict
 
 TorqueChannel = Annotated[
     Literal["load_torque_nm", "motor_torque_nm"],
-    Field(description="the channel that the torque is taken from"),
+    Field(description="channel with the torque"),
 ]
 _SLOT = {each.value: slot for each, slot in SLOT.items()}
 
 TorqueLimit = Annotated[
     float,
     Field(
-        gt=0, le=1e5, description="torque beyond which the effect is held: no sensor fault moves the axis far"
+        gt=0,
+        le=1e5,
+        description="torque beyond which the effect stays constant; limits the motion due to a sensor fault",
     ),
 ]
 
@@ -48,7 +50,7 @@ def beyond_limit(effects: Iterable[object], motion: Motion) -> tuple[str, ...]:
             share = 100.0 * float(np.mean(np.abs(torque) > limit_nm))
             lines.append(
                 f"{name} reaches {largest:.4g} Nm, beyond the limit_nm of {limit_nm:g} of the model's "
-                f"{getattr(each, 'name', 'effect')}, which is held there ({share:.2g} % of the samples): "
+                f"{getattr(each, 'name', 'effect')}, which is clamped there ({share:.2g} % of the samples): "
                 "raise limit_nm if the torque is right"
             )
     return tuple(lines)

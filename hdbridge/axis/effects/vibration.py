@@ -90,7 +90,7 @@ class Vibration(Angleless):
         return self.amplitude_arcsec * np.array([math.cos(phase), -math.sin(phase)])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns the vibration with another amplitude and phase and, if given, another frequency."""
+        """Returns the vibration with a new amplitude and phase and, if given, a new frequency."""
         cosine, sine = (float(each) for each in coefficients)
         update = {
             "amplitude_arcsec": math.hypot(cosine, sine),

@@ -53,7 +53,7 @@ class Wear(Linear):
     exponent: float = Field(1.0, ge=0.1, le=3, description="1 for steady wear, below 1 while it runs in")
     turns_before: float = Field(0.0, ge=0, le=1e9, description="motor turns run before the first sample")
     turns_limit: float = Field(
-        10_000.0, gt=0, le=1e9, description="motor turns from which on the height is held"
+        10_000.0, gt=0, le=1e9, description="motor turns beyond which the height stays constant"
     )
 
     @classmethod

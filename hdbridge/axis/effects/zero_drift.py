@@ -1,4 +1,4 @@
-"""Shift of the zero with temperature, because housing, encoder mount and gear expand differently."""
+"""Shift of the zero position with temperature, because housing, encoder mount and gear expand differently."""
 
 from collections.abc import Iterator, Sequence
 from typing import Self
@@ -15,7 +15,7 @@ from hdbridge.axis.effects.warmth import Warmed, WarmthState
 
 
 class ZeroDrift(Linear, Warmed):
-    """drift w: a zero shift proportional to the gear's warmth w."""
+    """drift w: a shift of the zero position proportional to the gear's warmth w."""
 
     name = "zero_drift"
     about = Cause(
@@ -33,7 +33,7 @@ class ZeroDrift(Linear, Warmed):
         size="5-60 arcsec, tau 10-60 min",
         apart={
             "count_loss": Experiment(
-                4, "return to one reference pose every half minute: a step has happened, a drift goes on"
+                4, "return to one reference pose every half minute: a step is over, a drift continues"
             ),
             "creep": Experiment(
                 10,
@@ -62,7 +62,7 @@ class ZeroDrift(Linear, Warmed):
             yield cls(drift_arcsec_per_k=1.0, tau_s=tau_s, driven_by=driven_by)
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the time, because a plot over time shows the drift of the zero."""
+        """Returns the time, because a plot over time shows the drift of the zero position."""
         return over.time(motion)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:

@@ -60,7 +60,6 @@ class ModelFile(BaseModel):
 def effects_of(document: Document, file: ModelFile) -> tuple[tuple[Effect, ...], dict[str, dict[str, Any]]]:
     """Returns the effects of a model file, and their uncertainties by name.
 
-
     Raises `InputError` with file:line:column and the nearest valid name.
     """
     effects: list[Effect] = []

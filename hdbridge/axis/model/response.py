@@ -24,7 +24,7 @@ class LeadFilter(Strict):
 
     lead_cycles: int = Field(ge=0, le=50, description="lead of the first weight, cycles")
     per_cycle: int = Field(ge=1, le=8, description="weights per cycle")
-    full_speed_deg_s: float = Field(gt=0, description="load speed from which the filter acts in full")
+    full_speed_deg_s: float = Field(gt=0, description="load speed from which the filter acts fully")
     weights: tuple[float, ...] = Field(
         min_length=1, max_length=1000, description="weights; their sum is 1 plus the sum of feedback"
     )
@@ -54,13 +54,15 @@ class Response(Strict):
     cycle_ms: float = Field(gt=0, description="SYNC period of the measurement")
     following_lag_ms: float = Field(description="lag of the motor behind its target at constant speed")
     known_to_hz: float = Field(gt=0, description="frequency up to which the correction is applied in full")
-    frequency_hz: tuple[float, ...] = Field(description="measured frequencies, rising")
-    gain: tuple[float, ...] = Field(description="amplitude of the load per unit of correction, at each")
+    frequency_hz: tuple[float, ...] = Field(description="measured frequencies, ascending")
+    gain: tuple[float, ...] = Field(
+        description="amplitude of the load per unit of correction, at each frequency"
+    )
     phase_deg: tuple[float, ...] = Field(
         description="phase of the load against the correction, following lag included"
     )
     uncertainty: tuple[float, ...] = Field(
-        description="half width of the 95 % interval, as a share of the gain"
+        description="half width of the 95 % interval, as a fraction of the gain"
     )
     load_gain: tuple[float, ...] = Field(
         default=(), description="amplitude of the load per unit of transmission error, without correction"
@@ -79,7 +81,7 @@ class Response(Strict):
             raise ValueError("expected frequency_hz, gain, phase_deg and uncertainty of the same length")
         if {len(self.load_gain), len(self.load_phase_deg)} not in ({0}, {len(self.frequency_hz)}):
             raise ValueError(
-                "expected load_gain and load_phase_deg of the length of frequency_hz, or neither"
+                "expected load_gain and load_phase_deg of the same length as frequency_hz, or neither"
             )
         return self
 

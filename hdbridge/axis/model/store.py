@@ -1,6 +1,5 @@
 """Storage of the models of a profile: the active one, a pending one, and all earlier ones.
 
-
     profiles/NAME/axis.yaml           written by the user
                   model.yaml          the active model, used by the commands
                   pending.yaml        proposed by a calibration or diagnosis, not yet committed
@@ -48,7 +47,7 @@ class Activation(BaseModel):
     date: str = Field(description="date, ISO 8601")
     action: Action = Field(description="action")
     version: int = Field(ge=1, description="version number")
-    reason: str = Field("", description="why, in words")
+    reason: str = Field("", description="reason for the activation, in words")
 
 
 class LogFile(BaseModel):
@@ -82,7 +81,7 @@ K = TypeVar("K", bound=Kept)
 
 @dataclass(frozen=True, slots=True)
 class Version(Generic[K]):
-    """A version in a store: its content, its place and its activations."""
+    """A version in a store: its content, its location and its activations."""
 
     number: int | None
     """Number in the history; None for the pending model, and for an active model copied or edited by hand."""
@@ -243,7 +242,7 @@ class Store(Generic[K]):
             except (InputError, UnicodeDecodeError):  # damaged by a manual edit: saved, but not as a version
                 write_atomically(self._history_folder(profile) / "unreadable.yaml", before)
             else:
-                reason_found = "was there, but not in the history"
+                reason_found = "found as the active version, but not in the history"
                 activations.append(
                     Activation(
                         date=_iso(date),

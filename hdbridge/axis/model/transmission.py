@@ -53,7 +53,7 @@ class TransmissionModel:
     def only(self, names: Iterable[str]) -> Self:
         """Returns the model with only the named effects; unknown names are ignored.
 
-        A law that replaces another law is also found by the name of the other.
+        A law that replaces another one by definition is also selected by the name of the replaced law.
         """
         wanted = set(names)
         kept = (each for each in self.effects if each.name in wanted or each.replaces in wanted)

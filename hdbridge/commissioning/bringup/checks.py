@@ -45,7 +45,7 @@ def failed(measured: str, *remedies: str, **figures: Figure) -> Verdict:
 
 
 def not_possible(why: str) -> Verdict:
-    """Returns the verdict of a check that could not be made."""
+    """Returns the verdict of a check that could not be performed."""
     return Verdict(Outcome.NOT_POSSIBLE, why)
 
 

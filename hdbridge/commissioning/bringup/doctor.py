@@ -144,15 +144,15 @@ def eds(context: BringUpContext) -> Verdict:
         stated = getattr(information, name, None)
         found = drive.sdo.fetch(address)
         if isinstance(stated, int) and stated and stated != found:
-            wrong.append(f"the EDS is for {name.replace('_', ' ')} {stated:#x}, the drive says {found:#x}")
+            wrong.append(f"the EDS is for {name.replace('_', ' ')} {stated:#x}, the drive reports {found:#x}")
     if wrong:
         return failed(
-            f"{len(wrong)} of {looked_at} objects are not as {axis.drive.eds} says",
+            f"{len(wrong)} of {looked_at} objects do not agree with {axis.drive.eds}",
             f"{where}: found {axis.drive.eds}, expected the EDS file of this drive and firmware",
             *wrong,
             objects=looked_at,
         )
-    return passed(f"{looked_at} objects answer as {axis.drive.eds} says", objects=looked_at)
+    return passed(f"{looked_at} objects agree with {axis.drive.eds}", objects=looked_at)
 
 
 def _listed(context: BringUpContext) -> Iterator[tuple[int, int]]:
@@ -188,7 +188,7 @@ def units(context: BringUpContext) -> Verdict:
     readings = read(*scaling_addresses(axis))
     complaints = [*scaling_complaints(axis, readings)]
     said = ", ".join(f"{each.index:04X}h:{each.sub:02X} {value}" for each, value in readings.items())
-    text = said or "the drive has no object that says how it counts"
+    text = said or "the drive has no object that states its scaling"
     if complaints:
         return failed(text, *complaints)
     gear = readings.get(objects.GEAR_MOTOR, 1) / readings.get(objects.GEAR_SHAFT, 1)
@@ -356,7 +356,9 @@ def heartbeat(context: BringUpContext) -> Verdict:
     has_timer = _timer(context) is not None
     if not sdo.has(objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub):
         if has_timer:
-            return not_possible("the drive watches no heartbeat (no 1016h); its RPDO event timer has to do")
+            return not_possible(
+                "the drive monitors no heartbeat (no 1016h); its RPDO event timer must suffice"
+            )
         return failed(
             "the drive has neither a heartbeat consumer (1016h) nor an RPDO event timer (1400h:05)",
             f"nothing stops this axis when its master dies; if the drive does have them, "
@@ -386,7 +388,9 @@ def set_points(context: BringUpContext) -> Verdict:
     axis, sdo = context.axis, context.drive.sdo
     timer = _timer(context)
     if timer is None:
-        return not_possible("the drive has no RPDO event timer (1400h:05); its heartbeat consumer has to do")
+        return not_possible(
+            "the drive has no RPDO event timer (1400h:05); its heartbeat consumer must suffice"
+        )
     timer_s = sdo.read(timer, 5) / 1000.0
     with context.interruptible() as interrupted:
         slow = context.slow(interrupted)
@@ -398,7 +402,7 @@ def set_points(context: BringUpContext) -> Verdict:
         speed,
         "SYNC and set-points",
         timer_s,
-        f"the drive ignores that no set-point comes: {axis.where('drive.cycle_ms')} decides its RPDO event "
+        f"the drive ignores missing set-points: {axis.where('drive.cycle_ms')} determines its RPDO event "
         "timer (1400h:05); check it and 6007h in the drive's manual",
     )
 
@@ -447,14 +451,14 @@ def _noticed(context: BringUpContext) -> str:
     axis = context.axis
     option = axis.drive.quick_stop_option
     again = (
-        f"; or it stopped, and went on by 'enable operation', which this check still sends (transition 16): "
-        f"{axis.where('drive.quick_stop_option')}: found {option}, with 1 to 4 it cannot"
+        f"; or it stopped, and continued at 'enable operation', which this check still sends (transition "
+        f"16): {axis.where('drive.quick_stop_option')}: found {option}, with 1 to 4 it cannot continue"
         if option >= 5
         else ""
     )
     return (
-        "the drive noticed that its master is silent, and neither stops (6007h) nor leaves OPERATIONAL "
-        f"(1029h) for it: see its manual for both{again}; the check of the set-points says whether it stops "
+        "the drive detects that its master is silent, but neither stops (6007h) nor leaves OPERATIONAL "
+        f"(1029h): see its manual for both{again}; the check of the set-points shows whether it stops "
         "otherwise"
     )
 
@@ -467,8 +471,8 @@ def _judge_silence(
     said = "".join(f"; it sent {each}" for each in silence.emergencies)
     if silence.resumed:
         what = (
-            f"no {what}: it stopped by itself, and the master's own 'enable operation', which a dead master "
-            f"does not send, took it out of that (transition 16){said}"
+            f"no {what}: it stopped on its own, and the master's 'enable operation', which a dead master "
+            f"does not send, ended this stop (transition 16){said}"
         )
         return judge_stop(
             context.axis,
@@ -480,7 +484,7 @@ def _judge_silence(
         )
     if silence.noticed_after_s is None or still_on or not silence.stands:
         return failed(
-            f"no {what} in motion at {speed:.3g} motor deg/s: the drive goes on{said}",
+            f"no {what} in motion at {speed:.3g} motor deg/s: the drive continues{said}",
             *(
                 [_noticed(context)]
                 if any(e.code == HEARTBEAT_LOST for e in silence.emergencies)
@@ -493,7 +497,7 @@ def _judge_silence(
         speed,
         silence.distance_deg,
         silence.noticed_after_s,
-        f"no {what}: '{state.value}' by itself",
+        f"no {what}: '{state.value}' on its own",
         2.0 * after_s + 0.05,
     )
 

@@ -101,7 +101,7 @@ def judge_turn(
             f"{axis.where(SOURCE)}: object {_source(axis)} does not follow the load; check the encoder, its "
             "cable and supply, and that the object is the load encoder's",
             f"if it is the right object: {axis.where(LOAD_COUNTS)}: found "
-            f"{axis.load_encoder.counts_per_turn}, far too many for what it moves",
+            f"{axis.load_encoder.counts_per_turn}, far too many for its motion",
             **figures,
         )
     if math.isclose(abs(measured), 1.0, rel_tol=1e-3) and not math.isclose(abs(factor), 1.0, rel_tol=0.01):
@@ -118,7 +118,7 @@ def judge_turn(
         remedies += [each.text(axis) for each in accuse(axis, abs(factor), tolerance, confirmed)]
     elif lost > 4.0 + 0.05 * abs(load) / 2.0:
         remedies.append(
-            f"{axis.where(SOURCE)}: the load encoder came back {lost:.0f} counts from where it had been; "
+            f"{axis.where(SOURCE)}: the load encoder returned {lost:.0f} counts off its initial reading; "
             "check it for lost counts and the coupling for slip"
         )
     ratio = f"ratio {axis.gear.ratio / abs(factor):.4g} against {axis.gear.ratio:g}"
@@ -170,7 +170,7 @@ def _counts(key: str, found: int, wanted: float, tolerance: float, weight: float
     digits = len(str(tidy).rstrip("0"))
     if digits == 1 or tidy & (tidy - 1) == 0:
         return Accusation(key, found, tidy, weight + 2.0, "a round number")
-    return Accusation(key, found, tidy, weight + (1.0 if digits == 2 else 0.0), "it would explain it")
+    return Accusation(key, found, tidy, weight + (1.0 if digits == 2 else 0.0), "it would explain the travel")
 
 
 def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> Accusation:
@@ -190,7 +190,7 @@ def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> Accusation:
             return Accusation(RATIO, found, whole, 2.0 - less, "a usual ratio")
         return Accusation(RATIO, found, whole, 1.0 - less, "a whole number")
     return Accusation(
-        RATIO, found, float(f"{wanted:.5g}"), -2.0, "it would explain it, but is not a whole number"
+        RATIO, found, float(f"{wanted:.5g}"), -2.0, "it would explain the travel, but is not a whole number"
     )
 
 
@@ -264,7 +264,7 @@ def judge_channels(
         elif 2 * channel.every_cycles * axis.drive.cycle_s < waited_s:
             text += f"; no {name}"
             remedies.append(
-                f"{axis.where(key)}: nothing comes that can be believed (within {channel.scale.least:g} to "
+                f"{axis.where(key)}: no plausible reading (within {channel.scale.least:g} to "
                 f"{channel.scale.greatest:g} {BY_KEY[key].unit}); check the sensor, the object and its unit"
             )
     return failed(text, *remedies, **figures) if remedies else passed(text, **figures)
@@ -281,8 +281,8 @@ def judge_hold(axis: AxisConfig, before: Turned, readings: Sequence[Turned]) -> 
     if motor > max(3.0, 0.5 / 360.0 * counts):
         return failed(
             text,
-            "the axis jumps when power comes: check the drive's commutation and tuning, and that its brake "
-            "opens after it holds",
+            "the axis jumps when power is switched on: check the drive's commutation and tuning, and that "
+            "the brake opens only once the drive holds the axis",
             **figures,
         )
     return passed(text, **figures)
@@ -338,7 +338,7 @@ def judge_torque(axis: AxisConfig, torques_permille: Sequence[float], limit_perc
         return passed(text, **figures)
     return failed(
         text,
-        "a slow move needs all the torque that it may have: check brake, load and lubrication; or allow "
+        "a slow move needs all of the permitted torque: check brake, load and lubrication; or allow "
         f"more: --torque-percent, at most {axis.where('limits.torque_percent')}",
         **figures,
     )
@@ -392,8 +392,8 @@ def judge_stop(
         return passed(text, **figures)
     return failed(
         text,
-        f"the drive brakes more slowly than its ramp: {axis.where('drive.quick_stop_option')} (605Ah) says "
-        f"which ramp, {axis.where('limits.acceleration_deg_s2')} how steep it is (6085h); see the drive's "
+        f"the drive brakes more slowly than its ramp: {axis.where('drive.quick_stop_option')} (605Ah) "
+        f"selects the ramp, {axis.where('limits.acceleration_deg_s2')} its slope (6085h); see the drive's "
         "manual",
         **figures,
     )

@@ -69,7 +69,7 @@ def axis_text(name: str, bus: BusConfig, node: Node, eds_name: str) -> str:
     said["drive"] += ["  cycle_ms: 4", "  following_error_deg: 5.0      # of the motor"]
     bitrate = [f"  bitrate_bps: {bus.bitrate_bps}"] if bus.bitrate_bps else []
     head = [
-        "# Made by `hdbridge new --from scan` of what the drive says of itself. From here on it is yours:",
+        "# Made by `hdbridge new --from scan` from the drive's own data. From now on this file is yours:",
         "# hdbridge reads it and never changes it. docs/files.md describes every key; `hdbridge check` says",
         "# what is missing or wrong.",
         "schema: hdbridge.axis/1",

@@ -82,7 +82,7 @@ class Node:
     def kind(self) -> str:
         """Kind of device, as text."""
         if self.profile is None:
-            return "not asked: another SDO client is talking to it" if self.busy else "unknown"
+            return "not queried: another SDO client is using it" if self.busy else "unknown"
         return (
             f"{PROFILES.get(self.profile, 'device')} (CiA {self.profile})" if self.profile else "no profile"
         )
@@ -165,14 +165,14 @@ class _Hearing:
         if self.syncs:
             remarks.append(
                 f"{self.syncs} SYNC messages were heard: another master runs on this bus; stop it before you "
-                "master an axis here"
+                "control an axis here"
             )
         if self.commands:
             remarks.append(f"{self.commands} NMT commands of another master were heard")
         if self.busy:
             who = ", ".join(map(str, sorted(self.busy)))
             remarks.append(
-                f"another SDO client is talking to node {who}; it was not asked: stop that client, scan again"
+                f"another SDO client is using node {who}; it was not queried: stop that client, scan again"
             )
         return remarks
 
@@ -296,7 +296,7 @@ def _identity_lines(axis: AxisConfig, node: Node) -> list[str]:
     for name, wanted in axis.drive.identity.model_dump(exclude_none=True).items():
         found = node.identity.get(name)
         if found != wanted:
-            said = "does not say" if found is None else f"says {found:#x}"
+            said = "does not report it" if found is None else f"reports {found:#x}"
             key = axis.where(f"drive.identity.{name}")
             lines.append(f"{key}: found {wanted:#x}; node {node.node_id} {said}")
     return lines

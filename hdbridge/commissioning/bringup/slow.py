@@ -44,7 +44,7 @@ STILL_CYCLES: Final = 3
 
 
 class TravelPlan(NamedTuple):
-    """Planned travel from the present position, signed motor degrees."""
+    """Planned travel from the current position, signed motor degrees."""
 
     lead_deg: float
     span_deg: float

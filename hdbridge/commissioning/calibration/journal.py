@@ -81,7 +81,7 @@ class Journal:
         """Creates a journal, written with its first task. InputError if the folder contains a recording."""
         if (folder / ABOUT_NAME).exists():
             raise InputError(
-                f"{folder}: there is a recording already; expected a new folder, or --resume to continue it"
+                f"{folder}: already contains a recording; expected a new folder, or --resume to continue it"
             )
         about = RecordingFile.made(
             axis=axis.name,
@@ -122,8 +122,8 @@ class Journal:
         ):
             if theirs is not None and ours is not None and theirs != ours:
                 raise InputError(
-                    f"{self.folder / ABOUT_NAME}: this recording is of {what} {theirs}, but here is {ours} "
-                    f"({axis.path}); resume it there, or begin a new one"
+                    f"{self.folder / ABOUT_NAME}: this recording is of {what} {theirs}, but the {what} here "
+                    f"is {ours} ({axis.path}); resume it on the axis that was recorded, or start a new one"
                 )
 
     @property

@@ -48,7 +48,7 @@ CHANCE = 1.05
 FADED = 0.5
 """Fraction of the required gain below which the filter counts as no longer correcting an order."""
 RETUNED = (
-    "the servo does not answer as it did when the response was measured (following lag {:.1f} ms then, "
+    "the servo does not respond as it did when the response was measured (following lag {:.1f} ms then, "
     "{:.1f} ms now; the response differs by {:.0f} %): it was retuned, or the load changed; measure the "
     "response again"
 )
@@ -59,8 +59,8 @@ NO_LOAD_ENCODER = (
     "encoder and model; path errors are not measured"
 )
 TRIALS = 3
-"""Maximum number of filters tried, each based on the runs of those before it. The first one explores,
-correcting orders beyond the known frequency range."""
+"""Maximum number of filters to try. Each is designed from the runs with the previous ones; the first is
+exploratory and also corrects orders beyond the known frequency range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,14 +231,14 @@ def motion_test(
     """Runs a booted drive's axis at several speeds and on paths, without and with the model's correction.
 
     With ``measure`` the response is measured, otherwise the model's own is tested. A filter is kept only if
-    neither the ripple at any speed nor the path error is larger than without correction.
-    InputError if no motor order of the model is large enough to measure, if the travel is too short, or if a
-    response to be tested was measured with another cycle time. Without an encoder at the load, the ripple is
-    that of the load angle predicted from the motor encoder, and no path is run.
+    neither the ripple at any speed nor the path error is larger than without correction. InputError if no
+    motor order of the model is large enough to measure, if the travel is too short, or if a response to be
+    tested was measured with a different cycle time. Without an encoder at the load, the ripple is that of the
+    load angle predicted from the motor encoder, and no path is run.
     """
     runner = _Runner(drive, model, progress, interrupted)
     if not measure:
-        compensation_for(drive.axis, model)  # rejects a response for another cycle time before any motion
+        compensation_for(drive.axis, model)  # rejects a response for a different cycle time before any motion
     gains = read_gains(drive.sdo) if isinstance(drive, Drive) else {}
     found = _ripple_test(runner, model, measure)
     if found.response is not None and measure:
@@ -363,8 +363,8 @@ class _Runner:
         self.orders = tuple(each.order for each in self.motor_orders)
         if not self.orders:
             raise InputError(
-                f"the model has no motor order of {LEAST_ARCSEC:g} arcsec or more: there is no ripple to "
-                "measure the response by; calibrate the axis first"
+                f"the model has no motor order of {LEAST_ARCSEC:g} arcsec or more: there is no ripple with "
+                "which to measure the response; calibrate the axis first"
             )
         self.lag_s = 0.0
         """Following lag of the axis, s, from the runs without correction."""

@@ -204,7 +204,7 @@ def calibrate(
     before, after = (each.pooled.three_sigma_arcsec for each in (checked.before, checked.after))
     if not checked.improves:
         reason = (
-            f"not offered for commit: stepping is worse, 3 sigma {after:.2f} arcsec after {before:.2f} "
+            f"not offered for commit: stepping is worse, 3 sigma {after:.2f} arcsec instead of {before:.2f} "
             f"with {checked.before.model}"
         )
         return _kept(journal.folder, replace(result, offer=Offer(False, reason)))
@@ -308,7 +308,7 @@ def active_model(
         notify(f"not compared with the active model: {problem}")
         return None
     if model.response and not model.response.fits_cycle(axis.drive.cycle_s):
-        notify("the response in motion of the active model is not used: it was measured at another cycle")
+        notify("the response in motion of the active model is not used: it was measured at a different cycle")
         return replace(model, response=None)
     return model
 

@@ -85,7 +85,7 @@ def axis_accuracy(
     count = int(group.max()) + 1 if len(target) else 0
     if count < MINIMUM_TARGETS:
         raise InputError(
-            f"{count} targets were approached; expected at least {MINIMUM_TARGETS}, better 8 per turn"
+            f"{count} targets were approached; expected at least {MINIMUM_TARGETS}, preferably 8 per turn"
         )
     runs_up, mean_up, s_up = _statistics(group[up], deviation[up], count)
     runs_down, mean_down, s_down = _statistics(group[~up], deviation[~up], count)
@@ -95,7 +95,7 @@ def axis_accuracy(
         raise InputError(
             f"the target at {place:g} deg was approached {int(runs_up[least.argmin()])} times forwards "
             f"and {int(runs_down[least.argmin()])} times backwards; "
-            f"expected at least {MINIMUM_RUNS} each, better 5"
+            f"expected at least {MINIMUM_RUNS} in each direction, preferably 5"
         )
     reversal = mean_up - mean_down
     both = (mean_up + mean_down) / 2.0

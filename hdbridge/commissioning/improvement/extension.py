@@ -43,7 +43,7 @@ def extension_of(
     A lost count or the phase of a vibration has no predictive value. Repeatable effects that are not
     compensated (load orders of unknown origin) stay in the model, so that the user can state their origin.
     Wear continues from the motor turns at the end of the record. Findings without a gain on held-out
-    data, or with another reason for refusal (`Finding.refusal`), are left out.
+    data, or with some other reason for refusal (`Finding.refusal`), are left out.
 
     ``rivals`` lists, for each finding, the causes from which it is not separated (`further.unseparated`). If
     one of these must not be compensated, the finding is left out too.
@@ -96,7 +96,7 @@ def _of_its_time(effect: Effect) -> bool:
 
 
 def _why_not(finding: Finding, rivals: Sequence[str]) -> str:
-    """Returns the reason for not compensating a finding; empty if it is compensated."""
+    """Returns the reason for not compensating a finding; empty if the finding is compensated."""
     if finding.cause == "unexplained":
         return (
             f"unexplained, depends on the {finding.lives_in or 'time'}: no law of the catalogue to compensate"

@@ -218,8 +218,8 @@ def _check_is_of(recording: Recording, axis: AxisConfig, path: Path) -> None:
     ):
         if theirs is not None and theirs != ours:
             raise InputError(
-                f"{path}: this recording is of {what} {theirs}, but here is {ours} ({axis.path}); "
-                "improve the axis that it was measured on"
+                f"{path}: this recording is of {what} {theirs}, but the {what} here is {ours} ({axis.path}); "
+                "run 'hdbridge improve' for the axis that was recorded"
             )
 
 
@@ -264,7 +264,7 @@ def _concluded(
     model = with_provenance(extension.model, _provenance(result, recording))
     if remark := cap_remark(drive.axis, model):
         notify(remark)
-    notify("stepping with the active and with the extended model, in turns")
+    notify("stepping with the active and the extended model, alternately")
     floor = floor_of(drive.axis, recording)
     try:
         trial = try_out(
@@ -282,7 +282,7 @@ def _concluded(
     result = replace(result, trial=trial)
     summary = _summary(trial)
     if not trial.improves:
-        return replace(result, offer=Offer(False, f"not offered: the axis does not point better, {summary}"))
+        return replace(result, offer=Offer(False, f"not offered: positioning does not improve, {summary}"))
     reason = f"improvement {source.folder.name}: {named(extension.carried)}; {summary}"
     return replace(result, offer=proposed(profile, model, reason, bench.date, drive))
 

@@ -76,7 +76,7 @@ class Move(Protocol):
         ...
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """Returns the path from the present load target."""
+        """Returns the path from the current load target."""
         ...
 
     def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
@@ -127,8 +127,8 @@ class MoveTo(_Timed):
                 break
         else:
             raise InputError(
-                f"no trajectory from {start_deg:g} to {self.load_deg:g} deg in the limits ({result.name}): "
-                "check the target, and velocity, acceleration and jerk in the axis file"
+                f"no trajectory from {start_deg:g} to {self.load_deg:g} deg within the limits "
+                f"({result.name}): check the target, and velocity, acceleration and jerk in the axis file"
             )
         at_time, duration, goal = trajectory.at_time, trajectory.duration, self.load_deg
 

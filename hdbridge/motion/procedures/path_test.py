@@ -7,8 +7,8 @@ from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Sample, Si
 from hdbridge.units import DEG_PER_TURN
 
 PRECONDITION_TURNS = 2.0
-"""Travel before each path, in its direction, motor turns. It exceeds the width of the gear's hysteresis, so
-that the gear's elastic state at the start is always the same."""
+"""Travel before each path, in the direction of the path, motor turns. It exceeds the width of the gear's
+hysteresis, so that the gear's elastic state at the start is always the same."""
 SHORT_TURNS = 1.5
 """Length of the short moves, motor turns."""
 EVEN_S = 0.3

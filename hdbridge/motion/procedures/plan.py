@@ -3,7 +3,7 @@
 A plan uses units that suit every axis (load turns, motor degrees, motor turns per second). `Plan.tasks`
 adapts it to the ratio, permitted travel and speed of one axis, and reports reductions.
 
-Every task starts at the plan's reference pose, which is approached by a pre-conditioning move. The elastic
+Every task starts at the plan's reference pose, which a pre-conditioning move approaches. The elastic
 state is therefore known even if a recording is interrupted and resumed, and the recurring pose shows drift.
 """
 
@@ -207,7 +207,7 @@ class Plan(Strict):
         5.0,
         gt=0,
         le=1e7,
-        description="acceleration of the moves at the load, if the axis file allows it; gentle, against "
+        description="acceleration of the moves at the load, if the axis file allows it; low, to limit "
         "wind-up of the gear",
     )
     procedures: tuple[Entry, ...] = Field(min_length=1, max_length=1000, description="procedures, in order")

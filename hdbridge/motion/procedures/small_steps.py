@@ -13,7 +13,7 @@ class SmallSteps:
     """Steps to ``count`` targets in mixed order, within ``reach_deg`` (motor degrees) of a centre.
 
     If steps are longer than the width of the hysteresis, the loop is saturated after each. Such a test cannot
-    show the loop's width, shape or memory, but these steps can. Results are divided by the direction of the
+    show the loop's width, shape or memory, but these steps can. Results are grouped by the direction of the
     last move; ``cw`` is upwards.
     """
 
