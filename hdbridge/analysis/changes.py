@@ -82,7 +82,8 @@ def _finding(
         now = fit.hypothesis.effects[place]
         if type(now) is type(given):
             return search.with_given(fit, place, given)
-        return estimator.fit(fit.hypothesis.instead(place, type(given)(**change.effect.parameters())))
+        old = type(given)(**change.effect.parameters())
+        return estimator.fit(replace(fit.hypothesis.instead(place, old), nuisances=None))
 
     as_it_was = as_given(loose)
     gate = gate_of_change(estimator, loose, as_it_was)
@@ -133,12 +134,13 @@ def _loop(
         return None
     # A loop that follows neither law exactly may partly follow the alternative law.
     laws = [kind.name for kind in CATALOGUE.values() if kind.part is Part.LOOP and kind.changes is Part.LOOP]
+    others = search.alternatives_to_change(fitted, place, given)
     return _Change(
         causes[0],
         max(peak, lawless),
         parameters_of(estimator, precise, place, spread),
         "the model's own loop receives the new parameters",
-        tuple(laws) if lawless else (),
+        tuple(dict.fromkeys((*others, *(laws if lawless else ())))),
     )
 
 
