@@ -82,8 +82,7 @@ def _finding(
         now = fit.hypothesis.effects[place]
         if type(now) is type(given):
             return search.with_given(fit, place, given)
-        old = type(given)(**change.effect.parameters())
-        return estimator.fit(replace(fit.hypothesis.instead(place, old), nuisances=None))
+        return estimator.fit(fit.hypothesis.instead(place, type(given)(**change.effect.parameters())))
 
     as_it_was = as_given(loose)
     gate = gate_of_change(estimator, loose, as_it_was)

@@ -363,10 +363,9 @@ class Search:
             return self.equal_alternatives(fitted, self.with_given(fitted, place, given), given.name)
 
     def with_given(self, fitted: Fitted, place: int, given: Effect) -> Fitted:
-        """Refits with the model part at ``place`` fixed exactly as ``given``, without a free-form loop."""
-        bare = replace(fitted.hypothesis, nuisances=None)
+        """Refits with the model part at ``place`` fixed exactly as ``given``."""
         with self.held({place}):
-            return self.estimator.fit(bare.instead(place, given))
+            return self.estimator.fit(fitted.hypothesis.instead(place, given))
 
     @contextmanager
     def held(self, places: Set[int]) -> Iterator[None]:

@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 
 from hdbridge.analysis.driving import SETTLE_S
 from hdbridge.analysis.hypothesis import Estimator, Fitted
-from hdbridge.analysis.linear import Nuisances, Prior, about_zeros, unknown
+from hdbridge.analysis.linear import Nuisances, Prior, about_zeros
 from hdbridge.analysis.nuisances import zeros
 from hdbridge.analysis.prepared import Observed, Samples
 from hdbridge.analysis.scales import Scales
@@ -235,8 +235,7 @@ def _seen(whole: float, rest: float, parameters: int, scales: Scales) -> bool:
 def visible_swing(base: Base, between: Nuisances, scales: Scales) -> Swing | None:
     """Fits the swing to the residual of the base's effects; returns None if no swing is visible.
 
-    The swing must improve on a fit of ``between``, the columns of the motion between samples, and of an error
-    proportional to the speed. In similar moves, a damped swing resembles that error, which may be a cause.
+    The swing must improve on a fit of ``between``, the columns of the motion between samples.
     """
     full, residual = base.full, base.residual_arcsec
     step_s, parts = np.maximum(np.diff(full.time_s), 1e-9), [each.rows for each in full.chains]
@@ -246,8 +245,7 @@ def visible_swing(base: Base, between: Nuisances, scales: Scales) -> Swing | Non
     rows = slice(begin, min(begin + LONGEST, len(full)))
     first = [0, *(each.start - begin for each in parts if rows.start < each.start < rows.stop)]
     inside = [each.within(rows) for each in base.fast]
-    skew = unknown(full.speed_deg_s[:, np.newaxis], ["skew"])
-    beside = _beside(full, between.and_also(skew), rows)
+    beside = _beside(full, between, rows)
 
     def tried(hertz: float, damping: float) -> float:
         damping = min(damping, MOST_DAMPED)
