@@ -118,7 +118,8 @@ def diagnose(
     if swing is None or not between.names:  # a larger cause may mask them
         # Inertial wind-up is the slow part of the swing and of the motion between samples, so the base
         # excludes it.
-        others = [each for each in found.hypothesis.effects if each.channels != {Channel.ACCELERATION}]
+        lawful = search.estimator.fit(replace(found.hypothesis, nuisances=None))  # without a free-form loop
+        others = [each for each in lawful.hypothesis.effects if each.channels != {Channel.ACCELERATION}]
         base, before = Base.of(data, others), (between.names, swing)
         between = between if between.names else between_samples(base, scales)
         swing = swing or visible_swing(base, between, scales)
