@@ -29,7 +29,7 @@ from hdbridge.units import figure
 # ----------------------------------------------------------------
 # Growth of a misfit, and significance of a rival's larger residuals against their scatter between legs.
 
-STRAY = 4.0
+CLIP_RATIO = 4.0
 """Limit to which residuals are clipped, in rms of their kind of leg, because a motor that breaks away at a
 different time is not a change of the axis."""
 FALSE_ALARM = 0.02
@@ -53,8 +53,8 @@ def scales_by_kind(data: Data, known: Misfit, noise: Mapping[str, float]) -> dic
 def growth(data: Data, residuals: Mapping[str, FloatArray], was: Mapping[str, Any]) -> dict[str, float]:
     """Returns, by channel, the rms residual relative to ``was`` (`scales_by_kind`).
 
-    A row counts as at most `STRAY` times the typical residual of its leg, because a single reading may be
-    wrong, but not a whole leg.
+    A row counts as at most `CLIP_RATIO` times the typical residual of its leg, because a single reading may
+    be wrong, but not a whole leg.
     """
     found = {}
     for name, inside in data.counts.items():
@@ -63,7 +63,7 @@ def growth(data: Data, residuals: Mapping[str, FloatArray], was: Mapping[str, An
             typical = np.zeros_like(now)
             for leg in np.unique(legs):
                 typical[legs == leg] = median_deviation(now[legs == leg])
-            now = np.minimum(now, STRAY * np.maximum(scale, typical))
+            now = np.minimum(now, CLIP_RATIO * np.maximum(scale, typical))
             found[name] = math.sqrt(float(np.sum(now**2)) / float(np.sum(scale**2)))
     return found
 

@@ -19,13 +19,13 @@ from hdbridge.twin.compare import FOLLOWING_ERROR, LOAD_ERROR, compare
 from hdbridge.twin.misfit import (
     CHANNELS,
     Data,
+    channel_residuals,
     noise_floor,
     noise_in_motion,
     prepare,
     remembers,
     residuals,
     scales,
-    what_is_left,
 )
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, free_value, with_values
 from hdbridge.twin.replay import replay
@@ -215,6 +215,6 @@ def test_residuals_within_motion_noise_are_explained() -> None:
         )
         for name in CHANNELS
     }
-    assert all(each.explained for each in what_is_left(data, left, noise_in_motion(data)))
-    some = what_is_left(data, left, noise_floor(data))
+    assert all(each.explained for each in channel_residuals(data, left, noise_in_motion(data)))
+    some = channel_residuals(data, left, noise_floor(data))
     assert {each.channel for each in some if not each.explained} == set(CHANNELS)
