@@ -369,7 +369,7 @@ def print_stepping(checked: Validation) -> None:
     print_steps("Stepping test: load error at rest, arcsec", (checked.before, checked.after))
     print_worse("stepping", checked.worse)
     _print_accuracy(checked)
-    for line in checked.survived:
+    for line in checked.fault_notes:
         say(f"note: {line}")
     floor = checked.floor
     say(

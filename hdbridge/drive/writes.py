@@ -123,7 +123,7 @@ def _heartbeats(axis: AxisConfig) -> Iterator[PlannedWrite]:
     why = "period of the drive's heartbeat, ms"
     without = "only missing TPDOs show that the drive is gone"
     yield _row(axis, objects.HEARTBEAT_PRODUCER, ms, why, field, without=without, exact=True)
-    why = f"the drive stops by itself when node {master}, the master, is silent for {ms} ms"
+    why = f"the drive stops on its own when node {master}, the master, is silent for {ms} ms"
     without = "only its event timer (1400h:05) stops the axis when the master dies"
     watched = _row(axis, objects.HEARTBEAT_CONSUMER, master_heartbeat(axis), why, field, without=without)
     yield replace(watched, composed=True)
@@ -150,7 +150,7 @@ def _pdos(axis: AxisConfig, od: ObjectDictionary | None, pdos: Layouts) -> Itera
             communication,
             5,
             timeout_ms,
-            f"the drive stops by itself when no set-point comes for {timeout_ms} ms",
+            f"the drive stops on its own when no set-point comes for {timeout_ms} ms",
             "drive.cycle_ms",
             IntegerType.UINT16,
             without="only its heartbeat consumer (1016h) stops the axis when the master dies",

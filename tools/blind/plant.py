@@ -100,7 +100,7 @@ class PlantRig:
 class PlantBench:
     """Runs procedures on a `PlantRig` (`hdbridge.control.rig.ProcedureBench`)."""
 
-    survived = ()
+    fault_counts = ()
 
     def __init__(self, rig: PlantRig, compensation: Compensation | None) -> None:
         self._rig = rig

@@ -467,7 +467,7 @@ def _judge_silence(
     said = "".join(f"; it sent {each}" for each in silence.emergencies)
     if silence.resumed:
         what = (
-            f"no {what}: it stopped by itself, and the master's own 'enable operation', which a dead master "
+            f"no {what}: it stopped on its own, and the master's own 'enable operation', which a dead master "
             f"does not send, took it out of that (transition 16){said}"
         )
         return judge_stop(
@@ -493,7 +493,7 @@ def _judge_silence(
         speed,
         silence.distance_deg,
         silence.noticed_after_s,
-        f"no {what}: '{state.value}' by itself",
+        f"no {what}: '{state.value}' on its own",
         2.0 * after_s + 0.05,
     )
 

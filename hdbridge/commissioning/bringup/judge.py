@@ -264,7 +264,7 @@ def judge_channels(
         elif 2 * channel.every_cycles * axis.drive.cycle_s < waited_s:
             text += f"; no {name}"
             remedies.append(
-                f"{axis.where(key)}: nothing comes that can be believed (within {channel.scale.least:g} to "
+                f"{axis.where(key)}: no plausible reading arrives (within {channel.scale.least:g} to "
                 f"{channel.scale.greatest:g} {BY_KEY[key].unit}); check the sensor, the object and its unit"
             )
     return failed(text, *remedies, **figures) if remedies else passed(text, **figures)

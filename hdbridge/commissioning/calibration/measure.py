@@ -140,4 +140,4 @@ def measure(
 def _add(journal: Journal, axis: AxisConfig, task: Task, bench: Bench, *, complete: bool) -> None:
     record = bench.record()
     lost = lost_channels(axis, record)
-    journal.add(task.name, record, bench.legs, complete=complete, lost=lost, survived=bench.survived)
+    journal.add(task.name, record, bench.legs, complete=complete, lost=lost, survived=bench.fault_counts)

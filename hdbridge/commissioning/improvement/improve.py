@@ -12,7 +12,7 @@ from hdbridge.analysis.findings import Diagnosis
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration.identification import provenance, with_provenance
-from hdbridge.commissioning.calibration.journal import Journal, survived_in, tasks_of
+from hdbridge.commissioning.calibration.journal import Journal, fault_notes_in, tasks_of
 from hdbridge.commissioning.calibration.measure import measure, start_journal
 from hdbridge.commissioning.calibration.pipeline import ACTIVE_NAME, MODEL_NAME, Offer, proposed
 from hdbridge.commissioning.calibration.validation import floor_of
@@ -21,7 +21,7 @@ from hdbridge.commissioning.improvement.further import Choice, advice, choose, u
 from hdbridge.commissioning.improvement.trial import Trial, try_out
 from hdbridge.control.bench import axis_view
 from hdbridge.control.caps import cap_remark
-from hdbridge.control.realtime import left_realtime
+from hdbridge.control.realtime import suspended_realtime
 from hdbridge.control.rig import Rig
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
@@ -65,7 +65,7 @@ class Improvement:
     """Advice to the user about open questions."""
     trial: Trial | None
     offer: Offer
-    survived: tuple[str, ...] = ()
+    fault_notes: tuple[str, ...] = ()
     """One line for each recorded file whose run tolerated faults."""
 
     def as_dict(self) -> dict[str, Any]:
@@ -88,7 +88,7 @@ class Improvement:
             "rounds": [asdict(each) for each in self.rounds],
             "further": self.further.as_dict() if self.further else None,
             "advice": list(self.advice),
-            "survived": list(self.survived),
+            "survived": list(self.fault_notes),
             **trial,
             "diagnosis": self.diagnosis.as_dict(),
         }
@@ -112,7 +112,7 @@ class Source:
     """True if the encoders' zeros were lost between the given recordings."""
 
 
-@left_realtime()  # fitting takes long; a bench resumes real-time priority for each motion
+@suspended_realtime()  # fitting takes long; a bench resumes real-time priority for each motion
 def improve(
     drive: Drive | Rig,
     source: Source,
@@ -171,7 +171,7 @@ def improve(
         advice=advice(diagnosis),
         trial=None,
         offer=Offer(False, "nothing found: the active model stays"),
-        survived=survived_in(list(recordings)),
+        fault_notes=fault_notes_in(list(recordings)),
     )
     if diagnosis.findings:
         whole = Recording.joined(list(recordings.values()))
