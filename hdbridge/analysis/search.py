@@ -546,13 +546,14 @@ def _share_in(effect: Effect, orders: Container[float]) -> float:
 
 
 def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:
-    """Chooses, among equivalent parametrisations (`Effect.retold`), the one that keeps the ``given`` model.
+    """Chooses, among equivalent parametrisations (`Effect.reparametrised`), the one that keeps the ``given``
+    model.
 
     Returns ``fitted`` unchanged without an equivalent one.
     """
     effects = fitted.hypothesis.effects
     for place in range(len(given), len(effects)):
-        told = effects[place].retold(effects, given, estimator.data)
+        told = effects[place].reparametrised(effects, given, estimator.data)
         if told is None:
             continue
         trial = estimator.fit(replace(fitted.hypothesis, effects=told))

@@ -16,7 +16,7 @@ import numpy as np
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
-from hdbridge.axis.effects import Channel, Moment, Observer, compensable, unmet
+from hdbridge.axis.effects import Channel, Moment, Observer, compensable, missing_channels
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.channelstate import ChannelState
 from hdbridge.control.compensation import Compensation, CompensationLimits
@@ -58,13 +58,13 @@ class Run(Recording, Generic[Outcome]):
     """Faults that the supervision tolerated."""
 
 
-def known_on_line(axis: AxisConfig) -> frozenset[Channel]:
+def online_channels(axis: AxisConfig) -> frozenset[Channel]:
     """Returns the channels that `Bench` passes to the effects in each cycle."""
     known = {each for each in Channel if each.axis_key in {"", *axis.channels}}
     return frozenset(known - ({Channel.MOTOR_TORQUE} if TORQUE_ACTUAL in layouts(axis).absent else set()))
 
 
-def walk(
+def run_moves(
     procedure: Procedure[Outcome],
     view: AxisView,
     rehearsal: Rehearsal,
@@ -134,7 +134,7 @@ def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation
     that the control loop lacks.
     """
     model.check_bound_to(axis)
-    for name, channels in unmet(compensable(model.effects), known_on_line(axis)).items():
+    for name, channels in missing_channels(compensable(model.effects), online_channels(axis)).items():
         lacking = sorted(channels, key=lambda each: each.value)
         keys = " and ".join(f"'{each.axis_key}'" for each in lacking if each.axis_key)
         add = f"add {keys} to {axis.path}, or " * bool(keys)
@@ -245,7 +245,7 @@ class Bench:
         """Runs the procedure, from power on to power off."""
         self._enable()
         try:
-            outcome = walk(procedure, self.view, rehearsal, progress, lambda: self._place, self._leg)
+            outcome = run_moves(procedure, self.view, rehearsal, progress, lambda: self._place, self._leg)
         except SafetyStop:
             raise  # the drive stands still, or stops on its own; the latch stays
         except BaseException:
@@ -297,7 +297,7 @@ class Bench:
         self._observer = Observer()
         self._channel_state.reset()
         self._channel_state.take(feedback)
-        self._compensation.know(self._channel_state.known)
+        self._compensation.set_known_channels(self._channel_state.known)
         self._compensation.reset(
             motor_deg,
             Moment(
@@ -351,7 +351,7 @@ class Bench:
                 moment = _AT_REST
             else:
                 if has_channels and channel_state.take(feedback):
-                    compensation.know(channel_state.known)
+                    compensation.set_known_channels(channel_state.known)
                 moment = observe(
                     ratio * target_deg,
                     feedback.time_s,

@@ -167,7 +167,7 @@ class AmplitudeDrift(Modulating, Warmed):
             return Part.LOOP, self.loop.law()
         return Part.ORDERS, MotorOrders(orders=self.orders)
 
-    def retold(
+    def reparametrised(
         self, now: Sequence[Effect], given: Sequence[Effect], observations: Observations
     ) -> tuple[Effect, ...] | None:
         """Expresses the drift relative to the temperature that brings the model closest to ``given``."""

@@ -44,7 +44,7 @@ class Compliance(Angleless, Linear):
     )
     compensable = Compensable(
         True,
-        "the load really moves so, where the torque is known on line (a torque sensor, or gravity from a "
+        "the load really has this error, if the torque is known on line (a torque sensor, or gravity from a "
         "model)",
     )
     shape = (

@@ -18,7 +18,9 @@ _SLOT = {each.value: slot for each, slot in SLOT.items()}
 TorqueLimit = Annotated[
     float,
     Field(
-        gt=0, le=1e5, description="torque beyond which the effect is held: no sensor fault moves the axis far"
+        gt=0,
+        le=1e5,
+        description="torque above which the effect is constant, so that no sensor fault moves the axis far",
     ),
 ]
 

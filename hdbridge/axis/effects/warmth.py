@@ -40,7 +40,7 @@ class Warmed(Effect):
         10.0, gt=0, le=200, description="warmth in the end, where driven by time (assumed)"
     )
     limit_k: float = Field(
-        60.0, gt=0, le=200, description="warmth in either direction beyond which the effect is held"
+        60.0, gt=0, le=200, description="warmth in either direction above which the effect is constant"
     )
 
     @classmethod
