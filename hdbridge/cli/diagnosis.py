@@ -361,7 +361,7 @@ def _conclude(
         print_worse("small steps", worse_ways(*result.trial.small))
         if result.trial.of_floor > LEFT_OF_FLOOR:
             say(
-                f"stepping is still {result.trial.of_floor:.1f} times the floor: something is left that "
+                f"stepping is still {result.trial.of_floor:.1f} times the floor: an error remains that "
                 "these data do not show; --auto, or a plan with two load turns, shows more"
             )
     say(result.offer.reason, style=None if result.offer.made else "bold")

@@ -194,7 +194,7 @@ class _Setup:
             recording = self._folder / RECORDING
             raise InputError(
                 f"{self._folder}: the calibration offers no model; {recording / 'report.html'} says why. "
-                f"Mend the axis, delete {recording} and {self._path}, and begin again"
+                f"Repair the axis, delete {recording} and {self._path}, and begin again"
             )
         self._run("model", "diff", self._folder)
         self._confirm("Make this the active model?")

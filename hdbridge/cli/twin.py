@@ -124,7 +124,9 @@ def _learned(
         twin.after,
         learned=_values(begun.truth, twin.truth) if verdict.kept else (),
         # If the twin is no better, only its unexplained residual is reported.
-        named=[*twin.findings, *twin.alike, *twin.unexplained] if verdict.kept else twin.unexplained,
+        named=[*twin.findings, *twin.inseparable_sets, *twin.unexplained]
+        if verdict.kept
+        else twin.unexplained,
         translated=begun.rows,
         facts=facts,
         verdict=verdict.text,

@@ -24,7 +24,7 @@ from hdbridge.drive.plausibility import Plausibility
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import ROWS, Event, Fault, Reaction, Supervision
 from hdbridge.drive.traffic import Traffic
-from hdbridge.drive.writes import drives_patience_s
+from hdbridge.drive.writes import drive_master_timeout_s
 from hdbridge.errors import InputError, SafetyStop
 
 Target = int | None
@@ -50,8 +50,8 @@ class AxisCycle:
     __slots__ = (
         "_awaited_channels", "_channel_ids", "_channels", "_commanded", "_good_cycle", "_handled_stop",
         "_last", "_left", "_plausibility", "_refused", "_still", "_stop_cycles", "_traffic", "awaited",
-        "changed", "command", "feedback", "flushing", "image", "monitor", "name", "needed", "patience_s",
-        "pending", "silent", "spoke_s", "supervision",
+        "changed", "command", "feedback", "flushing", "image", "last_sent_s", "master_timeout_s", "monitor",
+        "name", "needed", "pending", "silent", "supervision",
     )  # fmt: skip
 
     def __init__(
@@ -80,9 +80,9 @@ class AxisCycle:
             image.torque_permille, False, image.readings,
         )  # fmt: skip
         """Feedback of the last cycle; stale if the cycle had none."""
-        self.patience_s = drives_patience_s(axis)
+        self.master_timeout_s = drive_master_timeout_s(axis)
         """Time without a frame of the master after which the drive stops on its own."""
-        self.spoke_s = 0.0
+        self.last_sent_s = 0.0
         """Clock time at the start of the last cycle that sent an RPDO to this axis."""
 
         # Shared with `BusCycle`:
@@ -180,7 +180,7 @@ class AxisCycle:
 
     def start(self, now: float, count: int) -> None:
         """Starts the first cycle after `begin`; ``now`` is the clock time, ``count`` the cycle number."""
-        self._traffic.heard_s = self.spoke_s = now
+        self._traffic.heard_s = self.last_sent_s = now
         self._good_cycle = count
 
     @property
@@ -224,13 +224,13 @@ class AxisCycle:
         if not (self.silent or self.flushing):
             self.pending += faults
 
-    def turn(self, now: float, count: int, time_s: float, complete: bool) -> Frames | None:
+    def run_period(self, now: float, count: int, time_s: float, complete: bool) -> Frames | None:
         """Judges one period of a speaking axis and returns the RPDOs to send, or None.
 
         ``complete`` states that all required TPDOs have arrived.
         """
         image, supervision = self.image, self.supervision
-        self.spoke_s = now
+        self.last_sent_s = now
         stop = supervision.stop
         if stop is not self._handled_stop:
             self._note(stop)

@@ -66,10 +66,10 @@ class BusCycle:
     """
 
     __slots__ = (
-        "_awaited", "_beginning", "_bits", "_bits_of_turn", "_bus_faults", "_changed", "_deadline",
+        "_awaited", "_beginning", "_bits", "_bus_faults", "_changed", "_deadline",
         "_discarded", "_dropped", "_early", "_flushing", "_heartbeat_id", "_heartbeat_period_s",
-        "_heartbeat_s", "_interrupted", "_late_s", "_listeners", "_listening", "_per_bit", "_recv",
-        "_send", "_slots", "_speaking", "_window_s", "axes", "busy_s", "clock", "count", "down",
+        "_heartbeat_s", "_interrupted", "_late_s", "_listeners", "_listening", "_per_bit", "_period_bits",
+        "_recv", "_send", "_slots", "_speaking", "_window_s", "axes", "busy_s", "clock", "count", "down",
         "due_s", "faults", "histogram", "late_s", "on_frame", "outgoing", "overruns", "period_s",
         "refused", "skipped", "woke_s",
     )  # fmt: skip
@@ -121,7 +121,7 @@ class BusCycle:
         self._listening: tuple[AxisCycle, ...] = ()
         self._beginning: list[AxisCycle] = []
         self._awaited = self._early = 0
-        self._bits = self._bits_of_turn = FRAME_BITS[0]
+        self._bits = self._period_bits = FRAME_BITS[0]
         self._heartbeat_id = 0
         self._heartbeat_period_s = math.inf
         self._heartbeat_s = self.woke_s
@@ -136,7 +136,7 @@ class BusCycle:
 
         NaN if the bit rate is unknown. An awaited frame counts even if it did not arrive.
         """
-        return self._bits_of_turn * self._per_bit
+        return self._period_bits * self._per_bit
 
     def join(self, axis: AxisCycle) -> None:
         """Adds an axis, which stays silent until its ``begin``. Must not be called within a cycle.
@@ -190,7 +190,7 @@ class BusCycle:
         self.down = None
         if self._changed:
             self._rebuild(now)
-        self._bits_of_turn = self._bits
+        self._period_bits = self._bits
         try:
             read = self._drain(now)
             try:
@@ -205,7 +205,7 @@ class BusCycle:
                     got = 0
 
             for axis in self._speaking:
-                frames = axis.turn(now, count, time_s, got & axis.needed == axis.needed)
+                frames = axis.run_period(now, count, time_s, got & axis.needed == axis.needed)
                 for frame in frames or ():
                     try:
                         self._send(*frame)
@@ -259,8 +259,8 @@ class BusCycle:
         """Replaces set-points that must not take effect with the next SYNC."""
         send, now = self._send, self.clock.now()
         for axis in self._speaking:
-            if now - axis.spoke_s >= axis.patience_s - _CLOCK_STEP_S and axis.powered:
-                self._note_hang(axis, now - axis.spoke_s)
+            if now - axis.last_sent_s >= axis.master_timeout_s - _CLOCK_STEP_S and axis.powered:
+                self._note_hang(axis, now - axis.last_sent_s)
         if self._interrupted:
             for axis in self.axes:
                 if axis.silent:
@@ -277,7 +277,7 @@ class BusCycle:
 
     def _note_hang(self, axis: AxisCycle, silence_s: float) -> None:
         """Records that this process was silent beyond the time-out of a powered drive."""
-        hang = (Fault.HANG, f"{1e3 * silence_s:.0f} ms; the drive waits {1e3 * axis.patience_s:.0f} ms")
+        hang = (Fault.HANG, f"{1e3 * silence_s:.0f} ms; the drive waits {1e3 * axis.master_timeout_s:.0f} ms")
         axis.pending.insert(0, hang)
         if all(fault is not Fault.HANG for fault, _ in self.faults):
             self.faults.append(hang)
@@ -321,7 +321,7 @@ class BusCycle:
                 axis.check_statusword(frame)
                 axis.pending.append((Fault.DUPLICATE_TPDO, f"{frame.can_id:03X}h before SYNC"))
             return
-        self._bits_of_turn += FRAME_BITS[len(frame.data)]
+        self._period_bits += FRAME_BITS[len(frame.data)]
         try:
             accept(frame.data)
         except PdoLengthError:
@@ -385,7 +385,7 @@ class BusCycle:
 
     def _other(self, frame: Frame) -> None:
         """Passes a frame that is not awaited to its axis and to ``on_frame``, and records bus faults."""
-        self._bits_of_turn += FRAME_BITS[len(frame.data)]
+        self._period_bits += FRAME_BITS[len(frame.data)]
         axis = self._listeners.get(frame.can_id)
         if axis is not None:
             axis.hear(frame)
@@ -401,7 +401,7 @@ class BusCycle:
         self._heartbeat_s += self._heartbeat_period_s
         if self._heartbeat_s <= now:
             self._heartbeat_s = now + self._heartbeat_period_s
-        self._bits_of_turn += FRAME_BITS[1]
+        self._period_bits += FRAME_BITS[1]
         try:
             self._send(self._heartbeat_id, _HEARTBEAT_DATA)
         except TransmitBufferFull as error:
@@ -414,7 +414,7 @@ class BusCycle:
         frame = outgoing()
         if frame is None:
             return
-        self._bits_of_turn += FRAME_BITS[len(frame[1])]
+        self._period_bits += FRAME_BITS[len(frame[1])]
         try:
             self._send(*frame)
         except TransmitBufferFull:

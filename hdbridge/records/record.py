@@ -61,7 +61,7 @@ def remedy(times: float, ratio: float, exact: float, origin: Origin | None) -> s
         return f"look at the load encoder's column{column}"
     if times < 0.0:
         how = f": pass {origin.scaled('load', -1.0)}, or {origin.scaled('motor', -1.0)}" if origin else ""
-        return f"turn the direction of one encoder round{how}"
+        return f"reverse the direction of one encoder{how}"
     found = [
         (abs(times * change - 1.0), words, how)
         for change, words, how in (*_other_units(origin), *_other_places(ratio, origin))

@@ -27,7 +27,7 @@ from hdbridge.report.page import (
 )
 from hdbridge.twin.compare import ALL, TITLES, UNITS, Comparison, Row, Spectrum, Trace
 from hdbridge.twin.misfit import ChannelResidual, Values
-from hdbridge.twin.naming import Alike, Finding
+from hdbridge.twin.naming import Finding, InseparableSet
 from hdbridge.twin.translate import Row as Translated
 
 WINDOW_S: Final = 1.0
@@ -64,7 +64,7 @@ class TwinReport:
     after: Comparison | None = None
     """Comparison with the fitted simulation; None without a fit."""
     learned: Sequence[Learned] = ()
-    named: Sequence[Finding | Alike | ChannelResidual] = ()
+    named: Sequence[Finding | InseparableSet | ChannelResidual] = ()
     translated: Sequence[Translated] = ()
     facts: Sequence[tuple[str, str]] = ()
     verdict: str = ""

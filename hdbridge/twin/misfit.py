@@ -293,7 +293,7 @@ def _piece(
     for each in held_out:
         out |= (part.time_s >= each.start_s) & (part.time_s <= each.end_s)
     travelled = np.abs(np.diff(part.motor_position_deg, prepend=part.motor_position_deg[0]))
-    elastic = unknown | (np.cumsum(travelled) < (UNKNOWN_DEG if remembers(base) else 0.0))
+    elastic = unknown | (np.cumsum(travelled) < (UNKNOWN_DEG if has_memory(base) else 0.0))
     # Between two parts the drive's loops may have been restarted.
     loops = elastic | (np.cumsum(np.where(judged, travelled, 0.0)) <= UNKNOWN_DEG)
     stuck, still, held = standing(part, 360.0 / axis.motor_encoder.counts_per_turn)
@@ -318,7 +318,7 @@ def _piece(
     return Piece(commands, measured, counts, leg, kinds, out, stuck)
 
 
-def remembers(truth: Truth) -> bool:
+def has_memory(truth: Truth) -> bool:
     """Returns True if the gear's angle depends on the history of the motor."""
     gear, load = truth.gear, truth.load_
     return bool(

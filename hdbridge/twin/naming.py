@@ -193,7 +193,7 @@ def _excess(grown: Mapping[str, float]) -> float:
 # ----------------------------------------------------------------
 # Findings.
 
-ALIKE = 0.4
+MIN_COMPONENT = 0.4
 """Minimum component of a parameter in an unobservable direction for including it in the set."""
 
 
@@ -242,7 +242,7 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Alike:
+class InseparableSet:
     """Parameters that are not separable in the motion, and motions that would separate them."""
 
     cause: ClassVar[str] = "not separable"
@@ -302,7 +302,7 @@ def findings(
     )
 
 
-def alike(fitted: Fitted, legs: NDArray[np.intp]) -> tuple[Alike, ...]:
+def inseparable_sets(fitted: Fitted, legs: NDArray[np.intp]) -> tuple[InseparableSet, ...]:
     """Returns sets of parameters that can change together by the prior's width without a significant effect.
 
     ``legs`` contains the leg number of each fitted row.
@@ -310,12 +310,14 @@ def alike(fitted: Fitted, legs: NDArray[np.intp]) -> tuple[Alike, ...]:
     spread = np.array([each.spread for each in fitted.parameters])
     scaled = fitted.jacobian * spread
     _, directions = np.linalg.eigh(scaled.T @ scaled)
-    sets: list[Alike] = []
+    sets: list[InseparableSet] = []
     for direction in directions.T:
         if worse_than_chance(fitted.vector, scaled @ direction, legs):
             continue
-        members = [each for each, part in zip(fitted.parameters, direction, strict=True) if abs(part) > ALIKE]
+        members = [
+            each for each, part in zip(fitted.parameters, direction, strict=True) if abs(part) > MIN_COMPONENT
+        ]
         if members:
             moves = dict.fromkeys(each.move for each in members)
-            sets.append(Alike(tuple(each.name for each in members), tuple(moves)))
+            sets.append(InseparableSet(tuple(each.name for each in members), tuple(moves)))
     return tuple(sets)

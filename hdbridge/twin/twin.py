@@ -56,7 +56,7 @@ from hdbridge.twin.misfit import (
     values_of,
     with_load_noise,
 )
-from hdbridge.twin.naming import Alike, Finding, alike, explain, findings, scales_by_kind
+from hdbridge.twin.naming import Finding, InseparableSet, explain, findings, inseparable_sets, scales_by_kind
 from hdbridge.twin.parameters import LOAD, by_cause, default_truth, with_sections
 from hdbridge.twin.replay import legs_of, replay
 from hdbridge.twin.response import with_response
@@ -78,7 +78,7 @@ class Twin:
     """Parameters, with intervals of the fitted ones; the provenance contains the data for `check`."""
     findings: tuple[Finding, ...]
     """Causes of the errors of the initial simulation, if its values were the axis's."""
-    alike: tuple[Alike, ...]
+    inseparable_sets: tuple[InseparableSet, ...]
     """Sets of parameters that are not separable in the recorded motion."""
     channel_residuals: tuple[ChannelResidual, ...]
     """Residual of each recorded channel, on held-out legs if any."""
@@ -351,11 +351,11 @@ def fit_twin(
             fitted = with_response(replays, fitted)
             remaining = channel_residuals(data, fitted.residuals, noise)
         findings: tuple[Finding, ...] = ()
-        sets: tuple[Alike, ...] = ()
+        sets: tuple[InseparableSet, ...] = ()
         if values is Values.AXIS:
             if Values.of(start) in {None, Values.AXIS}:
                 findings = _wrong(replays, start, fitted)
-            sets = alike(fitted, legs_of_rows(data, fitted_rows(data)))
+            sets = inseparable_sets(fitted, legs_of_rows(data, fitted_rows(data)))
     truth, warmth = with_warmth(whole, axis, fitted, with_knowledge(fitted, data, values))
     if values is Values.REPLAY:
         truth = truth.model_copy(update={"intervals": {}})

@@ -102,7 +102,7 @@ def segment(**changes):
         ),
         (segment, 21.0, r"a\.csv: the motor makes 20 turns per turn of the load .*; expected a ratio of 21"),
         (segment, -20.0, "ratio"),
-        (lambda: segment(load_deg=-np.arange(400) / 10.0), 20.0, "direction of one encoder round"),
+        (lambda: segment(load_deg=-np.arange(400) / 10.0), 20.0, "reverse the direction of one encoder"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(make, ratio, complaint):

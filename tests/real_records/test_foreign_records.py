@@ -283,7 +283,7 @@ ADVISED: dict[str, tuple[str, str, str]] = {
     ),
     "against each other": (
         text(load=-LOAD),
-        "turn the direction of one encoder round",
+        "reverse the direction of one encoder",
         "--units load=-deg",
     ),
 }

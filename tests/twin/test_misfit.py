@@ -20,10 +20,10 @@ from hdbridge.twin.misfit import (
     CHANNELS,
     Data,
     channel_residuals,
+    has_memory,
     noise_floor,
     noise_in_motion,
     prepare,
-    remembers,
     residuals,
     scales,
 )
@@ -162,7 +162,7 @@ def test_without_memory_the_load_counts_at_once() -> None:
     plain = with_values(TRUTH, {})
     gear = plain.gear.model_copy(update={"hysteresis": None, "second_hysteresis": None, "backlash_arcsec": 0})
     for truth, at_once in ((TRUTH, False), (plain.model_copy(update={"gear": gear}), True)):
-        assert remembers(truth) is not at_once
+        assert has_memory(truth) is not at_once
         (piece,) = prepare(recorded(), AXIS, truth).pieces
         first = int(np.argmin(piece.rest))
         assert bool(piece.counts[LOAD][first]) is at_once

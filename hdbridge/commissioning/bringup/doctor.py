@@ -188,7 +188,7 @@ def units(context: BringUpContext) -> Verdict:
     readings = read(*scaling_addresses(axis))
     complaints = [*scaling_complaints(axis, readings)]
     said = ", ".join(f"{each.index:04X}h:{each.sub:02X} {value}" for each, value in readings.items())
-    text = said or "the drive has no object that says how it counts"
+    text = said or "the drive has no object that states its scaling"
     if complaints:
         return failed(text, *complaints)
     gear = readings.get(objects.GEAR_MOTOR, 1) / readings.get(objects.GEAR_SHAFT, 1)
@@ -356,7 +356,9 @@ def heartbeat(context: BringUpContext) -> Verdict:
     has_timer = _timer(context) is not None
     if not sdo.has(objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub):
         if has_timer:
-            return not_possible("the drive watches no heartbeat (no 1016h); its RPDO event timer has to do")
+            return not_possible(
+                "the drive watches no heartbeat (no 1016h); its RPDO event timer must suffice"
+            )
         return failed(
             "the drive has neither a heartbeat consumer (1016h) nor an RPDO event timer (1400h:05)",
             f"nothing stops this axis when its master dies; if the drive does have them, "
@@ -386,7 +388,9 @@ def set_points(context: BringUpContext) -> Verdict:
     axis, sdo = context.axis, context.drive.sdo
     timer = _timer(context)
     if timer is None:
-        return not_possible("the drive has no RPDO event timer (1400h:05); its heartbeat consumer has to do")
+        return not_possible(
+            "the drive has no RPDO event timer (1400h:05); its heartbeat consumer must suffice"
+        )
     timer_s = sdo.read(timer, 5) / 1000.0
     with context.interruptible() as interrupted:
         slow = context.slow(interrupted)
@@ -447,8 +451,8 @@ def _noticed(context: BringUpContext) -> str:
     axis = context.axis
     option = axis.drive.quick_stop_option
     again = (
-        f"; or it stopped, and went on by 'enable operation', which this check still sends (transition 16): "
-        f"{axis.where('drive.quick_stop_option')}: found {option}, with 1 to 4 it cannot"
+        f"; or it stopped, and 'enable operation', which this check still sends, restarted it (transition "
+        f"16): {axis.where('drive.quick_stop_option')}: found {option}; 1 to 4 prevent that"
         if option >= 5
         else ""
     )
@@ -468,7 +472,7 @@ def _judge_silence(
     if silence.resumed:
         what = (
             f"no {what}: it stopped on its own, and the master's own 'enable operation', which a dead master "
-            f"does not send, took it out of that (transition 16){said}"
+            f"does not send, restarted it (transition 16){said}"
         )
         return judge_stop(
             context.axis,

@@ -18,7 +18,7 @@ from hdbridge.commissioning.calibration.pipeline import ACTIVE_NAME, MODEL_NAME,
 from hdbridge.commissioning.calibration.validation import floor_of
 from hdbridge.commissioning.improvement.extension import Extension, alternatives, extension_of, named
 from hdbridge.commissioning.improvement.further import Choice, advice, choose, unseparated
-from hdbridge.commissioning.improvement.trial import Trial, try_out
+from hdbridge.commissioning.improvement.trial import Trial, run_trial
 from hdbridge.control.bench import axis_view
 from hdbridge.control.caps import cap_remark
 from hdbridge.control.realtime import suspended_realtime
@@ -264,10 +264,10 @@ def _concluded(
     model = with_provenance(extension.model, _provenance(result, recording))
     if remark := cap_remark(drive.axis, model):
         notify(remark)
-    notify("stepping with the active and with the extended model, in turns")
+    notify("stepping with the active and the extended model alternately")
     floor = floor_of(drive.axis, recording)
     try:
-        trial = try_out(
+        trial = run_trial(
             drive,
             source.plan,
             result.active,
@@ -282,7 +282,9 @@ def _concluded(
     result = replace(result, trial=trial)
     summary = _summary(trial)
     if not trial.improves:
-        return replace(result, offer=Offer(False, f"not offered: the axis does not point better, {summary}"))
+        return replace(
+            result, offer=Offer(False, f"not offered: positioning is not more accurate, {summary}")
+        )
     reason = f"improvement {source.folder.name}: {named(extension.carried)}; {summary}"
     return replace(result, offer=proposed(profile, model, reason, bench.date, drive))
 

@@ -78,7 +78,7 @@ class Trial:
         }
 
 
-def try_out(
+def run_trial(
     drive: Drive | Rig,
     plan: Plan,
     active: TransmissionModel,

@@ -99,7 +99,7 @@ class Follower:
         sensed, correction = self.sensed, self.correction
         sensed.reset()
         sensed.take(feedback)
-        correction.know(sensed.known)
+        correction.set_known_channels(sensed.known)
         moment = Moment(time_s=feedback.time_s, measured=sensed.measured(feedback), load_deg=place_deg)
         correction.reset(motor_deg, moment)
         self.engage(self.compensating)
@@ -120,7 +120,7 @@ class Follower:
         if self._needs:
             sensed = self.sensed
             if self._has_channels and sensed.take(feedback):
-                correction.know(sensed.known)
+                correction.set_known_channels(sensed.known)
             moment = self._observer.moment(
                 self._ratio * target_deg,
                 feedback.time_s,
