@@ -392,8 +392,8 @@ def deviance_residuals(
     to ``off``.
 
     ``off`` is reading minus simulation, ``half`` half the resolution, both in standard deviations of the
-    simulation, shape (n,); ``outlier_probability`` by row. Without resolution, ``off`` is
-    returned unchanged.
+    simulation, shape (n,); ``outlier_probability`` by row. Without resolution, ``off`` is returned
+    unchanged.
     """
     size, plain = np.abs(off), half == 0.0
     outlier_probability = np.where(
