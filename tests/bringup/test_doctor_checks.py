@@ -301,7 +301,7 @@ def test_a_drive_that_only_reports_a_lost_heartbeat(case: Callable[..., Any]) ->
     assert "1016h" not in verdict.remedies[0]
     assert "neither stops (6007h) nor leaves OPERATIONAL (1029h)" in verdict.remedies[0]
     assert "transition 16" in verdict.remedies[0]
-    assert ": drive.quick_stop_option: found 6, with 1 to 4 it cannot" in verdict.remedies[0]
+    assert ": drive.quick_stop_option: found 6; 1 to 4 prevent that" in verdict.remedies[0]
 
 
 def test_a_drive_that_the_master_itself_takes_out_of_its_stop(case: Callable[..., Any]) -> None:
