@@ -75,7 +75,7 @@ def mode_advice(modes: int) -> str:
     """Returns advice for a drive whose 6502h lacks the mode of the control cycle."""
     for name, each in objects.CYCLIC.items():
         if modes & each.mode.supported_bit:
-            return f"it has 'mode: {name}'"
+            return f"'mode: {name}' is supported"
     return (
         "this drive cannot be used: choose one with cyclic synchronous position (csp) or interpolated "
         "position (ip), or enable that in the drive"
