@@ -1,4 +1,4 @@
-"""hdbridge: a CANopen CiA-402 master that makes a harmonic-drive axis point where it is told.
+"""hdbridge: a CANopen CiA-402 master that makes a harmonic-drive axis point to its commanded angle.
 
 These names are the library's public interface. docs/api.md describes each, and they change only with a note
 in the changelog. Each is loaded on first use, so importing hdbridge costs nothing. Everything else may change

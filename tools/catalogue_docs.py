@@ -31,7 +31,7 @@ load is ahead of motor angle / N, in arcsec at the load. Each section has the eq
   those of the commanded motor angle; `load_deg` is the predicted load angle.
 - **Parameters**: names end in the unit; = is the default. `orders` are `{order, amplitude_arcsec,
   phase_deg}`; a `loop` (or `base`) is a copy of the model's: `{offset_arcsec, width_deg, exponent, memory}`.
-  `ratio` is N. Beyond a `limit_*` of its input an effect is held, so that a faulty sensor cannot move the
+  `ratio` is N. Above a `limit_*` of its input an effect is constant, so that a faulty sensor cannot move the
   axis far.
 
 Signatures, with the usual size:
@@ -68,8 +68,8 @@ def _section(kind: type[Effect]) -> Iterator[str]:
         yield f"- **Not compensated**: {why}."
     elif not why.startswith("the load really"):
         yield f"- **Compensated**: {why}."
-    elif condition := why.partition(", where ")[2]:
-        yield f"- **Compensated** where {condition}."
+    elif condition := why.partition(", if the torque ")[2]:
+        yield f"- **Compensated** if the torque {condition}."
     if kind.replaces:
         yield f"- In a model it replaces [`{kind.replaces}`](#{kind.replaces})."
     if needs := _needs(kind):

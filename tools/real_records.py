@@ -155,8 +155,8 @@ def _twins(folder: Path) -> None:
                 print(f"  {finding}")
             for rest in twin.unexplained:
                 print(f"  unexplained: {rest.channel}, {rest.times_noise:.3g} times its noise")
-            for alike in twin.alike:
-                print(f"  not separable: {', '.join(alike.names)}")
+            for each in twin.inseparable_sets:
+                print(f"  not separable: {', '.join(each.names)}")
         for (signal, name), values in left.items():
             print(f"  {signal}, {name}: {np.sqrt(np.mean(np.square(values))):.4g}")
 

@@ -177,7 +177,7 @@ def _orders(
         before, after = old.coefficients(), new.coefficients()
         # Effects that change sign with the direction of motion reduce an order's mean over both directions.
         number = round(new.waves()[0][0]) if new.waves() else 0
-        share = math.prod(each.left_in_mean(number) for each in fitted.hypothesis.effects)
+        share = math.prod(each.symmetric_fraction(number) for each in fitted.hypothesis.effects)
         part = next(each for each in usual if str(named.columns[0]) in each.parameters).times(share)
         large = float(np.linalg.norm(after - share * before)) >= estimator.floor_arcsec
         if large and strain(fitted, part, spread) >= scales.calibrations**2:

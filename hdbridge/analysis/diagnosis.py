@@ -57,7 +57,7 @@ from hdbridge.analysis.unexplained import (
     rest,
     unfitted,
 )
-from hdbridge.axis.effects import Channel, Effect, FloatArray, Part, Start, unmet
+from hdbridge.axis.effects import Channel, Effect, FloatArray, Part, Start, missing_channels
 from hdbridge.axis.effects.kinematics import direction_of
 from hdbridge.axis.effects.motion import missing_error
 from hdbridge.axis.effects.torque import beyond_limit
@@ -101,7 +101,7 @@ def diagnose(
     remarks = (
         () if independent_zeros else _of_zeros(observed(record, model.ratio).record.parts(), model.ratio)
     )
-    lacking = unmet(model.effects, record.motion().available() | {Channel.LOAD_ANGLE})
+    lacking = missing_channels(model.effects, record.motion().available() | {Channel.LOAD_ANGLE})
     for name, channels in lacking.items():
         if channels:
             raise missing_error(name, channels)

@@ -16,7 +16,16 @@ import numpy as np
 from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.linear import Linearised
 from hdbridge.analysis.readings import median_deviation
-from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, Observations, Sought, Start, causes, unmet
+from hdbridge.axis.effects import (
+    CATALOGUE,
+    Effect,
+    FloatArray,
+    Observations,
+    Sought,
+    Start,
+    causes,
+    missing_channels,
+)
 from hdbridge.axis.effects.orders import HIGHEST_MOTOR_ORDER
 from hdbridge.units import DEG_PER_TURN
 
@@ -39,7 +48,7 @@ def candidates(observations: Observations, base: Sequence[Effect], screened: boo
 def proposed(kind: type[Effect], observations: Observations, base: Sequence[Effect] = ()) -> list[Effect]:
     """Returns a kind's proposals for a record and the model ``base``; none if its channels are missing."""
     available = observations.motion.available()
-    return [each for each in kind.proposals(observations, base) if not unmet([each], available)]
+    return [each for each in kind.proposals(observations, base) if not missing_channels([each], available)]
 
 
 @dataclass(frozen=True, slots=True)

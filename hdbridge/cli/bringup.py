@@ -201,7 +201,7 @@ class _Report:
         from hdbridge.commissioning.evaluation.stepping import quantisation_floor_arcsec
         from hdbridge.control.bench import compensation_for
         from hdbridge.control.caps import cap_remark
-        from hdbridge.drive.bootplan import left_to_drive, plan, sent_along
+        from hdbridge.drive.bootplan import left_to_drive, plan, unrequested_objects
         from hdbridge.drive.layout import layouts
         from hdbridge.files.edsfile import shared_eds
 
@@ -233,7 +233,7 @@ class _Report:
             "fixed mapping": [
                 str(each) for each in (*pdos.cyclic, *pdos.channels, *pdos.rpdos) if each.is_fixed
             ],
-            "sent along": sent_along(axis),
+            "sent along": unrequested_objects(axis),
             "left to the drive": [
                 f"{each}{f' ({axis.where(each.field)})' if each.field else ''}"
                 for each in left_to_drive(axis)

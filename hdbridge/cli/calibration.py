@@ -61,13 +61,13 @@ class Measured:
         Also creates the folder, so that an unwritable location is refused before a drive is connected.
         """
         from hdbridge.commissioning.calibration import Journal
-        from hdbridge.commissioning.calibration.measure import outlook
+        from hdbridge.commissioning.calibration.measure import remaining_plan
         from hdbridge.motion.procedures.plan import Plan
 
         axis, date = session.axis, datetime.now().astimezone()
         if self.resume is None:
             plan = Plan.load(self.plan)
-            outlook(plan, axis)  # an impossible plan is refused before the folder is created
+            remaining_plan(plan, axis)  # an impossible plan is refused before the folder is created
             default = Path("recordings") / f"{axis.name}-{date:%Y%m%d-%H%M%S}"
             folder = make_folder(self.out) if self.out else new_folder(default)
             return Measurement(session, plan, folder, date, None)
@@ -91,10 +91,10 @@ class Measurement:
 
     def announce(self, after: str = "") -> None:
         """Prints the remaining part of the plan and its duration; ``after`` describes the step after it."""
-        from hdbridge.commissioning.calibration.measure import outlook
+        from hdbridge.commissioning.calibration.measure import remaining_plan
 
         done = self.journal.done if self.journal else ()
-        left = outlook(self.plan, self.session.axis, done)
+        left = remaining_plan(self.plan, self.session.axis, done)
         for each in left.notes:
             note(f"plan '{self.plan.name}': {each}")
         there = f" ({len(done)} tasks are there already)" if self.journal else ""
@@ -369,7 +369,7 @@ def print_stepping(checked: Validation) -> None:
     print_steps("Stepping test: load error at rest, arcsec", (checked.before, checked.after))
     print_worse("stepping", checked.worse)
     _print_accuracy(checked)
-    for line in checked.survived:
+    for line in checked.fault_notes:
         say(f"note: {line}")
     floor = checked.floor
     say(

@@ -83,7 +83,7 @@ def conform(
     from hdbridge.conformance.tester import StoppedError, Timing
     from hdbridge.daemon.machine import machine_file
     from hdbridge.drive.link import Link
-    from hdbridge.drive.manners import Ear, listening_s
+    from hdbridge.drive.masterdetection import MasterDetector, listening_s
     from hdbridge.files.edsfile import read_eds
 
     wanted = _chosen(checks(moves=motion, stores=store), checks(moves=True, stores=True), only)
@@ -114,9 +114,9 @@ def conform(
         link = Link(bus, clock)
         task = bar.add_task(f"{len(wanted)} checks", total=len(wanted))
         if not reach.simulate and not reach.force:
-            ear = Ear((node_id,), asked=(node_id,))
-            ear.listen(link, listening_s())
-            ear.refuse(link.name, listening_s())
+            detector = MasterDetector((node_id,), sdo_servers=(node_id,))
+            detector.listen(link, listening_s())
+            detector.raise_if_heard(link.name, listening_s())
         tester = NodeTester(
             link,
             node_id,

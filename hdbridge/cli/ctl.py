@@ -337,7 +337,7 @@ def _machine_lines(state: MachineState) -> list[str]:
     simulated = ", simulated" if state.simulated else ""
     load = "" if state.bus.load is None else f", load {100 * state.bus.load:.0f} %"
     bus = f"{state.bus.interface} {state.bus.channel} is {'up' if state.bus.up else 'DOWN'}{load}"
-    turning = "" if state.cycle.alive else ", which does NOT run"
+    turning = "" if state.cycle.alive else ", which is NOT running"
     skipped = f", {state.cycle.skipped} periods skipped" if state.cycle.skipped else ""
     cycle = f"cycle of {1e3 * state.cycle.period_s:g} ms{turning}{skipped}"
     return [f"machine '{state.name}'{simulated}; {bus}; {cycle}", _lease_line(state.lease)]

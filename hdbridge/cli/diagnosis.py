@@ -347,7 +347,7 @@ def _conclude(
     print_diagnosis(result.diagnosis)
     for line in result.extension.left:
         say(line)
-    for line in result.survived:
+    for line in result.fault_notes:
         say(f"note: {line}")
     if result.further is not None:
         further = result.further
@@ -361,7 +361,7 @@ def _conclude(
         print_worse("small steps", worse_ways(*result.trial.small))
         if result.trial.of_floor > LEFT_OF_FLOOR:
             say(
-                f"stepping is still {result.trial.of_floor:.1f} times the floor: something remains that "
+                f"stepping is still {result.trial.of_floor:.1f} times the floor: an error remains that "
                 "these data do not show; --auto, or a plan with two load turns, shows more"
             )
     say(result.offer.reason, style=None if result.offer.made else "bold")
@@ -382,7 +382,7 @@ def _write_improvement_page(path: Path, result: Improvement) -> None:
         "recorded": result.date or "not known",
         "plan": result.plan,
         **{f"round {number}": each.about for number, each in enumerate(result.rounds, 1)},
-        **({"survived": "; ".join(result.survived)} if result.survived else {}),
+        **({"tolerated faults": "; ".join(result.fault_notes)} if result.fault_notes else {}),
     }
     page = diagnosis_page(
         result.diagnosis,

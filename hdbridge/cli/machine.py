@@ -394,7 +394,7 @@ def simulate(
 def _refuse_another(bus: can.BusABC, clock: Clock, node_id: int) -> None:
     """Raises `BusInUseError` if another node with this id answers a request or sends frames of its own."""
     from hdbridge.drive.link import Link
-    from hdbridge.drive.manners import listening_s
+    from hdbridge.drive.masterdetection import listening_s
     from hdbridge.drive.objects import COB_SDO_REQUEST
 
     link = Link(bus, clock)

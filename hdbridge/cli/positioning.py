@@ -318,7 +318,7 @@ def _reported_when_stopped(
 def _print_stepping(axis: AxisConfig, comparison: Comparison) -> None:
     title = f"Load error at rest, arcsec: axis '{axis.name}'"
     print_steps(title, comparison.results.values(), "compensation")
-    for line in comparison.survived:
+    for line in comparison.fault_notes:
         say(f"note: {line}")
     best, result = min(comparison.results.items(), key=lambda item: item[1].pooled.three_sigma_arcsec)
     floor = comparison.quantisation_floor_arcsec
@@ -356,8 +356,8 @@ def _write_stepping_page(
         "motor encoder": f"{axis.motor_encoder.counts_per_turn:,} counts per turn",
         "load encoder": f"{axis.load_encoder.counts_per_turn:,} counts per turn",
     }
-    if comparison.survived:
-        facts["survived"] = "; ".join(comparison.survived)
+    if comparison.fault_notes:
+        facts["tolerated faults"] = "; ".join(comparison.fault_notes)
     page = stepping_page(
         axis.name,
         comparison.results,

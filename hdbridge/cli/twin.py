@@ -107,14 +107,14 @@ def _learned(
     from hdbridge.axis.model.store import measuring
     from hdbridge.report.page import Command, Status
     from hdbridge.report.twin import TwinReport
-    from hdbridge.twin.twin import TWINS, KeptTwin, fit_twin, judge
+    from hdbridge.twin.twin import TWINS, TwinFile, fit_twin, judge
 
     with measuring(files.axis), progress_bar() as bar:
         task = bar.add_task("fit", total=1.0)
         twin = fit_twin([recording], axis, begun.truth, lambda share: bar.update(task, completed=share))
         verdict = judge(twin)
         if verdict.kept:
-            kept = KeptTwin(twin.truth).with_provenance(recordings=[str(each) for each in paths])
+            kept = TwinFile(twin.truth).with_provenance(recordings=[str(each) for each in paths])
             reason = f"learned from {', '.join(each.name for each in paths)}"
             TWINS.propose(files.folder, kept, reason, datetime.now().astimezone(), recording.drive)
     commit = Command(f"hdbridge model commit {files.folder} --twin", "makes it what --simulate uses")
@@ -123,13 +123,15 @@ def _learned(
         twin.before,
         twin.after,
         learned=_values(begun.truth, twin.truth) if verdict.kept else (),
-        # If the twin is no better than before, only its unexplained residual is reported.
-        named=[*twin.findings, *twin.alike, *twin.unexplained] if verdict.kept else twin.unexplained,
+        # If the twin is no better, only its unexplained residual is reported.
+        named=[*twin.findings, *twin.inseparable_sets, *twin.unexplained]
+        if verdict.kept
+        else twin.unexplained,
         translated=begun.rows,
         facts=facts,
         verdict=verdict.text,
         values=str(twin.values),
-        left=twin.left,
+        channel_residuals=twin.channel_residuals,
         commands=(commit,) if verdict.kept else (),
         status=Status.PENDING if verdict.kept else Status.REFUSED,
     )
@@ -157,11 +159,11 @@ def _check(
 ) -> None:
     """Reports the changes since the profile's twin was made, in one sentence."""
     from hdbridge.twin.check import check
-    from hdbridge.twin.twin import KeptTwin
+    from hdbridge.twin.twin import TwinFile
 
     if html_file is not None:
         raise InputError("--check writes no page: leave out --html, or use --compare")
-    twin = KeptTwin.load(files.twin) if files.twin.is_file() else None
+    twin = TwinFile.load(files.twin) if files.twin.is_file() else None
     if twin is None:
         raise InputError(
             f"{files.folder}: there is no active twin to check; make one with 'hdbridge twin', and commit it "
@@ -257,7 +259,7 @@ def as_dict(report: TwinReport) -> dict[str, Any]:
         "axis": report.axis,
         "verdict": report.verdict,
         "values": report.values,
-        "left": [{**asdict(each), "explained": each.explained} for each in report.left],
+        "left": [{**asdict(each), "explained": each.explained} for each in report.channel_residuals],
         "before": report.before.as_dict(),
         "after": report.after.as_dict() if report.after is not None else None,
         "parameters": [

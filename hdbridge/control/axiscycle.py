@@ -24,7 +24,7 @@ from hdbridge.drive.plausibility import Plausibility
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import ROWS, Event, Fault, Reaction, Supervision
 from hdbridge.drive.traffic import Traffic
-from hdbridge.drive.writes import drives_patience_s
+from hdbridge.drive.writes import drive_master_timeout_s
 from hdbridge.errors import InputError, SafetyStop
 
 Target = int | None
@@ -48,10 +48,10 @@ class AxisCycle:
     """
 
     __slots__ = (
-        "_awaited_channels", "_channel_ids", "_channels", "_commanded", "_good_cycle", "_last", "_left",
-        "_plausibility", "_refused", "_ridden", "_still", "_stop_cycles", "_traffic", "awaited", "changed",
-        "command", "feedback", "image", "monitor", "name", "needed", "patience_s", "pending", "rested",
-        "silent", "spoke_s", "supervision",
+        "_awaited_channels", "_channel_ids", "_channels", "_commanded", "_good_cycle", "_handled_stop",
+        "_last", "_left", "_plausibility", "_refused", "_still", "_stop_cycles", "_traffic", "awaited",
+        "changed", "command", "feedback", "flushing", "image", "last_sent_s", "master_timeout_s", "monitor",
+        "name", "needed", "pending", "silent", "supervision",
     )  # fmt: skip
 
     def __init__(
@@ -80,9 +80,9 @@ class AxisCycle:
             image.torque_permille, False, image.readings,
         )  # fmt: skip
         """Feedback of the last cycle; stale if the cycle had none."""
-        self.patience_s = drives_patience_s(axis)
+        self.master_timeout_s = drive_master_timeout_s(axis)
         """Time without a frame of the master after which the drive stops on its own."""
-        self.spoke_s = 0.0
+        self.last_sent_s = 0.0
         """Clock time at the start of the last cycle that sent an RPDO to this axis."""
 
         # Shared with `BusCycle`:
@@ -92,7 +92,7 @@ class AxisCycle:
         """Bits of the TPDOs required for fresh feedback."""
         self.awaited = False
         """True if the cycle waits for this axis's TPDOs."""
-        self.rested = True
+        self.flushing = True
         """True from `begin` until the next cycle has read the queued frames, which are not judged."""
         self.changed: Callable[[], None] = _nobody
         """Called when the identifiers or the state of the axis change, which takes effect in the next cycle.
@@ -107,7 +107,7 @@ class AxisCycle:
         self._last: Feedback | None = None
         self._good_cycle = 0
         self._commanded = False
-        self._ridden: Event | None = None
+        self._handled_stop: Event | None = None
         self._left = self._still = 0
         self._stop_cycles = max(int(stop_timeout_s / axis.drive.cycle_s), STILL_CYCLES + 1)
 
@@ -116,7 +116,7 @@ class AxisCycle:
 
         After a `Reaction.LATCH`, the axis stays silent unless the latch has been released.
         """
-        self.rested = True
+        self.flushing = True
         self.pending.clear()
         self.silent = self.supervision.reaction is Reaction.LATCH
         self._last = None
@@ -136,27 +136,27 @@ class AxisCycle:
         self.supervision.reset(verified=verified)
 
     @property
-    def riding(self) -> bool:
+    def stopping(self) -> bool:
         """True while a quick stop is under way: neither confirmed by the drive nor timed out."""
         stop = self.supervision.stop
         if stop is None or self.supervision.reaction is Reaction.LATCH:
             return False
-        return stop is not self._ridden or not self._over()
+        return stop is not self._handled_stop or not self._over()
 
     @property
     def confirmed(self) -> bool:
         """True if, after a quick stop, the drive has left 'operation enabled' and the motor stood still."""
         stop = self.supervision.stop
-        return stop is not None and stop is self._ridden and self._still >= STILL_CYCLES
+        return stop is not None and stop is self._handled_stop and self._still >= STILL_CYCLES
 
     @property
     def stopped(self) -> SafetyStop | None:
-        """Latched stop as an error, complete once `riding` is over; None while the axis may run."""
+        """Latched stop as an error, complete once `stopping` is over; None while the axis may run."""
         supervision = self.supervision
         if supervision.stop is None:
             return None
         stop = supervision.error()
-        if supervision.reaction is not Reaction.QUICK_STOP or self.riding or self.confirmed:
+        if supervision.reaction is not Reaction.QUICK_STOP or self.stopping or self.confirmed:
             return stop
         return SafetyStop(
             f"{stop.text}; the drive did not confirm it: its own watchdogs have to stop it", stop.hint
@@ -174,13 +174,13 @@ class AxisCycle:
 
         Also decides whether the following cycles wait for them.
         """
-        self.awaited = not self.silent and (self.supervision.stop is None or self.riding)
+        self.awaited = not self.silent and (self.supervision.stop is None or self.stopping)
         self._awaited_channels = self.image.awaited_channels()
         return self.image.tpdo_ids, tuple(self._awaited_channels)
 
     def start(self, now: float, count: int) -> None:
         """Starts the first cycle after `begin`; ``now`` is the clock time, ``count`` the cycle number."""
-        self._traffic.heard_s = self.spoke_s = now
+        self._traffic.heard_s = self.last_sent_s = now
         self._good_cycle = count
 
     @property
@@ -201,7 +201,7 @@ class AxisCycle:
         self.image.power.quick_stop()
         return self.image.pack_rpdo_stop()
 
-    def glance(self, frame: Frame) -> None:
+    def check_statusword(self, frame: Frame) -> None:
         """Checks the statusword of a TPDO that came too early or too late to be used."""
         word = self.image.statusword_in(frame.can_id, frame.data)
         if self._commanded and word is not None:
@@ -221,18 +221,18 @@ class AxisCycle:
                 self.image.accept(can_id, data)
             except PdoLengthError:
                 faults.append((Fault.DISCARDED_FRAME, f"{can_id:03X}h with {len(data)} bytes"))
-        if not (self.silent or self.rested):
+        if not (self.silent or self.flushing):
             self.pending += faults
 
-    def turn(self, now: float, count: int, time_s: float, complete: bool) -> Frames | None:
+    def run_period(self, now: float, count: int, time_s: float, complete: bool) -> Frames | None:
         """Judges one period of a speaking axis and returns the RPDOs to send, or None.
 
         ``complete`` states that all required TPDOs have arrived.
         """
         image, supervision = self.image, self.supervision
-        self.spoke_s = now
+        self.last_sent_s = now
         stop = supervision.stop
-        if stop is not self._ridden:
+        if stop is not self._handled_stop:
             self._note(stop)
         if self._channels:
             self._step_channels()
@@ -287,16 +287,16 @@ class AxisCycle:
         else:
             self.stale(count, time_s)
 
-    def also(self, count: int, fault: Fault, detail: str) -> None:
+    def add_fault(self, count: int, fault: Fault, detail: str) -> None:
         """Judges a fault that occurred while or after this cycle's RPDOs were sent."""
-        if self.supervision.also(count, fault, detail) is Reaction.LATCH:
+        if self.supervision.add_fault(count, fault, detail) is Reaction.LATCH:
             self._latch()
 
     def bus_down(self, count: int, time_s: float, detail: str) -> None:
         """Judges a failure of the interface during the cycle."""
         if self.pending:
             self._judge(count)
-        self.also(count, Fault.BUS_DOWN, detail)
+        self.add_fault(count, Fault.BUS_DOWN, detail)
         if self.feedback.cycle != count:
             self.stale(count, time_s)
 
@@ -322,7 +322,7 @@ class AxisCycle:
             power.quick_stop()
             data = None
         if stop is not None:
-            self._ride(before)
+            self._count_stop_cycle(before)
         if reaction is Reaction.LATCH:
             return None
         self._commanded = power.state is State.OPERATION_ENABLED and power.aim is State.OPERATION_ENABLED
@@ -388,13 +388,13 @@ class AxisCycle:
 
     def _note(self, stop: Event | None) -> None:
         """Handles a stop that was latched or released since the last cycle; a latched stop starts braking."""
-        self._ridden = stop
+        self._handled_stop = stop
         self._still, self._left = 0, self._stop_cycles
         if stop is not None:
             self.image.power.quick_stop()
         self.changed()
 
-    def _ride(self, before: Feedback) -> None:
+    def _count_stop_cycle(self, before: Feedback) -> None:
         """Counts one cycle of the quick stop."""
         if self._over():
             return

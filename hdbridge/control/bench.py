@@ -16,13 +16,13 @@ import numpy as np
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
-from hdbridge.axis.effects import Channel, Moment, Observer, compensable, unmet
+from hdbridge.axis.effects import Channel, Moment, Observer, compensable, missing_channels
 from hdbridge.axis.model import TransmissionModel
+from hdbridge.control.channelstate import ChannelState
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.cycle import Cycle, Feedback
+from hdbridge.control.faultcounts import FaultCount, FaultCounter
 from hdbridge.control.realtime import resumed_realtime
-from hdbridge.control.sensed import Sensed
-from hdbridge.control.survived import Survived, Watch
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.feedback import ENABLE_TIMEOUT_S, STANDING, STOP_TIMEOUT_S, until_enabled
 from hdbridge.drive.layout import layouts
@@ -54,17 +54,17 @@ class Run(Recording, Generic[Outcome]):
     """Recording of a completed procedure, with its outcome."""
 
     outcome: Outcome = field(kw_only=True)
-    survived: tuple[Survived, ...] = field(default=(), kw_only=True)
+    fault_counts: tuple[FaultCount, ...] = field(default=(), kw_only=True)
     """Faults that the supervision tolerated."""
 
 
-def known_on_line(axis: AxisConfig) -> frozenset[Channel]:
+def online_channels(axis: AxisConfig) -> frozenset[Channel]:
     """Returns the channels that `Bench` passes to the effects in each cycle."""
     known = {each for each in Channel if each.axis_key in {"", *axis.channels}}
     return frozenset(known - ({Channel.MOTOR_TORQUE} if TORQUE_ACTUAL in layouts(axis).absent else set()))
 
 
-def walk(
+def run_moves(
     procedure: Procedure[Outcome],
     view: AxisView,
     rehearsal: Rehearsal,
@@ -134,7 +134,7 @@ def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation
     that the control loop lacks.
     """
     model.check_bound_to(axis)
-    for name, channels in unmet(compensable(model.effects), known_on_line(axis)).items():
+    for name, channels in missing_channels(compensable(model.effects), online_channels(axis)).items():
         lacking = sorted(channels, key=lambda each: each.value)
         keys = " and ".join(f"'{each.axis_key}'" for each in lacking if each.axis_key)
         add = f"add {keys} to {axis.path}, or " * bool(keys)
@@ -187,13 +187,13 @@ class Bench:
         self._compensation = compensation
         self._interrupted = interrupted
         self._observer = Observer()
-        self._sensed = Sensed(axis)
+        self._channel_state = ChannelState(axis)
         self._place = 0.0
         self._most = math.inf
         """Maximum number of samples of a leg; beyond it, the first half is dropped."""
         self._measured: list[list[Sample]] = []
         self._legs: list[_Leg] = []
-        self._watch = Watch(self.supervision, 0)
+        self._fault_counter = FaultCounter(self.supervision, 0)
 
     def run(
         self,
@@ -220,7 +220,7 @@ class Bench:
         self._legs.clear()
         self._most = math.inf if math.isinf(keep_s) else max(2 * math.ceil(keep_s / self.cycle.period_s), 2)
         _log.info("run begins", {"procedure": type(procedure).__name__, "ideally_s": rehearsal.duration_s})
-        self._watch = Watch(self.supervision, self.cycle.skipped)
+        self._fault_counter = FaultCounter(self.supervision, self.cycle.skipped)
         try:
             with resumed_realtime():
                 outcome = self._powered(procedure, rehearsal, progress)
@@ -236,7 +236,7 @@ class Bench:
             versions=versions_here(),
             notes={"procedure": type(procedure).__name__},
             outcome=outcome,
-            survived=self.survived,
+            fault_counts=self.fault_counts,
         )
 
     def _powered(
@@ -245,7 +245,7 @@ class Bench:
         """Runs the procedure, from power on to power off."""
         self._enable()
         try:
-            outcome = walk(procedure, self.view, rehearsal, progress, lambda: self._place, self._leg)
+            outcome = run_moves(procedure, self.view, rehearsal, progress, lambda: self._place, self._leg)
         except SafetyStop:
             raise  # the drive stands still, or stops on its own; the latch stays
         except BaseException:
@@ -282,9 +282,9 @@ class Bench:
         return tuple(Segment(kind=each.kind, start_s=each.start_s, end_s=each.end_s) for each in self._legs)
 
     @property
-    def survived(self) -> tuple[Survived, ...]:
+    def fault_counts(self) -> tuple[FaultCount, ...]:
         """Faults of the present procedure so far, including one that stopped it, and skipped periods."""
-        return self._watch.survived(self.cycle.skipped)
+        return self._fault_counter.fault_counts(self.cycle.skipped)
 
     def _enable(self) -> None:
         """Enables the drive by PDO at standstill, with the compensation starting from its position."""
@@ -295,14 +295,14 @@ class Bench:
         motor_deg = self._image.motor_deg(feedback.motor_counts)
         self._place = motor_deg / self.view.ratio
         self._observer = Observer()
-        self._sensed.reset()
-        self._sensed.take(feedback)
-        self._compensation.know(self._sensed.known)
+        self._channel_state.reset()
+        self._channel_state.take(feedback)
+        self._compensation.set_known_channels(self._channel_state.known)
         self._compensation.reset(
             motor_deg,
             Moment(
                 time_s=feedback.time_s,
-                measured=self._sensed.measured(feedback),
+                measured=self._channel_state.measured(feedback),
                 load_deg=self._place,
             ),
         )
@@ -322,7 +322,7 @@ class Bench:
         image.power.go(State.SWITCH_ON_DISABLED)
         self._rest()
         raise DriveError(
-            f"{image.axis.where(waiting[0].key)}: no reading came that can be believed ({waiting[0].why}); "
+            f"{image.axis.where(waiting[0].key)}: no plausible reading arrived ({waiting[0].why}); "
             "check the sensor, or leave the key out"
         )
 
@@ -335,11 +335,11 @@ class Bench:
             self._compensation.hold,
             image.target_counts_for,
         )
-        axis, torque_nm = image.axis, self._sensed.torque_nm
+        axis, torque_nm = image.axis, self._channel_state.torque_nm
         motor_deg, load_deg = axis.motor_encoder.scale.degrees, axis.load_encoder.scale.degrees
         period_s, duration_s, at = self.cycle.period_s, path.duration_s, path.at
         observe, ratio = self._observer.moment, self.view.ratio
-        compensation, sensed = self._compensation, self._sensed
+        compensation, channel_state = self._compensation, self._channel_state
         needs, has_channels = bool(compensation.needs), bool(image.channels)
         target_deg, most = self._place, self._most
         # Counted in completed cycles, not in clock time: a skipped period must not make the
@@ -350,12 +350,12 @@ class Bench:
             if not needs:
                 moment = _AT_REST
             else:
-                if has_channels and sensed.take(feedback):
-                    compensation.know(sensed.known)
+                if has_channels and channel_state.take(feedback):
+                    compensation.set_known_channels(channel_state.known)
                 moment = observe(
                     ratio * target_deg,
                     feedback.time_s,
-                    measured=sensed.measured(feedback),
+                    measured=channel_state.measured(feedback),
                     load_deg=target_deg,
                 )
             return counts_for(command(target_deg, moment) if feedback.fresh else hold(target_deg, moment))

@@ -66,10 +66,10 @@ class BusCycle:
     """
 
     __slots__ = (
-        "_awaited", "_beginning", "_bits", "_bits_of_turn", "_bus_faults", "_changed", "_deadline",
-        "_discarded", "_dropped", "_early", "_heartbeat_id", "_heartbeat_period_s", "_heartbeat_s",
-        "_interrupted", "_late_s", "_listeners", "_listening", "_per_bit", "_recv", "_rested",
-        "_send", "_slots", "_speaking", "_window_s", "axes", "busy_s", "clock", "count", "down",
+        "_awaited", "_beginning", "_bits", "_bus_faults", "_changed", "_deadline",
+        "_discarded", "_dropped", "_early", "_flushing", "_heartbeat_id", "_heartbeat_period_s",
+        "_heartbeat_s", "_interrupted", "_late_s", "_listeners", "_listening", "_per_bit", "_period_bits",
+        "_recv", "_send", "_slots", "_speaking", "_window_s", "axes", "busy_s", "clock", "count", "down",
         "due_s", "faults", "histogram", "late_s", "on_frame", "outgoing", "overruns", "period_s",
         "refused", "skipped", "woke_s",
     )  # fmt: skip
@@ -121,7 +121,7 @@ class BusCycle:
         self._listening: tuple[AxisCycle, ...] = ()
         self._beginning: list[AxisCycle] = []
         self._awaited = self._early = 0
-        self._bits = self._bits_of_turn = FRAME_BITS[0]
+        self._bits = self._period_bits = FRAME_BITS[0]
         self._heartbeat_id = 0
         self._heartbeat_period_s = math.inf
         self._heartbeat_s = self.woke_s
@@ -136,7 +136,7 @@ class BusCycle:
 
         NaN if the bit rate is unknown. An awaited frame counts even if it did not arrive.
         """
-        return self._bits_of_turn * self._per_bit
+        return self._period_bits * self._per_bit
 
     def join(self, axis: AxisCycle) -> None:
         """Adds an axis, which stays silent until its ``begin``. Must not be called within a cycle.
@@ -165,7 +165,7 @@ class BusCycle:
         stay.
         """
         self._deadline: float | None = None
-        self._rested = self._interrupted = True
+        self._flushing = self._interrupted = True
         for axis in self.axes:
             if not axis.silent:
                 axis.begin()
@@ -190,14 +190,14 @@ class BusCycle:
         self.down = None
         if self._changed:
             self._rebuild(now)
-        self._bits_of_turn = self._bits
+        self._period_bits = self._bits
         try:
             read = self._drain(now)
             try:
                 self._stop_before_sync()
                 self._send(COB_SYNC, b"")
             except TransmitBufferFull as error:
-                self._everybody(Fault.TRANSMIT_FULL, f"SYNC: {error}")
+                self._fault_on_all(Fault.TRANSMIT_FULL, f"SYNC: {error}")
                 got = 0
             else:
                 got = self._receive(self.clock.now() + self._window_s)
@@ -205,7 +205,7 @@ class BusCycle:
                     got = 0
 
             for axis in self._speaking:
-                frames = axis.turn(now, count, time_s, got & axis.needed == axis.needed)
+                frames = axis.run_period(now, count, time_s, got & axis.needed == axis.needed)
                 for frame in frames or ():
                     try:
                         self._send(*frame)
@@ -253,14 +253,14 @@ class BusCycle:
         self.overruns += 1
         self.skipped += missed
         self.count += missed
-        self._everybody(Fault.OVERRUN, f"by {1e3 * late_s:.1f} ms, periods skipped: {missed}")
+        self._fault_on_all(Fault.OVERRUN, f"by {1e3 * late_s:.1f} ms, periods skipped: {missed}")
 
     def _stop_before_sync(self) -> None:
         """Replaces set-points that must not take effect with the next SYNC."""
         send, now = self._send, self.clock.now()
         for axis in self._speaking:
-            if now - axis.spoke_s >= axis.patience_s - _CLOCK_STEP_S and axis.powered:
-                self._note_hang(axis, now - axis.spoke_s)
+            if now - axis.last_sent_s >= axis.master_timeout_s - _CLOCK_STEP_S and axis.powered:
+                self._note_hang(axis, now - axis.last_sent_s)
         if self._interrupted:
             for axis in self.axes:
                 if axis.silent:
@@ -277,7 +277,7 @@ class BusCycle:
 
     def _note_hang(self, axis: AxisCycle, silence_s: float) -> None:
         """Records that this process was silent beyond the time-out of a powered drive."""
-        hang = (Fault.HANG, f"{1e3 * silence_s:.0f} ms; the drive waits {1e3 * axis.patience_s:.0f} ms")
+        hang = (Fault.HANG, f"{1e3 * silence_s:.0f} ms; the drive waits {1e3 * axis.master_timeout_s:.0f} ms")
         axis.pending.insert(0, hang)
         if all(fault is not Fault.HANG for fault, _ in self.faults):
             self.faults.append(hang)
@@ -287,7 +287,7 @@ class BusCycle:
         recv, slots = self._recv, self._slots
         self._early = 0
         most = DRAIN_MAXIMUM
-        if self._rested:
+        if self._flushing:
             # After a pause all queued frames are stale.
             most = FLUSH_MAXIMUM
             self._heartbeat_s = now
@@ -301,15 +301,15 @@ class BusCycle:
             else:
                 self._before_sync(frame, slot)
         else:
-            if not self._rested:
-                self._everybody(Fault.FLOOD, f"more than {DRAIN_MAXIMUM} before SYNC")
+            if not self._flushing:
+                self._fault_on_all(Fault.FLOOD, f"more than {DRAIN_MAXIMUM} before SYNC")
                 return False
-        if self._rested:
-            self._rested = False
+        if self._flushing:
+            self._flushing = False
             self._discarded = self._dropped.total
         if self._beginning:
             for axis in self._beginning:
-                axis.rested = False
+                axis.flushing = False
             self._beginning.clear()
         return True
 
@@ -317,11 +317,11 @@ class BusCycle:
         """Handles a TPDO before SYNC: stale if awaited, else accepted."""
         bit, accept, axis = slot
         if axis.awaited:
-            if not axis.rested:
-                axis.glance(frame)
+            if not axis.flushing:
+                axis.check_statusword(frame)
                 axis.pending.append((Fault.DUPLICATE_TPDO, f"{frame.can_id:03X}h before SYNC"))
             return
-        self._bits_of_turn += FRAME_BITS[len(frame.data)]
+        self._period_bits += FRAME_BITS[len(frame.data)]
         try:
             accept(frame.data)
         except PdoLengthError:
@@ -358,7 +358,7 @@ class BusCycle:
         discarded = dropped.remote + dropped.extended + dropped.error + dropped.fd
         if discarded != self._discarded:
             self._discarded = discarded
-            self._everybody(Fault.DISCARDED_FRAME, "remote, extended, FD or error frame")
+            self._fault_on_all(Fault.DISCARDED_FRAME, "remote, extended, FD or error frame")
         if spoilt is not None or got & awaited != awaited:
             self._note_missing(got, spoilt or {})
         return got
@@ -385,14 +385,14 @@ class BusCycle:
 
     def _other(self, frame: Frame) -> None:
         """Passes a frame that is not awaited to its axis and to ``on_frame``, and records bus faults."""
-        self._bits_of_turn += FRAME_BITS[len(frame.data)]
+        self._period_bits += FRAME_BITS[len(frame.data)]
         axis = self._listeners.get(frame.can_id)
         if axis is not None:
             axis.hear(frame)
-        elif not self._rested:
+        elif not self._flushing:
             fault = self._bus_faults.get(frame.can_id)
             if fault is not None:
-                self._everybody(*fault)
+                self._fault_on_all(*fault)
         if self.on_frame is not None:
             self.on_frame(frame)
 
@@ -401,7 +401,7 @@ class BusCycle:
         self._heartbeat_s += self._heartbeat_period_s
         if self._heartbeat_s <= now:
             self._heartbeat_s = now + self._heartbeat_period_s
-        self._bits_of_turn += FRAME_BITS[1]
+        self._period_bits += FRAME_BITS[1]
         try:
             self._send(self._heartbeat_id, _HEARTBEAT_DATA)
         except TransmitBufferFull as error:
@@ -414,7 +414,7 @@ class BusCycle:
         frame = outgoing()
         if frame is None:
             return
-        self._bits_of_turn += FRAME_BITS[len(frame[1])]
+        self._period_bits += FRAME_BITS[len(frame[1])]
         try:
             self._send(*frame)
         except TransmitBufferFull:
@@ -422,11 +422,11 @@ class BusCycle:
 
     # ---------------------------------------------------------------- faults of the bus
 
-    def _everybody(self, fault: Fault, detail: str) -> None:
+    def _fault_on_all(self, fault: Fault, detail: str) -> None:
         """Records a bus fault for every axis, before the axes react."""
         self.faults.append((fault, detail))
         for axis in self._speaking:
-            if not axis.rested:
+            if not axis.flushing:
                 axis.pending.append((fault, detail))
 
     def _no_room(self, detail: str) -> None:
@@ -434,7 +434,7 @@ class BusCycle:
         self.faults.append((Fault.TRANSMIT_FULL, detail))
         for axis in self._speaking:
             if axis.feedback.cycle == self.count:
-                axis.also(self.count, Fault.TRANSMIT_FULL, detail)
+                axis.add_fault(self.count, Fault.TRANSMIT_FULL, detail)
             else:
                 axis.pending.append((Fault.TRANSMIT_FULL, detail))
 
@@ -471,7 +471,7 @@ class BusCycle:
             self.axes
         )
         for axis in self._speaking:
-            if axis.rested:
+            if axis.flushing:
                 axis.start(now, self.count)
                 self._beginning.append(axis)
 

@@ -11,8 +11,9 @@ from its present state and w the ramp's weight. Three choices matter:
 * The model's state changes only when a command is issued (`Compensation.command`), with the angle issued,
   after caps and ramps.
 
-An effect may need a channel that can be lost (`LOSABLE`). `Compensation.know` sets the available channels.
-The part of the correction that needs a lost channel is faded out, as by `disengage`, and later back in.
+An effect may need a channel that can be lost (`LOSABLE`). `Compensation.set_known_channels` sets the
+available channels. The part of the correction that needs a lost channel is faded out, as by `disengage`, and
+later back in.
 
 In motion the servo filters the correction. If the model has the measured response of the axis, the correction
 passes through its filter (`prefilter`). The model's state follows the unfiltered path, which is the intended
@@ -355,7 +356,7 @@ class Compensation:
         """
         return self._inverse.memory_known
 
-    def know(self, channels: frozenset[Channel]) -> None:
+    def set_known_channels(self, channels: frozenset[Channel]) -> None:
         """Sets the available channels of `LOSABLE`; effects that need other channels fade out."""
         self._known = channels
         self._fading = bool(self._inverse.faded)

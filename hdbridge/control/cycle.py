@@ -26,7 +26,7 @@ class Cycle:
     """
 
     __slots__ = (
-        "_axis", "_bus", "_exchange", "clock", "histogram", "monitor", "period_s", "stopping",
+        "_axis", "_bus", "_exchange", "clock", "histogram", "monitor", "period_s", "stop_feedbacks",
         "supervision",
     )  # fmt: skip
 
@@ -56,7 +56,7 @@ class Cycle:
         self._bus.join(self._axis)
         self._exchange = self._bus.exchange
         self.histogram = self._bus.histogram
-        self.stopping: list[Feedback] = []
+        self.stop_feedbacks: list[Feedback] = []
         """Feedback of the cycles that `tick` ran to complete the last quick stop."""
         self.restart()
 
@@ -97,10 +97,10 @@ class Cycle:
         self._exchange()
         if supervision.stop is None:
             return axis.feedback
-        self.stopping = [axis.feedback]
-        while axis.riding:
+        self.stop_feedbacks = [axis.feedback]
+        while axis.stopping:
             self._exchange()
-            self.stopping.append(axis.feedback)
+            self.stop_feedbacks.append(axis.feedback)
         stop = axis.stopped
         assert stop is not None
         raise stop

@@ -123,7 +123,7 @@ ENOUGH: Final = 10_000
 """Minimum number of wake-ups for determining the worst ten-thousandth."""
 
 
-def carries(histogram: Histogram, period_s: float) -> bool:
+def sustains(histogram: Histogram, period_s: float) -> bool:
     """Returns True if the rule (`RULE`) holds for a cycle of ``period_s``; False for an empty histogram.
 
     With a lateness of half a cycle, the control cycle skips a period and counts an overrun.
@@ -145,9 +145,9 @@ class Measurement:
     """Number of whole periods missed."""
 
     @property
-    def carried(self) -> bool:
+    def sustained(self) -> bool:
         """True if the computer sustains this period."""
-        return self.skipped == 0 and carries(self.histogram, self.period_s)
+        return self.skipped == 0 and sustains(self.histogram, self.period_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,11 +159,11 @@ class LatencyReport:
     """Measurement conditions in words: with or without a bus, real-time scheduling or not."""
 
     @property
-    def carried_s(self) -> float | None:
+    def sustained_s(self) -> float | None:
         """Shortest measured period that the computer sustains with all longer ones; None without one."""
         best = None
         for each in reversed(self.measurements):
-            if not each.carried:
+            if not each.sustained:
                 break
             best = each.period_s
         return best
@@ -171,28 +171,28 @@ class LatencyReport:
     @property
     def verdict(self) -> str:
         """Shortest cycle that the computer sustains, as a sentence with the rule."""
-        if self.carried_s is None:
+        if self.sustained_s is None:
             return (
                 f"this computer sustains none of these cycle times ({RULE}); "
                 "close other programs, allow real-time priority, or use a kernel with PREEMPT_RT"
             )
         few = min(each.histogram.total for each in self.measurements)
         more = f"; only {few} wake-ups were measured, take {ENOUGH} or more" if few < ENOUGH else ""
-        return f"this computer sustains a cycle of {1e3 * self.carried_s:g} ms ({RULE}){more}"
+        return f"this computer sustains a cycle of {1e3 * self.sustained_s:g} ms ({RULE}){more}"
 
     def table(self) -> str:
         """Returns the measurements and their combined histogram as plain text."""
         lines = [f"wake-up lateness, {self.conditions}", ""]
         lines.append(
             f"{'cycle':>8} {'wake-ups':>9} {'p50':>8} {'p99':>8} {'p99.9':>8} {'p99.99':>8} {'max':>8} "
-            f"{'skipped':>8}  carried"
+            f"{'skipped':>8}  sustained"
         )
         for each in self.measurements:
             h = each.histogram.as_dict()
             lines.append(
                 f"{1e3 * each.period_s:>5g} ms {h['count']:>9} {h['p50_us']:>5} us {h['p99_us']:>5} us "
                 f"{h['p99_9_us']:>5} us {h['p99_99_us']:>5} us {h['max_us']:>5} us {each.skipped:>8}  "
-                f"{'yes' if each.carried else 'no'}"
+                f"{'yes' if each.sustained else 'no'}"
             )
         together = Histogram()
         for each in self.measurements:
@@ -214,12 +214,12 @@ class LatencyReport:
                 {
                     "cycle_ms": 1e3 * each.period_s,
                     "skipped": each.skipped,
-                    "carried": each.carried,
+                    "carried": each.sustained,
                     **each.histogram.as_dict(),
                 }
                 for each in self.measurements
             ],
-            "carried_cycle_ms": None if self.carried_s is None else 1e3 * self.carried_s,
+            "carried_cycle_ms": None if self.sustained_s is None else 1e3 * self.sustained_s,
         }
 
 

@@ -86,7 +86,7 @@ def prepare_realtime(priority: int = PRIORITY, cpus: Collection[int] = ()) -> It
 
 
 @contextmanager
-def left_realtime() -> Iterator[None]:
+def suspended_realtime() -> Iterator[None]:
     """Suspends `prepare_realtime` within the block, for example for a fit between two motions.
 
     A long computation with SCHED_FIFO would block other processes for minutes. Without the garbage collector,
@@ -106,7 +106,7 @@ def left_realtime() -> Iterator[None]:
 
 @contextmanager
 def resumed_realtime() -> Iterator[None]:
-    """Resumes `prepare_realtime` within the block, if `left_realtime` has suspended it."""
+    """Resumes `prepare_realtime` within the block, if `suspended_realtime` has suspended it."""
     held = _held[-1] if _held else None
     if held is None or not held.left:
         yield

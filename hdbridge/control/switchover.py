@@ -100,9 +100,9 @@ class Correction:
         self._weight = 0.0
         self.command = self._first_blended
 
-    def know(self, channels: frozenset[Channel]) -> None:
+    def set_known_channels(self, channels: frozenset[Channel]) -> None:
         for each in self._all():
-            each.know(channels)
+            each.set_known_channels(channels)
 
     def engage(self) -> None:
         for each in self._all():

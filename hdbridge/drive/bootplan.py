@@ -16,7 +16,7 @@ from hdbridge.errors import InputError
 
 
 @dataclass(frozen=True, slots=True)
-class Left:
+class OmittedObject:
     """Object that the boot-up leaves to the drive, or that the drive cannot provide."""
 
     index: int
@@ -40,20 +40,20 @@ def plan(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[PlannedWr
     cannot be expressed in its object, or if the EDS forbids it, lacks an object that the control cycle or the
     axis file needs, or excludes the mode.
     """
-    return _sorted(axis, od)[0]
+    return _split(axis, od)[0]
 
 
-def left_to_drive(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[Left]:
+def left_to_drive(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[OmittedObject]:
     """Returns the objects that `plan` leaves to the drive, and the missing objects that the control cycle
     can do without.
     """
     od = dictionary_of(axis) if od is None else od
     if od is None:
         return []
-    return [*_sorted(axis, od)[1], *_not_read(axis, od)]
+    return [*_split(axis, od)[1], *_not_read(axis, od)]
 
 
-def sent_along(axis: AxisConfig) -> list[str]:
+def unrequested_objects(axis: AxisConfig) -> list[str]:
     """Describes the objects that the master sends only because the drive's fixed mappings contain them."""
     own = {(each.index, each.sub) for each in (objects.CONTROLWORD, objects.MODE, cyclic_mode(axis).target)}
     od = dictionary_of(axis)
@@ -67,20 +67,20 @@ def sent_along(axis: AxisConfig) -> list[str]:
     return found
 
 
-def _sorted(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[list[PlannedWrite], list[Left]]:
+def _split(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[list[PlannedWrite], list[OmittedObject]]:
     """Splits all rows into the writes of the boot-up and the objects left to the drive."""
     od = dictionary_of(axis) if od is None else od
     if od is not None:
         _check_mode(axis, od)
     pdos = layouts(axis, od)
     planned: list[PlannedWrite] = []
-    left: dict[tuple[int, int], Left] = {}
+    left: dict[tuple[int, int], OmittedObject] = {}
     for row in rows(axis, od, pdos):
-        reason = _left_because(axis, od, row) if od is not None else None
+        reason = _omission_reason(axis, od, row) if od is not None else None
         if reason is None:
             planned.append(row)
         else:
-            left[row.index, row.sub] = Left(row.index, row.sub, reason, row.without, row.field)
+            left[row.index, row.sub] = OmittedObject(row.index, row.sub, reason, row.without, row.field)
     watchdogs = [(objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub)]
     watchdogs += [(objects.RPDO_COMMUNICATION + each.number - 1, 5) for each in pdos.rpdos]
     if left.keys() >= set(watchdogs):
@@ -89,7 +89,7 @@ def _sorted(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[list[Planned
     return planned, list(left.values())
 
 
-def _left_because(axis: AxisConfig, od: ObjectDictionary, row: PlannedWrite) -> str | None:
+def _omission_reason(axis: AxisConfig, od: ObjectDictionary, row: PlannedWrite) -> str | None:
     """Returns the reason for leaving an object to the drive; None if the boot-up sets it.
 
     Raises `InputError` if the drive must not keep its own value.
@@ -147,7 +147,7 @@ def _value_of_6502h(od: ObjectDictionary) -> int:
     return (held(variable) if variable is not None else None) or 0
 
 
-def _not_read(axis: AxisConfig, od: ObjectDictionary) -> Iterator[Left]:
+def _not_read(axis: AxisConfig, od: ObjectDictionary) -> Iterator[OmittedObject]:
     """Yields the objects that the control cycle and the boot-up would read but the drive cannot provide."""
     absent = layouts(axis, od).absent
     for address, consequence in (
@@ -165,4 +165,4 @@ def _not_read(axis: AxisConfig, od: ObjectDictionary) -> Iterator[Left]:
             reason = f"for which {axis.drive.eds} gives no value"
         else:
             continue
-        yield Left(address.index, address.sub, reason, consequence)
+        yield OmittedObject(address.index, address.sub, reason, consequence)

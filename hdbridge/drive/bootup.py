@@ -18,7 +18,7 @@ from hdbridge.drive.bootplan import plan
 from hdbridge.drive.dictionary import find
 from hdbridge.drive.image import drive_heartbeat_ms
 from hdbridge.drive.link import Link
-from hdbridge.drive.manners import heartbeat_of
+from hdbridge.drive.masterdetection import heartbeat_of
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.nameplate import (
     IDENTITY,

@@ -41,7 +41,7 @@ class ChannelFollower:
         self.lost = False
         """True if no good reading has come for longer than the hold time; the cycle then no longer waits for
         readings."""
-        self.why = "none came"
+        self.why = "none arrived"
         """Reason for the lack of a new value, for messages."""
         self._age = 0
 
@@ -52,7 +52,7 @@ class ChannelFollower:
             self.value = value
             self.lost = False
             self._age = 0
-            self.why = "none came"
+            self.why = "none arrived"
         else:
             self.why = (
                 f"{value:g} {self._unit} is not within {self._least:g} to {self._greatest:g} {self._unit}"

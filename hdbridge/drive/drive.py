@@ -26,7 +26,7 @@ from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
 from hdbridge.drive.dictionary import find
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
-from hdbridge.drive.manners import USUAL_MASTER, Ear, listening_s
+from hdbridge.drive.masterdetection import DEFAULT_MASTER_ID, MasterDetector, listening_s
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import Address, IntegerType, Mode
 from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoAbortError, SdoClient
@@ -96,11 +96,11 @@ class Drive:
         if self._may_speak:
             return
         drive = self.axis.drive
-        ear = Ear({drive.node_id}, {drive.master_node_id, USUAL_MASTER}, self._clients)
+        detector = MasterDetector({drive.node_id}, {drive.master_node_id, DEFAULT_MASTER_ID}, self._clients)
         duration_s = listening_s(drive.heartbeat_ms)
-        ear.listen(self.link, duration_s, self.monitor.dispatch)
-        ear.refuse(self.link.name, duration_s)
-        self._heard = frozenset(ear.nodes.difference(self._clients))
+        detector.listen(self.link, duration_s, self.monitor.dispatch)
+        detector.raise_if_heard(self.link.name, duration_s)
+        self._heard = frozenset(detector.nodes.difference(self._clients))
         self._may_speak = True
 
     def boot(self, *, reset: bool = True) -> BootReport:

@@ -75,7 +75,7 @@ def mode_advice(modes: int) -> str:
     """Returns advice for a drive whose 6502h lacks the mode of the control cycle."""
     for name, each in objects.CYCLIC.items():
         if modes & each.mode.supported_bit:
-            return f"'mode: {name}' would be one that it has"
+            return f"'mode: {name}' is supported"
     return (
         "this drive cannot be used: choose one with cyclic synchronous position (csp) or interpolated "
         "position (ip), or enable that in the drive"
@@ -126,7 +126,7 @@ def _gear(axis: AxisConfig, gear: Fraction, feed: Fraction | None) -> Iterator[s
 def _motor_counts(axis: AxisConfig, increments: Fraction | None, per_turn: Fraction | None) -> Iterator[str]:
     counts = axis.motor_encoder.counts_per_turn
     informative = (
-        f"; on a drive that counts encoder counts whatever 6092h says: 'feed_scales: false' under "
+        f"; if the drive reports encoder counts regardless of 6092h: 'feed_scales: false' under "
         f"{axis.where('drive')}"
     )
     for value, used, hint in (

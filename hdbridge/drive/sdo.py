@@ -76,7 +76,7 @@ class _Channel(CanopenSdoClient):
         self.timeout_s = DEFAULT_TIMEOUT_S
         self.transfer_ends_s = 0.0
         """Deadline of the whole transfer, because a node could answer every segment in time but never end."""
-        self.strays = 0
+        self.unsolicited_answers = 0
 
     def send_request(self, request: bytes | bytearray) -> None:
         self.link.send(self.rx_cobid, bytes(request))
@@ -112,7 +112,7 @@ class _Channel(CanopenSdoClient):
     def _set_aside(self, frame: Frame) -> None:
         if frame.can_id == self.tx_cobid:
             # A delayed answer to an earlier request, or an answer to another client.
-            self.strays += 1
+            self.unsolicited_answers += 1
         else:
             self.monitor.dispatch(frame)
 
@@ -159,9 +159,9 @@ class SdoClient:
         self._channel.timeout_s = timeout_s
 
     @property
-    def strays(self) -> int:
+    def unsolicited_answers(self) -> int:
         """Number of unsolicited SDO answers: delayed ones, or answers to another client."""
-        return self._channel.strays
+        return self._channel.unsolicited_answers
 
     def has(self, index: int, sub: int = 0) -> bool:
         """Returns True if the EDS lists the object."""

@@ -36,15 +36,15 @@ class Fault(Enum):
     HANG = "the control process stalled for longer than the drive waits"
     DUPLICATE_TPDO = "a TPDO came twice or out of its cycle"
     WRONG_LENGTH = "a TPDO has the wrong length"
-    DISCARDED_FRAME = "a frame of the wrong kind was thrown away"
+    DISCARDED_FRAME = "a frame of the wrong kind was discarded"
     FLOOD = "more frames waited than one cycle reads"
     EMERGENCY = "the drive sent an emergency message"
     MASTER_LOST = "the drive reports that it missed its master"
     DRIVE_FAULT = "the drive reports a fault"
-    DROPPED_OUT = "the drive left 'operation enabled' by itself"
+    DROPPED_OUT = "the drive left 'operation enabled' on its own"
     BOOT_UP = "a node restarted"
     NMT_CHANGE = "a node is not operational"
-    HEARTBEAT_LOST = "the drive's heartbeat stays away"
+    HEARTBEAT_LOST = "the drive's heartbeat is missing"
     OWN_ID_ELSEWHERE = "another node sends with an identifier of this master"
     FOREIGN_SYNC = "another node sends SYNC"
     ENCODER_JUMP = "an encoder moved faster than the axis can"
@@ -52,8 +52,8 @@ class Fault(Enum):
     BAD_TARGET = "the target is not a number within the limits"
     BUS_DOWN = "the CAN interface went away"
     TRANSMIT_FULL = "the transmit queue is full"
-    CHANNEL_HELD = "a load torque or temperature did not come, or is not believed"
-    CHANNEL_LOST = "a load torque or temperature stays away"
+    CHANNEL_HELD = "a load torque or temperature did not arrive, or is implausible"
+    CHANNEL_LOST = "a load torque or temperature is missing"
 
 
 class Row(NamedTuple):
@@ -78,7 +78,7 @@ TABLE: Final[tuple[Row, ...]] = (
     Row(Fault.DUPLICATE_TPDO, _GO, 1, _GO, "look for a second node with the drive's node id"),
     Row(Fault.WRONG_LENGTH, _FREEZE, 2, _STOP, "boot the drive again: its PDO mapping (1A00h) was changed"),
     Row(Fault.DISCARDED_FRAME, _GO, 1, _GO, "look for a node that is not CANopen, or restart the drive"),
-    Row(Fault.FLOOD, _FREEZE, 2, _STOP, "look for a node that babbles"),
+    Row(Fault.FLOOD, _FREEZE, 2, _STOP, "look for a node that floods the bus"),
     Row(Fault.EMERGENCY, _GO, 1, _GO, "look the code up in the drive's manual"),
     Row(Fault.MASTER_LOST, _STOP, 1, _STOP, "check the bus load, and 'hdbridge latency' for this machine"),
     Row(
@@ -105,7 +105,7 @@ TABLE: Final[tuple[Row, ...]] = (
 ROWS: Final[dict[Fault, Row]] = {row.fault: row for row in TABLE}
 
 EVENTS_KEPT: Final = 1000
-EMERGENCIES_TOLD: Final = 3
+EMERGENCIES_SHOWN: Final = 3
 _BY_THE_DRIVE: Final = frozenset({Fault.DRIVE_FAULT, Fault.DROPPED_OUT, Fault.NMT_CHANGE})
 """Faults that the drive raises on its own, with the reason in its emergency messages."""
 _EMERGENCIES: Final = frozenset({Fault.EMERGENCY, Fault.MASTER_LOST})
@@ -173,7 +173,7 @@ class Supervision:
                 worst = max(worst, self._note(cycle, fault, detail, previous.get(fault, 0) + 1, frozen))
         return max(worst, self.reaction)
 
-    def also(self, cycle: int, fault: Fault, detail: str) -> Reaction:
+    def add_fault(self, cycle: int, fault: Fault, detail: str) -> Reaction:
         """Adds a fault that arose during the reaction to the cycle that `judge` has just judged."""
         self._note(cycle, fault, detail, self._runs.get(fault, 0) + 1, frozen=False)
         return self.reaction
@@ -225,7 +225,7 @@ class Supervision:
             for event in self.events
             if event.fault in _EMERGENCIES and event.cycle >= since_cycle and event is not self.stop
         ]
-        return list(dict.fromkeys(said))[:EMERGENCIES_TOLD]
+        return list(dict.fromkeys(said))[:EMERGENCIES_SHOWN]
 
     def reset(self, *, verified: bool = False) -> None:
         """Releases the latch.

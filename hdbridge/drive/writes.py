@@ -113,7 +113,7 @@ def set_point_timeout_ms(axis: AxisConfig) -> int:
     return max(math.ceil(RPDO_TIMEOUT_CYCLES * axis.drive.cycle_ms), 10)
 
 
-def drives_patience_s(axis: AxisConfig) -> float:
+def drive_master_timeout_s(axis: AxisConfig) -> float:
     """Returns the time without a master after which a drive with all its watchdogs stops; s."""
     return min(axis.drive.heartbeat_ms, set_point_timeout_ms(axis)) / 1000.0
 
@@ -123,7 +123,7 @@ def _heartbeats(axis: AxisConfig) -> Iterator[PlannedWrite]:
     why = "period of the drive's heartbeat, ms"
     without = "only missing TPDOs show that the drive is gone"
     yield _row(axis, objects.HEARTBEAT_PRODUCER, ms, why, field, without=without, exact=True)
-    why = f"the drive stops by itself when node {master}, the master, is silent for {ms} ms"
+    why = f"the drive stops on its own when node {master}, the master, is silent for {ms} ms"
     without = "only its event timer (1400h:05) stops the axis when the master dies"
     watched = _row(axis, objects.HEARTBEAT_CONSUMER, master_heartbeat(axis), why, field, without=without)
     yield replace(watched, composed=True)
@@ -150,7 +150,7 @@ def _pdos(axis: AxisConfig, od: ObjectDictionary | None, pdos: Layouts) -> Itera
             communication,
             5,
             timeout_ms,
-            f"the drive stops by itself when no set-point comes for {timeout_ms} ms",
+            f"the drive stops on its own when no set-point comes for {timeout_ms} ms",
             "drive.cycle_ms",
             IntegerType.UINT16,
             without="only its heartbeat consumer (1016h) stops the axis when the master dies",
@@ -163,7 +163,7 @@ def _pdos(axis: AxisConfig, od: ObjectDictionary | None, pdos: Layouts) -> Itera
         yield last
     for base, kind, without in (
         (objects.TPDO_COMMUNICATION, "TPDO", "it keeps sending"),
-        (objects.RPDO_COMMUNICATION, "RPDO", "it stays, and nobody sends it"),
+        (objects.RPDO_COMMUNICATION, "RPDO", "it stays configured, but no node sends it"),
     ):
         for index in range(base, base + PDOS_PER_KIND):
             if od is not None and find(od, index, 1) and (axis.drive.node_id, index) not in used:
@@ -328,7 +328,7 @@ def _limits(axis: AxisConfig) -> Iterator[PlannedWrite]:
             f"{axis.where('drive.following_error_deg')} {drive.following_error_deg:g} is less than half a "
             "motor count, and 0 in object 6065h means no supervision; raise it"
         )
-    alone = "only hdbridge keeps to it"
+    alone = "only hdbridge enforces it"
     slew = axis.compensation.slew_arcsec_s
     rpm = math.ceil((limits.velocity_deg_s + slew / ARCSEC_PER_DEG) * axis.gear.ratio / 6.0)
     ramp = motor_rate(axis, limits.acceleration_deg_s2)
@@ -357,7 +357,7 @@ def _limits(axis: AxisConfig) -> Iterator[PlannedWrite]:
     )  # fmt: skip
     yield _row(
         axis, objects.FOLLOWING_WINDOW, window, "following error window, motor counts",
-        "drive.following_error_deg", without="following error window; hdbridge watches by its own",
+        "drive.following_error_deg", without="following error window; hdbridge applies its own",
     )  # fmt: skip
     yield _row(
         axis, objects.FOLLOWING_TIME, drive.following_error_time_ms, f"{late}, ms",

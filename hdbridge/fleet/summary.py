@@ -69,7 +69,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Odd:
+class Outlier:
     """Figure of a joint outside the normal range of its gear type."""
 
     joint: str
@@ -80,7 +80,7 @@ class Odd:
 
 
 @dataclass(frozen=True)
-class Mistaken:
+class MismatchedRecording:
     """Recording whose orders differ from its joint's first recording."""
 
     joint: str
@@ -101,8 +101,8 @@ class Summary:
     """Number of joints with the cause, number of joints, and prevalence, by attribute, cause and group."""
     rates: Mapping[str, tuple[float, float, float]]
     """Fraction of joints with the cause, and rates of findings in joints with and without it, by cause."""
-    odd: tuple[Odd, ...]
-    mistaken: tuple[Mistaken, ...]
+    odd: tuple[Outlier, ...]
+    mistaken: tuple[MismatchedRecording, ...]
     duplicates: tuple[tuple[str, str, str], ...]
     """Joint and path of each duplicate, and path of the original."""
     silent: tuple[tuple[str, str], ...]
@@ -126,7 +126,7 @@ class Summary:
                 yield f"{words}: {len(found)}"
 
 
-def counted(mistaken: Sequence[Mistaken]) -> Iterator[str]:
+def counted(mistaken: Sequence[MismatchedRecording]) -> Iterator[str]:
     """Yields the number of mistaken recordings of each kind, as text."""
     for kind, count in Counter(each.kind for each in mistaken).items():
         yield f"recordings {_KINDS[kind]}: {count}"
@@ -164,7 +164,7 @@ def summarise(rows: Sequence[Row], limit_arcsec: float) -> Summary:
     )
 
 
-def own_recordings(rows: Sequence[Row]) -> tuple[dict[str, list[Row]], tuple[Mistaken, ...]]:
+def own_recordings(rows: Sequence[Row]) -> tuple[dict[str, list[Row]], tuple[MismatchedRecording, ...]]:
     """Returns each joint's own diagnosed recordings in time order, without copies; and the mistaken ones."""
     good = [row for row in rows if row["reason"] is None and row["duplicate_of"] is None]
     good.sort(key=_when)
@@ -180,9 +180,9 @@ def _when(row: Row) -> tuple[float, str, str]:
     return (row["hours"] if row["hours"] is not None else -1.0, row["date"] or "", row["path"])
 
 
-def _mistaken(good: Sequence[Row]) -> tuple[tuple[Mistaken, ...], set[tuple[str, str]]]:
+def _mistaken(good: Sequence[Row]) -> tuple[tuple[MismatchedRecording, ...], set[tuple[str, str]]]:
     """Returns the mistaken recordings, and key and path of those that no other result uses."""
-    result: list[Mistaken] = []
+    result: list[MismatchedRecording] = []
     foreign: set[tuple[str, str]] = set()
     gears: dict[str, list[Row]] = defaultdict(list)
     for row in good:
@@ -206,7 +206,7 @@ def _mistaken(good: Sequence[Row]) -> tuple[tuple[Mistaken, ...], set[tuple[str,
                 text = f"all its orders are turned by {each.angle_deg:.1f} deg of the motor: fit a new model"
             else:
                 text = "its orders are neither those of the joint's first recording nor another joint's"
-            result.append(Mistaken(row["joint"], row["path"], each.kind, text))
+            result.append(MismatchedRecording(row["joint"], row["path"], each.kind, text))
             if each.kind != "changed":
                 foreign.add((row["key"], row["path"]))
     return tuple(result), foreign
@@ -389,7 +389,7 @@ def _prevalence(
     return result
 
 
-def _odd(joints: Mapping[str, Sequence[Row]]) -> tuple[Odd, ...]:
+def _odd(joints: Mapping[str, Sequence[Row]]) -> tuple[Outlier, ...]:
     """Returns the figures whose median over a joint's recordings is outside the gear type's normal range."""
     table: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for name, rows in joints.items():
@@ -411,7 +411,7 @@ def _odd(joints: Mapping[str, Sequence[Row]]) -> tuple[Odd, ...]:
         normal = normal_range(values)
         for name, value, odd in zip(of_joint, values.tolist(), chosen.tolist(), strict=True):
             if odd:
-                found.append(Odd(name, gear, figure, value, normal))
+                found.append(Outlier(name, gear, figure, value, normal))
     return tuple(sorted(found, key=lambda each: -abs(each.value - each.normal.value)))
 
 

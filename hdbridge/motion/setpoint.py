@@ -288,9 +288,9 @@ class SetPoint:
             if self.at_rest:
                 break
         raise InputError(
-            f"no path from {now.position_deg:.9g} deg at {now.velocity_deg_s:.4g} deg/s to {target_deg:.9g} "
-            "deg within the limits: check velocity and acceleration of the move and the limits in the axis "
-            "file, or stop the axis first"
+            f"no trajectory from {now.position_deg:.9g} deg at {now.velocity_deg_s:.4g} deg/s to "
+            f"{target_deg:.9g} deg within the limits: check velocity and acceleration of the move and the "
+            "limits in the axis file, or stop the axis first"
         )
 
     def _brake(self, since_s: float) -> None:

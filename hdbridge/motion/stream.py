@@ -178,7 +178,7 @@ class Stream:
 
     def _check(self, cubic: Cubic, time_s: float, position_deg: float, velocity_deg_s: float) -> None:
         limits, bounds = self._limits, self._bounds
-        where = f"the path to the knot at {time_s:.6g} s"
+        where = f"the segment to the knot at {time_s:.6g} s"
         fastest, hardest = cubic.fastest_deg_s(), cubic.hardest_deg_s2()
         lowest, highest = cubic.extremes_deg()
         # Velocity error due to rounding of the positions.

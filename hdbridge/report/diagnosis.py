@@ -28,7 +28,7 @@ from hdbridge.report.residuals import beside_charts, partial_residual, partial_r
 from hdbridge.report.stepping import of_offer, stepping_sections
 from hdbridge.units import without_unit
 
-TOLD: Final = 3
+MAX_CLAIMS: Final = 3
 """Maximum number of findings in the verdict."""
 PLUS_MINUS: Final = "\N{PLUS-MINUS SIGN} 95 %"
 
@@ -110,8 +110,8 @@ def _verdict(diagnosis: Diagnosis, stepping: Validation | None) -> str:
             f"everyday calibration account for; {noise}."
         )
     else:
-        causes = _listed([_claim(each) for each in diagnosis.findings[:TOLD]])
-        if more := len(diagnosis.findings[TOLD:]):
+        causes = _listed([_claim(each) for each in diagnosis.findings[:MAX_CLAIMS]])
+        if more := len(diagnosis.findings[MAX_CLAIMS:]):
             causes += f"; and {more} more"
         text = f"The model is off by {given} arcsec (rms): {causes}."
         if all(each.cause == UNEXPLAINED for each in diagnosis.findings):

@@ -26,8 +26,8 @@ from hdbridge.report.page import (
     sentence,
 )
 from hdbridge.twin.compare import ALL, TITLES, UNITS, Comparison, Row, Spectrum, Trace
-from hdbridge.twin.misfit import Left, Values
-from hdbridge.twin.naming import Alike, Finding
+from hdbridge.twin.misfit import ChannelResidual, Values
+from hdbridge.twin.naming import Finding, InseparableSet
 from hdbridge.twin.translate import Row as Translated
 
 WINDOW_S: Final = 1.0
@@ -64,15 +64,15 @@ class TwinReport:
     after: Comparison | None = None
     """Comparison with the fitted simulation; None without a fit."""
     learned: Sequence[Learned] = ()
-    named: Sequence[Finding | Alike | Left] = ()
+    named: Sequence[Finding | InseparableSet | ChannelResidual] = ()
     translated: Sequence[Translated] = ()
     facts: Sequence[tuple[str, str]] = ()
     verdict: str = ""
     """One sentence on the quality of the values and the outcome for the twin."""
     values: str = ""
     """Origin of the values (`hdbridge.twin.twin.Values`); empty without a fit."""
-    left: Sequence[Left] = ()
-    """Residual of the fitted simulation, for each channel."""
+    channel_residuals: Sequence[ChannelResidual] = ()
+    """Remaining difference of each channel."""
     commands: Sequence[Command] = ()
     status: Status = Status.MEASURED
 

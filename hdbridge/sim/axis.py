@@ -147,7 +147,7 @@ class Axis:
 
     def _prepare(self, limit_nm: float, outer_nm: float) -> None:
         """Passes the slowly varying inputs to the loops, for the next cycle."""
-        self.loops.take(self.heat.body_c, self.heat.rub, limit_nm, self._lost_deg(), outer_nm)
+        self.loops.take(self.heat.body_c, self.heat.friction_factor, limit_nm, self._lost_deg(), outer_nm)
 
     def _readings(self, elapsed_s: float, noise_deg: float, outer_nm: float) -> Measured:
         """Returns the drive's measurements at the end of a cycle, from the state of the loops."""

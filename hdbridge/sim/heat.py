@@ -13,7 +13,7 @@ class Heat:
 
     body_c: float
     """Temperature of motor and gear."""
-    rub: float
+    friction_factor: float
     """Motor friction at the present temperature, relative to the friction in the truth file."""
     since_s: float
     """Time since the axis was switched on."""
@@ -28,8 +28,8 @@ class Heat:
     _resistance_k_per_w: float
     _step_s: float
     _time_constant_s: float
-    _warmer: float
-    _weather: bool
+    _warming_fraction: float
+    _ambient_varies: bool
 
     def __init__(self, truth: Truth) -> None:
         heat = truth.temperature
@@ -41,24 +41,24 @@ class Heat:
         self._ambient_k_per_hour = heat.ambient_k_per_hour
         self._ambient_swing_k = heat.ambient_swing_k
         self._ambient_period_s = heat.ambient_period_s
-        self._weather = bool(heat.ambient_k_per_hour or heat.ambient_swing_k)
+        self._ambient_varies = bool(heat.ambient_k_per_hour or heat.ambient_swing_k)
         self._resistance_k_per_w = heat.resistance_k_per_w
         self._time_constant_s = heat.time_constant_s
-        self._step_s = self._warmer = self.since_s = 0.0
+        self._step_s = self._warming_fraction = self.since_s = 0.0
         self.body_c = heat.ambient_c if heat.start_c is None else heat.start_c
-        self.rub = self._growth.at(self.body_c) if self._friction_grows else 1.0
+        self.friction_factor = self._growth.at(self.body_c) if self._friction_grows else 1.0
 
     def warm(self, torque_squares: float, friction_j: float, elapsed_s: float) -> None:
         """Advances by several substeps, given the sum of the squared torques (Nm^2) and the friction work."""
         self.since_s += elapsed_s
         copper_j = torque_squares * self._copper_loss_w * self._dt_s
         goal_c = self._ambient_c + self._resistance_k_per_w * ((copper_j + friction_j) / elapsed_s)
-        if self._weather:
+        if self._ambient_varies:
             goal_c += self._ambient_k_per_hour * self.since_s / 3600.0
             goal_c += self._ambient_swing_k * math.sin(math.tau * self.since_s / self._ambient_period_s)
         if elapsed_s != self._step_s:
             self._step_s = elapsed_s
-            self._warmer = -math.expm1(-elapsed_s / self._time_constant_s)
-        self.body_c += (goal_c - self.body_c) * self._warmer
+            self._warming_fraction = -math.expm1(-elapsed_s / self._time_constant_s)
+        self.body_c += (goal_c - self.body_c) * self._warming_fraction
         if self._friction_grows:
-            self.rub = self._growth.at(self.body_c)
+            self.friction_factor = self._growth.at(self.body_c)

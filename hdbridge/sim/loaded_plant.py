@@ -173,7 +173,7 @@ class LoadedPlant(Plant):
             speeds = abs(load_speed / self._breakaway_speed)
             loss += self._breakaway * math.exp(-(speeds**self._breakaway_exponent))
         if loss:
-            new_load, new_load_speed = self._rub(load, new_load, new_load_speed, loss)
+            new_load, new_load_speed = self._apply_friction(load, new_load, new_load_speed, loss)
         now.torque_nm = self._spring.pull_nm(new_output - new_load)
         now.load_deg = new_load
         self.load_deg_s = new_load_speed

@@ -125,7 +125,9 @@ class Plant:
         new_load = new_output + spline.distance_by_rate * slip - spline.distance_by_distance * lag
         new_load_speed = (rate + spline.rate_by_rate * slip - spline.rate_by_distance * lag) * self._load_drag
         if self._load_friction:
-            new_load, new_load_speed = self._rub(load, new_load, new_load_speed, self._load_friction)
+            new_load, new_load_speed = self._apply_friction(
+                load, new_load, new_load_speed, self._load_friction
+            )
         now.torque_nm = self._stiffness * (new_output - new_load)
         now.load_deg = new_load
         self.load_deg_s = new_load_speed
@@ -187,7 +189,7 @@ class Plant:
         self.encoder_deg = new_load + step.distance_by_distance * ahead + step.distance_by_rate * slip
         self._encoder_rate = rate + step.rate_by_distance * ahead + step.rate_by_rate * slip
 
-    def _rub(self, before: float, load: float, speed: float, loss: float) -> tuple[float, float]:
+    def _apply_friction(self, before: float, load: float, speed: float, loss: float) -> tuple[float, float]:
         """Applies Coulomb friction at the load: reduces its speed, or holds it if the friction suffices."""
         if abs(speed) <= loss:
             return before, 0.0

@@ -45,20 +45,20 @@ class Reach:
                 bus.send(can.Message(arbitration_id=can_id, data=data, **kind))
         return _nothing
 
-    def wish(self, name: str, value: object) -> End:
+    def set_fault(self, name: str, value: object) -> End:
         """Sets an attribute of the drive's fault settings; ending the fault restores the previous value."""
-        wishes = self.drive.faults
-        before = getattr(wishes, name)
-        setattr(wishes, name, value)
-        return lambda: setattr(wishes, name, before)
+        settings = self.drive.faults
+        before = getattr(settings, name)
+        setattr(settings, name, value)
+        return lambda: setattr(settings, name, before)
 
     def mute(self, can_id: int) -> End:
         """Suppresses all frames with an identifier."""
-        wishes = self.drive.faults
-        wishes.muted_ids |= {can_id}
+        settings = self.drive.faults
+        settings.muted_ids |= {can_id}
 
         def speaks() -> None:
-            wishes.muted_ids -= {can_id}
+            settings.muted_ids -= {can_id}
 
         return speaks
 
@@ -81,7 +81,7 @@ class Needs(Enum):
 
     NOTHING = "nothing"
     INTERFACE = "the program's interface, in this process"
-    CLOCK = "a clock that is the drive's to move"
+    CLOCK = "a clock that the simulated drive controls"
 
 
 @dataclass(frozen=True)
@@ -93,10 +93,10 @@ class Row:
     """Description in one sentence, which names the arguments."""
     make: Make
     arguments: Mapping[str, Value] = field(default_factory=dict)
-    answers: str = ""
+    reported_as: str = ""
     """Text of the corresponding fault in the fault table."""
     needs: Needs = Needs.NOTHING
-    touches: Callable[[Mapping[str, Any]], tuple[int, int]] | None = None
+    required_object: Callable[[Mapping[str, Any]], tuple[int, int]] | None = None
     """Returns the object that the drive must have, given the arguments."""
 
     def check(self, reach: Reach, arguments: Mapping[str, Any]) -> None:
@@ -104,15 +104,15 @@ class Row:
         __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
         if self.needs is Needs.INTERFACE and reach.port is None:
             raise InputError(
-                f"fault '{self.name}': the interface of {reach.bus} is not the drive's to take away; choose "
-                "the bus 'virtual' or 'lockstep', or do it in the test (ip link set vcan0 down)"
+                f"fault '{self.name}': the simulated drive cannot take down the interface of {reach.bus}; "
+                "choose the bus 'virtual' or 'lockstep', or do it in the test (ip link set vcan0 down)"
             )
         if self.needs is Needs.CLOCK and (reach.port is None or reach.port.clock is None):
             raise InputError(
-                f"fault '{self.name}' needs the bus 'lockstep', where time is the drive's to move; in real "
-                "time let the program itself sleep, or stop its process (SIGSTOP)"
+                f"fault '{self.name}' needs the bus 'lockstep', whose clock the simulated drive controls; "
+                "in real time let the program itself sleep, or stop its process (SIGSTOP)"
             )
-        place = self.touches(arguments) if self.touches else None
+        place = self.required_object(arguments) if self.required_object else None
         if place is not None and place not in reach.drive.dictionary:
             raise InputError(f"fault '{self.name}': the drive has no object {place[0]:04X}h:{place[1]:02X}")
 
@@ -141,12 +141,12 @@ class Row:
         return {**self.arguments, **given}
 
 
-def _wish(name: str, value: object) -> Make:
-    return lambda reach: reach.wish(name, value)
+def _setting(name: str, value: object) -> Make:
+    return lambda reach: reach.set_fault(name, value)
 
 
-def _counted(name: str) -> Make:
-    return lambda reach, count: reach.wish(name, count)
+def _count_setting(name: str) -> Make:
+    return lambda reach, count: reach.set_fault(name, count)
 
 
 def _once(act: Callable[[WatchedDrive], object]) -> Make:
@@ -196,18 +196,20 @@ def _missed(reach: Reach, code: int) -> End:
 
 def _glitch(reach: Reach, counts: int, samples: int) -> End:
     left = [counts] * samples
-    return reach.wish("load_reading", lambda right: right + (left.pop() if left else 0))
+    return reach.set_fault("load_reading", lambda right: right + (left.pop() if left else 0))
 
 
 def _frozen(reach: Reach) -> End:
     counts = reach.drive.firmware.motion.load_counts
-    return reach.wish("load_reading", lambda _: counts)
+    return reach.set_fault("load_reading", lambda _: counts)
 
 
 def _drift(reach: Reach, counts_per_s: float) -> End:
     drive = reach.drive
     begin_s = drive.time_s
-    return reach.wish("load_reading", lambda right: right + round(counts_per_s * (drive.time_s - begin_s)))
+    return reach.set_fault(
+        "load_reading", lambda right: right + round(counts_per_s * (drive.time_s - begin_s))
+    )
 
 
 def _weak(reach: Reach, percent: float) -> End:
@@ -242,11 +244,11 @@ def _stall(reach: Reach, duration_s: float) -> End:
 
 
 def _reported(reach: Reach, index: int, subindex: int, value: int) -> End:
-    return reach.drive.report_instead(index, subindex, value)
+    return reach.drive.report_false_value(index, subindex, value)
 
 
 def _identity(reach: Reach, product_code: int) -> End:
-    return reach.drive.report_instead(0x1018, 2, product_code)
+    return reach.drive.report_false_value(0x1018, 2, product_code)
 
 
 def _no_object(reach: Reach, index: int, subindex: int) -> End:
@@ -255,7 +257,10 @@ def _no_object(reach: Reach, index: int, subindex: int) -> End:
 
 
 def _no_watchdogs(reach: Reach) -> End:
-    ends = (reach.wish("ignore_lost_heartbeat", True), reach.wish("ignore_missing_set_points", True))
+    ends = (
+        reach.set_fault("ignore_lost_heartbeat", True),
+        reach.set_fault("ignore_missing_set_points", True),
+    )
 
     def watches_again() -> None:
         for end in ends:
@@ -265,43 +270,46 @@ def _no_watchdogs(reach: Reach) -> End:
 
 
 def _slow_brakes(reach: Reach, counts_per_s2: float) -> End:
-    return reach.wish("deceleration_counts_s2", counts_per_s2)
+    return reach.set_fault("deceleration_counts_s2", counts_per_s2)
 
 
 _MISSING = "a TPDO is missing"
 _DUPLICATED = "a TPDO came twice or out of its cycle"
-_WRONG_KIND = "a frame of the wrong kind was thrown away"
+_WRONG_KIND = "a frame of the wrong kind was discarded"
 _JUMP = "an encoder moved faster than the axis can"
 _OWN_ID = "another node sends with an identifier of this master"
-_CHANNEL = "a load torque or temperature did not come, or is not believed"
+_CHANNEL = "a load torque or temperature did not arrive, or is implausible"
 _AWAY = "the CAN interface went away"
-_DROPPED_OUT = "the drive left 'operation enabled' by itself"
+_DROPPED_OUT = "the drive left 'operation enabled' on its own"
 
 _ROWS: Final = (
-    Row("lost_tpdo", "The next `count` TPDOs are not sent.", _counted("drop_tpdos"), {"count": 1}, _MISSING),
+    Row("lost_tpdo", "The next `count` TPDOs are not sent.",
+        _count_setting("drop_tpdos"), {"count": 1}, _MISSING),
     Row("late_tpdo", "The next `count` TPDOs come one SYNC later, after the fresh ones.",
-        _counted("hold_tpdos"), {"count": 1}, _DUPLICATED),
+        _count_setting("hold_tpdos"), {"count": 1}, _DUPLICATED),
     Row("duplicated_tpdo", "The next `count` TPDOs come twice.",
-        _counted("duplicate_tpdos"), {"count": 1}, _DUPLICATED),
-    Row("stale_tpdo", "The TPDOs of the last SYNC are repeated now.", _stale, answers=_DUPLICATED),
+        _count_setting("duplicate_tpdos"), {"count": 1}, _DUPLICATED),
+    Row("stale_tpdo", "The TPDOs of the last SYNC are repeated now.", _stale, reported_as=_DUPLICATED),
     Row("reordered_tpdos", "After the next `count` SYNCs the TPDOs come in reverse order.",
-        _counted("reverse_tpdos"), {"count": 1}),
+        _count_setting("reverse_tpdos"), {"count": 1}),
     Row("short_tpdo", "The next `count` TPDOs come without their last byte.",
-        _counted("shorten_tpdos"), {"count": 1}, "a TPDO has the wrong length"),
+        _count_setting("shorten_tpdos"), {"count": 1}, "a TPDO has the wrong length"),
     Row("tpdo_stopped", "TPDO `number` is not sent any more.",
-        _tpdo_stopped, {"number": 1}, _CHANNEL, touches=_tpdo),
-    Row("cable_pulled", "The drive neither receives nor sends.", _wish("silent", True), answers=_MISSING),
+        _tpdo_stopped, {"number": 1}, _CHANNEL, required_object=_tpdo),
+    Row("cable_pulled", "The drive neither receives nor sends.",
+        _setting("silent", True), reported_as=_MISSING),
     Row("drive_deaf", "The drive receives nothing but continues to send.",
-        _wish("deaf", True), answers="the control process stalled for longer than the drive waits"),
+        _setting("deaf", True), reported_as="the control process stalled for longer than the drive waits"),
     Row("program_stalls", "The program's next wait takes `duration_s` longer (only in lockstep).",
         _stall, {"duration_s": 0.1}, "the cycle started too late", Needs.CLOCK),
     Row("remote_frame", "A remote frame (RTR) with the identifier of TPDO 1.",
-        _frame(0x180, own=True, is_remote_frame=True), answers=_WRONG_KIND),
+        _frame(0x180, own=True, is_remote_frame=True), reported_as=_WRONG_KIND),
     Row("extended_frame", "A frame with a 29-bit identifier, of the number of TPDO 1.",
-        _frame(0x180, bytes(8), own=True, is_extended_id=True), answers=_WRONG_KIND),
-    Row("error_frame", "An error frame.", _frame(0x004, bytes(8), is_error_frame=True), answers=_WRONG_KIND),
+        _frame(0x180, bytes(8), own=True, is_extended_id=True), reported_as=_WRONG_KIND),
+    Row("error_frame", "An error frame.",
+        _frame(0x004, bytes(8), is_error_frame=True), reported_as=_WRONG_KIND),
     Row("bus_off", "The error frame of a CAN controller that went bus-off.",
-        _frame(_BUS_OFF, bytes(8), is_error_frame=True), answers=_AWAY),
+        _frame(_BUS_OFF, bytes(8), is_error_frame=True), reported_as=_AWAY),
     Row("babbling_node", "`count` frames of an unknown node, at once.",
         lambda reach, count: reach.send(0x7E5, bytes(8), times=count), {"count": 300},
         "more frames waited than one cycle reads"),
@@ -310,49 +318,52 @@ _ROWS: Final = (
     Row("drive_fault", "The drive detects an error, sends EMCY `code`, brakes and goes into FAULT.",
         _drive_fault, {"code": 0x3210}, "the drive reports a fault"),
     Row("enable_lost", "The power stage switches off without a message, as by a hardware enable input.",
-        _once(lambda drive: drive.faults.open_enable_input()), answers=_DROPPED_OUT),
+        _once(lambda drive: drive.faults.open_enable_input()), reported_as=_DROPPED_OUT),
     Row("master_missed", "The drive misses its master, sends EMCY `code` and stops according to 6007h.",
         _missed, {"code": 0x8130}, "the drive reports that it missed its master"),
     Row("restart", "The drive restarts, as after a brown-out.",
-        _once(lambda drive: drive.faults.boot_up()), answers="a node restarted"),
+        _once(lambda drive: drive.faults.boot_up()), reported_as="a node restarted"),
     Row("leaves_operational", "The drive goes into NMT PRE-OPERATIONAL.",
-        _once(lambda drive: drive.faults.leave_operational()), answers="a node is not operational"),
+        _once(lambda drive: drive.faults.leave_operational()), reported_as="a node is not operational"),
     Row("heartbeat_lost", "The drive's heartbeat stops.",
-        _wish("mute_heartbeat", True), answers="the drive's heartbeat stays away"),
-    Row("second_master_sync", "SYNC of another master.", _frame(0x080), answers="another node sends SYNC"),
+        _setting("mute_heartbeat", True), reported_as="the drive's heartbeat is missing"),
+    Row("second_master_sync", "SYNC of another master.",
+        _frame(0x080), reported_as="another node sends SYNC"),
     Row("second_master_set_point", "An RPDO of another master: no power, target 0.",
-        _frame(0x200, bytes(6), own=True), answers=_OWN_ID),
+        _frame(0x200, bytes(6), own=True), reported_as=_OWN_ID),
     Row("second_master_heartbeat", "A heartbeat of another master, node `node_id`.",
         lambda reach, node_id: reach.send(0x700 + node_id, b"\x05"), {"node_id": 127}, _OWN_ID),
     Row("second_master_nmt", "An NMT `command` of another master to all nodes (128: pre-operational).",
         lambda reach, command: reach.send(0x000, bytes([command, 0])), {"command": 128}, _OWN_ID),
     Row("second_master_sdo", "An SDO request of another client: it reads 1000h.",
-        _frame(0x600, bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0]), own=True), answers=_OWN_ID),
+        _frame(0x600, bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0]), own=True), reported_as=_OWN_ID),
     Row("encoder_jump", "The load encoder reads `counts` more from now on.",
-        lambda reach, counts: reach.wish("load_jump_counts", reach.drive.faults.load_jump_counts + counts),
+        lambda reach, counts: reach.set_fault(
+            "load_jump_counts", reach.drive.faults.load_jump_counts + counts),
         {"counts": 100_000}, _JUMP),
     Row("encoder_glitch", "The load encoder reads `counts` more for the next `samples` samples.",
         _glitch, {"counts": 100_000, "samples": 1}, _JUMP),
     Row("encoder_frozen", "The load encoder keeps reporting the same counts.", _frozen),
     Row("encoder_drift", "The load encoder drifts by `counts_per_s`.", _drift, {"counts_per_s": 1000.0}),
     Row("motor_encoder_jump", "The motor encoder reads `counts` more; the servo loops act on it.",
-        lambda reach, counts: reach.wish("motor_jump_counts", reach.drive.faults.motor_jump_counts + counts),
+        lambda reach, counts: reach.set_fault(
+            "motor_jump_counts", reach.drive.faults.motor_jump_counts + counts),
         {"counts": 1000}, _JUMP),
     Row("motor_weak", "The motor gives at most `percent` of its rated torque, and falls behind.",
         _weak, {"percent": 0.0}, "the drive does not follow its demand"),
     Row("bus_down", "The program's interface goes down (ENETDOWN); its end brings it up again.",
-        _gone(Condition.DOWN), answers=_AWAY, needs=Needs.INTERFACE),
+        _gone(Condition.DOWN), reported_as=_AWAY, needs=Needs.INTERFACE),
     Row("bus_deleted", "The program's interface is deleted (ENXIO); after its end it can be opened again.",
-        _gone(Condition.DELETED), answers=_AWAY, needs=Needs.INTERFACE),
+        _gone(Condition.DELETED), reported_as=_AWAY, needs=Needs.INTERFACE),
     Row("transmit_queue_full", "The program's next `count` frames find the transmit queue full (ENOBUFS).",
         _full, {"count": 1}, "the transmit queue is full", Needs.INTERFACE),
     Row("sdo_silent", "SDO requests are not answered.",
         lambda reach: reach.mute(0x580 + reach.drive.node_id)),
     Row("wrong_value", "The drive reports `value` for an object, by SDO and in its TPDOs.",
-        _reported, {"index": 0x2100, "subindex": 0, "value": 32767}, _CHANNEL, touches=_named_object),
+        _reported, {"index": 0x2100, "subindex": 0, "value": 32767}, _CHANNEL, required_object=_named_object),
     Row("wrong_identity", "Object 1018h:02 holds another `product_code`.", _identity, {"product_code": 1}),
     Row("missing_object", "The drive has no object `index`:`subindex` (for good).",
-        _no_object, {"index": 0x60E4, "subindex": 1}, touches=_named_object),
+        _no_object, {"index": 0x60E4, "subindex": 1}, required_object=_named_object),
     Row("no_watchdogs", "The drive does not notice missing heartbeats or set-points of its master.",
         _no_watchdogs),
     Row("slow_brakes", "The drive brakes with `counts_per_s2`, regardless of its objects.",
@@ -363,7 +374,7 @@ FAULTS: Final[Mapping[str, Row]] = MappingProxyType({row.name: row for row in _R
 
 OF_THE_PROGRAM: Final = (
     "the target is not a number within the limits",
-    "a load torque or temperature stays away",
+    "a load torque or temperature is missing",
 )
 """Rows of the fault table without a fault here: faults of the program, and consequences of other faults."""
 

@@ -100,8 +100,8 @@ class Settings:
         path = folder / truth if truth is not None else files.simulated
         if truth is None and not path.is_file():
             raise InputError(
-                f"{path}: no such file, and no twin.yaml beside it, so nothing says what the simulated axis "
-                "is like; make a twin of the axis, or name a truth file"
+                f"{path}: no such file, and no twin.yaml in the same folder: the simulated axis is not "
+                "defined; make a twin of the axis, or name a truth file"
             )
         known = Truth.load(path)
         behaviour = _behaviour({**known.firmware.model_dump(), **firmware})
@@ -120,7 +120,7 @@ def _behaviour(keys: Mapping[str, Any]) -> Behaviour:
 
 LONGEST_WAIT_S: Final = 0.005
 """Maximum delay of a requested fault in real time; s."""
-LONGEST_TURN_S: Final = 600.0
+MAX_BUS_WAIT_S: Final = 600.0
 """Maximum wait for a bus of the computer that other tests are using; s."""
 
 _IN_USE: Final[dict[str, int]] = {}
@@ -167,13 +167,13 @@ class Line:
             self.nodes.append(node)
             try:
                 node.poll(self.clock.now())
-                with self._living(bus, node) as failures:
+                with self._running(bus, node) as failures:
                     yield node, failures
             finally:
                 self.nodes.remove(node)
 
     @contextmanager
-    def _living(self, bus: can.BusABC, node: WatchedDrive) -> Iterator[list[HdbridgeError]]:
+    def _running(self, bus: can.BusABC, node: WatchedDrive) -> Iterator[list[HdbridgeError]]:
         """Runs the drive on the virtual clock, or in a thread."""
         if isinstance(self.clock, StallingClock):
             nodes = self.clock.nodes
@@ -207,7 +207,7 @@ def open_line(choice: BusChoice) -> Iterator[Line]:
     """Yields a bus for drives, waiting until it is free; raises `BusError` if it cannot be opened."""
     if not choice.in_process:
         settings = BusConfig(interface=choice.interface, channel=choice.channel, bitrate_bps=None)
-        with _turn(choice):
+        with _reserve(choice):
             yield Line(
                 choice,
                 choice.interface,
@@ -230,7 +230,7 @@ def open_line(choice: BusChoice) -> Iterator[Line]:
 
 
 @contextmanager
-def _turn(choice: BusChoice) -> Iterator[None]:
+def _reserve(choice: BusChoice) -> Iterator[None]:
     """Reserves the bus; waits until no other test on this computer (pytest-xdist) has a drive on it."""
     name = str(choice)
     if _IN_USE.get(name) == threading.get_ident():
@@ -239,7 +239,7 @@ def _turn(choice: BusChoice) -> Iterator[None]:
             "simulated_drive(..., beside=drive)"
         )
     folder = Path(tempfile.gettempdir())
-    end_s = time.monotonic() + LONGEST_TURN_S
+    end_s = time.monotonic() + MAX_BUS_WAIT_S
     with ExitStack() as stack:
         while True:
             try:

@@ -13,7 +13,7 @@ from hdbridge.clock import Clock
 from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.testing.faulttable import FAULTS, Reach, find
 from hdbridge.testing.line import LOCKSTEP, Line, Settings, open_line
-from hdbridge.testing.watched import Event, Fault, Frame, TrueState, WatchedDrive, When, words
+from hdbridge.testing.watched import Event, Fault, Frame, Trigger, TrueState, WatchedDrive, words
 
 POLL_S: Final = 0.005
 
@@ -180,7 +180,9 @@ class SimulatedDrive:
         self._check()
         row.check(self._reach, checked)
         made = Fault(name, checked)
-        self._node.make(made, lambda: row.begin(self._reach, checked), When(after_s, beyond_deg), for_s)
+        self._node.schedule(
+            made, lambda: row.begin(self._reach, checked), Trigger(after_s, beyond_deg), for_s
+        )
         if self.lockstep:
             for node in self._line.nodes:  # frames of another node reach them as well
                 node.poll(self._clock.now())

@@ -153,7 +153,7 @@ class Fault:
 
 
 @dataclass(frozen=True)
-class When:
+class Trigger:
     """Trigger of a fault; immediate if neither time nor angle is given."""
 
     after_s: float = 0.0
@@ -162,7 +162,7 @@ class When:
 
 
 @dataclass
-class _Plan:
+class _ScheduledAction:
     """Action at a time, or once the load has passed an angle."""
 
     act: Callable[[], None]
@@ -201,7 +201,7 @@ class WatchedDrive(DriveNode):
         self.ratio = self.nameplate.gear_motor_turns / self.nameplate.gear_load_turns
         self.last_tpdos: dict[int, bytes] = {}
         """Data of the last TPDO sent with each identifier."""
-        self._plans: list[_Plan] = []
+        self._scheduled: list[_ScheduledAction] = []
         self._begin_s = clock.now()
         super().__init__(bus, self.machine, eds_path, node_id, clock, self.nameplate, truth.firmware)
         self._last_state, self._last_nmt = self.firmware.state, self.nmt
@@ -222,7 +222,7 @@ class WatchedDrive(DriveNode):
 
     # ---------------------------------------------------------------- faults
 
-    def make(self, fault: Fault, begin: Callable[[], End], when: When, for_s: float | None) -> None:
+    def schedule(self, fault: Fault, begin: Callable[[], End], when: Trigger, for_s: float | None) -> None:
         """Starts a fault at its trigger; it ends ``for_s`` later, or on request."""
 
         def begins() -> None:
@@ -232,15 +232,17 @@ class WatchedDrive(DriveNode):
             self.note("fault", str(fault))
             fault._undo = begin()
             if for_s is not None:
-                self._plans.append(_Plan(lambda: self._finish(fault), at_s=self._clock.now() + for_s))
+                self._scheduled.append(
+                    _ScheduledAction(lambda: self._finish(fault), at_s=self._clock.now() + for_s)
+                )
 
         fault._finish = self._finish
         with self.lock:
             if when.beyond_deg is not None:
                 below = self.machine.true_load_deg < when.beyond_deg
-                self._plans.append(_Plan(begins, beyond_deg=when.beyond_deg, from_below=below))
+                self._scheduled.append(_ScheduledAction(begins, beyond_deg=when.beyond_deg, from_below=below))
             else:
-                self._plans.append(_Plan(begins, at_s=self._clock.now() + when.after_s))
+                self._scheduled.append(_ScheduledAction(begins, at_s=self._clock.now() + when.after_s))
             self.run_until(self._clock.now())
 
     def _finish(self, fault: Fault) -> None:
@@ -250,9 +252,9 @@ class WatchedDrive(DriveNode):
             fault.ended_s = self.time_s
             if fault._undo is not None:
                 fault._undo()
-            self.note("fault", f"{fault.name} {'ends' if fault._undo is not None else 'is called off'}")
+            self.note("fault", f"{fault.name} {'ends' if fault._undo is not None else 'is cancelled'}")
 
-    def report_instead(self, index: int, subindex: int, value: int) -> End:
+    def report_false_value(self, index: int, subindex: int, value: int) -> End:
         """Makes the drive report a false value of an object, by SDO and in TPDOs."""
         entry = self.dictionary[index, subindex]
         before = entry.bound
@@ -270,7 +272,7 @@ class WatchedDrive(DriveNode):
     def next_event_s(self) -> float:
         """Returns the time by which ``poll`` must be called; triggers of faults count as events."""
         event_s = super().next_event_s()
-        return min((event_s, *(plan.at_s for plan in self._plans))) if self._plans else event_s
+        return min((event_s, *(action.at_s for action in self._scheduled))) if self._scheduled else event_s
 
     def handle(self, message: can.Message, now_s: float) -> None:
         with self.lock:
@@ -280,14 +282,14 @@ class WatchedDrive(DriveNode):
 
     def run_until(self, now_s: float) -> None:
         with self.lock:
-            while due := next((each for each in self._plans if self._is_due(each, now_s)), None):
-                self._plans.remove(due)
+            while due := next((each for each in self._scheduled if self._is_due(each, now_s)), None):
+                self._scheduled.remove(due)
                 due.act()
             super().run_until(now_s)
             self._look()
 
-    def _is_due(self, plan: _Plan, now_s: float) -> bool:
-        return plan.is_due(now_s, self.machine.true_load_deg)
+    def _is_due(self, action: _ScheduledAction, now_s: float) -> bool:
+        return action.is_due(now_s, self.machine.true_load_deg)
 
     def _send(self, can_id: int, data: bytes) -> None:
         if not (self.faults.silent or can_id in self.faults.muted_ids):

@@ -89,7 +89,7 @@ def check(
     about: Any = twin.provenance.get("fit")
     if not isinstance(about, dict):
         raise InputError(
-            f"the truth '{twin.name}' does not say how sure it is (provenance.fit); expected a twin that "
+            f"the truth '{twin.name}' has no uncertainty (provenance.fit); expected a twin that "
             "was fitted: make one with hdbridge twin"
         )
     data = coarse(prepare(recording, axis, twin), CHECK_S)

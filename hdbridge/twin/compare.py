@@ -156,7 +156,7 @@ TITLES: Final[Mapping[str, str]] = {
 
 STAND_S: Final = 0.2
 """Minimum rest of the command after a motion for a stop to count."""
-SIGHT_S: Final = 1.0
+MAX_SETTLING_S: Final = 1.0
 """Maximum time after a stop in which settling is evaluated; servo axes of this kind settle in tenths of a
 second."""
 CALM_S: Final = 0.3
@@ -377,7 +377,7 @@ def _stops(loads: Trace, command_deg: FloatArray, moves: Rows, parts: Sequence[s
         for stop in edges.tolist():
             later = starts[starts > stop]
             end = int(later[0]) if len(later) else part.stop
-            end = min(end, int(np.searchsorted(time_s, time_s[stop] + SIGHT_S)), part.stop)
+            end = min(end, int(np.searchsorted(time_s, time_s[stop] + MAX_SETTLING_S)), part.stop)
             if end - stop < LEAST_SAMPLES or time_s[end - 1] - time_s[stop] < STAND_S:
                 continue
             earlier = starts[starts < stop]

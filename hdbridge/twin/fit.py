@@ -34,17 +34,17 @@ from hdbridge.twin.misfit import (
     Replays,
     Scales,
     Values,
+    channel_residuals,
+    deviance_residuals,
     expected,
     least_deviation,
     misfit,
     noise_in_motion,
-    rooted,
     rounding,
     scales,
-    surprise,
+    surprisal,
     units,
     values_of,
-    what_is_left,
 )
 from hdbridge.twin.parameters import (
     BY_NAME,
@@ -200,7 +200,7 @@ def _with_loop(truth: Truth, loop: Hysteresis) -> Truth:
 # ----------------------------------------------------------------
 # Uncertainty of the coordinates: information from the slopes, and a jackknife over legs.
 
-LEAST = 1e-9
+JACKKNIFE_RIDGE = 1e-9
 """Regularisation of the jackknife: share of the information that no single leg may contribute alone."""
 
 
@@ -210,8 +210,8 @@ def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
     A long valley of the misfit is one of these directions. The covariance may inflate each direction
     separately; inflating each *coordinate* would lose the well-known combinations of two coordinates.
     """
-    worth, directions = eigen(slopes, spread)
-    return np.asarray(spread[:, None] * directions / np.sqrt(worth), dtype=np.float64)
+    information, directions = eigen(slopes, spread)
+    return np.asarray(spread[:, None] * directions / np.sqrt(information), dtype=np.float64)
 
 
 def sandwich(slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], spread: FloatArray) -> FloatArray:
@@ -232,7 +232,7 @@ def sandwich(slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], sprea
     order = np.argsort(numbers, kind="stable")
     drawn = []
     for leg in np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1):
-        others = (1.0 + LEAST) * np.eye(len(spread)) - rows[leg].T @ rows[leg]
+        others = (1.0 + JACKKNIFE_RIDGE) * np.eye(len(spread)) - rows[leg].T @ rows[leg]
         drawn.append(np.linalg.solve(others, rows[leg].T @ left[leg]))
     squares = np.sum(np.square(drawn), axis=0) * (1.0 - 1.0 / len(drawn))
     before = 1.0 / np.sum(np.square(along / spread[:, None]), axis=0)
@@ -252,25 +252,25 @@ def eigen(slopes: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArra
 
 STEP = 0.01
 """Step of the first Jacobian's finite differences, in spreads of a parameter."""
-RESPONSE = 1.0
+RESIDUAL_CHANGE = 1.0
 """Norm of the change of the scaled residuals that determines the later difference steps: one standard
 deviation, the smallest visible change."""
-FARTHEST = 0.1
+MAX_DIFFERENCE = 0.1
 """Maximum length of a difference step, in spreads, because the valley of the misfit is curved."""
-WIDE = 3.0
+WIDE_FACTOR = 3.0
 """Factor of the difference steps for intervals, which are two-sided. A sticking motor breaks away
 differently in each replay, so slopes over short differences are too steep and intervals too narrow."""
-TOO_FAR = 1.0
+MAX_RESIDUAL_CHANGE = 1.0
 """Change of the scaled residuals (rms) above which the loops at the end of a difference count as unstable."""
-NEARER = 0.1
-"""Factor by which a difference is shortened if its change exceeds `TOO_FAR`."""
-ROUND = 4
+SHORTENING = 0.1
+"""Factor by which a difference is shortened if its change exceeds `MAX_RESIDUAL_CHANGE`."""
+STEPS_PER_ROUND = 4
 """Number of steps between two estimates of the residuals' scales."""
-EDGE = 1e-6
+BOUND_MARGIN = 1e-6
 """Minimum distance to the bounds, in spreads, as required by `scipy.optimize.least_squares`."""
-WORTH = 1.0
+MIN_COST_DECREASE = 1.0
 """Fall of half the sum of squares in a round below which a fit ends."""
-SOFT = 4.0
+HUBER_THRESHOLD = 4.0
 """Residual, in scales, above which a residual is down-weighted, because a motor that slips elsewhere is not
 evidence."""
 
@@ -312,10 +312,12 @@ class Fitted:
 
         The likelihood ratio of two fits of the same readings is the exponential of the difference.
         """
-        half, stray = (each[self.rows] for each in self.scales.halves(len(self.rows) // len(CHANNELS)))
+        half, outlier_probability = (
+            each[self.rows] for each in self.scales.halves(len(self.rows) // len(CHANNELS))
+        )
         size = np.abs(self.scales.scaled(self.residuals)[self.rows])
         wide = np.maximum(half, FINE)
-        return float(np.sum(surprise(size, wide, stray) - np.log(half / wide)))
+        return float(np.sum(surprisal(size, wide, outlier_probability) - np.log(half / wide)))
 
     def intervals(self) -> dict[str, tuple[float, float]]:
         """Returns 95 % intervals by parameter name."""
@@ -368,7 +370,7 @@ class _Problem:
         moves = np.diag(STEP * self.spread) if self.along is None else _moves(self.along, self.spread)
         now = self.scale.scaled(self.found(place))[self.rows]
         slopes = slopes_at(self._scaled, now, place, moves, (self.low, self.high), wide=wide)
-        self.along = slopes * counting(now, self.scale, self.rows)[1][:, None]
+        self.along = slopes * robust_residuals(now, self.scale, self.rows)[1][:, None]
         return self.along
 
     def stepped(self, place: FloatArray, steps: int) -> FloatArray:
@@ -395,7 +397,10 @@ class _Problem:
             residuals,
             np.zeros(len(place)),
             slopes,
-            ((self.low - place) / self.spread - EDGE, (self.high - place) / self.spread + EDGE),
+            (
+                (self.low - place) / self.spread - BOUND_MARGIN,
+                (self.high - place) / self.spread + BOUND_MARGIN,
+            ),
             max_nfev=1 + steps,
             gtol=None,
         )
@@ -439,10 +444,10 @@ def solve(
         found = problem.found(place)
         problem.scale = scales(data, found) if known is None else _tempered(known, found, rows)
         before = problem.residuals(place)
-        taken = min(ROUND, steps - done)
+        taken = min(STEPS_PER_ROUND, steps - done)
         place = problem.stepped(place, taken)
         after = problem.residuals(place)
-        done = done + taken if 0.5 * float(before @ before - after @ after) >= WORTH else steps
+        done = done + taken if 0.5 * float(before @ before - after @ after) >= MIN_COST_DECREASE else steps
     found = problem.found(place)
     problem.scale = known or scales(data, found)
     left = softened(found, problem.scale, rows)
@@ -477,17 +482,17 @@ def legs_of_rows(data: Data, rows: Mask) -> NDArray[np.intp]:
 
 def softened(found: dict[str, FloatArray], scale: Scales, rows: Mask) -> FloatArray:
     """Returns the residuals of some rows, transformed by their likelihood and softened."""
-    return counting(scale.scaled(found)[rows], scale, rows)[0]
+    return robust_residuals(scale.scaled(found)[rows], scale, rows)[0]
 
 
-def counting(off: FloatArray, scale: Scales, rows: Mask) -> tuple[FloatArray, FloatArray]:
+def robust_residuals(off: FloatArray, scale: Scales, rows: Mask) -> tuple[FloatArray, FloatArray]:
     """Transforms scaled residuals by their likelihood and softens them; also returns the derivative."""
-    half, stray = (each[rows] for each in scale.halves(len(rows) // len(CHANNELS)))
-    root, slope = rooted(off, half, stray)
-    # Beyond `SOFT`, squares grow linearly (Huber loss).
-    size = np.maximum(np.abs(root) / SOFT, 1.0)
+    half, outlier_probability = (each[rows] for each in scale.halves(len(rows) // len(CHANNELS)))
+    root, slope = deviance_residuals(off, half, outlier_probability)
+    # Beyond `HUBER_THRESHOLD`, squares grow linearly (Huber loss).
+    size = np.maximum(np.abs(root) / HUBER_THRESHOLD, 1.0)
     soft = np.sqrt(2.0 * size - 1.0)
-    return np.where(size > 1.0, np.sign(root) * SOFT * soft, root), slope / soft
+    return np.where(size > 1.0, np.sign(root) * HUBER_THRESHOLD * soft, root), slope / soft
 
 
 def _tempered(known: Scales, found: dict[str, FloatArray], rows: Mask) -> Scales:
@@ -513,30 +518,32 @@ def slopes_at(
     """Returns finite-difference derivatives of the scaled residuals at ``place``, shape (n, p).
 
     ``seen`` evaluates residuals at places, ``now`` are those at ``place``. Differences are taken along the
-    moves, in the direction with more distance to the bounds; ``wide`` differences, for intervals, are `WIDE`
-    times as long and two-sided.
+    moves, in the direction with more distance to the bounds; ``wide`` differences, for intervals, are
+    `WIDE_FACTOR` times as long and two-sided.
     """
     both = [
         [np.clip(place + way * move, *bounds) for way in (1.0, -1.0)]
-        for move in moves * (WIDE if wide else 1.0)
+        for move in moves * (WIDE_FACTOR if wide else 1.0)
     ]
     if wide:
         ends = [end for pair in both for end in pair]
     else:
         ends = [max(pair, key=lambda each: float(np.linalg.norm(each - place))) for pair in both]
     changes = np.stack(seen(ends)) - now
-    far = np.flatnonzero(np.mean(np.square(changes), axis=1) > TOO_FAR**2)
+    far = np.flatnonzero(np.mean(np.square(changes), axis=1) > MAX_RESIDUAL_CHANGE**2)
     if wide and len(far):
         for each in far:
-            ends[each] = place + NEARER * (ends[each] - place)
+            ends[each] = place + SHORTENING * (ends[each] - place)
         changes[far] = np.stack(seen([ends[each] for each in far])) - now
     return np.asarray((np.linalg.pinv(np.stack(ends) - place) @ changes).T, dtype=np.float64)
 
 
 def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
-    """Returns difference steps along the principal directions that change the residuals by `RESPONSE`."""
-    worth, directions = eigen(slopes, spread)
-    far = np.minimum(RESPONSE / np.sqrt(worth), FARTHEST)
+    """Returns difference steps along the principal directions; each changes the residuals by
+    `RESIDUAL_CHANGE`.
+    """
+    information, directions = eigen(slopes, spread)
+    far = np.minimum(RESIDUAL_CHANGE / np.sqrt(information), MAX_DIFFERENCE)
     moves: FloatArray = (directions * far).T * spread
     return moves
 
@@ -567,10 +574,10 @@ VELOCITY_FEEDFORWARD: Final = 0.9
 """Start value between none (rare) and the full speed."""
 FEW_STEPS = 3
 """Maximum number of steps of a fit from each start between two halvings."""
-HOPELESS: Final = 2.0
+MAX_COST_RATIO: Final = 2.0
 """Ratio of a start's cost to the lowest cost, after the same number of steps, above which a start is dropped
 even if it is in the better half. The starts that won on three foreign servos had at most 1.8."""
-GAIN: Final = 0.97
+MAX_MISFIT_RATIO: Final = 0.97
 """Maximum ratio of the misfits with and without a block for keeping the block; superfluous parameters gain
 less."""
 MECHANICS: Final = (
@@ -614,7 +621,7 @@ def in_best_structure(
     keep(best)
     while more := list(more_blocks(best)):
         found = by_halving(few, more, scale)
-        if misfit(few.data, found.residuals) > GAIN * misfit(few.data, best.residuals):
+        if misfit(few.data, found.residuals) > MAX_MISFIT_RATIO * misfit(few.data, best.residuals):
             break
         best = found
         keep(best)
@@ -637,7 +644,7 @@ def by_halving(
     tried = [led(each) for each in begun]
     while True:
         tried = sorted(tried, key=lambda each: each.cost)[: (len(tried) + 1) // 2]
-        tried = [each for each in tried if each.cost <= HOPELESS * tried[0].cost]
+        tried = [each for each in tried if each.cost <= MAX_COST_RATIO * tried[0].cost]
         keep(tried[0])
         tried = [led((each.truth, each.parameters)) for each in tried]
         if len(tried) == 1:
@@ -828,37 +835,37 @@ def exchanged(truth: Truth) -> Truth:
 # Optional parameters, which a fit adds at the end if the recording shows them.
 
 GROWTH: Final = "friction growth"
-LAST: Final = (
+OPTIONAL_GROUPS: Final = (
     ("velocity feed-forward",),
     ("encoder coupling",),
     (GROWTH,),
     ("friction's rise at rest", "Stribeck speed"),
 )
 """Groups of optional parameters; each group is added as a whole or not at all."""
-EARNED = 8.0
+MIN_LOG_LIKELIHOOD_RATIO = 8.0
 """Minimum log likelihood ratio for adding parameters or leaving the start's minimum: exp(8) to one."""
-SURE = 4.0
-"""Minimum change of the first parameter of a group of `LAST`, standard deviations."""
-EARNED_STEPS = 6
+MIN_Z_SCORE = 4.0
+"""Minimum change of the first parameter of a group of `OPTIONAL_GROUPS`, standard deviations."""
+TRIAL_STEPS = 6
 """Steps of a trial fit with added parameters; several, because the Stribeck speed is visible only once the
 rise is not zero."""
 LOOP_STEPS = 10
 """Steps of a trial fit of each loop law on a few legs, with all other parameters held."""
 
 
-def with_last(replays: Replays, best: Fitted) -> Fitted:
-    """Adds the significant groups of `LAST`; the returned fit is not yet at its minimum."""
-    for names in LAST:
+def with_optional_groups(replays: Replays, best: Fitted) -> Fitted:
+    """Adds the significant groups of `OPTIONAL_GROUPS`; the returned fit is not yet at its minimum."""
+    for names in OPTIONAL_GROUPS:
         extra = [each for each in named(*names) if each not in best.parameters]
         if not extra or (GROWTH in names and not _warms(replays.data)):
             continue
         wider, there = (*best.parameters, *extra), with_sections(best.truth, extra)
         around = np.append(best.prior, coordinates(there, extra))
-        tried = solve(replays, there, wider, EARNED_STEPS, around, known=best.scales)
+        tried = solve(replays, there, wider, TRIAL_STEPS, around, known=best.scales)
         new = len(best.parameters)
         off = abs(float(tried.place[new] - around[new]))
-        sure = off > SURE * math.sqrt(float(tried.covariance[new, new]))
-        if sure and best.cost - tried.cost > EARNED:
+        sure = off > MIN_Z_SCORE * math.sqrt(float(tried.covariance[new, new]))
+        if sure and best.cost - tried.cost > MIN_LOG_LIKELIHOOD_RATIO:
             best = tried
     return best
 
@@ -884,7 +891,7 @@ def with_loop(replays: Replays, best: Fitted) -> Fitted | None:
     laws = [(there, loop_parameters(there)) for there in by_each_law(best.truth)[fitted:]]
     led = [solve(few, there, own, LOOP_STEPS, known=noise, linear=False) for there, own in laws if own]
     nearest = min(led, key=lambda each: each.cost, default=None)
-    if nearest is None or best.cost - _cost(replays, nearest.truth, best) < EARNED:
+    if nearest is None or best.cost - _cost(replays, nearest.truth, best) < MIN_LOG_LIKELIHOOD_RATIO:
         return None
     rest = [number for number, each in enumerate(best.parameters) if each.cause != ELASTIC]
     parameters = (*(best.parameters[number] for number in rest), *nearest.parameters)
@@ -902,7 +909,7 @@ def with_limit(replays: Replays, best: Fitted, usual: Truth) -> Fitted:
     if free_value(best.truth, LIMIT) >= highest or LIMIT in best.parameters:
         return best
     without = with_values(best.truth, {LIMIT.name: highest})
-    if _cost(replays, without, best) - best.cost <= EARNED:
+    if _cost(replays, without, best) - best.cost <= MIN_LOG_LIKELIHOOD_RATIO:
         return replace(best, truth=without)
     parameters, prior = (*best.parameters, LIMIT), np.append(best.prior, coordinates(usual, [LIMIT]))
     return solve(replays, best.truth, parameters, STEPS, prior)
@@ -924,7 +931,7 @@ MORE_STEPS = 10
 """Steps from an alternative start over the whole recording."""
 STEPS = 30
 """Maximum steps over the whole recording."""
-MORE = 1.1
+EXCESS_RATIO = 1.1
 """Ratio to the true axis's residuals above which a fit has excess residuals; scales are not known more
 accurately."""
 OPTIONAL = (
@@ -976,7 +983,7 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
     rows = fitted_rows(few.data)
 
     def near(fitted: Fitted) -> bool:
-        return bool(np.mean(np.square(softened(fitted.residuals, noise, rows))) < SOFT**2)
+        return bool(np.mean(np.square(softened(fitted.residuals, noise, rows))) < HUBER_THRESHOLD**2)
 
     if not near(best):
         others = starts(begun, 1e3 * data.pieces[0].commands.cycle_s)
@@ -985,7 +992,7 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
     polished = None
     if near(best):
         polished = _polished(replays, best, begun, keep)
-        if values_of(what_is_left(data, polished.residuals, noise_in_motion(data))) is Values.AXIS:
+        if values_of(channel_residuals(data, polished.residuals, noise_in_motion(data))) is Values.AXIS:
             return polished
         best = in_best_structure(few, polished, ())
     progress(0.8)
@@ -1007,7 +1014,7 @@ def _polished(replays: Replays, near: Fitted, begun: Truth, keep: Callable[[Fitt
     laws = len(LAWS)  # maximum number of changes
     while True:
         best = _in_best_minimum(replays, best, begun)
-        wider = with_last(replays, best)
+        wider = with_optional_groups(replays, best)
         if wider is not best:
             best = _ended(replays, wider)
             continue
@@ -1039,13 +1046,13 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
         # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
         # the next substep increases the residuals too little for any channel to show it.
         places = [exchanged(best.truth), *neighbours(best.truth)]
-        if any(best.scales.deviation[name] > MORE * least[name] for name in CHANNELS):
+        if any(best.scales.deviation[name] > EXCESS_RATIO * least[name] for name in CHANNELS):
             tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
             places.append(by_halving(few, tried, noise).truth)
         last = best
         for place in places:
             other = continued(replays, best, MORE_STEPS, place)
-            if other.loss + EARNED < best.loss:
+            if other.loss + MIN_LOG_LIKELIHOOD_RATIO < best.loss:
                 best = _ended(replays, other)
         if best is last:
             return best

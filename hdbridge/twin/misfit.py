@@ -172,13 +172,13 @@ def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
     begun = [each.commands.start_c for each in pieces]
     warm_c = [0.0 if None in begun or each is None else each for each in begun]
 
-    def worth(place: int) -> tuple[int, float, float]:
+    def priority(place: int) -> tuple[int, float, float]:
         seen = WITHOUT_MOTION.union(*(pieces[each].kind for each in taken))
         apart_k = min((abs(warm_c[place] - warm_c[each]) for each in taken), default=0.0)
         return len({*pieces[place].kind} - seen), apart_k, -_replayed_s(pieces[place])
 
     while left:
-        place = max(left, key=worth)
+        place = max(left, key=priority)
         left.remove(place)
         if not taken or sum(_replayed_s(pieces[each]) for each in (*taken, place)) <= wanted_s:
             taken.append(place)
@@ -218,7 +218,7 @@ def residuals(data: Data, truth: Truth) -> dict[str, FloatArray]:
             found[FOLLOWING][rows] -= np.median(found[FOLLOWING][rows][piece.rest])
     for name, counts in data.counts.items():
         found[name] *= counts
-    found[LOAD] = _not_taken_along(data, found[FOLLOWING], found[LOAD])
+    found[LOAD] = _without_motor_part(data, found[FOLLOWING], found[LOAD])
     return found
 
 
@@ -227,7 +227,7 @@ def beyond(values: FloatArray, least: float) -> FloatArray:
     return np.asarray(np.sign(values) * np.maximum(np.abs(values) - least, 0.0), dtype=np.float64)
 
 
-def _not_taken_along(data: Data, following: FloatArray, load: FloatArray) -> FloatArray:
+def _without_motor_part(data: Data, following: FloatArray, load: FloatArray) -> FloatArray:
     """Returns the load's residuals without the part due to the motor and without their zeros.
 
     The motor's residuals enter with a regression coefficient between 0 and 1, which is one if the loops are
@@ -293,7 +293,7 @@ def _piece(
     for each in held_out:
         out |= (part.time_s >= each.start_s) & (part.time_s <= each.end_s)
     travelled = np.abs(np.diff(part.motor_position_deg, prepend=part.motor_position_deg[0]))
-    elastic = unknown | (np.cumsum(travelled) < (UNKNOWN_DEG if remembers(base) else 0.0))
+    elastic = unknown | (np.cumsum(travelled) < (UNKNOWN_DEG if has_memory(base) else 0.0))
     # Between two parts the drive's loops may have been restarted.
     loops = elastic | (np.cumsum(np.where(judged, travelled, 0.0)) <= UNKNOWN_DEG)
     stuck, still, held = standing(part, 360.0 / axis.motor_encoder.counts_per_turn)
@@ -318,7 +318,7 @@ def _piece(
     return Piece(commands, measured, counts, leg, kinds, out, stuck)
 
 
-def remembers(truth: Truth) -> bool:
+def has_memory(truth: Truth) -> bool:
     """Returns True if the gear's angle depends on the history of the motor."""
     gear, load = truth.gear, truth.load_
     return bool(
@@ -380,24 +380,28 @@ class Replays:
 
 FINE = 1e-3
 """Half the resolution, in standard deviations, below which rounding is negligible."""
-STRAY = 0.02
+OUTLIER_SHARE = 0.02
 """Share of outliers among the readings. The break-away of a stuck motor and its position at switch-on are
 not evidence of a simulation error or of a parameter."""
 
 
-def rooted(off: FloatArray, half: FloatArray, stray: FloatArray) -> tuple[FloatArray, FloatArray]:
+def deviance_residuals(
+    off: FloatArray, half: FloatArray, outlier_probability: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Returns residuals whose half squares are the loss of log likelihood, and their derivative with respect
     to ``off``.
 
     ``off`` is reading minus simulation, ``half`` half the resolution, both in standard deviations of the
-    simulation, shape (n,); ``stray`` the probability of an outlier. Without resolution, ``off`` is returned
+    simulation, shape (n,); ``outlier_probability`` by row. Without resolution, ``off`` is returned
     unchanged.
     """
     size, plain = np.abs(off), half == 0.0
-    stray = np.where(half < FINE, stray * FINE / np.where(plain, 1.0, half), stray)
+    outlier_probability = np.where(
+        half < FINE, outlier_probability * FINE / np.where(plain, 1.0, half), outlier_probability
+    )
     half = np.maximum(half, FINE)
-    least = surprise(np.zeros_like(half), half, stray)
-    lost = surprise(size, half, stray)
+    least = surprisal(np.zeros_like(half), half, outlier_probability)
+    lost = surprisal(size, half, outlier_probability)
     root = np.sqrt(2.0 * np.maximum(lost - least, 0.0))
     rise = np.exp(lost - 0.5 * np.square(size - half)) * -np.expm1(-2.0 * size * half) / np.sqrt(2.0 * np.pi)
     flat = np.sqrt(2.0 * half * np.exp(least - 0.5 * np.square(half)) / np.sqrt(2.0 * np.pi))
@@ -407,12 +411,12 @@ def rooted(off: FloatArray, half: FloatArray, stray: FloatArray) -> tuple[FloatA
     return np.sign(off) * np.where(plain, size, root), np.where(plain, 1.0, slope)
 
 
-def surprise(size: FloatArray, half: FloatArray, stray: FloatArray) -> FloatArray:
+def surprisal(size: FloatArray, half: FloatArray, outlier_probability: FloatArray) -> FloatArray:
     """Returns the negative log probability of a reading at distance ``size`` >= 0."""
     nearer = log_ndtr(half - size)
     inside = nearer + np.log1p(-np.exp(np.minimum(log_ndtr(-size - half) - nearer, -1e-12)))
     with np.errstate(divide="ignore"):
-        return np.asarray(-np.logaddexp(inside, np.log(stray)), dtype=np.float64)
+        return np.asarray(-np.logaddexp(inside, np.log(outlier_probability)), dtype=np.float64)
 
 
 def deviation(off: FloatArray, step: float, least: float) -> tuple[float, float]:
@@ -422,24 +426,24 @@ def deviation(off: FloatArray, step: float, least: float) -> tuple[float, float]
     """
     size = np.abs(off)
     farthest = max(float(np.max(size)), least)
-    stray = STRAY / (1.0 - STRAY) * step / (2.0 * farthest + step)
+    outlier_probability = OUTLIER_SHARE / (1.0 - OUTLIER_SHARE) * step / (2.0 * farthest + step)
 
     def cost(log_deviation: float) -> float:
         each = math.exp(log_deviation)
         half = 0.5 * step / each
         times = min(1.0, half / FINE)
-        lost = surprise(size / each, np.array(max(half, FINE)), np.array(stray / times))
+        lost = surprisal(size / each, np.array(max(half, FINE)), np.array(outlier_probability / times))
         return float(np.sum(lost)) - len(size) * math.log(times)
 
     bounds = (np.log(least), np.log(2.0 * farthest))
     found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.02})
-    return float(np.exp(found.x)), stray
+    return float(np.exp(found.x)), outlier_probability
 
 
 # ----------------------------------------------------------------
 # Scales of the residuals: standard deviation of a simulation's error by channel.
 
-MOST_ANSWERED = 1.5
+MAX_CORRECTED_SHARE = 1.5
 """Maximum share of a speed error that a velocity loop corrects within a step; it is unstable at two."""
 
 
@@ -452,7 +456,7 @@ class Scales:
 
     deviation: Mapping[str, float]
     step: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(CHANNELS, 0.0))
-    stray: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(CHANNELS, 0.0))
+    outlier_probability: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(CHANNELS, 0.0))
     """Probability of an outlier."""
 
     def scaled(self, found: Mapping[str, FloatArray]) -> FloatArray:
@@ -460,12 +464,17 @@ class Scales:
         return np.concatenate([found[name] / self.deviation[name] for name in CHANNELS])
 
     def halves(self, length: int) -> tuple[FloatArray, FloatArray]:
-        """Returns half the resolution in standard deviations and `stray`, for ``length`` rows per channel."""
+        """Returns half the resolution in standard deviations, and `outlier_probability`, by row.
+
+        Each channel has ``length`` rows.
+        """
         by_channel = [
             np.broadcast_to(0.5 * self.step[name] / self.deviation[name], length) for name in CHANNELS
         ]
-        strays = [self.stray[name] if self.step[name] else 0.0 for name in CHANNELS]
-        return np.concatenate(by_channel), np.repeat(strays, length)
+        outlier_probabilities = [
+            self.outlier_probability[name] if self.step[name] else 0.0 for name in CHANNELS
+        ]
+        return np.concatenate(by_channel), np.repeat(outlier_probabilities, length)
 
     @property
     def noise(self) -> dict[str, float]:
@@ -488,14 +497,14 @@ def least_deviation(data: Data) -> dict[str, float]:
     fine_deg = 360.0 / (encoder.counts_per_turn * encoder.interpolation)
     return {
         FOLLOWING: fine_deg / 12.0**0.5,
-        TORQUE: _shaken_nm(truth, math.radians(fine_deg)) / 12.0**0.5,
+        TORQUE: _torque_noise_nm(truth, math.radians(fine_deg)) / 12.0**0.5,
         LOAD: float(
             np.hypot(truth.load_.encoder.noise_arcsec, fine_deg * ARCSEC_PER_DEG / data.axis.gear.ratio)
         ),
     }
 
 
-def _shaken_nm(truth: Truth, off_rad: float) -> float:
+def _torque_noise_nm(truth: Truth, off_rad: float) -> float:
     """Returns the rms torque of the velocity loop due to independent reading errors of this rms.
 
     Speed is the readings' difference over the step, and the motor responds within the next step. The transfer
@@ -503,7 +512,7 @@ def _shaken_nm(truth: Truth, off_rad: float) -> float:
     error.
     """
     gain, step_s = truth.servo.velocity_gain_nm_s_per_rad, truth.substep_s
-    share = min(gain * step_s / truth.motor.inertia_kg_m2, MOST_ANSWERED)
+    share = min(gain * step_s / truth.motor.inertia_kg_m2, MAX_CORRECTED_SHARE)
     norm = math.sqrt(1.0 + (1.0 + share) ** 2 + share**3 / (2.0 - share))
     return gain * off_rad / step_s * norm
 
@@ -514,14 +523,14 @@ def scales(data: Data, found: Mapping[str, FloatArray]) -> Scales:
     Residuals at rest are excluded, because they would dominate a recording that rests half of the time.
     """
     least, steps = least_deviation(data), rounding(data.axis)
-    given, stray = dict(least), dict.fromkeys(CHANNELS, 0.0)
+    given, outlier_probability = dict(least), dict.fromkeys(CHANNELS, 0.0)
     for name, counts in data.counts.items():
         inside = found[name][data.moving & counts]
         if len(inside):
             # At least half of the readings in motion are not outliers.
             typical = median_deviation(beyond(inside, 0.5 * steps[name]))
-            given[name], stray[name] = deviation(inside, steps[name], max(least[name], typical))
-    return Scales(given, steps, stray)
+            given[name], outlier_probability[name] = deviation(inside, steps[name], max(least[name], typical))
+    return Scales(given, steps, outlier_probability)
 
 
 # ----------------------------------------------------------------
@@ -550,14 +559,14 @@ def expected(data: Data) -> Scales:
     return Scales(noise_floor(data) | {LOAD: noise_in_motion(data)[LOAD]})
 
 
-def with_load_noise(truth: Truth, left_arcsec: FloatArray) -> Truth:
+def with_load_noise(truth: Truth, residuals_arcsec: FloatArray) -> Truth:
     """Returns the truth with the load encoder's noise, from differences of residuals between rows.
 
-    ``left_arcsec`` are the load's residuals, zero for rows that do not count. Rounding is subtracted.
+    ``residuals_arcsec`` are the load's residuals, zero for rows that do not count. Rounding is subtracted.
     """
     encoder = truth.load_.encoder
-    inside = left_arcsec != 0.0
-    steps = np.diff(left_arcsec)[inside[1:] & inside[:-1]]
+    inside = residuals_arcsec != 0.0
+    steps = np.diff(residuals_arcsec)[inside[1:] & inside[:-1]]
     if not len(steps):
         return truth
     spread = median_deviation(steps) / math.sqrt(2.0)
@@ -652,7 +661,7 @@ class Values(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Left:
+class ChannelResidual:
     """Residual of a channel."""
 
     cause: ClassVar[str] = "unexplained"
@@ -668,7 +677,7 @@ class Left:
     def text(self) -> str:
         """Description in words."""
         return (
-            f"{self.channel} is left with {self.times_noise:.3g} times its noise, most of it in legs of the "
+            f"{self.channel}: residual is {self.times_noise:.3g} times the noise, most of it in legs of the "
             f"kind {self.kind}"
         )
 
@@ -680,9 +689,9 @@ class Left:
         )
 
 
-def what_is_left(
+def channel_residuals(
     data: Data, residuals: Mapping[str, FloatArray], noise: Mapping[str, float]
-) -> tuple[Left, ...]:
+) -> tuple[ChannelResidual, ...]:
     """Returns the residual of each recorded channel, on held-out legs if any.
 
     ``residuals`` by channel over all rows of the data, ``noise`` by channel in its unit (`noise_in_motion`).
@@ -692,10 +701,12 @@ def what_is_left(
     for name, by_kind in misfit_of(data, residuals, rows).items():
         left, signal = rms(residuals[name][rows[name]]), rms(signals[name][rows[name]])
         share = left / signal if signal else math.inf
-        found.append(Left(name, share, left / noise[name], max(by_kind, key=lambda kind: by_kind[kind])))
+        found.append(
+            ChannelResidual(name, share, left / noise[name], max(by_kind, key=lambda kind: by_kind[kind]))
+        )
     return tuple(found)
 
 
-def values_of(left: Sequence[Left]) -> Values:
+def values_of(left: Sequence[ChannelResidual]) -> Values:
     """Returns the origin of fitted values: the axis if all channels are explained, else a replay."""
     return Values.AXIS if all(each.explained for each in left) else Values.REPLAY

@@ -29,7 +29,7 @@ from hdbridge.units import figure
 # ----------------------------------------------------------------
 # Growth of a misfit, and significance of a rival's larger residuals against their scatter between legs.
 
-STRAY = 4.0
+CLIP_RATIO = 4.0
 """Limit to which residuals are clipped, in rms of their kind of leg, because a motor that breaks away at a
 different time is not a change of the axis."""
 FALSE_ALARM = 0.02
@@ -53,8 +53,8 @@ def scales_by_kind(data: Data, known: Misfit, noise: Mapping[str, float]) -> dic
 def growth(data: Data, residuals: Mapping[str, FloatArray], was: Mapping[str, Any]) -> dict[str, float]:
     """Returns, by channel, the rms residual relative to ``was`` (`scales_by_kind`).
 
-    A row counts as at most `STRAY` times the typical residual of its leg, because a single reading may be
-    wrong, but not a whole leg.
+    A row counts as at most `CLIP_RATIO` times the typical residual of its leg, because a single reading may
+    be wrong, but not a whole leg.
     """
     found = {}
     for name, inside in data.counts.items():
@@ -63,7 +63,7 @@ def growth(data: Data, residuals: Mapping[str, FloatArray], was: Mapping[str, An
             typical = np.zeros_like(now)
             for leg in np.unique(legs):
                 typical[legs == leg] = median_deviation(now[legs == leg])
-            now = np.minimum(now, STRAY * np.maximum(scale, typical))
+            now = np.minimum(now, CLIP_RATIO * np.maximum(scale, typical))
             found[name] = math.sqrt(float(np.sum(now**2)) / float(np.sum(scale**2)))
     return found
 
@@ -193,7 +193,7 @@ def _excess(grown: Mapping[str, float]) -> float:
 # ----------------------------------------------------------------
 # Findings.
 
-ALIKE = 0.4
+MIN_COMPONENT = 0.4
 """Minimum component of a parameter in an unobservable direction for including it in the set."""
 
 
@@ -242,7 +242,7 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Alike:
+class InseparableSet:
     """Parameters that are not separable in the motion, and motions that would separate them."""
 
     cause: ClassVar[str] = "not separable"
@@ -302,7 +302,7 @@ def findings(
     )
 
 
-def alike(fitted: Fitted, legs: NDArray[np.intp]) -> tuple[Alike, ...]:
+def inseparable_sets(fitted: Fitted, legs: NDArray[np.intp]) -> tuple[InseparableSet, ...]:
     """Returns sets of parameters that can change together by the prior's width without a significant effect.
 
     ``legs`` contains the leg number of each fitted row.
@@ -310,12 +310,14 @@ def alike(fitted: Fitted, legs: NDArray[np.intp]) -> tuple[Alike, ...]:
     spread = np.array([each.spread for each in fitted.parameters])
     scaled = fitted.jacobian * spread
     _, directions = np.linalg.eigh(scaled.T @ scaled)
-    sets: list[Alike] = []
+    sets: list[InseparableSet] = []
     for direction in directions.T:
         if worse_than_chance(fitted.vector, scaled @ direction, legs):
             continue
-        members = [each for each, part in zip(fitted.parameters, direction, strict=True) if abs(part) > ALIKE]
+        members = [
+            each for each, part in zip(fitted.parameters, direction, strict=True) if abs(part) > MIN_COMPONENT
+        ]
         if members:
             moves = dict.fromkeys(each.move for each in members)
-            sets.append(Alike(tuple(each.name for each in members), tuple(moves)))
+            sets.append(InseparableSet(tuple(each.name for each in members), tuple(moves)))
     return tuple(sets)

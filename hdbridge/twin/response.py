@@ -34,7 +34,7 @@ RIDGES: Final = (1e-1, 1e-2, 1e-3, 1e-4)
 """Weights of the taps' squares, as a share of each tap's information in the rows; chosen by held-out legs."""
 ROUNDS: Final = 2
 """Number of fits of the demand's response; the second corrects the changes due to friction."""
-GAIN: Final = 0.97
+MAX_MISFIT_RATIO: Final = 0.97
 """Maximum ratio of the misfit with a response to that without for keeping the response."""
 
 
@@ -49,7 +49,7 @@ def with_response(replays: Replays, fitted: Fitted) -> Fitted:
         for channel in (*[FOLLOWING] * demanded, TORQUE):
             truth = _added(truth, replays.data, found, ridge, channel)
             (found,) = replays([truth])
-        if misfit(replays.data, found) < GAIN * misfit(replays.data, best.residuals):
+        if misfit(replays.data, found) < MAX_MISFIT_RATIO * misfit(replays.data, best.residuals):
             best = replace(fitted, truth=truth, residuals=found)
     return best
 

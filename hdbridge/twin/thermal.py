@@ -62,7 +62,7 @@ LEAST_ERROR: Final = 1e-4
 START_K: Final = 1.0
 """Standard deviation of the body's temperature about the first reading of a part, because a sensor lags
 behind."""
-TOGETHER: Final = 0.25
+CORRELATION_SHARE: Final = 0.25
 """Correlation time of the thermal model's error, as a share of the time constant."""
 PLACES: Final = (0.0, -1.4, 1.4)
 """Start values of the time constant: logarithms of the ratio to the truth's."""
@@ -78,7 +78,7 @@ class _Part:
     """Friction power, averaged over the step that ends at each time."""
     torque_squares: FloatArray
     """Square of torque over rated torque, averaged over the step that ends at each time."""
-    weather_k: FloatArray
+    ambient_change_k: FloatArray
     """Change of the truth's ambient temperature since the start of the part."""
     reading_c: FloatArray
     rows: NDArray[np.intp]
@@ -168,9 +168,9 @@ def _fit(
             break
         noise_k, off, slopes = rest_k, off * noise_k / rest_k, slopes * noise_k / rest_k
     numbers, goes_on = [], 0
-    together_s = TOGETHER * _values(place[:count])[2]
+    correlation_s = CORRELATION_SHARE * _values(place[:count])[2]
     for each in parts:
-        number = (STEP_S * each.rows[each.firsts] // together_s).astype(np.intp)
+        number = (STEP_S * each.rows[each.firsts] // correlation_s).astype(np.intp)
         numbers.append(goes_on + number)
         goes_on += int(number[-1]) + 1
     covariance = sandwich(slopes, off, np.concatenate(numbers), spread)
@@ -195,7 +195,9 @@ def _shown(parts: Sequence[_Part], place: FloatArray) -> FloatArray:
     friction, shown = math.exp(place[count]), []
     for part, start_c in zip(parts, place[count + 1 :].tolist(), strict=True):
         losses_w = friction * part.friction_w + copper_w * part.torque_squares
-        shown.append(part.runs(_body(ambient_c + part.weather_k + k_per_w * losses_w, start_c, time_s)))
+        shown.append(
+            part.runs(_body(ambient_c + part.ambient_change_k + k_per_w * losses_w, start_c, time_s))
+        )
     return np.concatenate(shown)
 
 
@@ -230,11 +232,13 @@ def _parts(
             np.append(0.0, np.diff(np.interp(at_s, time_s, each[rows])) / STEP_S)
             for each in (friction_j, torque_squares)
         )
-        weather_k = heat.ambient_k_per_hour * at_s / 3600.0
-        weather_k = weather_k + heat.ambient_swing_k * np.sin(math.tau * at_s / heat.ambient_period_s)
+        ambient_change_k = heat.ambient_k_per_hour * at_s / 3600.0
+        ambient_change_k = ambient_change_k + heat.ambient_swing_k * np.sin(
+            math.tau * at_s / heat.ambient_period_s
+        )
         new = (np.diff(reading_c[inside]) != 0.0) | (np.diff(inside) > 1)
         firsts = np.append(0, np.flatnonzero(new) + 1)
-        found.append(_Part(friction_w, squares, weather_k, reading_c, inside, firsts))
+        found.append(_Part(friction_w, squares, ambient_change_k, reading_c, inside, firsts))
     return found
 
 
@@ -244,7 +248,7 @@ def _losses(recording: Recording, axis: AxisConfig, truth: Truth) -> tuple[Float
     Replays are needed because a recording contains the torque at the end of each cycle, while the motor is
     heated by the torque within the cycle. The friction's work is corrected to the recorded temperature.
     """
-    told_c = recording.record.columns[Channel.TEMPERATURE.value]
+    recorded_c = recording.record.columns[Channel.TEMPERATURE.value]
     taken_j = []
     for copper_w in (0.0, 1.0):
         heat = truth.temperature.model_copy(
@@ -261,7 +265,7 @@ def _losses(recording: Recording, axis: AxisConfig, truth: Truth) -> tuple[Float
         above_k = 0.5 * (warm_c[1:] + warm_c[:-1]) - heat.ambient_c
         cooled_j = np.append(0.0, np.cumsum(above_k * np.diff(time_s)))
         taken_j.append(LARGE_S * warm_c + cooled_j)
-    friction_j = np.diff(taken_j[0]) * (_grown(truth, told_c) / _grown(truth, warm_c))[1:]
+    friction_j = np.diff(taken_j[0]) * (_grown(truth, recorded_c) / _grown(truth, warm_c))[1:]
     return np.append(0.0, np.cumsum(friction_j)), taken_j[1] - taken_j[0]
 
 

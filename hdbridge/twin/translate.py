@@ -227,7 +227,7 @@ def torque_modulation(effect: effects.TorqueModulation, draft: Draft) -> None:
     per_nm = 0.01 * effect.growth_percent_per_nm
     if effect.torque == "motor_torque_nm":
         per_nm /= draft.ratio
-        draft.note("by the motor's torque times the ratio, its own friction included")
+        draft.note("driven by the motor's torque times the ratio, including the motor's own friction")
     teeth = draft.gear.get("motor_orders", ())
     carried = {each.order for each in effect.orders}
     if any(each["order"] not in carried for each in teeth):
@@ -236,7 +236,8 @@ def torque_modulation(effect: effects.TorqueModulation, draft: Draft) -> None:
     if yields * abs(per_nm) > MOST_YIELD:
         held = math.copysign(MOST_YIELD / yields, per_nm)
         draft.note(
-            f"held at {100 * held:.3g} %/Nm: with {100 * per_nm:.3g} teeth would yield more than the spring"
+            f"limited to {100 * held:.3g} %/Nm: at {100 * per_nm:.3g} the teeth would yield more than the "
+            "spring"
         )
         per_nm = held
     draft.gear["torque_growth_per_nm"] = per_nm
@@ -290,7 +291,7 @@ def load_orders(effect: effects.LoadOrders, draft: Draft) -> None:
     draft.part("load", "encoder")["disc"] = _disc(few, 1.0, lambda phase_deg: -90.0 - phase_deg)
     if more:
         orders("load_orders", effect.model_copy(update={"orders": more}), draft)
-        draft.notes.insert(0, "orders beyond 2 go to gear.load_orders: a disc has none")
+        draft.notes.insert(0, "orders above 2 are written to gear.load_orders, because a disc has none")
     draft.notes.insert(0, f"radius assumed as {RADIUS_MM:g} mm")
     draft.place = "load.encoder.disc"
 
@@ -319,7 +320,7 @@ def channel_skew(effect: effects.ChannelSkew, draft: Draft) -> None:
     most = 0.5e-6 * abs(rest_ms2) * draft.axis.limits.acceleration_deg_s2 * 3600.0
     if most > SMALL_ARCSEC:
         draft.note(
-            f"a pure delay: up to {most:.2g} arcsec of the model's part by acceleration are not of a delay"
+            f"a pure delay: up to {most:.2g} arcsec of the model's acceleration term are not reproduced"
         )
 
 
@@ -346,7 +347,7 @@ def subdivisional_error(effect: effects.SubdivisionalError, draft: Draft) -> Non
         draft.note(f"{lost_arcsec:.2g} arcsec of the fourth order are no third harmonic of either signal")
     for name, limit in _LIMITS.items():
         if abs(signals.get(name, 0.0)) > limit:
-            draft.note(f"{name} held at {limit:g}: {signals[name]:.2g} is no signal any more")
+            draft.note(f"{name} limited to {limit:g}: {signals[name]:.2g} is not plausible")
             signals[name] = math.copysign(limit, signals[name])
     draft.part("load", "encoder")["signals"] = signals
 
@@ -360,7 +361,7 @@ def count_loss(effect: effects.CountLoss, draft: Draft) -> None:
         if each.time_s >= 0.0
     ]
     if not losses:
-        draft.refuse("it was before the record's time zero, and is in the encoders' zero by now")
+        draft.refuse("it occurred before the record's time zero, and the encoders' zero already includes it")
         return
     draft.part("load", "encoder")["losses"] = losses
     draft.note("repeats at this time after each switching on; whole counts")
@@ -395,7 +396,7 @@ def amplitude_drift(effect: effects.AmplitudeDrift, draft: Draft) -> None:
         heat["reference_c"] = heat["start_c"]
     else:
         heat["reference_c"] = effect.reference_c
-        draft.note(f"at once with the temperature, where the model follows it in {effect.tau_s:.3g} s")
+        draft.note(f"follows the temperature at once; the model has a time constant of {effect.tau_s:.3g} s")
     if effect.friction_percent_per_k:
         draft.note("the motor's friction grows with the loop")
 
@@ -403,7 +404,7 @@ def amplitude_drift(effect: effects.AmplitudeDrift, draft: Draft) -> None:
 def wear(effect: effects.Wear, draft: Draft) -> None:
     """Sets a gap between the teeth that grows with the travel; refuses a model whose elastic loop widens."""
     if effect.growth_arcsec_per_kiloturn > 0.0:
-        draft.refuse("the loop widens in the sense of the elastic one: the plant's teeth wear to a gap only")
+        draft.refuse("the model's elastic loop widens; wear of the plant's teeth only opens a gap")
         return
     draft.gear["wear"] = {
         "arcsec_per_1000_turns": -0.5 * effect.growth_arcsec_per_kiloturn,
@@ -411,7 +412,7 @@ def wear(effect: effects.Wear, draft: Draft) -> None:
     }
     draft.note("crossed within the gap's own travel")
     if effect.turns_before:
-        draft.note(f"from zero turns on: the {effect.turns_before:.0f} turns before are not in it")
+        draft.note(f"starts at zero turns, without the {effect.turns_before:.0f} turns before")
 
 
 def creep(effect: effects.Creep, draft: Draft) -> None:
@@ -421,7 +422,10 @@ def creep(effect: effects.Creep, draft: Draft) -> None:
     ]
     draft.gear["creep"] = [*draft.gear.get("creep", ()), *parts]
     if not LINEAR_BUILD_UP <= effect.build_up <= 1.0 / LINEAR_BUILD_UP:
-        draft.note(f"strained as slowly as it lets go, where the model needs {effect.build_up:.2g} of that")
+        draft.note(
+            f"builds up as slowly as it relaxes; the model's build-up takes {effect.build_up:.2g} of that "
+            "time"
+        )
 
 
 def _warm_up(effect: Warmed, draft: Draft) -> None:
@@ -430,7 +434,10 @@ def _warm_up(effect: Warmed, draft: Draft) -> None:
     ambient_c = heat.get("ambient_c", 22.0)
     heat["start_c"] = max(-60.0, ambient_c - effect.warm_up_k)
     heat["time_constant_s"] = effect.tau_s
-    draft.note(f"started {effect.warm_up_k:g} K below the ambient temperature, in {effect.tau_s:.3g} s")
+    draft.note(
+        f"starts {effect.warm_up_k:g} K below the ambient temperature, with a time constant of "
+        f"{effect.tau_s:.3g} s"
+    )
 
 
 # ----------------------------------------------------------------
@@ -481,7 +488,7 @@ def compliance(effect: effects.Compliance, draft: Draft) -> None:
             "third_stiffness_nm_per_rad": stages[2],
         }
     if times != 1.0:
-        draft.note("by the motor's torque times the ratio, friction included")
+        draft.note("driven by the motor's torque times the ratio, including friction")
     else:
         draft.load["torque_sense"] = effect.sense
 
@@ -503,7 +510,7 @@ def inertial_windup(effect: effects.InertialWindup, draft: Draft) -> None:
     if known and inertia > draft.hanging_kg_m2:
         draft.set_inertia(inertia)
         draft.place = "load.inertia_kg_m2"
-        draft.note("the spring is known otherwise, so the load follows from it")
+        draft.note("the spring is already known, so the load's inertia follows from it")
         return
     draft.set_stiffness(draft.inertia_kg_m2 / seconds2)
     draft.place = "gear.stiffness_nm_per_rad"
@@ -552,7 +559,7 @@ def hysteresis(effect: effects.Hysteresis | effects.HysteresisMemory, draft: Dra
         slips = [{"limit_arcsec": limit, "yield_deg": travel} for limit, travel in parts]
         if slips:
             draft.gear["hysteresis"] = {"law": "maxwell_slip", "elements": slips}
-        draft.note(f"straight between {NODES} points of a branch")
+        draft.note(f"linear between {NODES} points of a branch")
     else:
         draft.gear["hysteresis"] = {
             "law": "rolling_friction",
@@ -593,7 +600,7 @@ def _lagging(effect: effects.Hysteresis | effects.HysteresisMemory, draft: Draft
     draft.place = "load.presliding, load.coulomb_nm"
     draft.note("friction at the load; after a fast stop the load's inertia pushes it on")
     if not isinstance(effect, effects.HysteresisMemory):
-        draft.note("with return-point memory, which the model's law has not")
+        draft.note("with return-point memory, which the model's law lacks")
 
 
 def backlash(effect: effects.Backlash, draft: Draft) -> None:
@@ -606,8 +613,8 @@ def backlash(effect: effects.Backlash, draft: Draft) -> None:
     draft.load["coulomb_nm"] = already_nm + friction_nm
     draft.gear["backlash_arcsec"] = effect.gap_arcsec - 2.0 * friction_nm * per_nm
     draft.note(
-        f"{friction_nm:.2g} Nm of friction hold the load on its side; a stop that is harder than "
-        f"{math.degrees(friction_nm / draft.inertia_kg_m2):.0f} deg/s^2 throws it across"
+        f"{friction_nm:.2g} Nm of friction hold the load on its side; a stop harder than "
+        f"{math.degrees(friction_nm / draft.inertia_kg_m2):.0f} deg/s^2 makes it cross the gap"
     )
 
 
@@ -762,8 +769,8 @@ def _validated(data: dict[str, Any]) -> Truth:
         first = problem.errors()[0]
         place = ".".join(map(str, first["loc"]))
         raise InputError(
-            f"the model asks the simulated drive for what it cannot be: {place}: {first['msg']}; look at the "
-            "effect of the model that says so"
+            f"the model needs a value that the simulated drive does not allow: {place}: {first['msg']}; "
+            "look at the effect of the model that requires it"
         ) from None
 
 

@@ -42,10 +42,11 @@ from hdbridge.twin.fit import FIT_S, MOST_DEAD_CYCLES, Fitted, by_law_of, fit, f
 from hdbridge.twin.misfit import (
     CHANNELS,
     NOISE_LEVEL,
+    ChannelResidual,
     Data,
-    Left,
     Replays,
     Values,
+    channel_residuals,
     coarse,
     held_out_legs,
     misfit_of,
@@ -53,10 +54,9 @@ from hdbridge.twin.misfit import (
     noise_in_motion,
     prepare,
     values_of,
-    what_is_left,
     with_load_noise,
 )
-from hdbridge.twin.naming import Alike, Finding, alike, explain, findings, scales_by_kind
+from hdbridge.twin.naming import Finding, InseparableSet, explain, findings, inseparable_sets, scales_by_kind
 from hdbridge.twin.parameters import LOAD, by_cause, default_truth, with_sections
 from hdbridge.twin.replay import legs_of, replay
 from hdbridge.twin.response import with_response
@@ -78,9 +78,9 @@ class Twin:
     """Parameters, with intervals of the fitted ones; the provenance contains the data for `check`."""
     findings: tuple[Finding, ...]
     """Causes of the errors of the initial simulation, if its values were the axis's."""
-    alike: tuple[Alike, ...]
+    inseparable_sets: tuple[InseparableSet, ...]
     """Sets of parameters that are not separable in the recorded motion."""
-    left: tuple[Left, ...]
+    channel_residuals: tuple[ChannelResidual, ...]
     """Residual of each recorded channel, on held-out legs if any."""
     before: Comparison
     """Comparison of the recordings with the initial simulation; the kind `HELD_OUT` is the held-out legs."""
@@ -95,9 +95,9 @@ class Twin:
         return Values.of(self.truth) or Values.REPLAY
 
     @property
-    def unexplained(self) -> tuple[Left, ...]:
+    def unexplained(self) -> tuple[ChannelResidual, ...]:
         """Channels with residuals above their noise."""
-        return tuple(each for each in self.left if each.times_noise > NOISE_LEVEL)
+        return tuple(each for each in self.channel_residuals if each.times_noise > NOISE_LEVEL)
 
 
 # ----------------------------------------------------------------
@@ -170,15 +170,15 @@ def judge(twin: Twin) -> Verdict:
 
 def replays_only(twin: Twin) -> str:
     """Returns the headline of a twin whose values are not the axis's."""
-    measured = [each for each in twin.left if math.isfinite(each.share)]
+    measured = [each for each in twin.channel_residuals if math.isfinite(each.share)]
     shown = ", ".join(f"{each.channel} to {figure(100.0 * each.share, 2)} %" for each in measured)
     lost = [
-        f"{each.channel} is left with {figure(each.times_noise, 3)} times its noise"
-        for each in twin.left
+        f"{each.channel}: residual is {figure(each.times_noise, 3)} times the noise"
+        for each in twin.channel_residuals
         if not each.explained
     ]
     if twin.truth.servo.response is not None:
-        lost.append("a measured response stands for what its loops do not do")
+        lost.append("a measured response supplies the part that its loops cannot reproduce")
     why = f": {'; '.join(lost)}" if lost else ""
     return f"the twin replays this drive ({shown}), but its values are not the axis's{why}"
 
@@ -212,10 +212,8 @@ def better(before: Comparison, after: Comparison) -> Verdict:
     if worse:
         return Verdict(False, f"{where}, {'; '.join(worse)}")
     if gain < LEAST_GAIN:
-        return Verdict(False, f"{where} it is no nearer to the axis than the simulation was")
-    return Verdict(
-        True, f"{where} the differences from the axis are {100.0 * gain:.0f} % smaller in the mean"
-    )
+        return Verdict(False, f"{where} the differences from the axis are not smaller than before")
+    return Verdict(True, f"{where} the differences from the axis are {100.0 * gain:.0f} % smaller on average")
 
 
 # ----------------------------------------------------------------
@@ -251,7 +249,7 @@ HEADER: Final = (
 
 
 @dataclass(frozen=True)
-class KeptTwin:
+class TwinFile:
     """Twin, and the file from which it was read."""
 
     truth: Truth
@@ -318,7 +316,7 @@ TWINS: Final = Store(
     "twin-history",
     "make one with 'hdbridge twin'",
     "hdbridge model log PROFILE --twin",
-    KeptTwin.load,
+    TwinFile.load,
 )
 
 
@@ -347,17 +345,17 @@ def fit_twin(
     with Replays(data, workers) as replays:
         noise = noise_in_motion(data)
         fitted = fit(replays, lambda share: progress(0.9 * share))
-        left = what_is_left(data, fitted.residuals, noise)
-        values = Values.REPLAY if fitted.interrupted else values_of(left)
+        remaining = channel_residuals(data, fitted.residuals, noise)
+        values = Values.REPLAY if fitted.interrupted else values_of(remaining)
         if values is Values.REPLAY and not fitted.interrupted:
             fitted = with_response(replays, fitted)
-            left = what_is_left(data, fitted.residuals, noise)
+            remaining = channel_residuals(data, fitted.residuals, noise)
         findings: tuple[Finding, ...] = ()
-        sets: tuple[Alike, ...] = ()
+        sets: tuple[InseparableSet, ...] = ()
         if values is Values.AXIS:
             if Values.of(start) in {None, Values.AXIS}:
                 findings = _wrong(replays, start, fitted)
-            sets = alike(fitted, legs_of_rows(data, fitted_rows(data)))
+            sets = inseparable_sets(fitted, legs_of_rows(data, fitted_rows(data)))
     truth, warmth = with_warmth(whole, axis, fitted, with_knowledge(fitted, data, values))
     if values is Values.REPLAY:
         truth = truth.model_copy(update={"intervals": {}})
@@ -370,7 +368,7 @@ def fit_twin(
         truth,
         findings,
         sets,
-        left,
+        remaining,
         before,
         after,
         impossible(truth, axis, cycle_s) if values is Values.REPLAY else (),

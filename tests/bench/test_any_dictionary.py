@@ -12,7 +12,7 @@ from support.eds import OWN, fixed, mapped, profile_with, section, stating, with
 
 from hdbridge import AxisConfig, Bench, Drive, Stepping, simulated
 from hdbridge.drive import plan
-from hdbridge.drive.bootplan import left_to_drive, sent_along
+from hdbridge.drive.bootplan import left_to_drive, unrequested_objects
 from hdbridge.drive.bootup import BootReport
 from hdbridge.errors import DriveError, InputError
 from hdbridge.files.profile import bundled_folder
@@ -101,7 +101,7 @@ def test_fixed_mappings_in_another_order_on_other_pdos(tmp_path: Path, usual: Re
     eds = mapped(eds, 0x1401, 0x607A0020, 0x60B00020)
     axis = profile_with(tmp_path, eds)
     report, record = stepped(axis)
-    assert sent_along(axis) == ["60B0h:00 = 0 in RPDO2"]
+    assert unrequested_objects(axis) == ["60B0h:00 = 0 in RPDO2"]
     assert not {0x1A01, 0x1A02, 0x1600, 0x1601} & {row.index for row in report.written}
     assert record.columns["load_position_deg"] == pytest.approx(usual.columns["load_position_deg"], abs=1e-9)
 

@@ -247,7 +247,7 @@ def test_a_torque_sensor_that_is_not_connected(case: Callable[..., Any]) -> None
     verdicts = case(axis=CHANNELS, spoil=unplug).run(until="hold")
     assert failures(verdicts) == ["rest"]
     assert "; no load torque; temperature 22 \N{DEGREE SIGN}C" in verdicts["rest"].measured
-    assert "axis.yaml:42:1: load_torque: no plausible reading" in verdicts["rest"].remedies[0]
+    assert "axis.yaml:42:1: load_torque: no plausible reading arrives" in verdicts["rest"].remedies[0]
     assert verdicts["hold"].outcome is NOT_POSSIBLE
 
 
@@ -297,11 +297,11 @@ def test_a_drive_that_only_reports_a_lost_heartbeat(case: Callable[..., Any]) ->
 
     verdict = case(axis=HOLDING, spoil=spoil).run(until="heartbeat")["heartbeat"]
     assert verdict.outcome is FAIL
-    assert "it sent EMCY 8130h (a heartbeat that the drive watches stayed away)" in verdict.measured
+    assert "it sent EMCY 8130h (a heartbeat that the drive watches was missing)" in verdict.measured
     assert "1016h" not in verdict.remedies[0]
     assert "neither stops (6007h) nor leaves OPERATIONAL (1029h)" in verdict.remedies[0]
     assert "transition 16" in verdict.remedies[0]
-    assert ": drive.quick_stop_option: found 6, with 1 to 4 it cannot" in verdict.remedies[0]
+    assert ": drive.quick_stop_option: found 6; 1 to 4 prevent that" in verdict.remedies[0]
 
 
 def test_a_drive_that_the_master_itself_takes_out_of_its_stop(case: Callable[..., Any]) -> None:

@@ -13,7 +13,6 @@ from hdbridge.commissioning.bringup.judge import (
     MOTOR_COUNTS,
     RATIO,
     Turned,
-    accuse,
     judge_following,
     judge_hold,
     judge_nudge,
@@ -22,6 +21,7 @@ from hdbridge.commissioning.bringup.judge import (
     judge_stop,
     judge_torque,
     judge_turn,
+    suspect_entries,
 )
 from hdbridge.commissioning.bringup.slow import plan_travel
 from hdbridge.errors import DriveError
@@ -137,7 +137,7 @@ def test_most_likely_key_is_reported_first(
 @given(factor=st.floats(0.05, 20.0))
 def test_each_suspected_key_explains_the_factor(factor: float) -> None:
     one, tolerance = file(50, 8000, 2_880_000), 0.007
-    for each in accuse(one, factor, tolerance):
+    for each in suspect_entries(one, factor, tolerance):
         ratio = each.expected / each.found
         explained = ratio if each.key == LOAD_COUNTS else 1.0 / ratio
         assert abs(explained / factor - 1.0) <= 2.0 * tolerance

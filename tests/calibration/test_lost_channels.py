@@ -13,7 +13,7 @@ from hdbridge.sim.truth import Truth
 
 
 def measured(cell, silent_cycles):
-    """`rec/`, measured by the short plan; the load torque stays away in some cycles."""
+    """`rec/`, measured by the short plan; the load torque is missing in some cycles."""
     path = cell.axis / "axis.yaml"
     path.write_text(path.read_text() + CHANNELS)
     axis, truth = AxisConfig.load(path), Truth.load(cell.axis / "truth.yaml")

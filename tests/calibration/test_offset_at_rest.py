@@ -97,4 +97,4 @@ def test_a_servo_that_hunts_at_rest_is_reported(tmp_path: Path) -> None:
         "load_feedforward": {"inertia_kg_m2": 2.2e-4, "frequency_hz": 23.7, "damping_ratio": 0.2},
     }
     found = validated(tmp_path, 0.55, 12233.0, servo)
-    assert [each for each in found.survived if "hunts" in each]
+    assert [each for each in found.fault_notes if "hunts" in each]

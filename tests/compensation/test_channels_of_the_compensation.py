@@ -94,7 +94,7 @@ def test_an_effect_fades_out_without_its_channel_and_in_again_with_it():
     gear = LOADED.tracker(Start.FORWARD)  # five degrees forward are many times the loop's width
     gear.advance(compensation.command(5.0, moment), moment)
     with_torque = compensation.correction_arcsec
-    compensation.know(LOSABLE - {Channel.LOAD_TORQUE})
+    compensation.set_known_channels(LOSABLE - {Channel.LOAD_TORQUE})
     steps, last = [], with_torque
     for _ in range(200):
         gear.advance(compensation.command(5.0, moment), moment)
@@ -105,7 +105,7 @@ def test_an_effect_fades_out_without_its_channel_and_in_again_with_it():
     assert 0 < max(steps) < 3.0
     assert max(steps[130:]) == 0.0
     assert abs(with_torque - without_torque) > 30
-    compensation.know(LOSABLE)
+    compensation.set_known_channels(LOSABLE)
     for _ in range(200):
         motor = compensation.command(5.0, moment)
         error = 3600 * (motor / 50 - 5.0) + gear.advance(motor, moment)
@@ -114,7 +114,7 @@ def test_an_effect_fades_out_without_its_channel_and_in_again_with_it():
 
 def test_without_a_channel_at_the_start_its_effect_starts_faded_out():
     compensation = Compensation(LOADED, CompensationLimits(ramp_s=0.5), PERIOD)
-    compensation.know(frozenset())
+    compensation.set_known_channels(frozenset())
     compensation.reset(0.0)
     compensation.engage()
     for _ in range(200):

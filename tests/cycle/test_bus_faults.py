@@ -47,15 +47,15 @@ def test_an_exception_in_a_command_stops_only_its_axis(pair: TwoAxes) -> None:
     assert pair.follows(1, 300)
     assert not pair.axes[1].supervision.events
     assert pair.stands(0)
-    assert not pair.axes[0].riding
+    assert not pair.axes[0].stopping
 
 
 def test_the_quick_stop_is_driven_and_confirmed_while_the_other_axis_moves(pair: TwoAxes) -> None:
     pair.interfere(0x601, bytes(8))
     pair.turn()
-    assert pair.axes[0].riding
+    assert pair.axes[0].stopping
     assert pair.follows(1)
-    assert not pair.axes[0].riding
+    assert not pair.axes[0].stopping
     assert pair.axes[0].confirmed
     assert "did not confirm" not in str(pair.axes[0].stopped)
     assert pair.axes[0].image.power.state is State.SWITCH_ON_DISABLED
@@ -65,7 +65,7 @@ def test_an_unconfirmed_stop_is_reported_and_delays_no_axis_forever(pair: TwoAxe
     pair.nodes[0].faults.silent = True
     pair.turn(2)
     pair.turn(270)
-    assert not pair.axes[0].riding
+    assert not pair.axes[0].stopping
     assert "did not confirm it" in str(pair.axes[0].stopped)
     pair.bus.sent.clear()
     pair.turn(20)

@@ -82,7 +82,7 @@ def test_a_stall_of_the_control_process_is_reported_as_such(moving, stays: bool)
     assert (
         "the control process stalled for longer than the drive waits (400 ms; the drive waits 16 ms)" in text
     )
-    assert "EMCY 8250h (set-points (RPDOs) stayed away)" in text
+    assert "EMCY 8250h (set-points (RPDOs) were missing)" in text
     assert "NMT master" not in text
     assert "enable input" not in text
     moving.stands_still()
@@ -109,7 +109,7 @@ def test_leaving_operational_is_reported_with_its_cause(moving) -> None:
     moving.interfere(0x701, b"\x7f")
     text = moving.stopped_within(1, Fault.MASTER_LOST)
     assert "then a node is not operational" in text
-    assert "EMCY 8130h (a heartbeat that the drive watches stayed away)" in text
+    assert "EMCY 8130h (a heartbeat that the drive watches was missing)" in text
     assert "NMT master" not in text
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.control.latency import Histogram, LatencyReport, Measurement, carries, measure, wake_ups
+from hdbridge.control.latency import Histogram, LatencyReport, Measurement, measure, sustains, wake_ups
 
 lateness_us = st.lists(st.integers(0, 50_000_000), min_size=1, max_size=200)
 
@@ -72,18 +72,18 @@ def test_early_and_extremely_late_wake_ups_are_recorded() -> None:
 
 
 def test_an_empty_histogram_sustains_no_cycle() -> None:
-    assert not carries(Histogram(), 0.01)
+    assert not sustains(Histogram(), 0.01)
     assert Histogram().octaves() == []
 
 
 def test_the_rule_uses_the_share_and_the_maximum() -> None:
     punctual = histogram_of([100] * 20_000)
-    assert carries(punctual, 0.001)
-    assert not carries(punctual, 0.0004)
+    assert sustains(punctual, 0.001)
+    assert not sustains(punctual, 0.0004)
     one_in_ten_thousand = histogram_of([100] * 9_999 + [450])
-    assert carries(one_in_ten_thousand, 0.001)
-    assert not carries(histogram_of([100] * 9_998 + [450] * 2), 0.001)
-    assert not carries(histogram_of([100] * 99_999 + [501]), 0.001)
+    assert sustains(one_in_ten_thousand, 0.001)
+    assert not sustains(histogram_of([100] * 9_998 + [450] * 2), 0.001)
+    assert not sustains(histogram_of([100] * 99_999 + [501]), 0.001)
 
 
 def test_lateness_does_not_add_up() -> None:
@@ -97,14 +97,14 @@ def test_missed_periods_are_skipped_and_counted() -> None:
     measurement = wake_ups(0.004, 0.4, LateClock([0.0] * 9 + [0.0105]))
     assert measurement.skipped == 2 * 8
     assert measurement.histogram.total == 100 - measurement.skipped
-    assert not measurement.carried
+    assert not measurement.sustained
 
 
 def test_report_names_the_shortest_sustained_cycle() -> None:
     report = measure(LateClock([0.0003]), 0.2, (0.004, 0.001, 0.002))
     assert [each.period_s for each in report.measurements] == [0.001, 0.002, 0.004]
-    assert [each.carried for each in report.measurements] == [False, True, True]
-    assert report.carried_s == 0.002
+    assert [each.sustained for each in report.measurements] == [False, True, True]
+    assert report.sustained_s == 0.002
     assert "sustains a cycle of 2 ms" in report.table()
     assert report.as_dict()["carried_cycle_ms"] == 2.0
 
@@ -118,12 +118,12 @@ def test_a_cycle_below_one_that_failed_is_not_recommended() -> None:
     report = LatencyReport(
         (Measurement(0.001, good, 0), Measurement(0.002, bad, 0), Measurement(0.004, good, 0)), "test"
     )
-    assert report.carried_s == 0.004
+    assert report.sustained_s == 0.004
 
 
 def test_a_computer_sustaining_no_cycle_is_reported() -> None:
     report = measure(LateClock([0.009]), 0.2, (0.001, 0.01))
-    assert report.carried_s is None
+    assert report.sustained_s is None
     assert "none of these" in report.table()
 
 

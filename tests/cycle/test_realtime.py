@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from hdbridge.control.realtime import left_realtime, prepare_realtime, resumed_realtime
+from hdbridge.control.realtime import prepare_realtime, resumed_realtime, suspended_realtime
 
 
 @pytest.fixture(autouse=True)
@@ -73,19 +73,19 @@ def test_a_missing_processor_is_reported() -> None:
 
 
 def test_a_fit_runs_without_priority_and_motion_within_it_with():
-    with left_realtime(), resumed_realtime():
+    with suspended_realtime(), resumed_realtime():
         assert gc.isenabled()  # without preparation there is nothing to change
     with prepare_realtime(priority=0):
         assert not gc.isenabled()
-        with left_realtime():
+        with suspended_realtime():
             assert gc.isenabled()
             with resumed_realtime():
                 assert not gc.isenabled()
-            with left_realtime():
+            with suspended_realtime():
                 assert gc.isenabled()
             assert gc.isenabled()
         assert not gc.isenabled()
-        with pytest.raises(RuntimeError), left_realtime():
+        with pytest.raises(RuntimeError), suspended_realtime():
             raise RuntimeError
         assert not gc.isenabled()
     assert gc.isenabled()

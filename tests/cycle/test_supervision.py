@@ -106,7 +106,7 @@ def test_a_latch_is_reset_only_after_verification() -> None:
 def test_a_fault_while_answering_counts_in_the_same_cycle() -> None:
     supervision = Supervision()
     supervision.judge(7, [(Fault.DUPLICATE_TPDO, "")])
-    assert supervision.also(7, Fault.TRANSMIT_FULL, "RPDO") is STOP
+    assert supervision.add_fault(7, Fault.TRANSMIT_FULL, "RPDO") is STOP
     assert [event.cycle for event in supervision.events] == [7, 7]
 
 

@@ -93,9 +93,9 @@ def test_missing_readings_are_held_then_lost_and_may_return() -> None:
     each.accept(1000)
     assert each.step() is None
     for _ in range(5):
-        assert each.step() == (Fault.CHANNEL_HELD, "load_torque: none came")
+        assert each.step() == (Fault.CHANNEL_HELD, "load_torque: none arrived")
         assert each.value == pytest.approx(1.0)
-    assert each.step() == (Fault.CHANNEL_LOST, "load_torque: none came")
+    assert each.step() == (Fault.CHANNEL_LOST, "load_torque: none arrived")
     assert each.value is None
     assert each.lost
     assert each.step() is None  # said once
@@ -106,7 +106,7 @@ def test_missing_readings_are_held_then_lost_and_may_return() -> None:
 def test_before_the_first_reading_there_is_nothing_to_hold() -> None:
     each = follower(hold_ms=20)
     said = [each.step() for _ in range(10)]
-    assert [fault for fault in said if fault] == [(Fault.CHANNEL_LOST, "load_torque: none came")]
+    assert [fault for fault in said if fault] == [(Fault.CHANNEL_LOST, "load_torque: none arrived")]
 
 
 @given(every=st.integers(2, 30), missed=st.integers(0, 5), late=st.lists(st.integers(0, 1), max_size=20))

@@ -82,7 +82,7 @@ def test_a_late_answer_is_not_used_for_another_object(client: SdoClient, tiny: A
     tiny.scripts[0x607A, 0] = lambda request: [other, expedited(request, struct.pack("<i", 5))]
     tiny.send(0x580, other)
     assert client.read(0x607A) == 5
-    assert client.strays == 2
+    assert client.unsolicited_answers == 2
 
 
 @pytest.mark.parametrize(

@@ -17,9 +17,9 @@ from hdbridge.axis.effects import (
     Moment,
     Motion,
     Start,
+    missing_channels,
     moments,
     readings,
-    unmet,
 )
 from hdbridge.axis.effects.described import Level, Memoryless
 from hdbridge.errors import InputError
@@ -120,8 +120,8 @@ def error_falls_no_steeper_than_its_slope_bound(effect, motion, start, away):
 
 def a_missing_channel_is_named_before_and_when_it_is_needed(effect, motion):
     bare = Motion(motion.motor_deg)
-    lacking = unmet([effect], bare.available())
-    assert unmet([effect], motion.available()) == {}
+    lacking = missing_channels([effect], bare.available())
+    assert missing_channels([effect], motion.available()) == {}
     if not lacking:
         effect.predict(bare)
         return

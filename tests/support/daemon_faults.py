@@ -219,7 +219,7 @@ def _control_goes(bench: DaemonBench, number: signal.Signals) -> tuple[str, int,
     axis = daemon.until_axis("disabled")
     assert axis["power"] != "operation enabled"
     assert daemon.pids("service") == services
-    return "the drive stops by itself; another control process, disabled", cycles, allowed
+    return "the drive stops on its own; another control process, disabled", cycles, allowed
 
 
 def _control_killed(bench: DaemonBench) -> tuple[str, int, int]:
@@ -305,7 +305,7 @@ IN_ORDER: Final = 25
 """Maximum cycles to brake, including the time for the signal to pass between processes."""
 
 _SAME: Final = "latch; verified again, disabled, no restart"
-_BY_ITSELF: Final = "the drive stops by itself; another process, disabled"
+_BY_ITSELF: Final = "the drive stops on its own; another process, disabled"
 
 DAEMON_ROWS: Final = (
     DaemonRow("the interface goes down, and up again", _SAME, f"{NOTICED}", _goes_down),

@@ -336,7 +336,7 @@ def test_without_a_fault_no_symptom_is_seen(drive, program):
 
 
 def test_every_fault_of_the_supervision_can_be_made():
-    answered = {each.answers for each in FAULTS.values() if each.answers} | {*OF_THE_PROGRAM}
+    answered = {each.reported_as for each in FAULTS.values() if each.reported_as} | {*OF_THE_PROGRAM}
     assert answered == {fault.value for fault in Fault}
 
 
@@ -399,4 +399,4 @@ def test_a_pending_fault_can_be_cancelled(drive, program):
     fault.end()
     assert ids(program.move(50)[-1]) == BOTH
     assert fault.begun_s is None
-    assert [each.text for each in drive.log if each.kind == "fault"] == ["cable_pulled is called off"]
+    assert [each.text for each in drive.log if each.kind == "fault"] == ["cable_pulled is cancelled"]

@@ -86,7 +86,7 @@ def test_a_twin_precedes_a_truth_and_paths_are_relative_to_their_origin(session,
     (axis / "twin.yaml").unlink()
     (axis / "truth.yaml").unlink()
     done = session(marked + PASSES, "-o", "hdbridge_truth=")
-    done.stdout.fnmatch_lines(["*mine/truth.yaml: no such file, and no twin.yaml beside it*"])
+    done.stdout.fnmatch_lines(["*mine/truth.yaml: no such file, and no twin.yaml in the same folder*"])
 
 
 def test_errors_are_one_line(session):

@@ -196,7 +196,7 @@ def test_a_failed_bus_of_a_drive_is_reported(monkeypatch):
 def test_a_real_interface_is_not_taken_down():
     with (
         simulated_drive("article", bus="udp_multicast:239.74.163.8") as drive,
-        pytest.raises(InputError, match="not the drive's to take away"),
+        pytest.raises(InputError, match="cannot take down the interface of"),
     ):
         drive.fault("bus_down")
 

@@ -200,7 +200,7 @@ def comparison(kind: str = HELD_OUT, **differences: float) -> Comparison:
         (ALL, {"load_error": 4.0}, {"load_error": 1.0}, True, "that it was fitted to"),
         (HELD_OUT, {"load_error": 4.0, "motor_torque": 1.0}, {"load_error": 1.0, "motor_torque": 1.2}, False,
          "motor torque differs by 1.2 Nm, before by 1"),
-        (HELD_OUT, {"load_error": 4.0}, {"load_error": 4.0}, False, "no nearer"),
+        (HELD_OUT, {"load_error": 4.0}, {"load_error": 4.0}, False, "not smaller than before"),
         # A loss below the noise does not count.
         (HELD_OUT, {"load_error": 4.0, "motor_torque": 0.02}, {"load_error": 1.0, "motor_torque": 0.04}, True,
          "29 % smaller"),

@@ -29,9 +29,9 @@ from hdbridge.twin.fit import (
     loop_parameters,
     solve,
     start_of,
-    with_last,
     with_limit,
     with_loop,
+    with_optional_groups,
 )
 from hdbridge.twin.misfit import Replays, prepare
 from hdbridge.twin.parameters import BY_NAME, named, value_in, with_load_encoder, with_values
@@ -100,7 +100,7 @@ def test_a_part_is_added_if_the_axis_has_it(
     start: Truth, axis: Truth, record: Callable[[Truth], Recording], earned: dict[str, float]
 ) -> None:
     with Replays(prepare(record(axis), AXIS, start), 1) as replays:
-        found = with_last(replays, fitted(replays, start))
+        found = with_optional_groups(replays, fitted(replays, start))
         assert {each.name for each in found.parameters} == {*NAMES, *earned}
         found = continued(replays, found, 4, near=found) if earned else found
     for name, value in earned.items():

@@ -34,7 +34,7 @@ from hdbridge.twin.fit import (
     solve,
     springs,
 )
-from hdbridge.twin.misfit import Data, Replays, deviation, expected, misfit, prepare, rooted
+from hdbridge.twin.misfit import Data, Replays, deviance_residuals, deviation, expected, misfit, prepare
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, coordinates, free_value, with_values
 
 
@@ -261,23 +261,23 @@ def test_rounding_misleads_only_a_fit_that_treats_it_as_noise() -> None:
 
 
 @pytest.mark.parametrize("half", [0.0, 0.01, 0.3, 4.0])
-@pytest.mark.parametrize("stray", [0.0, 1e-4])
-def test_half_the_squares_are_the_loss_of_log_likelihood(half: float, stray: float) -> None:
+@pytest.mark.parametrize("outlier_probability", [0.0, 1e-4])
+def test_half_the_squares_are_the_loss_of_log_likelihood(half: float, outlier_probability: float) -> None:
     if half == 0.0:
-        stray = 0.0  # without steps: least squares
+        outlier_probability = 0.0  # without steps: least squares
     off = np.array([-7.0, -3.9, -0.2, 0.0, 0.05, 1.0, 4.1, 6.0])
-    halves, strays = np.full(8, half), np.full(8, stray)
+    halves, outlier_probabilities = np.full(8, half), np.full(8, outlier_probability)
 
     def loss(off: np.ndarray) -> np.ndarray:
         if half == 0.0:
             return np.asarray(0.5 * off**2)
         size = np.abs(off)
-        return -np.log(ndtr(half - size) - ndtr(-half - size) + stray)
+        return -np.log(ndtr(half - size) - ndtr(-half - size) + outlier_probability)
 
-    root, slope = rooted(off, halves, strays)
+    root, slope = deviance_residuals(off, halves, outlier_probabilities)
     assert 0.5 * root**2 == pytest.approx(loss(off) - loss(np.zeros(8)), rel=1e-6, abs=1e-9)
     assert np.all(np.sign(root) == np.sign(off))
-    ahead, behind = (rooted(off + by, halves, strays)[0] for by in (1e-5, -1e-5))
+    ahead, behind = (deviance_residuals(off + by, halves, outlier_probabilities)[0] for by in (1e-5, -1e-5))
     assert slope == pytest.approx((ahead - behind) / 2e-5, rel=1e-4, abs=1e-5)
 
 

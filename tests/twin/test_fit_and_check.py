@@ -25,12 +25,12 @@ from hdbridge.twin.misfit import (
     CHANNELS,
     Replays,
     Values,
+    channel_residuals,
     noise_floor,
     noise_in_motion,
     prepare,
     residuals,
     values_of,
-    what_is_left,
 )
 from hdbridge.twin.naming import growth, scales_by_kind
 from hdbridge.twin.parameters import BY_NAME, named, value_in, with_values
@@ -174,7 +174,7 @@ def replay_only() -> Truth:
     parameters = named(*NAMES)
     with Replays(prepare(recorded(), AXIS, wrong), 1) as replays:
         fitted = solve(replays, wrong, parameters, 6)
-        left = what_is_left(replays.data, fitted.residuals, noise_in_motion(replays.data))
+        left = channel_residuals(replays.data, fitted.residuals, noise_in_motion(replays.data))
         assert values_of(left) is Values.REPLAY
         return with_knowledge(fitted, replays.data, Values.REPLAY)
 

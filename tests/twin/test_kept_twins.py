@@ -16,7 +16,7 @@ from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile
 from hdbridge.sim.truth import Truth
 from hdbridge.simulated import simulated
-from hdbridge.twin.twin import TWINS, KeptTwin, diff
+from hdbridge.twin.twin import TWINS, TwinFile, diff
 
 DATE = datetime(2026, 3, 1, 12, tzinfo=UTC)
 SERIAL = Identity(vendor_id=0x4844, product_code=0x402, serial=17)
@@ -30,11 +30,11 @@ def profile(tmp_path: Path) -> Path:
     return folder
 
 
-def twin_of(profile: Path, coulomb_nm: float = 0.05) -> KeptTwin:
+def twin_of(profile: Path, coulomb_nm: float = 0.05) -> TwinFile:
     truth = Truth.load(profile)
     motor = truth.motor.model_copy(update={"coulomb_nm": coulomb_nm})
     intervals = {"motor.coulomb_nm": (0.9 * coulomb_nm, 1.1 * coulomb_nm)}
-    return KeptTwin(truth.model_copy(update={"motor": motor, "intervals": intervals}))
+    return TwinFile(truth.model_copy(update={"motor": motor, "intervals": intervals}))
 
 
 def test_a_twin_is_pending_until_it_is_committed_and_activations_are_undone(profile: Path) -> None:
@@ -48,7 +48,7 @@ def test_a_twin_is_pending_until_it_is_committed_and_activations_are_undone(prof
     TWINS.propose(profile, twin_of(profile, 0.06), "after a repair", DATE, SERIAL)
     assert TWINS.commit(profile, DATE, SERIAL) == 2
     assert TWINS.rollback(profile, "no better", DATE, SERIAL) == 1
-    assert KeptTwin.load(profile / "twin.yaml").truth.motor.coulomb_nm == 0.05
+    assert TwinFile.load(profile / "twin.yaml").truth.motor.coulomb_nm == 0.05
     # The models of the same profile are kept apart.
     assert store.log(profile) == []
 
@@ -58,18 +58,18 @@ def test_twins_read_back_exactly(profile: Path) -> None:
     fit = {"parameters": ["Coulomb friction", "load inertia"], "noise": {"motor torque": 1e-05}}
     twin = twin_of(profile).with_provenance(fit=fit).bound_to(AxisConfig.load(profile), SERIAL)
     twin.save(profile / "pending-twin.yaml")
-    assert KeptTwin.load(profile / "pending-twin.yaml") == twin
+    assert TwinFile.load(profile / "pending-twin.yaml") == twin
     lines = [each.strip() for each in (profile / "pending-twin.yaml").read_text().splitlines()]
     assert "serial: 0x11" in lines
     assert sum(each.startswith("motor.coulomb_nm: [0.045") for each in lines) == 1
 
 
 def test_the_older_twin_layout_is_read(profile: Path) -> None:
-    text = KeptTwin(Truth.load(profile)).dump()
+    text = TwinFile(Truth.load(profile)).dump()
     text += "intervals:\n  motor.coulomb_nm:\n    - 0.03\n    - 0.04\n"
     text += "provenance:\n  fit:\n    covariance:\n      -\n        - 0.1\n        - 0.2\n"
     (profile / "twin.yaml").write_text(text)
-    kept = KeptTwin.load(profile / "twin.yaml")
+    kept = TwinFile.load(profile / "twin.yaml")
     assert kept.truth.intervals == {"motor.coulomb_nm": (0.03, 0.04)}
     assert kept.provenance["fit"]["covariance"] == [[0.1, 0.2]]
 
@@ -81,13 +81,13 @@ def test_a_twin_of_another_drive_or_gear_is_refused(profile: Path) -> None:
     other = twin_of(profile)
     gear = other.truth.gear.model_copy(update={"ratio": 80.0})
     with pytest.raises(InputError, match="this twin is of a gear with ratio 80"):
-        TWINS.propose(profile, KeptTwin(other.truth.model_copy(update={"gear": gear})), "", DATE)
+        TWINS.propose(profile, TwinFile(other.truth.model_copy(update={"gear": gear})), "", DATE)
 
 
 def test_the_simulated_drive_uses_an_existing_twin(profile: Path) -> None:
     data = Truth.load(profile).model_dump(by_alias=True)
     data["motor"]["encoder"]["counts_per_turn"] = 4000
-    (profile / "twin.yaml").write_text(KeptTwin(Truth.model_validate(data)).dump())
+    (profile / "twin.yaml").write_text(TwinFile(Truth.model_validate(data)).dump())
     axis = AxisConfig.load(profile)
     with simulated(axis) as drive, pytest.raises(Exception, match="4000"):
         drive.boot()

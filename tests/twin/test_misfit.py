@@ -19,13 +19,13 @@ from hdbridge.twin.compare import FOLLOWING_ERROR, LOAD_ERROR, compare
 from hdbridge.twin.misfit import (
     CHANNELS,
     Data,
+    channel_residuals,
+    has_memory,
     noise_floor,
     noise_in_motion,
     prepare,
-    remembers,
     residuals,
     scales,
-    what_is_left,
 )
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, free_value, with_values
 from hdbridge.twin.replay import replay
@@ -162,7 +162,7 @@ def test_without_memory_the_load_counts_at_once() -> None:
     plain = with_values(TRUTH, {})
     gear = plain.gear.model_copy(update={"hysteresis": None, "second_hysteresis": None, "backlash_arcsec": 0})
     for truth, at_once in ((TRUTH, False), (plain.model_copy(update={"gear": gear}), True)):
-        assert remembers(truth) is not at_once
+        assert has_memory(truth) is not at_once
         (piece,) = prepare(recorded(), AXIS, truth).pieces
         first = int(np.argmin(piece.rest))
         assert bool(piece.counts[LOAD][first]) is at_once
@@ -215,6 +215,6 @@ def test_residuals_within_motion_noise_are_explained() -> None:
         )
         for name in CHANNELS
     }
-    assert all(each.explained for each in what_is_left(data, left, noise_in_motion(data)))
-    some = what_is_left(data, left, noise_floor(data))
+    assert all(each.explained for each in channel_residuals(data, left, noise_in_motion(data)))
+    some = channel_residuals(data, left, noise_floor(data))
     assert {each.channel for each in some if not each.explained} == set(CHANNELS)

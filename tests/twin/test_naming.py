@@ -14,7 +14,7 @@ from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import fitted_rows, legs_of_rows, solve
 from hdbridge.twin.misfit import Scales
-from hdbridge.twin.naming import Alike, Explained, alike, explain, worse_than_chance
+from hdbridge.twin.naming import Explained, InseparableSet, explain, inseparable_sets, worse_than_chance
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, named, with_values
 
 NAMES = ("Coulomb friction", "servo dead time", "command filter")
@@ -54,14 +54,14 @@ class Known:
         }
 
 
-def diagnosed(axis: Truth, quick: float) -> tuple[Explained, tuple[Alike, ...]]:
+def diagnosed(axis: Truth, quick: float) -> tuple[Explained, tuple[InseparableSet, ...]]:
     """Returns the causes by which the axis differs from `TRUTH`, and sets that slopes do not separate."""
     replays: Any = Known(axis, quick)
     parameters = named(*NAMES)
     noise = dict.fromkeys((FOLLOWING, TORQUE, LOAD), 1.0)
     fitted = solve(replays, TRUTH, parameters, 12, known=Scales(noise))
     found = explain(replays, TRUTH, parameters, dict.fromkeys(noise, np.ones(ROWS)))
-    return found, alike(fitted, legs_of_rows(replays.data, fitted_rows(replays.data)))
+    return found, inseparable_sets(fitted, legs_of_rows(replays.data, fitted_rows(replays.data)))
 
 
 def test_nothing_is_named_for_a_correct_start() -> None:

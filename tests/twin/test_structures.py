@@ -21,12 +21,12 @@ from hdbridge.twin.misfit import (
     Data,
     Replays,
     Values,
+    channel_residuals,
     misfit,
     prepare,
     residuals,
     units,
     values_of,
-    what_is_left,
 )
 from hdbridge.twin.parameters import BY_NAME, at_coordinates, coordinates, default_truth, with_values
 from hdbridge.twin.replay import replay
@@ -119,5 +119,5 @@ def test_a_twin_follows_a_foreign_servo_and_is_never_worse_than_a_plain_fit(stru
     twin, reference = (shares(other, axis, each) for each in (found.truth, plain))
     assert twin["following_error"] < max(0.05, 1.02 * reference["following_error"])
     assert twin["motor_torque"] < max(0.10, 1.02 * reference["motor_torque"])
-    left = what_is_left(data, found.residuals, dict.fromkeys(CHANNELS, 1e-09))
+    left = channel_residuals(data, found.residuals, dict.fromkeys(CHANNELS, 1e-09))
     assert values_of(left) is Values.REPLAY

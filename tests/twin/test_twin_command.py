@@ -22,11 +22,11 @@ from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import compare
-from hdbridge.twin.misfit import Left
+from hdbridge.twin.misfit import ChannelResidual
 from hdbridge.twin.naming import Finding, Moved
 from hdbridge.twin.parameters import with_values
 from hdbridge.twin.replay import replay
-from hdbridge.twin.twin import KeptTwin, Twin, impossible
+from hdbridge.twin.twin import Twin, TwinFile, impossible
 
 moves = moved((400.0, 600.0, 6000.0, 0.6), (-450.0, 600.0, 6000.0, 0.6))
 
@@ -168,7 +168,7 @@ def fitted(truth: Truth, values: str = "axis", times_noise: float = 2.5) -> Call
         about = {"values": values, "fit": {"parameters": ["Coulomb friction"]}}
         intervals = {"motor.coulomb_nm": (0.033, 0.035)} if values == "axis" else {}
         known = truth.model_copy(update={"intervals": intervals, "provenance": about})
-        left = (Left("motor torque", 0.04, times_noise, "step"),)
+        left = (ChannelResidual("motor torque", 0.04, times_noise, "step"),)
         findings = (finding,) if values == "axis" and "values" not in start.provenance else ()
         wrong = impossible(truth, axis, 0.01) if values == "replay" else ()
         return Twin(known, findings, (), left, before, after, wrong)
@@ -197,9 +197,9 @@ def run(profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 def test_a_better_twin_is_kept_as_pending(profile: Path, recording: Path, run: Run) -> None:
     said, report, page = run(fitted(TRUTH))
     assert "friction: Coulomb friction 0.068 -> 0.034 Nm" in said
-    assert "unexplained: motor torque is left with 2.5 times its noise" in said
+    assert "unexplained: motor torque: residual is 2.5 times the noise" in said
     assert f"hdbridge model commit {profile} --twin" in said
-    pending = KeptTwin.load(profile / "pending-twin.yaml")
+    pending = TwinFile.load(profile / "pending-twin.yaml")
     assert pending.truth.motor.coulomb_nm == 0.034
     assert pending.provenance["recordings"] == [str(recording)]
     assert pending.provenance["axis"] == "demo"
@@ -224,8 +224,8 @@ def test_a_twin_without_improvement_is_not_kept(profile: Path, run: Run) -> None
 def test_values_fitting_the_replay_only_are_offered_as_such(profile: Path, run: Run) -> None:
     said, report, page = run(fitted(TRUTH, "replay", 22.0))
     headline = (
-        "The twin replays this drive (motor torque to 4 %), but its values are not the axis's: motor torque "
-        "is left with 22 times its noise; the twin is kept as pending:"
+        "The twin replays this drive (motor torque to 4 %), but its values are not the axis's: motor torque: "
+        "residual is 22 times the noise; the twin is kept as pending:"
     )
     assert said.startswith(headline)
     assert "friction:" not in said, "no value is called a finding"
@@ -236,7 +236,7 @@ def test_values_fitting_the_replay_only_are_offered_as_such(profile: Path, run: 
     assert [each["ci95"] for each in report["parameters"]] == [None]
     assert headline.replace("'", "&#x27;") in page or headline.replace("'", "&#39;") in page
     assert "They are not the axis" in page
-    pending = KeptTwin.load(profile / "pending-twin.yaml").truth
+    pending = TwinFile.load(profile / "pending-twin.yaml").truth
     assert pending.provenance["values"] == "replay"
     assert pending.intervals == {}
 
@@ -271,7 +271,7 @@ def test_an_axis_is_learned_and_a_later_change_of_it_is_named(profile: Path) -> 
     recording = trips(TRUTH, profile / "recording")
     done = run_here(profile, "twin", profile, recording)
     assert done.returncode == 0, done.stderr
-    learned = KeptTwin.load(profile / "pending-twin.yaml").truth
+    learned = TwinFile.load(profile / "pending-twin.yaml").truth
     lower, upper = learned.intervals["motor.coulomb_nm"]
     assert lower < 0.036
     assert upper > 0.032

@@ -29,8 +29,8 @@ from hdbridge.clock import Clock
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.buscycle import BusCycle
+from hdbridge.control.channelstate import ChannelState
 from hdbridge.control.cycle import Cycle
-from hdbridge.control.sensed import Sensed
 from hdbridge.daemon.loop.controller import Controller
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Memory, OuterKnot
@@ -71,7 +71,7 @@ def bench_cycle(
     cycle = Cycle(Link(bus, clock), clock, image, Supervision(), axis.drive.cycle_s)
     compensation = compensation_for(axis, model.bound_to(axis))
     compensation.engage()
-    observer, sensed = Observer(), Sensed(axis)
+    observer, sensed = Observer(), ChannelState(axis)
     needs, at_rest = bool(compensation.needs), Moment()
     # Set-points of the same move as in the daemon's loop, so that both follow the same path.
     set_point = SetPoint(axis_view(axis).limits, axis.drive.cycle_s)

@@ -20,7 +20,7 @@ from support.hidden.elastic import remembering
 from support.hidden.site import ARCSEC_PER_RAD, ARCSEC_PER_TURN
 
 from hdbridge.axis import AxisConfig
-from hdbridge.commissioning.calibration.measure import outlook
+from hdbridge.commissioning.calibration.measure import remaining_plan
 from hdbridge.control.bench import axis_view
 from hdbridge.files.profile import bundled_profile
 from hdbridge.motion.procedures.moves import MoveTo
@@ -380,7 +380,7 @@ def _everyday(
     while True:
         data["limits"] |= {"position_min_deg": -reach_deg, "position_max_deg": reach_deg}
         config = AxisConfig.from_text(yaml.safe_dump(data), bundled_profile("demo") / "axis.yaml")
-        if outlook(Plan.load(plan), config).duration_s <= MOST_SAMPLES * config.drive.cycle_s:
+        if remaining_plan(Plan.load(plan), config).duration_s <= MOST_SAMPLES * config.drive.cycle_s:
             return EverydayAxis(config, Truth.model_validate(truth), law, flicker, plan)
         if reach_deg > 60.0:
             reach_deg = max(0.7 * reach_deg, 60.0)

@@ -26,7 +26,7 @@ from support.hidden import CAUSES, UNKNOWN, Hidden, Run, hide, hide_all
 from support.hidden.site import ARCSEC_PER_RAD, ARCSEC_PER_TURN
 
 from hdbridge import InputError
-from hdbridge.commissioning.calibration.measure import outlook
+from hdbridge.commissioning.calibration.measure import remaining_plan
 from hdbridge.control.bench import axis_view
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.records.record import Record, concatenate
@@ -383,7 +383,7 @@ def _everyday(case: Case, seed: int, folder: Path, axes: Path) -> dict[str, Any]
 def _bench_course(rig: PlantRig, rng: random.Random) -> Course:
     view, period_s = axis_view(rig.axis), rig.axis.drive.cycle_s
     name = rng.choice(("quick", "quick", "full", "dynamics"))
-    if outlook(Plan.load(name), rig.axis).duration_s > MOST_BENCH_SAMPLES * period_s:
+    if remaining_plan(Plan.load(name), rig.axis).duration_s > MOST_BENCH_SAMPLES * period_s:
         name = "quick"
     course = Course(rig, f"plan {name}", [], [], BETWEEN_TASKS_S)
     bench = rig.bench()

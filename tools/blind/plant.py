@@ -24,7 +24,7 @@ from hdbridge import InputError, TransmissionModel, fit
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment
 from hdbridge.commissioning.calibration import measure, start_journal
-from hdbridge.control.bench import Run, axis_view, compensation_for, record_of, walk
+from hdbridge.control.bench import Run, axis_view, compensation_for, record_of, run_moves
 from hdbridge.control.compensation import Compensation
 from hdbridge.motion.procedures.moves import Move, Procedure, Sample, Settle
 from hdbridge.motion.procedures.moves import Path as Way
@@ -100,7 +100,7 @@ class PlantRig:
 class PlantBench:
     """Runs procedures on a `PlantRig` (`hdbridge.control.rig.ProcedureBench`)."""
 
-    survived = ()
+    fault_counts = ()
 
     def __init__(self, rig: PlantRig, compensation: Compensation | None) -> None:
         self._rig = rig
@@ -119,7 +119,7 @@ class PlantBench:
         self._samples, self._legs = [], []
         view = axis_view(self._rig.axis)
         rehearsal = rehearse(procedure, view, self._place)
-        outcome = walk(procedure, view, rehearsal, progress, lambda: self._place, self._leg)
+        outcome = run_moves(procedure, view, rehearsal, progress, lambda: self._place, self._leg)
         return Run(self.record(), self.legs, outcome=outcome)
 
     def record(self) -> Record:

@@ -2,7 +2,7 @@
 
 from hdbridge.axis.effects.amplitude_drift import AmplitudeDrift
 from hdbridge.axis.effects.backlash import Backlash
-from hdbridge.axis.effects.base import Effect, unmet
+from hdbridge.axis.effects.base import Effect, missing_channels
 from hdbridge.axis.effects.carried import BASIC, USUAL_LOOP, Loop, is_ripple, ripple
 from hdbridge.axis.effects.channel_skew import ChannelSkew
 from hdbridge.axis.effects.combine import compensable, conflicts, extended, fall_bound, in_place, refreshed
@@ -105,6 +105,6 @@ __all__ = [
     "Observer", "Part", "RateDependence", "RatioError", "Relaxation", "Shape", "Sought", "Start",
     "Step", "SubdivisionalError", "Synchronous", "TorqueGrowth", "TorqueModulation", "Tracker",
     "VelocityWindup", "Vibration", "Wear", "ZeroDrift", "aliases_of", "causes", "compensable",
-    "conflicts", "extended", "fall_bound", "in_place", "is_ripple", "moments", "readings", "refreshed",
-    "register", "ripple", "unmet", "withdraw",
+    "conflicts", "extended", "fall_bound", "in_place", "is_ripple", "missing_channels", "moments",
+    "readings", "refreshed", "register", "ripple", "withdraw",
 ]  # fmt: skip

@@ -251,7 +251,7 @@ class Effect(Law):
         """
         return 0.0
 
-    def left_in_mean(self, order: int) -> float:
+    def symmetric_fraction(self, order: int) -> float:
         """Returns the fraction of a motor order that this effect leaves in the mean over both directions."""
         return 1.0
 
@@ -359,7 +359,9 @@ class Angleless(Momentary):
         return 0.0
 
 
-def unmet(effects: Iterable[Effect], available: frozenset[Channel]) -> dict[str, frozenset[Channel]]:
+def missing_channels(
+    effects: Iterable[Effect], available: frozenset[Channel]
+) -> dict[str, frozenset[Channel]]:
     """Returns the missing channels of each effect, by name; empty if all channels are available.
 
     ``available`` is `Motion.available()` for a record, or the channels that a control loop can supply. Check

@@ -64,10 +64,10 @@ class ChannelSkew(Angleless, Linear):
         description="coefficient of half the acceleration; delay squared for a pure delay",
     )
     limit_deg_s: float = Field(
-        1e5, gt=0, le=1e6, description="motor speed beyond which the effect stays constant"
+        1e5, gt=0, le=1e6, description="motor speed above which the effect is constant"
     )
     limit_deg_s2: float = Field(
-        1e6, gt=0, le=1e8, description="motor acceleration beyond which the effect stays constant"
+        1e6, gt=0, le=1e8, description="motor acceleration above which the effect is constant"
     )
 
     @classmethod

@@ -44,8 +44,8 @@ class Compliance(Angleless, Linear):
     )
     compensable = Compensable(
         True,
-        "the load really moves like this, if the torque is known on line (from a torque sensor, or gravity "
-        "from a model)",
+        "the load really has this error, if the torque is known on line (a torque sensor, or gravity from a "
+        "model)",
     )
     shape = (
         Shape("torque1_nm", 0.1, 1e5, logarithmic=True),

@@ -60,7 +60,7 @@ class Creep(Effect):
         source="generalised Kelvin-Voigt element: a sum of exponentials",
         size="1-10 arcsec",
     )
-    compensable = Compensable(True, "the load really moves like this, and the command says when it stopped")
+    compensable = Compensable(True, "the load really has this error, and the command says when it stopped")
     shape = (
         Shape("tau_s", 0.05, 3600.0, logarithmic=True),
         Shape("build_up", 0.01, 1.0, logarithmic=True),

@@ -44,7 +44,7 @@ class DirectionPhase(Modulating):
         source="phase of the kinematic error differs between the tooth flanks that carry",
         size="1-5 arcsec",
     )
-    compensable = Compensable(True, "the load really moves like this; the direction is commanded")
+    compensable = Compensable(True, "the load really has this error; the direction is commanded")
     carries = {Part.ORDERS: "orders"}
     curved = True
     linear = ("shift_deg",)
@@ -61,7 +61,7 @@ class DirectionPhase(Modulating):
         if has_orders(base):
             yield cls(orders=orders_of(base), shift_deg=0.0)
 
-    def left_in_mean(self, order: int) -> float:
+    def symmetric_fraction(self, order: int) -> float:
         """Returns cos(k shift), by which the shift reduces an order in the mean over both directions."""
         return math.cos(order * math.radians(self.shift_deg))
 

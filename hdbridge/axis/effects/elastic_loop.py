@@ -54,7 +54,7 @@ def rise_at(xi: float, n: float, steepest: float = math.inf) -> float:
 class ElasticLoop(Effect):
     """Base class of hysteresis laws: a loop between plus and minus the offset, proportional to the offset."""
 
-    compensable = Compensable(True, "the load really moves like this, and the command says where it reverses")
+    compensable = Compensable(True, "the load really has this error, and the command says where it reverses")
     shape = (
         Shape("width_deg", 0.5, 120.0, logarithmic=True),
         Shape("exponent", 1.02, 4.0),

@@ -28,7 +28,7 @@ class FlexsplineOrders(OrderSeries):
         "generator",
         size="1-10 arcsec",
     )
-    compensable = Compensable(True, "the load really moves like this, and it repeats")
+    compensable = Compensable(True, "the load really has this error, and it repeats")
     typical = {"orders": orders_from((1, 2, 4), 2.0)}
     searched = range(1, 9)
 

@@ -33,7 +33,7 @@ class InertialWindup(Angleless, Linear):
         size="7 arcsec at 200 deg/s^2 with a resonance at 50 Hz",
     )
     compensable = Compensable(
-        True, "the load really moves like this and the acceleration is commanded; at rest it is zero"
+        True, "the load really has this error and the acceleration is commanded; it is zero at rest"
     )
     ordinary_arcsec = 1.5
     """Peak wind-up of an ordinary axis in its fastest moves."""
@@ -46,7 +46,7 @@ class InertialWindup(Angleless, Linear):
         ge=0, le=0.1, description="J / K at the load, 1 / (2 pi f)^2 of its resonance"
     )
     limit_deg_s2: float = Field(
-        1e6, gt=0, le=1e8, description="motor acceleration beyond which the effect stays constant"
+        1e6, gt=0, le=1e8, description="motor acceleration above which the effect is constant"
     )
 
     @classmethod

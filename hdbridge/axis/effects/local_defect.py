@@ -46,7 +46,7 @@ class LocalDefect(Momentary, Linear):
         size="1-20 arcsec",
     )
     compensable = Compensable(
-        True, "the load really moves like this, if it is a tooth and not a mark on the encoder's disc"
+        True, "the load really has this error, if it is a tooth and not a mark on the encoder's disc"
     )
     shape = (
         Shape("centre_deg", 0.0, 360.0),

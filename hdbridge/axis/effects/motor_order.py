@@ -31,7 +31,7 @@ class MotorOrders(OrderSeries):
             )
         },
     )
-    compensable = Compensable(True, "the load really moves like this, and it repeats")
+    compensable = Compensable(True, "the load really has this error, and it repeats")
     part = Part.ORDERS
     searched = range(1, HIGHEST_MOTOR_ORDER + 1)
     usual = 4

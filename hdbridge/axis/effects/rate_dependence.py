@@ -32,7 +32,7 @@ class RateDependence(Modulating):
         source="rate-dependent friction, logarithmic in the rate (rate-and-state laws)",
         size="5-30 % of the loop",
     )
-    compensable = Compensable(True, "the load really moves like this; the speed is commanded")
+    compensable = Compensable(True, "the load really has this error; the speed is commanded")
     shape = (Shape("reference_deg_s", 1.0, 1000.0, logarithmic=True),)
     carries = {Part.LOOP: "loop"}
     linear = ("growth_percent",)
@@ -40,9 +40,9 @@ class RateDependence(Modulating):
 
     loop: Loop = Field(description="the model's loop")
     growth_percent: float = Field(ge=0, le=200, description="growth per decade of speed")
-    reference_deg_s: float = Field(gt=0, le=1e5, description="motor speed above which the loop grows")
+    reference_deg_s: float = Field(gt=0, le=1e5, description="motor speed from which on it grows")
     limit_deg_s: float = Field(
-        20_000.0, gt=0, le=1e6, description="motor speed beyond which the effect stays constant"
+        20_000.0, gt=0, le=1e6, description="motor speed above which the effect is constant"
     )
 
     @classmethod

@@ -41,16 +41,14 @@ class RatioError(Momentary, Linear):
     )
     compensable = Compensable(
         True,
-        "the load really moves like this (unless the load encoder's scale is wrong), but correct the axis "
+        "the load really has this error (unless the load encoder's scale is wrong), but correct the axis "
         "file instead",
     )
     linear = ("ramp_arcsec_per_turn",)
     typical = {"ramp_arcsec_per_turn": 2.592}
 
     ramp_arcsec_per_turn: float = Field(ge=-1e6, le=1e6, description="ramp per motor turn")
-    limit_deg: float = Field(
-        1e6, gt=0, le=1e9, description="motor angle beyond which the effect stays constant"
-    )
+    limit_deg: float = Field(1e6, gt=0, le=1e9, description="motor angle above which the effect is constant")
 
     def true_ratio(self, ratio: float) -> float:
         """Returns the true gear ratio if a model with ``ratio`` has this ramp as its error."""

@@ -28,7 +28,7 @@ class Synchronous(OrderSeries):
         source="Fourier series over the wave generator's angle, the usual kinematic error model",
         size="20-60 arcsec peak to peak",
     )
-    compensable = Compensable(True, "the load really moves like this, and it repeats")
+    compensable = Compensable(True, "the load really has this error, and it repeats")
     typical = {"orders": TYPICAL_ORDERS}
     """Orders of the published gear."""
     part = Part.ORDERS

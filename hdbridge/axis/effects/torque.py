@@ -20,7 +20,7 @@ TorqueLimit = Annotated[
     Field(
         gt=0,
         le=1e5,
-        description="torque beyond which the effect stays constant; limits the motion due to a sensor fault",
+        description="torque above which the effect is constant, so that no sensor fault moves the axis far",
     ),
 ]
 

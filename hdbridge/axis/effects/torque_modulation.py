@@ -44,7 +44,7 @@ class TorqueModulation(TorqueGrowth, Modulating):
             "amplitude_drift": Experiment(10, "the same motor turns under two torques at one temperature")
         },
     )
-    compensable = Compensable(True, "the load really moves like this, if the torque is known on line")
+    compensable = Compensable(True, "the load really has this error, if the torque is known on line")
     part = Part.GROWTH
     carries = {Part.ORDERS: "orders"}
     linear = ("growth_percent_per_nm",)

@@ -45,7 +45,9 @@ class VelocityWindup(Angleless, Linear):
         source="Coulomb and viscous friction with shear thinning, over the gear's stiffness",
         size="5-50 arcsec",
     )
-    compensable = Compensable(True, "the load really lags and the speed is commanded; at rest it is zero")
+    compensable = Compensable(
+        True, "the load really has this error and the speed is commanded; it is zero at rest"
+    )
     shape = (Shape("shear_deg_s", 10.0, 100_000.0, logarithmic=True),)
     nonnegative = True
     """Drag always opposes the motion. Without this constraint, the estimate of an absent drag could have
@@ -62,11 +64,9 @@ class VelocityWindup(Angleless, Linear):
     viscous_arcsec_s_per_deg: float = Field(
         ge=0, le=100, description="slope at low speed, per motor degree per second"
     )
-    shear_deg_s: float = Field(
-        gt=0, le=1e7, description="motor speed at which the viscous part is half its linear value"
-    )
+    shear_deg_s: float = Field(gt=0, le=1e7, description="motor speed at which it has fallen off by half")
     limit_deg_s: float = Field(
-        50_000.0, gt=0, le=1e6, description="motor speed beyond which the effect stays constant"
+        50_000.0, gt=0, le=1e6, description="motor speed above which the effect is constant"
     )
 
     @classmethod

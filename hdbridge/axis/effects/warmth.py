@@ -38,7 +38,7 @@ class Warmed(Effect):
     reference_c: float = Field(20.0, ge=-60, le=200, description="temperature at which the effect is zero")
     warm_up_k: float = Field(10.0, gt=0, le=200, description="final warmth, if driven by time (assumed)")
     limit_k: float = Field(
-        60.0, gt=0, le=200, description="warmth in either direction beyond which the effect stays constant"
+        60.0, gt=0, le=200, description="warmth in either direction above which the effect is constant"
     )
 
     @classmethod

@@ -357,7 +357,7 @@ def heartbeat(context: BringUpContext) -> Verdict:
     if not sdo.has(objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub):
         if has_timer:
             return not_possible(
-                "the drive monitors no heartbeat (no 1016h); its RPDO event timer must suffice"
+                "the drive watches no heartbeat (no 1016h); its RPDO event timer must suffice"
             )
         return failed(
             "the drive has neither a heartbeat consumer (1016h) nor an RPDO event timer (1400h:05)",
@@ -451,8 +451,8 @@ def _noticed(context: BringUpContext) -> str:
     axis = context.axis
     option = axis.drive.quick_stop_option
     again = (
-        f"; or it stopped, and continued at 'enable operation', which this check still sends (transition "
-        f"16): {axis.where('drive.quick_stop_option')}: found {option}, with 1 to 4 it cannot continue"
+        f"; or it stopped, and 'enable operation', which this check still sends, restarted it (transition "
+        f"16): {axis.where('drive.quick_stop_option')}: found {option}; 1 to 4 prevent that"
         if option >= 5
         else ""
     )
@@ -471,8 +471,8 @@ def _judge_silence(
     said = "".join(f"; it sent {each}" for each in silence.emergencies)
     if silence.resumed:
         what = (
-            f"no {what}: it stopped on its own, and the master's 'enable operation', which a dead master "
-            f"does not send, ended this stop (transition 16){said}"
+            f"no {what}: it stopped on its own, and the master's own 'enable operation', which a dead master "
+            f"does not send, restarted it (transition 16){said}"
         )
         return judge_stop(
             context.axis,

@@ -42,7 +42,7 @@ class Turned(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Accusation:
+class SuspectEntry:
     """Suspected key of the axis file, with the value that would explain the measurement."""
 
     key: str
@@ -115,7 +115,7 @@ def judge_turn(
     if factor < 0:
         remedies += _direction(axis)
     if abs(abs(factor) - 1.0) > tolerance:
-        remedies += [each.text(axis) for each in accuse(axis, abs(factor), tolerance, confirmed)]
+        remedies += [each.text(axis) for each in suspect_entries(axis, abs(factor), tolerance, confirmed)]
     elif lost > 4.0 + 0.05 * abs(load) / 2.0:
         remedies.append(
             f"{axis.where(SOURCE)}: the load encoder returned {lost:.0f} counts off its initial reading; "
@@ -136,9 +136,9 @@ def _direction(axis: AxisConfig) -> list[str]:
     ]
 
 
-def accuse(
+def suspect_entries(
     axis: AxisConfig, factor: float, tolerance: float, confirmed: frozenset[str] = frozenset()
-) -> list[Accusation]:
+) -> list[SuspectEntry]:
     """Returns the keys that explain a load travel of ``factor`` times the expected travel, most likely
     first.
 
@@ -154,43 +154,43 @@ def accuse(
     for row in rows:
         taken = -4.0 if row.key in confirmed else 0.0
         why = f"{row.why}; but the drive itself confirms {_plain(row.found)}" if taken else row.why
-        weighed.append(Accusation(row.key, row.found, row.expected, row.weight + taken, why))
+        weighed.append(SuspectEntry(row.key, row.found, row.expected, row.weight + taken, why))
     return sorted(weighed, key=lambda each: -each.weight)
 
 
-def _counts(key: str, found: int, wanted: float, tolerance: float, weight: float) -> Accusation:
+def _counts(key: str, found: int, wanted: float, tolerance: float, weight: float) -> SuspectEntry:
     for power in range(-8, 9):
         multiple = found * 2.0**power
         if power and abs(multiple / wanted - 1.0) <= tolerance:
             if power in (2, -2):
                 why = "lines taken for counts" if power > 0 else "counts taken for lines"
-                return Accusation(key, found, round(multiple), weight + 3.0, why)
-            return Accusation(key, found, round(multiple), weight + 2.0, f"{2.0**power:g} times")
+                return SuspectEntry(key, found, round(multiple), weight + 3.0, why)
+            return SuspectEntry(key, found, round(multiple), weight + 2.0, f"{2.0**power:g} times")
     tidy = _roundest(wanted)
     digits = len(str(tidy).rstrip("0"))
     if digits == 1 or tidy & (tidy - 1) == 0:
-        return Accusation(key, found, tidy, weight + 2.0, "a round number")
-    return Accusation(key, found, tidy, weight + (1.0 if digits == 2 else 0.0), "it would explain the travel")
+        return SuspectEntry(key, found, tidy, weight + 2.0, "a round number")
+    return SuspectEntry(key, found, tidy, weight + (1.0 if digits == 2 else 0.0), "it would explain it")
 
 
-def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> Accusation:
+def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> SuspectEntry:
     found, teeth = axis.gear.ratio, axis.gear.teeth
     if teeth is not None:
         other = found + (1.0 if teeth.output == "flexspline" else -1.0)
         if abs(other / wanted - 1.0) <= tolerance:
             held = "circular_spline" if teeth.output == "flexspline" else "flexspline"
-            return Accusation(RATIO, found, other, 4.0, f"the output is the other one: teeth.output {held}")
+            return SuspectEntry(RATIO, found, other, 4.0, f"the output is the other one: teeth.output {held}")
     whole = round(wanted)
     if whole >= 1 and abs(whole / wanted - 1.0) <= tolerance:
         # Numbers of teeth that give the ratio of the axis file are evidence for that ratio.
         less = 1.0 if teeth is not None else 0.0
         if abs(whole - found) == 1.0:
-            return Accusation(RATIO, found, whole, 3.5 - less, "the other output of the same gear")
+            return SuspectEntry(RATIO, found, whole, 3.5 - less, "the other output of the same gear")
         if whole in USUAL_RATIOS:
-            return Accusation(RATIO, found, whole, 2.0 - less, "a usual ratio")
-        return Accusation(RATIO, found, whole, 1.0 - less, "a whole number")
-    return Accusation(
-        RATIO, found, float(f"{wanted:.5g}"), -2.0, "it would explain the travel, but is not a whole number"
+            return SuspectEntry(RATIO, found, whole, 2.0 - less, "a usual ratio")
+        return SuspectEntry(RATIO, found, whole, 1.0 - less, "a whole number")
+    return SuspectEntry(
+        RATIO, found, float(f"{wanted:.5g}"), -2.0, "it would explain it, but is not a whole number"
     )
 
 
@@ -264,7 +264,7 @@ def judge_channels(
         elif 2 * channel.every_cycles * axis.drive.cycle_s < waited_s:
             text += f"; no {name}"
             remedies.append(
-                f"{axis.where(key)}: no plausible reading (within {channel.scale.least:g} to "
+                f"{axis.where(key)}: no plausible reading arrives (within {channel.scale.least:g} to "
                 f"{channel.scale.greatest:g} {BY_KEY[key].unit}); check the sensor, the object and its unit"
             )
     return failed(text, *remedies, **figures) if remedies else passed(text, **figures)

@@ -14,7 +14,7 @@ from hdbridge.cia301 import NmtState
 from hdbridge.commissioning.bringup import ASK_TIMEOUT_S, LISTEN_S
 from hdbridge.drive import objects
 from hdbridge.drive.link import Frame, Link
-from hdbridge.drive.manners import Ear, listening_s
+from hdbridge.drive.masterdetection import MasterDetector, listening_s
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.nameplate import IDENTITY
 from hdbridge.drive.objects import CYCLIC, Address, IntegerType
@@ -127,7 +127,7 @@ class Scan:
         return next((each for each in self.nodes if each.node_id == node_id), None)
 
 
-class _Hearing:
+class _BusObserver:
     """Observes all frames: records the nodes that send, SDO traffic, and signs of another master."""
 
     def __init__(self, link: Link) -> None:
@@ -138,10 +138,10 @@ class _Hearing:
         self.busy: set[int] = set()
         self.syncs = 0
         self.commands = 0
-        self.masters = Ear(NODE_IDS)
+        self.detector = MasterDetector(NODE_IDS)
 
     def take(self, frame: Frame) -> None:
-        self.masters.take(frame)
+        self.detector.take(frame)
         can_id, node_id = frame.can_id, frame.can_id & 0x7F
         function = can_id - node_id
         if self.monitor.dispatch(frame):
@@ -194,29 +194,29 @@ def scan_bus(
     fails.
     """
     force = force or link.private
-    ear = _Hearing(link)
+    observer = _BusObserver(link)
     duration_s = listen_s if force else max(listen_s, listening_s())
-    ear.listen(duration_s)
+    observer.listen(duration_s)
     if not force:
-        ear.masters.refuse(link.name, duration_s)
+        observer.detector.raise_if_heard(link.name, duration_s)
     nodes: dict[int, Node] = {}
     for place, node_id in enumerate(NODE_IDS):
-        if node_id in ear.busy:
+        if node_id in observer.busy:
             nodes[node_id] = Node(node_id, busy=True)
         else:
-            node = _ask(ear, node_id, timeout_s)
+            node = _ask(observer, node_id, timeout_s)
             if node.answers:
                 nodes[node_id] = node
         progress((place + 1) / len(NODE_IDS))
-    for node_id, status in ear.monitor.nodes.items():
+    for node_id, status in observer.monitor.nodes.items():
         if status.heartbeat_s is not None or status.emergency_count:
             nodes.setdefault(node_id, Node(node_id)).nmt_state = status.nmt_state
-    return Scan(tuple(nodes[each] for each in sorted(nodes)), tuple(ear.remarks()))
+    return Scan(tuple(nodes[each] for each in sorted(nodes)), tuple(observer.remarks()))
 
 
-def _ask(ear: _Hearing, node_id: int, timeout_s: float) -> Node:
+def _ask(observer: _BusObserver, node_id: int, timeout_s: float) -> Node:
     node = Node(node_id)
-    sdo = SdoClient(ear.link, ear.monitor, node_id, None, timeout_s, attempts=1)
+    sdo = SdoClient(observer.link, observer.monitor, node_id, None, timeout_s, attempts=1)
     try:
         node.device_type = sdo.fetch(objects.DEVICE_TYPE)
     except SdoAbortError:
@@ -224,7 +224,7 @@ def _ask(ear: _Hearing, node_id: int, timeout_s: float) -> Node:
     except SdoError:
         return node
     node.answers = True
-    sdo = SdoClient(ear.link, ear.monitor, node_id, None, DETAIL_TIMEOUT_S, attempts=2)
+    sdo = SdoClient(observer.link, observer.monitor, node_id, None, DETAIL_TIMEOUT_S, attempts=2)
     for address, name in IDENTITY:
         value = _fetch(sdo, address)
         if value is not None:

@@ -245,9 +245,9 @@ class SlowAxis:
         """Quick-stops half-way; returns the speed before the stop, its travel and its time (motor deg, s)."""
         moved = self._half_way(self._follow(motor_deg), motor_deg)
         speed = self._measured_speed(moved)
-        stopping = self.stop()
-        start, end = moved[-1].motor_counts, stopping[-1].motor_counts
-        rest = next(place for place, each in enumerate(stopping) if abs(each.motor_counts - end) <= 1)
+        stop_feedbacks = self.stop()
+        start, end = moved[-1].motor_counts, stop_feedbacks[-1].motor_counts
+        rest = next(place for place, each in enumerate(stop_feedbacks) if abs(each.motor_counts - end) <= 1)
         way = abs(self.axis.motor_encoder.degrees(end - start))
         return speed, way, (rest + 1) * self.cycle.period_s
 
@@ -279,7 +279,7 @@ class SlowAxis:
         event = self.supervision.stop
         if event is not None:
             noticed_s = muted_s - last_s + (event.cycle - start.cycle) * self.cycle.period_s
-        states = [decode(each.statusword) for each in self.cycle.stopping] if event is not None else []
+        states = [decode(each.statusword) for each in self.cycle.stop_feedbacks] if event is not None else []
         if event is None:
             self.stop()
         silence = self._after_silence(start.motor_counts, noticed_s, event, self._pause)

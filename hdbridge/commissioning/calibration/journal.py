@@ -13,7 +13,7 @@ from typing import Any, Self
 from pydantic import BaseModel, ConfigDict, Field
 
 from hdbridge.axis import AxisConfig, Identity
-from hdbridge.control.survived import Survived, lines
+from hdbridge.control.faultcounts import FaultCount, fault_notes
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import read_yaml
 from hdbridge.motion.procedures.plan import Plan
@@ -46,7 +46,7 @@ class TaskEntry(BaseModel):
         (),
         description="channels of the axis file that failed during the test; the samples do not contain them",
     )
-    survived: tuple[Survived, ...] = Field(
+    survived: tuple[FaultCount, ...] = Field(
         (), description="faults that the run tolerated, and the one that ended it"
     )
 
@@ -157,7 +157,7 @@ class Journal:
         *,
         complete: bool,
         lost: tuple[str, ...] = (),
-        survived: tuple[Survived, ...] = (),
+        survived: tuple[FaultCount, ...] = (),
     ) -> None:
         """Writes a task's samples and legs; does nothing without samples."""
         if not len(record):
@@ -203,7 +203,7 @@ class Journal:
         return Recording.load(self.folder)
 
 
-def survived_in(folders: Iterable[Path]) -> tuple[str, ...]:
+def fault_notes_in(folders: Iterable[Path]) -> tuple[str, ...]:
     """Returns one line for each recorded file whose run tolerated faults."""
     found = []
     for folder in folders:
@@ -211,7 +211,7 @@ def survived_in(folders: Iterable[Path]) -> tuple[str, ...]:
             notes = read_yaml(folder / ABOUT_NAME).validate(RecordingFile).notes
             tasks = _Notes.model_validate({"plan": {}, **notes}).tasks if "plan" in notes else ()
             found += [(f"{folder.name}/{each.file}", each.survived) for each in tasks]
-    return tuple(lines(found))
+    return tuple(fault_notes(found))
 
 
 def tasks_of(recording: Recording) -> tuple[TaskEntry, ...]:

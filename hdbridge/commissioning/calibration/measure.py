@@ -59,7 +59,7 @@ class Pace:
 
 
 @dataclass(frozen=True, slots=True)
-class Outlook:
+class RemainingPlan:
     """Remaining tasks of a plan."""
 
     tasks: tuple[Task, ...]
@@ -68,13 +68,13 @@ class Outlook:
     notes: tuple[str, ...]
 
 
-def outlook(plan: Plan, axis: AxisConfig, done: Sequence[str] | frozenset[str] = ()) -> Outlook:
+def remaining_plan(plan: Plan, axis: AxisConfig, done: Sequence[str] | frozenset[str] = ()) -> RemainingPlan:
     """Returns the remaining tasks of a plan on an axis; InputError if they would leave its limits."""
     view = axis_view(axis)
     fitted = plan.tasks(view)
     left = tuple(each for each in fitted.tasks if each.name not in set(done))
     middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
-    return Outlook(
+    return RemainingPlan(
         left, sum(rehearse(each.procedure, view, middle).duration_s for each in left), fitted.notes
     )
 
@@ -92,7 +92,7 @@ def start_journal(
     InputError if the axis has no encoder at its load.
     """
     axis.require_load_encoder()
-    shortened = outlook(plan, axis).notes
+    shortened = remaining_plan(plan, axis).notes
     return Journal.create(
         folder,
         axis,
@@ -117,7 +117,7 @@ def measure(
     raised.
     """
     journal.check_is_of(drive.axis, drive.identity)
-    left = outlook(journal.plan, drive.axis, journal.done)
+    left = remaining_plan(journal.plan, drive.axis, journal.done)
     if not left.tasks:
         return
     make_folder(journal.folder)  # fails on an unwritable disk before the axis moves
@@ -140,4 +140,4 @@ def measure(
 def _add(journal: Journal, axis: AxisConfig, task: Task, bench: Bench, *, complete: bool) -> None:
     record = bench.record()
     lost = lost_channels(axis, record)
-    journal.add(task.name, record, bench.legs, complete=complete, lost=lost, survived=bench.survived)
+    journal.add(task.name, record, bench.legs, complete=complete, lost=lost, survived=bench.fault_counts)

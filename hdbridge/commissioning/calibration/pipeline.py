@@ -15,12 +15,12 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.difference import diff
 from hdbridge.axis.model.store import propose
 from hdbridge.commissioning.calibration.identification import identify, provenance, standings, with_provenance
-from hdbridge.commissioning.calibration.journal import Journal, survived_in, tasks_of
+from hdbridge.commissioning.calibration.journal import Journal, fault_notes_in, tasks_of
 from hdbridge.commissioning.calibration.measure import measure
 from hdbridge.commissioning.calibration.motion import MotionTest, motion_test, wind_up_of
 from hdbridge.commissioning.calibration.validation import Validation, floor_of, validate
 from hdbridge.control.caps import cap_remark
-from hdbridge.control.realtime import left_realtime
+from hdbridge.control.realtime import suspended_realtime
 from hdbridge.control.rig import Rig
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError, OutputError
@@ -143,7 +143,7 @@ ACTIVE_NAME = "active.yaml"
 Progress = Callable[[str, float, float], None]
 
 
-@left_realtime()  # fitting takes long; a bench resumes real-time priority for each motion
+@suspended_realtime()  # fitting takes long; a bench resumes real-time priority for each motion
 def calibrate(
     drive: Drive | Rig,
     journal: Journal,
@@ -240,7 +240,7 @@ def conclude(
     """
     measured = list(recordings.values())
     fit = identify(measured, ratio, active, independent_zeros=independent_zeros)
-    fit = replace(fit, warnings=(*_lost(recordings), *survived_in(recordings), *fit.warnings))
+    fit = replace(fit, warnings=(*_lost(recordings), *fault_notes_in(recordings), *fit.warnings))
     gain = fit.held_out.gain
     model = with_provenance(
         fit.model, provenance(recordings, measured, gain.as_dict() if gain else fit.held_out.text)

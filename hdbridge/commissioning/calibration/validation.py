@@ -21,8 +21,8 @@ from hdbridge.commissioning.calibration.path import SETTLED_ARCSEC
 from hdbridge.commissioning.evaluation.accuracy import AxisAccuracy, axis_accuracy
 from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_floor_arcsec
 from hdbridge.control.bench import Bench, Run, axis_view, compensation_for
+from hdbridge.control.faultcounts import fault_notes
 from hdbridge.control.rig import Rig, bench_on
-from hdbridge.control.survived import lines
 from hdbridge.drive.drive import Drive
 from hdbridge.files.outputs import writing
 from hdbridge.motion.procedures.moves import Settle
@@ -74,7 +74,7 @@ class Validation:
     accuracy_before: AxisAccuracy | None = None
     accuracy_after: AxisAccuracy | None = None
     """Accuracy from the positioning test; None if the plan has none."""
-    survived: tuple[str, ...] = ()
+    fault_notes: tuple[str, ...] = ()
     """One line for each run with tolerated faults, or with a motor that turns back at rest."""
 
     @property
@@ -108,7 +108,7 @@ class Validation:
             "quantisation_floor_arcsec": self.floor.quantisation_arcsec,
             "noise_floor_arcsec": self.floor.noise_arcsec,
             "worse": list(self.worse),
-            "survived": list(self.survived),
+            "survived": list(self.fault_notes),
             "of_floor": self.after.pooled.three_sigma_arcsec / self.floor.three_sigma_arcsec,
             "accuracy": {
                 "before": self.accuracy_before.as_dict() if self.accuracy_before else None,
@@ -205,7 +205,7 @@ def validate(
             bench, run = stepped(name, model)
             test = Stepped.of(words, run.outcome)
         results.append(test)
-        notes += lines([(f"stepping {name}", run.survived)])
+        notes += fault_notes([(f"stepping {name}", run.fault_counts)])
         if name == "after" and _exceeds(_within_directions(test), floor.three_sigma_arcsec, test):
             notes += _turning_back(run, axis)
         if positioning:
@@ -213,7 +213,7 @@ def validate(
             with record_kept(bench, folder / f"positioning-{name}.csv.gz"):
                 measured = bench.run(positioning)
             approaches = measured.outcome
-            notes += lines([(f"positioning {name}", measured.survived)])
+            notes += fault_notes([(f"positioning {name}", measured.fault_counts)])
             accuracies.append(
                 axis_accuracy(
                     [each.target_deg for each in approaches],

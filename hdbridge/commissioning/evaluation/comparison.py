@@ -9,8 +9,8 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scheme, Stepped, quantisation_floor_arcsec
 from hdbridge.control.bench import Run, compensation_for
+from hdbridge.control.faultcounts import fault_notes
 from hdbridge.control.rig import Rig, bench_on
-from hdbridge.control.survived import lines
 from hdbridge.drive.drive import Drive
 from hdbridge.motion.procedures.stepping import Stepping, SteppingOutcome
 from hdbridge.records.record import Record
@@ -32,16 +32,18 @@ class Comparison:
         return cls(results, runs, floor)
 
     @property
-    def survived(self) -> tuple[str, ...]:
+    def fault_notes(self) -> tuple[str, ...]:
         """One line for each scheme whose test continued despite tolerated faults."""
-        return tuple(lines((f"'{scheme.value}'", run.survived) for scheme, run in self.runs.items()))
+        return tuple(
+            fault_notes((f"'{scheme.value}'", run.fault_counts) for scheme, run in self.runs.items())
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the document of ``hdbridge step --json``."""
         return {
             "schema": "hdbridge.stepping/1",
             **{scheme.value: self._figures(scheme) for scheme in self.results},
-            "survived": list(self.survived),
+            "survived": list(self.fault_notes),
             "quantisation_floor_arcsec": self.quantisation_floor_arcsec,
         }
 

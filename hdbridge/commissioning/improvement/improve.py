@@ -12,16 +12,16 @@ from hdbridge.analysis.findings import Diagnosis
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration.identification import provenance, with_provenance
-from hdbridge.commissioning.calibration.journal import Journal, survived_in, tasks_of
+from hdbridge.commissioning.calibration.journal import Journal, fault_notes_in, tasks_of
 from hdbridge.commissioning.calibration.measure import measure, start_journal
 from hdbridge.commissioning.calibration.pipeline import ACTIVE_NAME, MODEL_NAME, Offer, proposed
 from hdbridge.commissioning.calibration.validation import floor_of
 from hdbridge.commissioning.improvement.extension import Extension, alternatives, extension_of, named
 from hdbridge.commissioning.improvement.further import Choice, advice, choose, unseparated
-from hdbridge.commissioning.improvement.trial import Trial, try_out
+from hdbridge.commissioning.improvement.trial import Trial, run_trial
 from hdbridge.control.bench import axis_view
 from hdbridge.control.caps import cap_remark
-from hdbridge.control.realtime import left_realtime
+from hdbridge.control.realtime import suspended_realtime
 from hdbridge.control.rig import Rig
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
@@ -65,7 +65,7 @@ class Improvement:
     """Advice to the user about open questions."""
     trial: Trial | None
     offer: Offer
-    survived: tuple[str, ...] = ()
+    fault_notes: tuple[str, ...] = ()
     """One line for each recorded file whose run tolerated faults."""
 
     def as_dict(self) -> dict[str, Any]:
@@ -88,7 +88,7 @@ class Improvement:
             "rounds": [asdict(each) for each in self.rounds],
             "further": self.further.as_dict() if self.further else None,
             "advice": list(self.advice),
-            "survived": list(self.survived),
+            "survived": list(self.fault_notes),
             **trial,
             "diagnosis": self.diagnosis.as_dict(),
         }
@@ -112,7 +112,7 @@ class Source:
     """True if the encoders' zeros were lost between the given recordings."""
 
 
-@left_realtime()  # fitting takes long; a bench resumes real-time priority for each motion
+@suspended_realtime()  # fitting takes long; a bench resumes real-time priority for each motion
 def improve(
     drive: Drive | Rig,
     source: Source,
@@ -171,7 +171,7 @@ def improve(
         advice=advice(diagnosis),
         trial=None,
         offer=Offer(False, "nothing found: the active model stays"),
-        survived=survived_in(list(recordings)),
+        fault_notes=fault_notes_in(list(recordings)),
     )
     if diagnosis.findings:
         whole = Recording.joined(list(recordings.values()))
@@ -264,10 +264,10 @@ def _concluded(
     model = with_provenance(extension.model, _provenance(result, recording))
     if remark := cap_remark(drive.axis, model):
         notify(remark)
-    notify("stepping with the active and the extended model, alternately")
+    notify("stepping with the active and the extended model alternately")
     floor = floor_of(drive.axis, recording)
     try:
-        trial = try_out(
+        trial = run_trial(
             drive,
             source.plan,
             result.active,
@@ -282,7 +282,9 @@ def _concluded(
     result = replace(result, trial=trial)
     summary = _summary(trial)
     if not trial.improves:
-        return replace(result, offer=Offer(False, f"not offered: positioning does not improve, {summary}"))
+        return replace(
+            result, offer=Offer(False, f"not offered: positioning is not more accurate, {summary}")
+        )
     reason = f"improvement {source.folder.name}: {named(extension.carried)}; {summary}"
     return replace(result, offer=proposed(profile, model, reason, bench.date, drive))
 

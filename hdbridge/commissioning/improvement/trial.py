@@ -21,8 +21,8 @@ from hdbridge.commissioning.calibration.validation import (
 )
 from hdbridge.commissioning.evaluation.stepping import Stepped
 from hdbridge.control.bench import axis_view, compensation_for
+from hdbridge.control.faultcounts import FaultCount, fault_notes
 from hdbridge.control.rig import Rig, bench_on
-from hdbridge.control.survived import Survived, lines
 from hdbridge.drive.drive import Drive
 from hdbridge.motion.procedures.moves import AxisView
 from hdbridge.motion.procedures.plan import Plan
@@ -78,7 +78,7 @@ class Trial:
         }
 
 
-def try_out(
+def run_trial(
     drive: Drive | Rig,
     plan: Plan,
     active: TransmissionModel,
@@ -99,7 +99,7 @@ def try_out(
     procedures = _procedures(plan, axis_view(axis), active)
     pace = Pace(trial_s(plan, axis, active), axis.drive.cycle_s, progress, interrupted)
     outcomes: tuple[list[SteppingOutcome], list[SteppingOutcome]] = ([], [])
-    survived: list[tuple[str, tuple[Survived, ...]]] = []
+    fault_counts: list[tuple[str, tuple[FaultCount, ...]]] = []
     for number, (name, procedure) in enumerate(procedures):
         for which in (0, 1) if number % 2 == 0 else (1, 0):
             title = f"{name}-{'before' if which == 0 else 'after'}"
@@ -108,10 +108,10 @@ def try_out(
             with record_kept(bench, folder / f"{title}.csv.gz"):
                 run = bench.run(procedure)
                 outcomes[which].append(run.outcome)
-                survived.append((title, run.survived))
+                fault_counts.append((title, run.fault_counts))
     pieces = [Stepped.of(words, _together(each[:-1])) for words, each in zip(_WORDS, outcomes, strict=True)]
     small = [Stepped.of(words, each[-1]) for words, each in zip(_WORDS, outcomes, strict=True)]
-    stepping = Validation(pieces[0], pieces[1], floor, survived=tuple(lines(survived)))
+    stepping = Validation(pieces[0], pieces[1], floor, fault_notes=tuple(fault_notes(fault_counts)))
     return Trial(stepping, (small[0], small[1]))
 
 

@@ -346,7 +346,7 @@ class AxisLoop:
         waiting = [each for each in self.image.channels if each.value is None]
         if waiting and waiting[0].lost:
             self._why = (
-                f"{self.config.where(waiting[0].key)}: no reading came that can be believed "
+                f"{self.config.where(waiting[0].key)}: no plausible reading arrived "
                 f"({waiting[0].why}); check the sensor, or leave the key out"
             )
             self._left = 0
@@ -445,7 +445,7 @@ class AxisLoop:
         if self.supervision.stop is None and self.state is AxisState.QUICK_STOPPED:
             if not self._obeyed():
                 return
-        elif self.cycle.riding:
+        elif self.cycle.stopping:
             return
         self.stands = True
         stop = self.supervision.stop

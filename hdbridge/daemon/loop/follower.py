@@ -13,8 +13,8 @@ from hdbridge.axis.effects import Moment, Observer
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import axis_view, compensation_for
+from hdbridge.control.channelstate import ChannelState
 from hdbridge.control.loadloop import LoadLoop
-from hdbridge.control.sensed import Sensed
 from hdbridge.control.switchover import Correction
 from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.setting import CompensationSetting
@@ -42,7 +42,7 @@ class Follower:
         """Load target of the last turn, without the load loop's correction."""
         self.loop_arcsec = 0.0
         """Correction by the load loop."""
-        self.sensed = Sensed(config)
+        self.sensed = ChannelState(config)
         self._axis, self._image, self._ratio = config, image, view.ratio
         self._has_channels = bool(image.channels)
         self._observer = Observer()
@@ -99,7 +99,7 @@ class Follower:
         sensed, correction = self.sensed, self.correction
         sensed.reset()
         sensed.take(feedback)
-        correction.know(sensed.known)
+        correction.set_known_channels(sensed.known)
         moment = Moment(time_s=feedback.time_s, measured=sensed.measured(feedback), load_deg=place_deg)
         correction.reset(motor_deg, moment)
         self.engage(self.compensating)
@@ -120,7 +120,7 @@ class Follower:
         if self._needs:
             sensed = self.sensed
             if self._has_channels and sensed.take(feedback):
-                correction.know(sensed.known)
+                correction.set_known_channels(sensed.known)
             moment = self._observer.moment(
                 self._ratio * target_deg,
                 feedback.time_s,

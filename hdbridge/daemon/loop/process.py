@@ -20,7 +20,7 @@ from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Cell, Memory
 from hdbridge.daemon.start import Simulation, Start, run_child, when_terminated
 from hdbridge.drive.link import Link, open_bus
-from hdbridge.drive.manners import USUAL_MASTER, Ear, listening_s
+from hdbridge.drive.masterdetection import DEFAULT_MASTER_ID, MasterDetector, listening_s
 from hdbridge.errors import BusError, HdbridgeError
 
 _POLLS: Final = 256
@@ -67,12 +67,12 @@ def listen(link: Link, axes: tuple[AxisConfig, ...]) -> None:
     """Listens for another master before the first SYNC; raises BusInUseError if one is heard."""
     if link.private:
         return
-    masters = {axis.drive.master_node_id for axis in axes} | {USUAL_MASTER}
+    masters = {axis.drive.master_node_id for axis in axes} | {DEFAULT_MASTER_ID}
     drives = {axis.drive.node_id for axis in axes}
     duration_s = listening_s(max(axis.drive.heartbeat_ms for axis in axes))
-    ear = Ear(drives, masters, {node for axis in axes for node in axis.nodes})
-    ear.listen(link, duration_s)
-    ear.refuse(link.name, duration_s)
+    detector = MasterDetector(drives, masters, {node for axis in axes for node in axis.nodes})
+    detector.listen(link, duration_s)
+    detector.raise_if_heard(link.name, duration_s)
 
 
 def run(start: Start) -> None:

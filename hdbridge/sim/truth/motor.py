@@ -87,7 +87,8 @@ class TrueServo(Strict):
         1.0,
         ge=0,
         le=1_000,
-        description="shortfall within which the integral rests once the demand does, in interpolated steps",
+        description="shortfall within which the integral is held once the demand rests, in interpolated "
+        "steps",
     )
     hunting_band: float = Field(
         16.0,
@@ -121,5 +122,6 @@ class TrueServo(Strict):
     dead_time_ms: float = Field(0.0, ge=0, le=100, description="age of the demand when the loops take it in")
     torque_limit_percent: float = Field(gt=0, le=1_000, description="highest torque, of the rated one")
     response: TrueResponse | None = Field(
-        None, description="what a drive of another make does in addition; without it: nothing"
+        None,
+        description="measured response in addition to the loops; without it: none",
     )

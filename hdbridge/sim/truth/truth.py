@@ -48,7 +48,9 @@ class TrueTemperature(Strict):
     ambient_k_per_hour: float = Field(
         0.0, ge=-100_000, le=100_000, description="how the surroundings warm up"
     )
-    ambient_swing_k: float = Field(0.0, ge=0, le=100, description="amplitude of their going to and fro")
+    ambient_swing_k: float = Field(
+        0.0, ge=0, le=100, description="amplitude of the periodic change of the surroundings"
+    )
     ambient_period_s: float = Field(3_600.0, gt=0, le=1e6, description="period of that")
 
     @property

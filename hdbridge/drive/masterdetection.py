@@ -18,7 +18,7 @@ LONGEST_CYCLE_S: Final = 0.255
 PERIODS: Final = 2
 """Listening time in periods of the slowest cycle or of the heartbeat, whichever is longer. Two, because a
 frame may have been sent just before."""
-USUAL_MASTER: Final = 127
+DEFAULT_MASTER_ID: Final = 127
 """Default node id of a master's heartbeat (77Fh), unless its axis file sets another."""
 _RPDOS: Final = (objects.COB_RPDO1, 0x300, 0x400, 0x500)
 _FUNCTION: Final = 0x780
@@ -36,18 +36,21 @@ def heartbeat_of(frame: Frame) -> int | None:
     return node_id if 0 < node_id <= _NODE else None
 
 
-class Ear:
+class MasterDetector:
     """Counts the frames that only another master sends.
 
     ``drives`` are the nodes whose set-points count, ``masters`` the node ids whose heartbeat is a master's,
-    ``asked`` the nodes whose SDO requests count.
+    ``sdo_servers`` the nodes whose SDO requests count.
     """
 
     def __init__(
-        self, drives: Container[int], masters: Container[int] = (USUAL_MASTER,), asked: Container[int] = ()
+        self,
+        drives: Container[int],
+        masters: Container[int] = (DEFAULT_MASTER_ID,),
+        sdo_servers: Container[int] = (),
     ) -> None:
-        self._drives, self._masters, self._asked = drives, masters, asked
-        self._heard: Counter[int] = Counter()
+        self._drives, self._masters, self._sdo_servers = drives, masters, sdo_servers
+        self._counts: Counter[int] = Counter()
         self.nodes: set[int] = set()
         """Nodes whose heartbeat was heard."""
 
@@ -57,7 +60,7 @@ class Ear:
         self._note(frame)
         if self._name(can_id) is None:
             return False
-        self._heard[can_id] += 1
+        self._counts[can_id] += 1
         return True
 
     def listen(self, link: Link, duration_s: float, then: Callable[[Frame], object] = lambda _: None) -> None:
@@ -82,11 +85,11 @@ class Ear:
     def __str__(self) -> str:
         """For example ``26 SYNC (080h), 26 set-points of node 1 (201h)``; empty if nothing was heard."""
         return ", ".join(f"{count} {self._name(can_id)} ({can_id:03X}h)" for can_id, count in
-                         sorted(self._heard.items()))  # fmt: skip
+                         sorted(self._counts.items()))  # fmt: skip
 
-    def refuse(self, bus: str, duration_s: float) -> None:
+    def raise_if_heard(self, bus: str, duration_s: float) -> None:
         """Raises `BusInUseError` if another master was heard."""
-        if self._heard:
+        if self._counts:
             raise BusInUseError(
                 f"{bus}: another master is on this bus: {self} in {duration_s:.2g} s; nothing was sent; "
                 "stop that master first (--force, in the library force=True, sends anyway)"
@@ -102,6 +105,6 @@ class Ear:
             return f"set-points of node {node}"
         if function == objects.COB_HEARTBEAT and node in self._masters:
             return f"heartbeats of master {node}"
-        if function == objects.COB_SDO_REQUEST and node in self._asked:
+        if function == objects.COB_SDO_REQUEST and node in self._sdo_servers:
             return f"SDO requests to node {node}"
         return None

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from hdbridge.drive.feedback import Feedback
 
 
-class Sensed:
+class ChannelState:
     """Channels of one axis; the last reading of each is held."""
 
     __slots__ = ("_channels", "_motor_torque", "_present", "_slots", "_values", "known", "torque_nm")

@@ -12,7 +12,7 @@ from hdbridge.drive.supervision import Fault, Supervision
 PERIODS_SKIPPED = "a period was skipped"
 
 
-class Survived(BaseModel):
+class FaultCount(BaseModel):
     """A kind of fault, with the number of cycles in which it occurred."""
 
     model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
@@ -28,7 +28,7 @@ class Survived(BaseModel):
         )
 
 
-class Watch:
+class FaultCounter:
     """Counts faults and skipped periods since its creation."""
 
     __slots__ = ("_before", "_skipped", "_supervision")
@@ -39,7 +39,7 @@ class Watch:
         self._before = dict(supervision.counts)
         self._skipped = skipped
 
-    def survived(self, skipped: int) -> tuple[Survived, ...]:
+    def fault_counts(self, skipped: int) -> tuple[FaultCount, ...]:
         """Returns the faults since creation in fault-table order, followed by the skipped periods."""
         counts = {
             fault: count - self._before[fault]
@@ -50,16 +50,16 @@ class Watch:
         for event in islice(reversed(self._supervision.events), sum(counts.values())):
             first[event.fault] = event.detail
         found = [
-            Survived(what=fault.value, cycles=count, first=first.get(fault, ""))
+            FaultCount(what=fault.value, cycles=count, first=first.get(fault, ""))
             for fault, count in counts.items()
         ]
         if skipped > self._skipped:
-            found.append(Survived(what=PERIODS_SKIPPED, cycles=skipped - self._skipped))
+            found.append(FaultCount(what=PERIODS_SKIPPED, cycles=skipped - self._skipped))
         return tuple(found)
 
 
-def lines(runs: Iterable[tuple[str, Sequence[Survived]]]) -> Iterator[str]:
+def fault_notes(runs: Iterable[tuple[str, Sequence[FaultCount]]]) -> Iterator[str]:
     """Yields one line for each run with tolerated faults, beginning with the run's name."""
-    for name, survived in runs:
-        if survived:
-            yield f"{name} continued despite: {'; '.join(map(str, survived))}"
+    for name, fault_counts in runs:
+        if fault_counts:
+            yield f"{name} continued despite: {'; '.join(map(str, fault_counts))}"

@@ -32,7 +32,7 @@ def bench(
     *frames: tuple[int, bytes], period_s: float = 0.1
 ) -> Iterator[tuple[can.BusABC, VirtualClock, can.BusABC]]:
     """Master's end of a bus on which another node sends ``frames``, and a witness of the sent frames."""
-    channel = f"manners-{uuid4()}"
+    channel = f"detection-{uuid4()}"
     truth = Truth.load(bundled_profile("article"))
     with ExitStack() as stack:
         chatter, witness = (
