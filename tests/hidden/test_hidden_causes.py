@@ -25,7 +25,6 @@ from support.hidden_bench import (
     SPEED_DEG_S,
     STEPPING,
     Cell,
-    Nested,
     Still,
     bare_truth,
     hidden_bench,
@@ -37,6 +36,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.cli import app
 from hdbridge.commissioning.improvement.extension import extension_of
 from hdbridge.motion.procedures.moves import Procedure, Settle
+from hdbridge.motion.procedures.reversals import Reversals
 from hdbridge.motion.procedures.sine import Sines
 from hdbridge.motion.procedures.standstill import Precondition
 from hdbridge.motion.procedures.stepping import Stepping
@@ -54,7 +54,7 @@ LOOP: Parts = (
     Still(3.0),
     Sweep(-10.0, 12.0, 2.0),
     Sines(0.0, (180.0, 45.0, 5.0), 0.1, 1.0),
-    Nested(),
+    Reversals(depths_deg=(2.0, 5.0, 9.0, 16.0), reach_deg=40.0, velocity_deg_s=0.5, beyond=True),
 )
 """Motion that shows the hysteresis loop and the motor orders; every bench begins with it."""
 FAST: Parts = (Sweep(-15.0, 65.0, SPEED_DEG_S),)
@@ -281,7 +281,7 @@ def test_unknown_causes_are_unexplained_with_their_coordinate(cell: Cell) -> Non
 
 def test_the_same_seed_gives_the_same_record_bit_for_bit(tmp_path: Path) -> None:
     def record(folder: str, seed: int) -> bytes:
-        parts = (Precondition(0.0, 2.0), Nested((5.0,)))
+        parts = (Precondition(0.0, 2.0), Reversals(depths_deg=(5.0,)))
         with hidden_bench(tmp_path / folder, [("vibration", 5.0), ("creep", 5.0)], seed, parts) as cell:
             columns = Recording.load(cell.recording).record.columns
             return b"".join(columns[name].tobytes() for name in sorted(columns))

@@ -23,7 +23,7 @@ from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_flo
 from hdbridge.control.bench import Bench, axis_view, compensation_for
 from hdbridge.drive.drive import Drive
 from hdbridge.motion.procedures.chain import Chain
-from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Procedure, Steps
+from hdbridge.motion.procedures.moves import AxisView, Dwell, Procedure, Steps
 from hdbridge.motion.procedures.rehearsal import legs_of
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.recording import Recording
@@ -56,21 +56,6 @@ temperature:
   source: {index: 0x2100, type: int16}
   celsius_per_count: 0.1
 """
-
-
-@dataclass(frozen=True)
-class Nested:
-    """Procedure of nested reversals, some of them beyond an earlier turning point; motor degrees."""
-
-    depths_deg: tuple[float, ...] = (2.0, 5.0, 9.0, 16.0)
-    velocity_deg_s: float = 0.5
-
-    def moves(self, axis: AxisView) -> Steps[None]:
-        """Yields the moves about the load's zero, each from the forward branch."""
-        for depth in self.depths_deg:
-            yield MoveTo(-40.0 / axis.ratio)
-            for part in (0.0, -1.0, -0.3, -0.8, -0.5, -1.4, 0.0):
-                yield MoveTo(part * depth / axis.ratio, self.velocity_deg_s, kind="reversal")
 
 
 @dataclass(frozen=True)
