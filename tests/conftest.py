@@ -31,3 +31,13 @@ def at_a_terminal() -> Iterator[None]:
     ours = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGHUP, ours)
+
+
+@pytest.fixture(scope="session")
+def place(tmp_path_factory):
+    """The API of a machine of two axes without drives; a test begins with ``place.bridge.__init__()``."""
+    from support.api import served
+    from support.fake_bridge import FakeBridge
+
+    with served(FakeBridge(), tmp_path_factory.mktemp("api")) as place:
+        yield place

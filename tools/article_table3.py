@@ -1,6 +1,6 @@
 """Computes all figures of docs/method.md: why the article's Tables 1 and 2 cannot give its Table 3.
 
-    python tools/article_table3.py [--json FILE] [--simulate] [--as-data]
+    python tools/article_table3.py [--simulate] [--as-data]
 
 The axis is ideal except for the article's own error model and the resolution of its two encoders: no
 dynamics, no noise. The hysteresis law is that of the project's effects; the inverse and the statistics are
@@ -11,12 +11,9 @@ the simulated drive (half a minute) and compares the errors step by step.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -100,133 +97,46 @@ def statistics(there: Sequence[float], back: Sequence[float]) -> Parts:
     return {name: (3.0 * float(np.std(errors)), float(np.mean(errors))) for name, errors in parts.items()}
 
 
-def rms(three_sigma: float, mean: float) -> float:
-    """Returns the root mean square about zero."""
-    return math.hypot(three_sigma / 3.0, mean)
-
-
 def figures() -> dict[str, Any]:
     """Returns all figures by name."""
     model = TransmissionModel.load(bundled_profile("article") / "model.yaml")
     law = next(effect for effect in model.effects if isinstance(effect, Hysteresis))
     errors = {scheme.value: step_errors(model, scheme.of(model)) for scheme in SCHEMES}
     computed = {name: statistics(*each) for name, each in errors.items()}
-    printed, fine = partial(step_errors, model, model, target=as_printed), 4 * MOTOR_COUNTS
+    printed = step_errors(model, model, target=as_printed)
     return {
         "computed": computed,
-        "both_by_the_formula_as_printed": statistics(*printed(MOTOR_COUNTS)),
+        "both_by_the_formula_as_printed": statistics(*printed),
         "table_3": TABLE_3,
-        "rms_about_zero_arcsec": {
-            name: {"computed": rms(*parts["pooled"]), "table 3": rms(*TABLE_3[name])}
-            for name, parts in computed.items()
-        },
-        **_about_table_3(computed),
-        **_about_the_test(model, law),
+        **_about_the_test(law),
         **_about_the_law(law),
         "floor_arcsec": quantisation_floor_arcsec(MOTOR_COUNTS, RATIO),
-        "with_4_x_counts_arcsec": {
-            "floor": quantisation_floor_arcsec(fine, RATIO),
-            "both": statistics(*step_errors(model, model, fine))["pooled"][0],
-            "both by the formula as printed": statistics(*printed(fine))["pooled"][0],
-        },
     }
 
 
-def _about_table_3(computed: Mapping[str, Parts]) -> dict[str, Any]:
-    """Returns figures derived from Table 3, and compared with the possible means and scatters."""
-    three_sigma = {name: each[0] for name, each in TABLE_3.items()}
-    mean = {name: each[1] for name, each in TABLE_3.items()}
-    wave = computed["none"]["cw"][0]
-    offset = computed["synchronous"]["cw"][1]
-    # A fraction p of forward steps adds (2 offset)^2 p (1 - p) to the variance; solved for that of "none".
-    both_ways = (three_sigma["none"] ** 2 - wave**2) / (3.0 * 2.0 * offset) ** 2
-    forward = 0.5 + math.sqrt(0.25 - both_ways)
-    return {
-        "remaining_share": three_sigma["both"] / three_sigma["none"],
-        "root_sum_square_of_the_single_schemes_arcsec": math.hypot(
-            three_sigma["synchronous"], three_sigma["hysteresis"]
-        ),
-        "shift_of_the_mean_arcsec": {
-            "by hysteresis compensation, without synchronous": mean["hysteresis"] - mean["none"],
-            "by hysteresis compensation, with synchronous": mean["both"] - mean["synchronous"],
-            "by synchronous compensation, without hysteresis": mean["synchronous"] - mean["none"],
-            "by synchronous compensation, with hysteresis": mean["both"] - mean["hysteresis"],
-            "the most that an offset of 40 could": computed["hysteresis"]["cw"][1]
-            - computed["none"]["cw"][1],
-        },
-        "none_as_a_mixture_of_directions": {
-            "share forward": forward,
-            "mean": offset * (2.0 * forward - 1.0),
-        },
-        "without_the_synchronous_part_of_table_1_arcsec": math.sqrt(three_sigma["none"] ** 2 - wave**2),
-        "beyond_one_motor_count_in_both_arcsec": math.sqrt(
-            three_sigma["both"] ** 2 - computed["both"]["pooled"][0] ** 2
-        ),
-    }
-
-
-def _about_the_test(model: TransmissionModel, law: Hysteresis) -> dict[str, Any]:
-    """Returns figures on the angles that the stepping test samples and on those that it misses."""
-    turn = np.linspace(0.0, 360.0, 100_001)
+def _about_the_test(law: Hysteresis) -> dict[str, Any]:
+    """Returns the load turns that the stepping test spans, and how many of its steps end saturated."""
     stops = np.concatenate([np.arange(COUNT + 1), np.arange(COUNT - 1, -1, -1)]) * STEP_DEG
     reached = law.predict(Motion(stops), Start.FORWARD)[1:]
-    other = [
-        law.model_copy(update={"width_deg": width, "exponent": exponent}).predict(
-            Motion(stops), Start.FORWARD
-        )[1:]
-        for width in (5.0, 40.0)
-        for exponent in (1.2, 2.5)
-    ]
-    per_turn = 360.0 / STEP_DEG
     return {
-        "ratio_of_80_and_82_teeth": {"flexspline output": 80 / 2, "circular-spline output": 82 / 2},
-        "ramp_per_step_between_ratios_40_and_50_arcsec": STEP_DEG * (1 / 40 - 1 / 50) * 3600.0,
-        "synchronous_peak_to_peak_arcsec": float(np.ptp(model.only(["synchronous"]).predict(Motion(turn)))),
-        "samples_per_motor_turn": per_turn,
-        "aliases": {str(order): alias(order, per_turn) for order in (1, 2, 3, 4, 6, 8)},
         "load_turns_spanned": COUNT * STEP_DEG / RATIO / 360.0,
         "steps_that_end_saturated": int(np.sum(np.abs(np.abs(reached) - law.offset_arcsec) < 1e-9)),
         "steps": len(reached),
-        "largest_change_with_widths_5_to_40_and_n_1.2_to_2.5_arcsec": float(
-            max(np.max(np.abs(each - reached)) for each in other)
-        ),
     }
-
-
-def alias(order: int, samples_per_turn: float) -> float:
-    """Returns the aliased frequency of a motor order in a stepping test, orders per motor turn."""
-    folded = order % samples_per_turn
-    return min(folded, samples_per_turn - folded)
 
 
 def _about_the_law(law: Hysteresis) -> dict[str, Any]:
-    n, offset = law.exponent, law.offset_arcsec
-    first_count = float(offset - law.predict(Motion(np.array([0.0, -COUNT_DEG])), Start.FORWARD)[-1])
-    rest = np.linspace(0.0, 20.0, 200_001)
-    xi = rest / law.width_deg
-    literal = 2.0 * offset * (xi ** (n - 1.0) - (n - 1.0) * xi) / (2.0 - n)
-    virgin = law.predict(Motion(rest), Start.VIRGIN)
-    back_step, staircase = memory_gaps(law)
+    first_count = law.offset_arcsec - law.predict(Motion(np.array([0.0, -COUNT_DEG])), Start.FORWARD)[-1]
     return {
-        "relay_jump_arcsec": 2.0 * offset,
-        "first_count_after_reversal_arcsec": first_count,
-        "same_in_counts_after_the_ratio": first_count * RATIO / 3600.0 / COUNT_DEG,
-        "saturation_from_rest_deg": {
-            "the formula as printed": float(rest[np.argmax(literal >= offset)]),
-            "a virgin curve": float(rest[np.argmax(virgin >= offset - 1e-9)]),
-        },
-        "without_return_point_memory_arcsec": {
-            "one 2 deg back-step": back_step,
-            "1 / 0.5 deg staircase": staircase,
-        },
+        "first_count_after_reversal_arcsec": float(first_count),
+        "without_return_point_memory_after_a_2_deg_back_step_arcsec": memory_gap(law),
     }
 
 
-def memory_gaps(law: Hysteresis) -> tuple[float, float]:
-    """Returns the maximum differences from the same law with return-point memory (Masing's rules), arcsec.
+def memory_gap(law: Hysteresis) -> float:
+    """Returns the maximum difference from the same law with return-point memory (Masing's rules), arcsec.
 
-    There are two rising paths after a saturated start: one with a single 2 deg step back, at the worst
-    position, and a staircase of 1 deg up and 0.5 deg down.
+    The path rises after a saturated start, with a single 2 deg step back at the worst position.
     """
     memory = HysteresisMemory.model_validate(law.parameters())
 
@@ -236,11 +146,7 @@ def memory_gaps(law: Hysteresis) -> tuple[float, float]:
         difference = memory.predict(motion, Start.BACKWARD) - law.predict(motion, Start.BACKWARD)
         return float(np.max(np.abs(difference)))
 
-    back_step = max(gap([-50.0, at, at - 2.0, 40.0]) for at in np.arange(-47.5, -30.0, 0.25))
-    staircase = [-50.0]
-    for _ in range(60):
-        staircase += [staircase[-1] + 1.0, staircase[-1] + 0.5]
-    return back_step, gap(staircase)
+    return max(gap([-50.0, at, at - 2.0, 40.0]) for at in np.arange(-47.5, -30.0, 0.25))
 
 
 def as_data(result: Mapping[str, Any]) -> dict[str, Any]:
@@ -317,9 +223,8 @@ def _words(value: object) -> str:
 
 
 def main() -> None:
-    """Prints the figures, and writes them to a file on request."""
+    """Prints the figures."""
     parser = argparse.ArgumentParser(description="Why Tables 1 and 2 cannot give Table 3.")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures for machines")
     parser.add_argument("--simulate", action="store_true", help="run the test on the simulated drive too")
     parser.add_argument("--as-data", action="store_true", help="take Table 3 as a measurement: what it lacks")
     options = parser.parse_args()
@@ -329,8 +234,6 @@ def main() -> None:
     if options.simulate:
         result["simulated"] = simulated()
     _print(result)
-    if options.json is not None:
-        options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -115,16 +115,13 @@ def draw(seed: int, presliding_arcsec: float = 0.0) -> tuple[dict[str, Any], dic
     return axis, truth
 
 
-def one(job: tuple[int, str, Path | None, float]) -> Outcome:
-    seed, plan, kept, presliding_arcsec = job
+def one(job: tuple[int, str, float]) -> Outcome:
+    seed, plan, presliding_arcsec = job
     axis_data, truth = draw(seed, presliding_arcsec)
     with tempfile.TemporaryDirectory() as name:
-        folder = kept / f"axis-{seed}" if kept else Path(name)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "truth.yaml").write_text(yaml.safe_dump(truth))
         axis = AxisConfig.from_text(yaml.safe_dump(axis_data), DEMO / "axis.yaml")
         wall, cpu = time.perf_counter(), time.process_time()
-        result, axis_s = calibrated(axis, Truth.load(folder / "truth.yaml"), plan, seed, folder)
+        result, axis_s = calibrated(axis, Truth.model_validate(truth), plan, seed, Path(name))
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     return judge(seed, axis, truth, result, axis_s, wall, cpu)
 
@@ -206,10 +203,8 @@ def main() -> None:
         default=0.0,
         help="arcsec of friction at the load that yields before it slips",
     )
-    options.add_argument("--keep", type=Path, help="folder for the axes' files and recordings")
     given = options.parse_args()
-    further = given.plan, given.keep, given.presliding
-    jobs = [(seed, *further) for seed in seeds(given)]
+    jobs = [(seed, given.plan, given.presliding) for seed in seeds(given)]
     print(HEAD)
     print(
         "worst: largest amplitude error over its tolerance (0.15 arcsec or 2 %); !: outside its 95 % interval"

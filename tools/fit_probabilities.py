@@ -1,11 +1,10 @@
-"""Fits the probability formula: `python tools/fit_probabilities.py [--suite FOLDER]... [--trials N]
-[--keep TABLE.json]`.
+"""Fits the probability formula: `python tools/fit_probabilities.py [--suite FOLDER]... [--keep TABLE.json]`.
 
-Diagnoses records whose causes are known: blind suites (tools/blind/generate.py) and short records from the
-formulas of tests/support/plant.py, N seeds of each cause. Each finding gives the terms of the formula
-(hdbridge/analysis/probability.py) and tells if the named cause was right. A logistic regression with a ridge
-penalty is fitted, every term with its required sign, and tested by cross-validation that leaves out whole
-records. An existing table of `--keep` is read instead. Prints the coefficients for `Scales`.
+Diagnoses the records of blind suites (tools/blind/generate.py), whose causes are known. Each finding gives
+the terms of the formula (hdbridge/analysis/probability.py) and tells if the named cause was right. A logistic
+regression with a ridge penalty is fitted, every term with its required sign, and tested by cross-validation
+that leaves out whole records. An existing table of `--keep` is read instead. Prints the coefficients for
+`Scales`.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ import argparse
 import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +20,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from blind.case import record_of, unsealed
+from blind.case import NEED_ROLLING, record_of, unsealed
+from blind.parameters import TWINS
 from blind.tables import CALIBRATION, Pair, brier, calibration, table
-from support.trials import CAUSES, LOOPS, NONE, PAIRS, SPECIAL, SYNONYMS, UNKNOWN, planted
 
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
@@ -71,11 +69,11 @@ def judged(
     met: set[str] = set()
     for each in result.findings:
         names = {each.cause, *each.aliases}
-        hits = {one for one in there if names & {one, *SYNONYMS.get(one, ())}} - met
+        hits = {one for one in there if names & {one, TWINS.get(one, one)}} - met
         if each.cause == "unexplained" or (each.cause in also and not hits):
             continue
         met |= set(sorted(hits)[:1])
-        right = bool(hits) or (loop and bool(names & LOOPS))
+        right = bool(hits) or (loop and bool(names & set(NEED_ROLLING)))
         yield {
             "source": source, "record": name, "cause": each.cause, "right": right,
             "terms": dict(each.terms), "given": each.probability,
@@ -92,16 +90,6 @@ def from_suite(folder: Path) -> Iterator[Row]:
         there = {each["cause"] for each in hidden["hidden"]} - {"unexplained"}
         loop = hidden["kind"] in {"law", "other_law"}
         yield from judged(folder.name, f"{folder.name}/{case.name}", result, there, set(hidden["also"]), loop)
-
-
-def from_trials(seeds: int, first: int) -> Iterator[Row]:
-    """Yields the judged findings in short records computed from formulas."""
-    for seed in range(first, first + seeds):
-        for name in (*CAUSES, *SPECIAL, *NONE, *UNKNOWN, *PAIRS):
-            there, record, model = planted(name, seed)
-            loop = name.startswith("none:") or bool(there & LOOPS)
-            result = diagnose(record, model, scales=Scales(named_from=0.0))
-            yield from judged("trials", f"{name} {seed}", result, there - {"unexplained"}, set(), loop)
 
 
 def kept(rows: Iterable[Row], file: Path | None) -> list[Row]:
@@ -124,16 +112,14 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--suite", type=Path, action="append", default=[], help="folder of a blind suite")
-    parser.add_argument("--trials", type=int, default=0, help="seeds of records from formulas")
     parser.add_argument("--keep", type=Path, help="JSON table of the findings")
     options = parser.parse_args()
     if options.keep and options.keep.exists():
         rows: list[Row] = json.loads(options.keep.read_text(encoding="utf-8"))
     else:
-        suites = (row for each in options.suite for row in from_suite(each))
-        rows = kept(chain(suites, from_trials(options.trials, 100)), options.keep)
+        rows = kept((row for each in options.suite for row in from_suite(each)), options.keep)
     if not rows:
-        print("no findings; give --suite or --trials", file=sys.stderr)
+        print("no findings; give --suite", file=sys.stderr)
         return 2
     names = list(coefficients(Scales()))
     terms = np.array([[row["terms"][name] for name in names] for row in rows])

@@ -8,79 +8,37 @@ from __future__ import annotations
 import argparse
 import math
 import statistics
+import sys
 import time
 from pathlib import Path
 
-import ruckig
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from support.bare_axis import CYCLE_S, DEG_PER_COUNT, STEP_COUNTS, Axis, static_arcsec, trajectory, truth
 
-from hdbridge.sim.machine import Machine
-from hdbridge.sim.truth import RollingFriction, Truth
-
-PROFILES = Path(__file__).parents[1] / "profiles"
-CYCLE_S = 0.004
-STEP_COUNTS = 968
-DEG_PER_COUNT = 360.0 / 8000.0
+from hdbridge.sim.truth import Truth
 
 
-def trajectory() -> list[int]:
-    """Returns the set-points of a step of 43.56 motor deg, in counts per cycle, within the axis limits."""
-    otg = ruckig.Ruckig(1, CYCLE_S)
-    way, out = ruckig.InputParameter(1), ruckig.OutputParameter(1)
-    way.current_position = way.current_velocity = way.current_acceleration = [0.0]
-    way.target_position = [float(STEP_COUNTS)]
-    counts_per_load_deg = 50.0 / DEG_PER_COUNT
-    way.max_velocity = [20.0 * counts_per_load_deg]
-    way.max_acceleration = [200.0 * counts_per_load_deg]
-    way.max_jerk = [4000.0 * counts_per_load_deg]
-    positions = []
-    while otg.update(way, out) == ruckig.Result.Working:
-        positions.append(round(out.new_position[0]))
-        out.pass_to_input(way)
-    return [*positions, STEP_COUNTS]
-
-
-def static_arcsec(truth: Truth, motor_deg: float, direction: int) -> float:
-    """Returns tooth error plus saturated hysteresis, the transmission error in the limit of slow motion."""
-    assert isinstance(truth.gear.hysteresis, RollingFriction)
-    tooth = (
-        each.amplitude_arcsec * math.cos(math.radians(each.order * motor_deg + each.phase_deg))
-        for each in truth.gear.motor_orders
-    )
-    return math.fsum(tooth) + direction * truth.gear.hysteresis.offset_arcsec
-
-
-def step_test(truth: Truth, steps: int) -> str:
+def step_test(known: Truth, steps: int) -> str:
     """Runs a stepping test in both directions with 0.3 s of settling; returns one row of the table."""
-    machine = Machine(truth, 1)
-    substeps = round(CYCLE_S / machine.dt_s)
-    move = trajectory()
-    position, cycles, spent_s = 0, 0, 0.0
+    axis, moving = Axis(known), len(trajectory(STEP_COUNTS))
+    cycles, spent_s = 0, 0.0
     measured: dict[int, list[float]] = {1: [], -1: []}
     off_law, overshoots, settled = [], [], []
     for direction in (1, -1):
         for step in range(steps + 1):
-            goal = position + direction * STEP_COUNTS
-            ends, over = [], 0.0
             began_s = time.perf_counter()
-            last = position
-            for point in move + [STEP_COUNTS] * 75:
-                target = position + direction * point
-                machine.follow(last, target, substeps)
-                last = target
-                over = max(over, direction * (machine.true_motor_deg - goal * DEG_PER_COUNT))
-                ends.append(machine.true_load_deg)
+            axis.move(direction * STEP_COUNTS)
             spent_s += time.perf_counter() - began_s
+            ends = axis.loads_deg
             cycles += len(ends)
-            position = goal
             if step == 0:
                 continue  # the pre-conditioning move
-            nominal_deg = goal * DEG_PER_COUNT / truth.gear.ratio
-            measured[direction].append((machine.load_counts / 8000.0 - nominal_deg) * 3600.0)
-            true_arcsec = (machine.true_load_deg - nominal_deg) * 3600.0
-            off_law.append(true_arcsec - static_arcsec(truth, goal * DEG_PER_COUNT, direction))
-            overshoots.append(over)
+            motor_deg = axis.target * DEG_PER_COUNT
+            measured[direction].append((axis.machine.load_counts / 8000.0 - motor_deg / 50.0) * 3600.0)
+            off_law.append(axis.error_arcsec - static_arcsec(known, motor_deg, direction))
+            overshoots.append(axis.overshoot_deg)
             apart = [i for i, deg in enumerate(ends) if abs(deg - ends[-1]) * 3600.0 > 0.3]
-            settled.append((apart[-1] + 2 - len(move)) * CYCLE_S)
+            settled.append((apart[-1] + 2 - moving) * CYCLE_S)
     columns = [
         f"{3 * statistics.pstdev(rows):.1f} / {statistics.fmean(rows):.2f}"
         for rows in (measured[1], measured[-1], measured[1] + measured[-1])
@@ -107,8 +65,8 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|---|")
     for profile in ("article", "demo"):
         for substep_ms in (1.0, 0.5, 0.25):
-            truth = Truth.load(PROFILES / profile).model_copy(update={"substep_ms": substep_ms})
-            print(f"| {profile} | {substep_ms:g} | {step_test(truth, steps)} |", flush=True)
+            row = step_test(truth(profile, substep_ms=substep_ms), steps)
+            print(f"| {profile} | {substep_ms:g} | {row} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -56,15 +56,19 @@ limits: {position_min_deg: -400, position_max_deg: 400, velocity_deg_s: 60,
 """Axis file for the robot's joints; the encoder resolutions come from the records, the rest is assumed."""
 
 
+FOLDER = Path(
+    os.environ.get("HDBRIDGE_REAL_RECORDS", Path(__file__).resolve().parents[2] / "shared" / "data")
+)
+"""Folder of the measured records: beside the repository, if not given."""
+
+
 def main() -> None:
     """Prints the figures."""
-    named = os.environ.get("HDBRIDGE_REAL_RECORDS")
-    if named is None:
-        sys.exit("HDBRIDGE_REAL_RECORDS is not set; expected the folder of the measured records")
-    folder = Path(named)
+    if not FOLDER.is_dir():
+        sys.exit(f"no folder {FOLDER}: set HDBRIDGE_REAL_RECORDS to that of the measured records")
     if sys.argv[1:] != ["twins"]:
-        _causes(folder)
-    _twins(folder)
+        _causes(FOLDER)
+    _twins(FOLDER)
 
 
 def _causes(folder: Path) -> None:
@@ -76,11 +80,8 @@ def _causes(folder: Path) -> None:
         _leave_one_out(records)
     _laws(folder)
     for name in ("sine", "earthquake"):
-        time, displacement, force = _damper(folder, name)
         for scale in (1.0, 2.0, 4.0):
-            motor = scale * displacement
-            load = motor / 50.0 + ARCSEC_PER_N * force / 3600.0
-            record = Record({"time_s": time, "motor_position_deg": motor, "load_position_deg": load})
+            record = damper_record(folder, name, scale)
             law = Hysteresis(offset_arcsec=95.0, width_deg=16.0 * scale, exponent=2.2)
             print(f"damper, {name}, {scale:g} deg/mm")
             _print(diagnose(record, TransmissionModel(50.0, (law,))))
@@ -220,38 +221,50 @@ def _rms(values: Sequence[float]) -> float:
     return math.sqrt(sum(each**2 for each in values) / len(values))
 
 
-def _damper(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def damper(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     time, displacement, force = np.loadtxt(
         folder / "damper" / f"{name}.csv", delimiter=",", skiprows=1, unpack=True
     )
     return time, displacement, force
 
 
-def _laws(folder: Path) -> None:
-    """Fits both hysteresis laws to the sine motion and predicts the earthquake; widths in mm."""
-    _, angle, force = _damper(folder, "sine")
-    _, other, measured = _damper(folder, "earthquake")
+def damper_record(folder: Path, name: str, deg_per_mm: float) -> Record:
+    """Returns the damper as an axis: its displacement for the motor's angle, its force for the error."""
+    time, displacement, force = damper(folder, name)
+    motor = deg_per_mm * displacement
+    load = motor / 50.0 + ARCSEC_PER_N * force / 3600.0
+    return Record({"time_s": time, "motor_position_deg": motor, "load_position_deg": load})
+
+
+def laws(folder: Path) -> dict[str, tuple[float, float, float, float]]:
+    """Fits both hysteresis laws to the damper's sine motion, and predicts the earthquake.
+
+    Returns, by law, the rms error of either in N, the width in mm and the exponent.
+    """
+    _, angle, force = damper(folder, "sine")
+    _, other, measured = damper(folder, "earthquake")
     bands = (CHATTER_COUNTS * reading_of(each).unaided_deg for each in (angle, other))
     angle, other = (steadied(each, each, band) for each, band in zip((angle, other), bands, strict=True))
-    print(f"damper: {np.std(force):.0f} N rms in the sine, {np.std(measured):.0f} N in the earthquake")
-    for law in (Hysteresis, HysteresisMemory):
-        best = None
-        for width in (8.0, 10.0, 12.0, 14.0, 16.0, 18.0, 20.0):
-            for exponent in (1.6, 1.8, 2.0, 2.2, 2.5):
-                effect = law(offset_arcsec=1.0, width_deg=width, exponent=exponent)
 
-                def table(place: np.ndarray, effect: Hysteresis | HysteresisMemory = effect) -> np.ndarray:
-                    loop = effect.predict(Motion(place), Start.VIRGIN)
-                    return np.column_stack([loop, place, np.ones(len(place))])
+    def left(law: type[Hysteresis | HysteresisMemory], width: float, n: float) -> tuple[float, ...]:
+        effect = law(offset_arcsec=1.0, width_deg=width, exponent=n)
 
-                solution = np.linalg.lstsq(table(angle), force, rcond=None)[0]
-                left = float(np.std(force - table(angle) @ solution))
-                if best is None or left < best[0]:
-                    best = (left, float(np.std(measured - table(other) @ solution)), width, exponent)
-        assert best is not None
-        print(
-            "  {}: {:.0f} N, earthquake as predicted {:.0f} N (width {:g} mm, n {:g})".format(law.name, *best)
-        )
+        def table(place: np.ndarray) -> np.ndarray:
+            return np.column_stack([effect.predict(Motion(place), Start.VIRGIN), place, np.ones(len(place))])
+
+        solution = np.linalg.lstsq(table(angle), force, rcond=None)[0]
+        errors = force - table(angle) @ solution, measured - table(other) @ solution
+        return (*(float(np.std(each)) for each in errors), width, n)
+
+    shapes = list(product((8.0, 10.0, 12.0, 14.0, 16.0, 18.0, 20.0), (1.6, 1.8, 2.0, 2.2, 2.5)))
+    return {law.name: min(left(law, *each) for each in shapes) for law in (Hysteresis, HysteresisMemory)}
+
+
+def _laws(folder: Path) -> None:
+    sine, earthquake = (damper(folder, name)[2] for name in ("sine", "earthquake"))
+    print(f"damper: {np.std(sine):.0f} N rms in the sine, {np.std(earthquake):.0f} N in the earthquake")
+    for name, row in laws(folder).items():
+        print("  {}: {:.0f} N, earthquake as predicted {:.0f} N (width {:g} mm, n {:g})".format(name, *row))
 
 
 if __name__ == "__main__":

@@ -91,8 +91,8 @@ class Outcome:
     """Change of the plant, causes that should be reported, and reported causes of each check."""
 
 
-def draw(seed: int, *, sticking: bool = False) -> tuple[AxisConfig, Truth]:
-    """Draws a random axis; with ``sticking``, its friction is higher near rest (Stribeck effect)."""
+def draw(seed: int) -> tuple[AxisConfig, Truth]:
+    """Draws a random axis."""
     rng = np.random.default_rng(seed)
 
     def some() -> float:
@@ -143,12 +143,6 @@ def draw(seed: int, *, sticking: bool = False) -> tuple[AxisConfig, Truth]:
     drive = axis.drive.model_copy(
         update={"following_error_deg": max(window_deg, axis.drive.following_error_deg)}
     )
-    if sticking:
-        more = np.random.default_rng([seed, 1])
-        motor["stribeck"] = {
-            "rise": float(more.uniform(0.2, 1.0)),
-            "speed_rad_s": float(np.exp(more.uniform(math.log(1.5), math.log(10.0)))),
-        }
     return axis.model_copy(update={"drive": drive}), Truth.model_validate(truth)
 
 
@@ -300,7 +294,6 @@ def line(each: Outcome) -> str:
 
 def main() -> None:
     given = parser(__doc__, axes=20, workers=2)
-    given.add_argument("--sticking", action="store_true", help="friction that is higher near rest, too")
     given.add_argument("--checks", action="store_true", help="change the plants, and check the twins")
     options = given.parse_args()
     print(
@@ -308,7 +301,7 @@ def main() -> None:
     )
     found = []
     for seed in seeds(options):
-        drawn = draw(seed, sticking=options.sticking)
+        drawn = draw(seed)
         both = both_motions(seed, *drawn)
         if both is None:
             continue

@@ -1,8 +1,8 @@
 """Probability of a finding: a logistic function of the evidence for and against it.
 
 `Scales` contains the coefficients. tools/fit_probabilities.py fits them, by ridge regression with fixed
-signs, to findings with known causes from two blind suites and synthetic records. docs/diagnosis.md reports
-the cross-validation.
+signs, to findings with known causes from blind suites (the present ones also from records computed from
+formulas). docs/how-well.md has the figures.
 """
 
 from __future__ import annotations

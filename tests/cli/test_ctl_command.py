@@ -9,18 +9,10 @@ import subprocess
 import sys
 
 import pytest
-from support.api import served
-from support.fake_bridge import FakeBridge
 from support.patience import PATIENCE_S, until
 
 from hdbridge import Client
 from hdbridge.client import messages
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    with served(FakeBridge(), tmp_path_factory.mktemp("api")) as place:
-        yield place
 
 
 @pytest.fixture

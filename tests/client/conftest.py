@@ -1,17 +1,10 @@
 """A machine of two axes, served, and clients of it."""
 
 import pytest
-from support.api import TOKEN, served
-from support.fake_bridge import FakeBridge
+from support.api import TOKEN
 
 from hdbridge import Client
 from hdbridge.client import messages
-
-
-@pytest.fixture(scope="session")
-def place(tmp_path_factory):
-    with served(FakeBridge(), tmp_path_factory.mktemp("api")) as place:
-        yield place
 
 
 @pytest.fixture

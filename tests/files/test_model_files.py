@@ -16,6 +16,8 @@ from hdbridge.errors import InputError
 from hdbridge.files.expectation import expected_words, field_at
 from hdbridge.files.profile import bundled_profile
 
+from .conftest import AXIS
+
 GOOD = """\
 schema: hdbridge.model/1
 ratio: 50
@@ -31,21 +33,9 @@ provenance:
   axis: test
 """
 
-HEADER = "schema: hdbridge.axis/1\nname: test\nbus: {interface: virtual, channel: test}\n"
-AXIS = """\
-drive:
-  node_id: 1
-  eds: test.eds
-  identity: {vendor_id: 0x4844, product_code: 0x402, revision: 1, serial: 17}
-  cycle_ms: 4
-  following_error_deg: 5.0
-  rated_torque_nm: 0.32
-motor_encoder: {counts_per_turn: 8000}
-load_encoder: {counts_per_turn: 2880000}
-gear: {ratio: 50, teeth: {flexspline: 100, circular_spline: 102}}
-limits:
-  {position_min_deg: -400, position_max_deg: 400, velocity_deg_s: 20, acceleration_deg_s2: 200, jerk_deg_s3: 4000, torque_percent: 100}
-"""
+IDENTIFIED = AXIS.replace("0x402}", "0x402, revision: 1, serial: 17}").replace(
+    "  ratio: 50", "  ratio: 50\n  teeth: {flexspline: 100, circular_spline: 102}"
+)
 
 
 WORDS = {
@@ -63,7 +53,7 @@ def test_fields_are_described_by_type_range_and_text():
 @pytest.fixture
 def axis(tmp_path) -> AxisConfig:
     (tmp_path / "test.eds").write_text("")
-    (tmp_path / "axis.yaml").write_text(HEADER + AXIS)
+    (tmp_path / "axis.yaml").write_text(IDENTIFIED)
     return AxisConfig.load(tmp_path)
 
 
@@ -138,7 +128,7 @@ def test_writing_and_reading_gives_the_same_model_to_the_last_bit(ratio, effects
 
 def test_a_saved_model_reads_well_and_predicts_the_same(tmp_path):
     model = TransmissionModel.from_text(GOOD).bound_to(
-        AxisConfig.from_text((HEADER + AXIS).replace("test.eds", __file__))
+        AxisConfig.from_text((IDENTIFIED).replace("test.eds", __file__))
     )
     path = tmp_path / "model.yaml"
     model.save(path)

@@ -8,21 +8,18 @@ The profile folder has an axis file and nothing else. The truth is in ``bench.tr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import can
 from foreign.draw import Truth, draw
 from foreign.machine import ForeignMachine
 
 from hdbridge.axis import AxisConfig
-from hdbridge.clock import Clock
 from hdbridge.device.dictionary import Dictionary
 from hdbridge.device.nameplate import Nameplate
 from hdbridge.device.node import DriveNode
-from hdbridge.device.run import run
 from hdbridge.sim.lockstep import LockstepBus, VirtualClock, lockstep_bench
 
 REACH_DEG = 4000.0
@@ -64,18 +61,6 @@ def bench_of(truth: Truth, folder: Path) -> Iterator[ForeignBench]:
         node,
     ):
         yield ForeignBench(bus, clock, node, axis, machine, truth)
-
-
-def serve(
-    truth: Truth, axis: AxisConfig, bus: can.BusABC, clock: Clock, should_stop: Callable[[], bool]
-) -> None:
-    """Runs the foreign drive in real time on any bus, for a daemon or a command in another process."""
-    machine = truth.machine()
-    machine.coast(1, True)  # compiles before time counts
-    machine.follow(0.0, 0.0, 1)
-    machine.coast(1, True)
-    node = DriveNode(bus, machine, axis.eds_path, axis.drive.node_id, clock, nameplate(truth))
-    run(bus, node, clock, should_stop)
 
 
 class Commissioned(Nameplate):

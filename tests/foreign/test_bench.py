@@ -1,18 +1,15 @@
 """The project's public commands on foreign axes, over real frames on the virtual bus."""
 
 import math
-import threading
 from dataclasses import replace
 
-import can
 import numpy as np
 import pytest
-from foreign.bench import bench_of, foreign_bench, serve, write_axis
+from foreign.bench import bench_of, foreign_bench
 from foreign.draw import draw
 from foreign.servos import STRUCTURES
 
 from hdbridge import AxisConfig, Bench, Drive, Stepping, Trajectory
-from hdbridge.clock import MonotonicClock
 
 every_structure = pytest.mark.parametrize("structure", STRUCTURES)
 
@@ -86,20 +83,3 @@ def test_a_changed_axis_and_a_mass_on_it_reach_the_bus(tmp_path):
         record = Bench(drive).run(there_and_back(bench.axis, 0.0, 60.0)).record
     torque_nm = record.columns["load_torque_nm"]
     assert torque_nm.min() == pytest.approx(-8.0 * math.sin(math.radians(60.0)), rel=0.03)
-
-
-def test_a_foreign_drive_serves_a_master_in_real_time(tmp_path):
-    truth = draw(1, "pi_notch")
-    axis = AxisConfig.load(write_axis(truth, tmp_path))
-    clock, stop = MonotonicClock(), threading.Event()
-    with can.Bus("foreign-real-time", "virtual") as far, can.Bus("foreign-real-time", "virtual") as near:
-        thread = threading.Thread(target=serve, args=(truth, axis, far, clock, stop.is_set))
-        thread.start()
-        try:
-            with Drive(near, axis, clock) as drive:
-                drive.boot()
-                assert drive.read_positions().load_deg == pytest.approx(0.0, abs=0.1)
-        finally:
-            stop.set()
-            thread.join(10.0)
-    assert not thread.is_alive()

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from support.hidden import CAUSES
+from support.hidden import UNKNOWN as UNKNOWN_CAUSES
 from support.hidden_bench import (
     ACCELERATION_DEG_S2,
     CYCLE_MS,
@@ -24,7 +25,6 @@ from support.hidden_bench import (
     SPEED_DEG_S,
     STEPPING,
     Cell,
-    Nested,
     Still,
     bare_truth,
     hidden_bench,
@@ -36,6 +36,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.cli import app
 from hdbridge.commissioning.improvement.extension import extension_of
 from hdbridge.motion.procedures.moves import Procedure, Settle
+from hdbridge.motion.procedures.reversals import Reversals
 from hdbridge.motion.procedures.sine import Sines
 from hdbridge.motion.procedures.standstill import Precondition
 from hdbridge.motion.procedures.stepping import Stepping
@@ -53,7 +54,7 @@ LOOP: Parts = (
     Still(3.0),
     Sweep(-10.0, 12.0, 2.0),
     Sines(0.0, (180.0, 45.0, 5.0), 0.1, 1.0),
-    Nested(),
+    Reversals(depths_deg=(2.0, 5.0, 9.0, 16.0), reach_deg=40.0, velocity_deg_s=0.5, beyond=True),
 )
 """Motion that shows the hysteresis loop and the motor orders; every bench begins with it."""
 FAST: Parts = (Sweep(-15.0, 65.0, SPEED_DEG_S),)
@@ -94,15 +95,15 @@ def greased() -> Truth:
     return Truth.model_validate(data)
 
 
-def bouc_wen() -> Truth:
+def obeying(law: str, **shape: float) -> Truth:
     """Returns an axis with a loop of about the size of the model's, but of a law outside the catalogue."""
     data = bare_truth().model_dump(by_alias=True)
     data["gear"]["hysteresis"] = {
-        "law": "bouc_wen",
+        "law": law,
         "offset_arcsec": 31.5,
         "yield_deg": 4.0,
         "exponent": 1.2,
-        "beta": 0.6,
+        **shape,
     }
     return Truth.model_validate(data)
 
@@ -171,12 +172,15 @@ PAIRS = dict(
         pair("torque_modulation", "amplitude_drift", (*TORQUES, *AGAIN)),
     )
 )
-QUICK = ("motor_order and channel_skew",)
-"""Pairs that are tested in every run; `make test-slow` tests all of them, and all causes with more seeds."""
-UNKNOWN = {"a roller": Bench(TURN, ("unexplained:roller",), cycle_ms=MORE_MS)}
-OTHER_LAW = {"Bouc-Wen": Bench(FAST, (), truth=bouc_wen())}
+UNKNOWN = {each: Bench(TURN, (each,), cycle_ms=MORE_MS) for each in UNKNOWN_CAUSES}
+OTHER_LAW = {
+    "Bouc-Wen": Bench(FAST, (), truth=obeying("bouc_wen", beta=0.6)),
+    "Dahl": Bench(FAST, (), truth=obeying("dahl")),
+}
 LAGGING = {"zero_drift behind its sensor": Bench(AGAIN, ("zero_drift",), truth=lagging())}
 NONE = {"nothing": Bench((*FAST, *TURN), ())}
+QUICK = {*SINGLE, *LAGGING, *NONE, "motor_order and channel_skew", "unexplained:roller", "Bouc-Wen"}
+"""Benches of every run; `make test-slow` has all of them."""
 
 
 def of(benches: dict[str, Bench]) -> list[Any]:
@@ -185,7 +189,7 @@ def of(benches: dict[str, Bench]) -> list[Any]:
         pytest.param(
             (bench, seed),
             id=name if len(SEEDS) == 1 else f"{name}-{seed}",
-            marks=[pytest.mark.slow] if seed != SEEDS[0] or (name in PAIRS and name not in QUICK) else [],
+            marks=[] if seed == SEEDS[0] and name in QUICK else [pytest.mark.slow],
         )
         for name, bench in benches.items()
         for seed in SEEDS
@@ -277,7 +281,7 @@ def test_unknown_causes_are_unexplained_with_their_coordinate(cell: Cell) -> Non
 
 def test_the_same_seed_gives_the_same_record_bit_for_bit(tmp_path: Path) -> None:
     def record(folder: str, seed: int) -> bytes:
-        parts = (Precondition(0.0, 2.0), Nested((5.0,)))
+        parts = (Precondition(0.0, 2.0), Reversals(depths_deg=(5.0,)))
         with hidden_bench(tmp_path / folder, [("vibration", 5.0), ("creep", 5.0)], seed, parts) as cell:
             columns = Recording.load(cell.recording).record.columns
             return b"".join(columns[name].tobytes() for name in sorted(columns))

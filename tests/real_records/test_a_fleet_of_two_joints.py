@@ -3,18 +3,15 @@
 Four one-way moves of a second each, all within minutes: nothing can have changed, so no joint may be listed.
 """
 
-import os
-from pathlib import Path
-
 import pytest
+import real_records
 
 from hdbridge.fleet.dataset import Dataset
 from hdbridge.fleet.diagnosing import diagnosed, fitted, model_in
 from hdbridge.fleet.sources import Source
 from hdbridge.fleet.summary import summarise
 
-BESIDE = Path(__file__).parents[3] / "shared" / "data"
-FOLDER = Path(os.environ.get("HDBRIDGE_REAL_RECORDS", BESIDE)) / "cobot"
+FOLDER = real_records.FOLDER / "cobot"
 pytestmark = pytest.mark.skipif(
     not FOLDER.is_dir(),
     reason=f"no folder {FOLDER}: set HDBRIDGE_REAL_RECORDS to that of the measured records",

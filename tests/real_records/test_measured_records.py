@@ -5,7 +5,6 @@ for in the folder that HDBRIDGE_REAL_RECORDS names, else beside the repository; 
 skipped.
 """
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +15,12 @@ from typer.testing import CliRunner
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
 from hdbridge.analysis.scales import Scales
-from hdbridge.axis.effects import FloatArray, Hysteresis, HysteresisMemory, Motion, Start
+from hdbridge.axis.effects import Hysteresis
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.cli import app
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record, concatenate
 
-BESIDE = Path(__file__).parents[3] / "shared" / "data"
 NOTHING = TransmissionModel(100.0, ())
 """A ratio without an error, the only prior knowledge of the robot."""
 UNLIKELY = {
@@ -38,10 +36,9 @@ UNLIKELY = {
 
 
 def measured(name: str) -> list[Path]:
-    folder = Path(os.environ.get("HDBRIDGE_REAL_RECORDS", BESIDE))
-    found = sorted(folder.glob(name))
+    found = sorted(real_records.FOLDER.glob(name))
     if not found:
-        pytest.skip(f"no {name} in {folder}: set HDBRIDGE_REAL_RECORDS to the folder of the measured records")
+        pytest.skip(f"no {name} in {real_records.FOLDER}: set HDBRIDGE_REAL_RECORDS to another folder")
     return found
 
 
@@ -67,7 +64,8 @@ def test_a_robot_joint_is_named_and_the_names_predict_the_recording_left_out(
     orders = next(each for each in found.model.effects if each.name == "motor_order").orders
     if joint == 4:
         assert max(orders, key=lambda each: each.amplitude_arcsec).order == 2
-        assert "channel_skew" in named  # a drag that is a straight line in speed is reported as a delay
+        # A drag that is a straight line in speed is reported as a delay.
+        assert "velocity_windup" in named["channel_skew"]
     else:
         assert "compliance" in named
     assert not set(named) & UNLIKELY
@@ -87,13 +85,6 @@ def test_findings_predict_a_held_out_recording_like_a_regression(
     records = joints[joint]
     after, regression = real_records.left_out(records), real_records.regressed(records)
     assert np.sqrt(np.mean(np.square(after))) < most * np.sqrt(np.mean(np.square(regression)))
-
-
-def test_a_drag_that_is_a_straight_line_in_speed_is_an_alias_of_a_delay(
-    joints: dict[int, list[Record]],
-) -> None:
-    named = names(diagnose(concatenate(joints[4][1:]), NOTHING, independent_zeros=True))
-    assert "velocity_windup" in named["channel_skew"]
 
 
 @pytest.mark.parametrize("folder", ["cobot", "cobot-command"])
@@ -133,48 +124,19 @@ def test_a_fit_of_one_fast_move_is_refused(joints: dict[int, list[Record]]) -> N
     assert "slow sweeps" in str(result.exception)
 
 
-# A friction damper: displacement for the motor's angle (2 deg per mm), force for the error (100 N: 1 arcsec).
-DEG_PER_MM, ARCSEC_PER_N = 2.0, 0.01
-
-
-def damper(name: str) -> tuple[FloatArray, FloatArray, FloatArray]:
-    (path,) = measured(f"damper/{name}.csv")
-    time, displacement, force = np.loadtxt(path, delimiter=",", skiprows=1, unpack=True)
-    return time, DEG_PER_MM * displacement, ARCSEC_PER_N * force
-
-
-def columns(
-    law: type[Hysteresis | HysteresisMemory], angle: FloatArray, width: float, n: float
-) -> FloatArray:
-    loop = law(offset_arcsec=1.0, width_deg=width, exponent=n).predict(Motion(angle), Start.VIRGIN)
-    return np.column_stack([loop, angle, np.ones(len(angle))])
-
-
-def test_return_point_memory_fits_the_damper_and_predicts_its_other_motion() -> None:
-    _, angle, force = damper("sine")
-    _, other_angle, other_force = damper("earthquake")
-    fitted, predicted = {}, {}
-    for law in (Hysteresis, HysteresisMemory):
-        shapes = [(width, n) for width in (16.0, 24.0, 28.0, 32.0, 40.0) for n in (1.6, 2.0, 2.5)]
-        trials = []
-        for width, n in shapes:
-            table = columns(law, angle, width, n)
-            coefficients = np.linalg.lstsq(table, force, rcond=None)[0]
-            trials.append((float(np.std(force - table @ coefficients)), width, n, coefficients))
-        fitted[law], width, n, coefficients = min(trials, key=lambda each: each[0])
-        predicted[law] = float(np.std(other_force - columns(law, other_angle, width, n) @ coefficients))
-    assert fitted[HysteresisMemory] < 0.9 * fitted[Hysteresis]
-    assert predicted[HysteresisMemory] < 0.9 * predicted[Hysteresis]
-    assert predicted[HysteresisMemory] < 0.5 * float(np.std(other_force))
+def test_return_point_memory_predicts_the_dampers_other_motion() -> None:
+    (path,) = measured("damper/earthquake.csv")
+    predicted = {name: row[1] for name, row in real_records.laws(path.parents[1]).items()}
+    assert predicted["hysteresis_memory"] < 0.9 * predicted["hysteresis"]
+    force = real_records.damper(path.parents[1], "earthquake")[2]
+    assert predicted["hysteresis_memory"] < 0.5 * float(np.std(force))
 
 
 @pytest.mark.parametrize("name", ["sine", "earthquake"])
 def test_return_point_memory_of_the_damper_is_reported_if_visible(name: str) -> None:
     """A sine reverses at ever different angles without nested loops, so both laws leave the same residual."""
-    time, angle, force = damper(name)
-    record = Record(
-        {"time_s": time, "motor_position_deg": angle, "load_position_deg": angle / 50.0 + force / 3600.0}
-    )
+    (path,) = measured(f"damper/{name}.csv")
+    record = real_records.damper_record(path.parents[1], name, 2.0)
     law = Hysteresis(offset_arcsec=95.0, width_deg=32.0, exponent=2.2)
     diagnosis = diagnose(record, TransmissionModel(50.0, (law,)))
     found = names(diagnosis)

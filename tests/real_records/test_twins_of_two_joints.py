@@ -3,23 +3,17 @@
 The records are looked for as in `test_measured_records.py`; without them these tests are skipped.
 """
 
-import os
-from pathlib import Path
-
 import pytest
 import real_records
 
 from hdbridge.records.recording import Recording
 from hdbridge.twin.translate import translate
 
-BESIDE = Path(__file__).parents[3] / "shared" / "data"
-
 
 def recordings_of(joint: int) -> list[Recording]:
-    folder = Path(os.environ.get("HDBRIDGE_REAL_RECORDS", BESIDE))
-    found = real_records.joint_recordings(folder, joint)
+    found = real_records.joint_recordings(real_records.FOLDER, joint)
     if not found:
-        pytest.skip(f"no cobot-command/joint{joint}-*.csv in {folder}: set HDBRIDGE_REAL_RECORDS")
+        pytest.skip(f"no cobot-command/joint{joint}-*.csv in {real_records.FOLDER}")
     return found
 
 

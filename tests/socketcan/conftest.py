@@ -160,21 +160,12 @@ class Master:
         self.target += STEP_COUNTS
         return self.cycle.tick(self.target)
 
-    def move_until_stopped(self, cycles: int) -> SafetyStop:
-        for _ in range(cycles):
-            try:
-                self.move()
-            except SafetyStop as stop:
-                return stop
-        raise AssertionError(f"no stop within {cycles} cycles")
-
 
 @contextmanager
-def master_on(channel: str, profile: Path | None = None, *, shared: bool = False) -> Iterator[Master]:
-    """``shared`` permits a second master next to one of this process whose link has died."""
+def master_on(channel: str, profile: Path | None = None) -> Iterator[Master]:
     axis = AxisConfig.load(profile or unhurried_profile())
     settings = axis.bus.model_copy(update={"interface": "socketcan", "channel": channel})
-    with open_bus(settings, shared=shared) as bus:
+    with open_bus(settings) as bus:
         drive = Drive(bus, axis, MonotonicClock())
         supervision = Supervision()
         cycle = Cycle(

@@ -23,8 +23,8 @@ from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_flo
 from hdbridge.control.bench import Bench, axis_view, compensation_for
 from hdbridge.drive.drive import Drive
 from hdbridge.motion.procedures.chain import Chain
-from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Procedure, Steps
-from hdbridge.motion.procedures.rehearsal import rehearse
+from hdbridge.motion.procedures.moves import AxisView, Dwell, Procedure, Steps
+from hdbridge.motion.procedures.rehearsal import legs_of
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
@@ -56,21 +56,6 @@ temperature:
   source: {index: 0x2100, type: int16}
   celsius_per_count: 0.1
 """
-
-
-@dataclass(frozen=True)
-class Nested:
-    """Procedure of nested reversals, some of them beyond an earlier turning point; motor degrees."""
-
-    depths_deg: tuple[float, ...] = (2.0, 5.0, 9.0, 16.0)
-    velocity_deg_s: float = 0.5
-
-    def moves(self, axis: AxisView) -> Steps[None]:
-        """Yields the moves about the load's zero, each from the forward branch."""
-        for depth in self.depths_deg:
-            yield MoveTo(-40.0 / axis.ratio)
-            for part in (0.0, -1.0, -0.3, -0.8, -0.5, -1.4, 0.0):
-                yield MoveTo(part * depth / axis.ratio, self.velocity_deg_s, kind="reversal")
 
 
 @dataclass(frozen=True)
@@ -176,23 +161,13 @@ class Cell:
 
 def run_of(parts: Sequence[Procedure[Any]], axis: AxisConfig, highest_deg_s2: float) -> Run:
     """Returns the properties of a plan that determine the sizes of causes; accelerations are of the load."""
-    view = axis_view(axis)
-    procedure = Chain(tuple(parts), ACCELERATION_DEG_S2)
-    ahead = rehearse(procedure, view)
-    way_deg, place = 0.0, 0.0
-    steps = procedure.moves(view)
-    move = next(steps)
-    while True:
-        path = move.path(place, view.limits)
+    legs = legs_of(Chain(tuple(parts), ACCELERATION_DEG_S2), axis_view(axis))
+    duration_s, way_deg, place = 0.0, 0.0, 0.0
+    for _, path in legs:
         there = path.at(path.duration_s)
-        way_deg += abs(there - place)
-        place = there
-        try:
-            move = steps.send([])
-        except StopIteration:
-            break
+        duration_s, way_deg, place = duration_s + path.duration_s, way_deg + abs(there - place), there
     return Run(
-        duration_s=ahead.duration_s,
+        duration_s=duration_s,
         load_speed_deg_s=SPEED_DEG_S,
         load_acceleration_deg_s2=highest_deg_s2,
         motor_turns=way_deg * axis.gear.ratio / 360.0,

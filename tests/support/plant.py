@@ -249,9 +249,6 @@ def record(truth: Truth, plan: Plan, seed: int, command: bool = True) -> dict[st
     carried = {"loop": loop(motor, truth.law, truth.offset, truth.width, truth.n)}
     if "backlash" in e:
         carried["play"] = stop(motor, e["backlash"]["gap"] * RATIO / 3600)
-    if "wear" in e:
-        run = np.cumsum(np.abs(np.diff(motor, prepend=motor[0])))
-        carried["worn"] = run / run[-1] * stop(motor, e["wear"].get("width", 0.3))
     if "creep" in e:
         carried["creep"] = crept(np.sign(v), dt, **e["creep"])
     # Quantities that do not depend on the history are computed only at the samples.
@@ -293,10 +290,6 @@ def record(truth: Truth, plan: Plan, seed: int, command: bool = True) -> dict[st
         actual = load + te / 3600
         for k, A, p in s["orders"]:
             te = te + A * np.cos(np.deg2rad(k * s["lines"] * actual + p))
-    if "zero_drift" in e:
-        te = te + e["zero_drift"]["size"] * (1 - np.exp(-t / (e["zero_drift"]["tau"] * end_s)))
-    if "wear" in e:
-        te = te - 0.5 * e["wear"]["growth"] * carried["worn"][at]
     if "creep" in e:
         te = te + e["creep"]["size"] * carried["creep"][at]
     if "ratio_error" in e:
@@ -339,16 +332,8 @@ def unknown(
 ) -> np.ndarray:
     """Returns an error that is not in the catalogue."""
     size = kind["size"]
-    if kind["kind"] == "saw":  # a saw tooth over the load angle, whose period is not a fraction of a turn
-        return size * (np.mod(load, 137.0) / 68.5 - 1)
-    if kind["kind"] == "square":
-        return size * np.sign(np.sin(np.deg2rad(motor * 0.37)))
-    if kind["kind"] == "chirp":
-        return size * np.sin(np.deg2rad(0.0006 * motor**2 / 10))
     if kind["kind"] == "one_way":  # a series of bumps in one direction only
         return size * (d > 0) * np.abs(np.sin(np.deg2rad(load * 3.3)))
-    if kind["kind"] == "beat":
-        return size * np.sin(2 * np.pi * t / 47.0) * np.cos(np.deg2rad(motor * 0.5))
     if kind["kind"] == "bursts":
         return size * (np.sin(2 * np.pi * t / 61.0) > 0.8) * np.sin(2 * np.pi * t / 1.7)
     if kind["kind"] == "packet":  # a roller that presses on near one load angle

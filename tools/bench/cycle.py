@@ -9,7 +9,6 @@ One run measures, in interleaved blocks, the CPU time of the thread (`time.threa
   cycle        `hdbridge.control.cycle.Cycle` with the whole fault table, target held
   compensated  the same with the compensation of the article's model in every cycle
   filtered     the same with the filter of the response in motion
-  wind-up      the same with the wind-up of the load in acceleration
   canopen      the same loop on canopen's PDO objects (no compensation, nothing is checked)
 
 and prints medians over the blocks, and their ratios to the bare exchange.
@@ -41,7 +40,6 @@ from can.interfaces.virtual import VirtualBus
 from harness import PROFILE, Busy, block_us, in_turn, keep, medians, parser, undisturbed
 
 from hdbridge.axis import AxisConfig
-from hdbridge.axis.effects import InertialWindup, Observer
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.clock import Clock
@@ -222,11 +220,6 @@ class Variants:
         response = replace(model, response=response_of_usual_length(1000.0 * self.period_s))
         self.in_motion = Compensation(response, CompensationLimits(), self.period_s)
         self.in_motion.engage()
-        wound = InertialWindup(ratio=model.ratio, inertia_over_stiffness_s2=1.4e-5)
-        effects = (*response.effects, wound)
-        self.winding = Compensation(replace(response, effects=effects), CompensationLimits(), self.period_s)
-        self.winding.engage()
-        self.observer = Observer()
         self.image = ProcessImage(axis)
         self.cycle = Cycle(Link(bus, self.clock), self.clock, self.image, Supervision(), self.period_s)
         self.network, self.node = self._canopen(axis.drive.node_id)
@@ -283,9 +276,6 @@ class Variants:
     def filtered(self) -> None:
         self.cycle.tick(self._command_in_motion)
 
-    def wind_up(self) -> None:
-        self.cycle.tick(self._command_winding)
-
     def _command(self, feedback: Feedback) -> int:
         # A slow sine of 2 deg at the load: steady motion with occasional reversals.
         load_deg = 2.0 * math.sin(feedback.time_s)
@@ -294,11 +284,6 @@ class Variants:
     def _command_in_motion(self, feedback: Feedback) -> int:
         load_deg = 2.0 * math.sin(feedback.time_s)
         return self.image.target_counts_for(self.in_motion.command(load_deg))
-
-    def _command_winding(self, feedback: Feedback) -> int:
-        load_deg = 2.0 * math.sin(feedback.time_s)
-        moment = self.observer.moment(self.winding.model.ratio * load_deg, feedback.time_s, load_deg=load_deg)
-        return self.image.target_counts_for(self.winding.command(load_deg, moment))
 
     @staticmethod
     def _canopen(node_id: int) -> tuple[canopen.Network, canopen.RemoteNode]:
@@ -382,7 +367,6 @@ def run(
         "cycle": variants.plain,
         "compensated": variants.compensated,
         "filtered": variants.filtered,
-        "wind-up": variants.wind_up,
         "canopen": variants.with_canopen,
     }
     measured = {name: partial(undisturbed, partial(block, loop)) for name, loop in loops.items()}
@@ -401,7 +385,6 @@ def report(result: dict[str, float], where: str) -> str:
         "cycle": "hdbridge cycle",
         "compensated": "hdbridge cycle, compensated",
         "filtered": "hdbridge cycle, compensated and filtered",
-        "wind-up": "hdbridge cycle, filtered, with wind-up",
         "canopen": "canopen's PDO objects",
     }
     for name, label in names.items():

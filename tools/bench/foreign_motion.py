@@ -1,16 +1,15 @@
 """Figures of the compensation in motion.
 
-    PYTHONPATH=tests python tools/bench/foreign_motion.py FILE [--kinds KIND...] [--seeds 0-4] [--exact]
+    PYTHONPATH=tests python tools/bench/foreign_motion.py FILE [--kinds KIND...] [--seeds 0-4]
     PYTHONPATH=tests python tools/bench/foreign_motion.py FILE --retuned [--seeds 0-4]
 
-Each axis is calibrated by `PLAN` with a motion test, without prior knowledge. With ``--exact``, its model is
-the exact static correction, and only the response is measured. Then the load error is measured at ten speeds
-up to the limit, both ways, without, with static and with filtered correction. The axes are the foreign servo
-structures, and the simulated drive with random servo, load and stiffness. FILE stores a line of JSON per
-axis; axes in it are not measured again. Prints, per speed, the percentage removed, as median (worst), of the
-orders slower than a third of the SYNC rate, with static and filtered correction, and on how many axes the
-whole ripple is larger than without correction. Then prints, per path, the error and the settling time without
-correction and with that of the calibration; and the error at rest.
+Each axis is calibrated by `PLAN` with a motion test, without prior knowledge. Then the load error is measured
+at ten speeds up to the limit, both ways, without, with static and with filtered correction. The axes are the
+foreign servo structures, and the simulated drive with random servo, load and stiffness. FILE stores a line of
+JSON per axis; axes in it are not measured again. Prints, per speed, the percentage removed, as median
+(worst), of the orders slower than a third of the SYNC rate, with static and filtered correction, and on how
+many axes the whole ripple is larger than without correction. Then prints, per path, the error and the
+settling time without correction and with that of the calibration; and the error at rest.
 
 With ``--retuned`` the position gains of simulated drives are multiplied by `GAINS` after the measurement of
 the response. FILE then stores the percentage of the slow orders removed over all speeds, before and after
@@ -34,7 +33,6 @@ from typing import Any
 import numpy as np
 import yaml
 from foreign.bench import foreign_bench
-from foreign.draw import draw
 from foreign.servos import STRUCTURES
 from support.raised import ARTICLE, raised_axis
 
@@ -49,7 +47,6 @@ from hdbridge.analysis.response import (
     order_hz,
 )
 from hdbridge.axis import AxisConfig
-from hdbridge.axis.effects import MotorOrder, Synchronous
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration import Calibration, calibrate, start_journal
 from hdbridge.commissioning.calibration.motion import MotionTest, motion_test
@@ -85,7 +82,7 @@ DATE = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 @contextmanager
-def simulated(seed: int, folder: Path) -> Iterator[tuple[Drive, TransmissionModel]]:
+def simulated(seed: int, folder: Path) -> Iterator[Drive]:
     """Provides the article's gear with random servo, load and stiffness, and with raised limits."""
     rng = np.random.default_rng([32, seed])
     axis = yaml.safe_load(raised_axis())
@@ -110,9 +107,8 @@ def simulated(seed: int, folder: Path) -> Iterator[tuple[Drive, TransmissionMode
     (folder / "axis.yaml").write_text(yaml.safe_dump(axis), encoding="utf-8")
     (folder / "truth.yaml").write_text(yaml.safe_dump(truth), encoding="utf-8")
     config = AxisConfig.load(folder)
-    model = TransmissionModel.load(ARTICLE / "model.yaml")
     with booted(config, folder, seed) as drive:
-        yield drive, model
+        yield drive
 
 
 @contextmanager
@@ -128,7 +124,8 @@ def booted(axis: AxisConfig, folder: Path, seed: int) -> Iterator[Drive]:
 
 def retuned(seed: int, folder: Path) -> Iterator[dict[str, Any]]:
     """Yields the figures of an axis for each change of its position gain."""
-    with simulated(seed, folder) as (drive, static):
+    static = TransmissionModel.load(ARTICLE / "model.yaml")
+    with simulated(seed, folder) as drive:
         axis, model = drive.axis, replace(static, response=motion_test(drive, static).response)
     truth = yaml.safe_load((folder / "truth.yaml").read_text(encoding="utf-8"))
     gain = truth["servo"]["position_gain_per_s"]
@@ -168,16 +165,14 @@ def retuned(seed: int, folder: Path) -> Iterator[dict[str, Any]]:
 
 
 @contextmanager
-def foreign(seed: int, structure: str, folder: Path) -> Iterator[tuple[Drive, TransmissionModel]]:
-    """Provides a foreign axis, random by seed, and the exact correction of its motor orders."""
-    truth = draw(seed, structure)
-    orders = tuple(MotorOrder(**each._asdict()) for each in truth.mechanics.motor_orders)
+def foreign(seed: int, structure: str, folder: Path) -> Iterator[Drive]:
+    """Provides a foreign axis, random by seed."""
     with (
         foreign_bench(seed, structure, folder) as bench,
         Drive(bench.bus, bench.axis, bench.clock) as drive,
     ):
         drive.boot()
-        yield drive, TransmissionModel(truth.mechanics.ratio, (Synchronous(orders=orders),))
+        yield drive
 
 
 def calibrated(drive: Drive, folder: Path) -> Calibration:
@@ -231,16 +226,12 @@ def _both_ways(values: list[float]) -> list[float]:
     return [math.hypot(*pair) / math.sqrt(2.0) for pair in zip(values[::2], values[1::2], strict=True)]
 
 
-def measure(kind: str, seed: int, exact: bool) -> dict[str, Any]:
+def measure(kind: str, seed: int) -> dict[str, Any]:
     """Returns the figures of one axis, or the error that ended its measurement."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:
-            with simulated(seed, folder) if kind == "simulated" else foreign(seed, kind, folder) as place:
-                drive, model = place
-                if exact:
-                    tested = motion_test(drive, model)
-                    return figures(drive, replace(model, response=tested.response)) | of_paths(tested)
+            with simulated(seed, folder) if kind == "simulated" else foreign(seed, kind, folder) as drive:
                 result = calibrated(drive, folder)
                 assert result.motion is not None
                 assert result.validation is not None
@@ -250,17 +241,17 @@ def measure(kind: str, seed: int, exact: bool) -> dict[str, Any]:
             return {"error": str(problem)}
 
 
-def main(file: Path, kinds: list[str], seeds: range, exact: bool) -> None:
+def main(file: Path, kinds: list[str], seeds: range) -> None:
     done = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
     for seed in seeds:
         for kind in kinds:
-            key = {"kind": kind, "seed": seed, "exact": exact}
+            key = {"kind": kind, "seed": seed}
             if not any(key.items() <= each.items() for each in done):
-                done.append(key | measure(kind, seed, exact))
+                done.append(key | measure(kind, seed))
                 with file.open("a") as out:
                     out.write(json.dumps(done[-1]) + "\n")
     for kind in kinds:
-        report(kind, [each for each in done if (each["kind"], each["exact"]) == (kind, exact)])
+        report(kind, [each for each in done if each["kind"] == kind])
 
 
 def report(kind: str, axes: list[dict[str, Any]]) -> None:
@@ -308,7 +299,6 @@ if __name__ == "__main__":
     parser.add_argument("file", type=Path)
     parser.add_argument("--kinds", nargs="+", default=[*STRUCTURES, "simulated"])
     parser.add_argument("--seeds", default="0-4", help="first and last")
-    parser.add_argument("--exact", action="store_true", help="take the exact static correction as the model")
     parser.add_argument("--retuned", action="store_true", help="change the position gain afterwards")
     given = parser.parse_args()
     first, last = map(int, given.seeds.split("-"))
@@ -318,4 +308,4 @@ if __name__ == "__main__":
                 for found in retuned(number, Path(name)):
                     print(json.dumps(found), file=out, flush=True)
         raise SystemExit
-    main(given.file, given.kinds, range(first, last + 1), given.exact)
+    main(given.file, given.kinds, range(first, last + 1))

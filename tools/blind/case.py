@@ -39,16 +39,13 @@ HELD_OUT_FROM = 1000
 """Suites with this seed and above choose between versions of the code; those below develop it."""
 KINDS: Mapping[str, str] = MappingProxyType(
     {
-        "single": "bench suite", "power": "bench suite", "pair": "bench suite", "triple": "bench suite",
+        "single": "bench suite", "pair": "bench suite", "triple": "bench suite",
         "none": "bench suite", "other_law": "bench suite", "unknown": "bench suite",
-        "no_torque": "bench suite",
         "healthy_bench": "everyday", "healthy_work": "everyday", "fault": "everyday", "law": "everyday",
         "outside": "everyday", "flicker": "everyday",
     }
 )  # fmt: skip
 """Kinds of cases, and the family that each belongs to."""
-POWER_RATIOS = (0.3, 1.0, 3.0, 10.0)
-TORQUE_CAUSES = ("compliance", "load_order")
 LOADED = ("compliance", "torque_modulation")
 WARM = ("zero_drift", "amplitude_drift")
 SLOW = (*WARM, "wear")
@@ -78,8 +75,6 @@ class Case:
     name: str
     kind: str
     causes: tuple[str, ...] = ()
-    over_noise: float | None = None
-    """Size over the noise of a reading; drawn if None."""
     axis: str = ""
     """Axis of an everyday case, with its calibration."""
     law: str = "rolling_friction"
@@ -95,7 +90,7 @@ class Case:
 
 
 def cases(wanted: Mapping[str, int], seed: int) -> Iterator[Case]:
-    """Returns the cases of a suite; ``wanted`` is a number by kind, for single and power per cause."""
+    """Returns the cases of a suite; ``wanted`` is a number by kind, for single per cause."""
     for kind, number in wanted.items():
         if kind not in KINDS:
             raise ValueError(f"--suite: found '{kind}'; expected kinds of {', '.join(KINDS)}")
@@ -104,11 +99,9 @@ def cases(wanted: Mapping[str, int], seed: int) -> Iterator[Case]:
 
 def _bench_cases(kind: str, number: int, seed: int) -> Iterator[Case]:
     rng = random.Random(f"cases {seed}")
-    if kind in {"single", "power"}:
-        ratios: tuple[float | None, ...] = (None,) if kind == "single" else POWER_RATIOS
-        for cause, ratio, index in itertools.product(CAUSES, ratios, range(number)):
-            tail = f"-{ratio:g}" if ratio else ""
-            yield Case(f"{kind}-{cause}{tail}-{index}", kind, (cause,), ratio)
+    if kind == "single":
+        for cause, index in itertools.product(CAUSES, range(number)):
+            yield Case(f"{kind}-{cause}-{index}", kind, (cause,))
         return
     for index in range(number):
         causes: tuple[str, ...] = ()
@@ -116,8 +109,6 @@ def _bench_cases(kind: str, number: int, seed: int) -> Iterator[Case]:
             causes = _together(rng, 2 if kind == "pair" else 3)
         elif kind == "unknown":
             causes = (sorted(UNKNOWN)[index % len(UNKNOWN)],)
-        elif kind == "no_torque":
-            causes = (TORQUE_CAUSES[index % len(TORQUE_CAUSES)],)
         yield Case(f"{kind}-{index:03d}", kind, causes)
 
 
@@ -196,17 +187,16 @@ def _full_bench(case: Case, seed: int, folder: Path) -> dict[str, Any]:
     axis = drawn_axis(rng, f"blind-{case.name}", law)
     plan = drawn_plan(rng, axis.truth.gear.ratio)
     run = run_of(plan, axis.truth)
-    sizes = [(cause, _size_arcsec(rng, cause, case.over_noise, axis.noise_arcsec)) for cause in case.causes]
+    sizes = [(cause, _size_arcsec(rng, cause, axis.noise_arcsec)) for cause in case.causes]
     truth, hidden = hide_all(axis.truth, sizes, rng, run)
     readings = Bench(truth, rng.randrange(2**31), plan).record()
-    columns = _columns(readings, rng, with_torque=case.kind != "no_torque")
+    columns = _columns(readings, rng)
     write_csv(folder / "record.csv", columns)
     (folder / "model.yaml").write_text(axis.model_yaml, encoding="utf-8")
     return {
         "motion": "full bench",
         "rate_hz": 50.0,
         "counts_per_turn": axis.truth.motor.encoder.counts_per_turn,
-        "over_noise": case.over_noise,
         "law": axis.law,
         "noise_arcsec": round(axis.noise_arcsec, 4),
         "samples": len(readings.time_s),
@@ -216,9 +206,7 @@ def _full_bench(case: Case, seed: int, folder: Path) -> dict[str, Any]:
     }
 
 
-def _size_arcsec(rng: random.Random, cause: str, over_noise: float | None, noise_arcsec: float) -> float:
-    if over_noise is not None:
-        return over_noise * noise_arcsec
+def _size_arcsec(rng: random.Random, cause: str, noise_arcsec: float) -> float:
     size = max(3.0, 3.0 * noise_arcsec) * math.exp(rng.uniform(0.0, math.log(2.0)))
     return size / 3.0 if cause == "subdivisional_error" else size
 
@@ -260,10 +248,10 @@ def _always(truth: Truth, run: Run, axis: BlindAxis, hidden: Sequence[Hidden]) -
     return sorted(causes - {each.cause for each in hidden})
 
 
-def _columns(readings: Readings, rng: random.Random, with_torque: bool) -> dict[str, tuple[Any, str]]:
+def _columns(readings: Readings, rng: random.Random) -> dict[str, tuple[Any, str]]:
     """Returns the columns of the record with their formats; slow channels have their own noise and steps."""
     torque, warmth = _slow_channels(readings.load_torque_nm, readings.temperature_c, rng.randrange(2**31))
-    columns: dict[str, tuple[Any, str]] = {
+    return {
         "time_s": (readings.time_s, "%.3f"),
         "motor_position_deg": (readings.motor_deg, "%.6f"),
         "load_position_deg": (readings.load_deg, "%.8f"),
@@ -272,9 +260,6 @@ def _columns(readings: Readings, rng: random.Random, with_torque: bool) -> dict[
         "motor_torque_nm": (readings.motor_torque_nm, "%.4f"),
         "temperature_c": (warmth, "%.4f"),
     }
-    if not with_torque:
-        del columns["load_torque_nm"]
-    return columns
 
 
 def _slow_channels(torque_nm: Any, temperature_c: Any, seed: int) -> tuple[Any, Any]:

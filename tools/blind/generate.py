@@ -9,7 +9,7 @@ find. An existing case is not made again, so the command continues where it was 
 is either complete or absent. The same seed and case give the same record. Suites with a seed of 1000 and more
 are held out: score.py prints their rates and no cases, so that they are not used for development.
 
-A suite may also be a list such as ``fault=60,law=20``. ``single`` and ``power`` are numbers for each cause of
+A suite may also be a list such as ``fault=60,law=20``. ``single`` is a number for each cause of
 the catalogue, ``flicker`` counts pairs, the others count cases.
 """
 
@@ -34,7 +34,7 @@ from blind.case import KINDS, SCHEMA, Case, cases, make
 SUITES = {
     "development": "healthy_bench=60,healthy_work=60,fault=60,law=20,outside=20,flicker=10",
     "everyday": "healthy_bench=200,healthy_work=200,fault=200,law=100,outside=60,flicker=50",
-    "bench": "single=4,power=1,pair=20,triple=10,none=20,other_law=20,unknown=20,no_torque=10",
+    "bench": "single=4,pair=20,triple=10,none=20,other_law=20,unknown=20",
 }
 
 

@@ -104,7 +104,7 @@ def bench(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
     for each in verdicts:
         by_kind.setdefault(each.kind, []).append(each)
     single, law, unknown = (by_kind.get(kind, []) for kind in ("single", "other_law", "unknown"))
-    none, no_torque = by_kind.get("none", []), by_kind.get("no_torque", [])
+    none = by_kind.get("none", [])
     several = [*by_kind.get("pair", []), *by_kind.get("triple", [])]
     return [
         ("single: right first", rate(map(right_first, single)), "99 %"),
@@ -120,7 +120,6 @@ def bench(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
         ),
         ("unknown: unexplained leads", rate(map(unexplained_first, unknown)), "95 %"),
         ("unknown: a name given", rate(map(false_name, unknown)), ""),
-        ("no torque channel: right alias set first", rate(map(right_first, no_torque)), ""),
         *(
             row
             for kind, goal in (("pair", "97 %"), ("triple", "95 %"))
@@ -210,13 +209,6 @@ def by_effect(verdicts: Sequence[Verdict]) -> list[list[str]]:
     return rows
 
 
-def power(verdicts: Sequence[Verdict]) -> list[list[str]]:
-    """Tabulates right names of the bench suite by size over the noise."""
-    mine = [each for each in verdicts if each.kind == "power"]
-    ratios = sorted({each.over_noise for each in mine if each.over_noise is not None})
-    return [[f"{ratio:g}", rate(right_first(v) for v in mine if v.over_noise == ratio)] for ratio in ratios]
-
-
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Returns a Markdown table."""
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
@@ -240,8 +232,6 @@ def page(verdicts: Sequence[Verdict], seed: int, cases: bool = False) -> str:
         if family == "everyday":
             head = ("reported detectable", "right first", "wrong first")
             parts.append(table(("fault's rms over noise", *head), by_effect(mine)))
-        elif powers := power(mine):
-            parts.append(table(("size over noise", "right first"), powers))
     if cases:
         parts += _cases(verdicts)
     return "\n\n".join(parts) + "\n"

@@ -22,7 +22,7 @@ NAMED_ABOVE = 0.5
 ANGLES = ("phase_deg", "centre_deg")
 """Parameters that are angles, compared modulo a turn."""
 SORTS = {
-    "single": "fault", "power": "fault", "no_torque": "fault", "fault": "fault", "pair": "several",
+    "single": "fault", "fault": "fault", "pair": "several",
     "triple": "several", "none": "healthy", "healthy_bench": "healthy", "healthy_work": "healthy",
     "other_law": "law", "law": "law", "unknown": "unknown", "outside": "unknown",
 }  # fmt: skip
@@ -84,7 +84,6 @@ class Verdict:
     pair: str
     flicker_counts: float
     samples: int
-    over_noise: float | None
     effect_over_noise: float | None
     """Rms of the cause's effect in the record over the noise of a reading."""
     hidden: tuple[str, ...]
@@ -146,7 +145,6 @@ def judged(secret: Data, answer: Answer, model: Data | None = None) -> Verdict:
         pair=secret.get("pair", ""),
         flicker_counts=secret.get("flicker_counts", 0.0),
         samples=secret["samples"],
-        over_noise=secret.get("over_noise"),
         effect_over_noise=effect["rms_arcsec"] / secret["noise_arcsec"] if effect and causes else None,
         hidden=causes,
         first=_first(first, expected),

@@ -1,15 +1,6 @@
 """A machine of two axes, served."""
 
 import pytest
-from support.api import served
-from support.fake_bridge import FakeBridge
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    """One server for all tests of a file; each test begins with a freshly started machine."""
-    with served(FakeBridge(), tmp_path_factory.mktemp("api")) as place:
-        yield place
 
 
 @pytest.fixture

@@ -13,8 +13,13 @@ from support.daemon import SteppedDaemon, stepped_daemon
 from hdbridge.daemon.loop.states import AxisState
 
 AWAY_S = st.sampled_from((0.0, 0.004, 0.011, 0.016, 0.03, 0.06, 0.5, 2.0))
-RESUMING = pytest.mark.parametrize("character", [RESTLESS, AWKWARD, INTERPOLATED], ids=str)
-"""The drives that resume whenever they can; `test_on_every_drive` has the others."""
+RESUMING = (RESTLESS, AWKWARD, INTERPOLATED)
+"""Drives that resume whenever they can."""
+every_drive = pytest.mark.parametrize(
+    "character",
+    [*RESUMING, *(pytest.param(each, marks=pytest.mark.slow) for each in every_character())],
+    ids=str,
+)
 RUNNING_S = st.integers(0, 80).map(lambda turns: 0.004 * turns)
 
 
@@ -42,7 +47,7 @@ def stays_without_power(daemon: SteppedDaemon, counts: list[PowerCount]) -> None
     assert all(abs(now - then) <= 2 for now, then in zip(places(daemon), before, strict=True))
 
 
-@RESUMING
+@every_drive
 @settings(max_examples=3)
 @given(RUNNING_S, AWAY_S)
 def test_after_another_start_of_the_control_process(
@@ -56,7 +61,7 @@ def test_after_another_start_of_the_control_process(
         assert daemon.states == [AxisState.UNVERIFIED] * 2
 
 
-@RESUMING
+@every_drive
 @settings(max_examples=3)
 @given(RUNNING_S, AWAY_S)
 def test_after_the_bus_was_down(character: Character, running_s: float, away_s: float) -> None:
@@ -69,7 +74,7 @@ def test_after_the_bus_was_down(character: Character, running_s: float, away_s: 
         assert daemon.states == [AxisState.LATCHED] * 2
 
 
-@RESUMING
+@every_drive
 @settings(max_examples=3)
 @given(RUNNING_S, st.floats(0.012, 1.0))
 def test_after_the_control_process_hung(character: Character, running_s: float, away_s: float) -> None:
@@ -78,20 +83,3 @@ def test_after_the_control_process_hung(character: Character, running_s: float, 
         daemon.hang(away_s)
         stays_without_power(daemon, counts)
         assert not {AxisState.ENABLED, AxisState.ENABLING} & set(daemon.states)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("character", every_character(), ids=str)
-def test_on_every_drive(character: Character) -> None:
-    for away_s in (0.011, 0.03, 0.06, 0.5):
-        with moving(character) as (daemon, counts):
-            daemon.run(0.1)
-            daemon.hang(away_s)
-            daemon.begin_again()
-            stays_without_power(daemon, counts)
-        with moving(character) as (daemon, counts):
-            daemon.run(0.1)
-            daemon.bus.down = errno.ENETDOWN
-            daemon.run(away_s)
-            daemon.bus.down = None
-            stays_without_power(daemon, counts)

@@ -5,9 +5,8 @@ import math
 from urllib.parse import urlsplit
 
 import pytest
-from support.api import TOKEN, served
+from support.api import TOKEN
 from support.browser import browser
-from support.fake_bridge import FakeBridge
 from support.patience import until
 
 from hdbridge.client import messages
@@ -15,12 +14,6 @@ from hdbridge.client.messages import Event, EventKind
 from hdbridge.daemon.page import page_files
 
 NOON = "2025-01-31T12:00:00Z"
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    with served(FakeBridge(), tmp_path_factory.mktemp("page")) as place:
-        yield place
 
 
 @pytest.fixture(scope="module")
