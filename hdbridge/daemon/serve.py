@@ -64,9 +64,7 @@ async def serve(start: Start, memory: Memory) -> None:
         metrics = Metrics()
         recorder = FlightRecorder(
             machine.recorder_folder(),
-            About.of(
-                machine.name, tuple(AxisAbout.of(each.config) for each in machine.axes), machine.cycle_s
-            ),
+            About(machine.name, machine.cycle_s, tuple(AxisAbout.of(each.config) for each in machine.axes)),
             machine.recorder,
             notify=bridge.core.log.note,
             in_use=lambda: {name: axis.models.in_use for name, axis in bridge.axes.items()},

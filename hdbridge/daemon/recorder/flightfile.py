@@ -12,7 +12,7 @@ import logging
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -111,14 +111,9 @@ class About:
     machine: str
     period_s: float
     axes: tuple[AxisAbout, ...]
-    versions: Mapping[str, str]
+    versions: Mapping[str, str] = field(default_factory=versions_here)
     offset_ns: int = 0
     """Time of day minus the clock of the samples, ns."""
-
-    @classmethod
-    def of(cls, machine: str, axes: tuple[AxisAbout, ...], period_s: float) -> Self:
-        """Returns the description of a machine served by this process."""
-        return cls(machine, period_s, axes, versions_here())
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """Returns the metadata records by name."""

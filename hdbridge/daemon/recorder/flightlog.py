@@ -18,7 +18,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import chain, count
 from pathlib import Path
@@ -68,18 +68,6 @@ class Note(NamedTuple):
 Item = Batch | ModelUse | Note
 
 
-@dataclass(slots=True)
-class Counts:
-    """Counts since the recorder began."""
-
-    recorded: int = 0
-    """Cycles on the disk."""
-    dropped: int = 0
-    """Cycles dropped because the recorder was too slow."""
-    refused: int = 0
-    """Cycles not written because the disk was full."""
-
-
 def free_bytes(folder: Path) -> int:
     """Returns the free bytes on the disk of ``folder``."""
     return shutil.disk_usage(folder).free
@@ -116,9 +104,8 @@ class FlightLog:
         self._newest_ns = 0
         self._trouble = ""
         self._refused_now = 0
-        self._behind = 0
-        """Number of cycles in a chunk that is not yet on the disk."""
-        self.counts = Counts()
+        self.refused = 0
+        """Cycles not written because the disk was full."""
         folder.mkdir(parents=True, exist_ok=True)
 
     def mend(self) -> None:
@@ -146,6 +133,7 @@ class FlightLog:
             return
         cycles = sum(len(each.samples) for each in waiting if isinstance(each, Batch))
         size = cycles * (1 + len(self._about.axes)) * MESSAGE_BYTES
+        self._note_spans(waiting)
         try:
             if self._free(self.folder) < size + self._settings.free_mb * _MB:
                 raise OSError(f"less than {self._settings.free_mb:g} MB are free")
@@ -156,15 +144,11 @@ class FlightLog:
             for item in waiting:
                 if not (begins and isinstance(item, ModelUse)):  # a new file begins with the models
                     self._write(file, item)
-            self._behind, cycles = self._behind + cycles, 0
+            cycles = 0  # in the file's chunk from now on, even if this flush fails
             file.flush()
         except OSError as problem:
-            self._note_spans(waiting)
             self._refuse(cycles, problem)
             return
-        self._note_spans(waiting)
-        self.counts.recorded += self._behind
-        self._behind = 0
         self._recovered()
         self._cut()
 
@@ -205,7 +189,7 @@ class FlightLog:
 
     def _refuse(self, cycles: int, problem: OSError) -> None:
         """Counts cycles that cannot be written, and reports the first failure."""
-        self.counts.refused += cycles
+        self.refused += cycles
         self._refused_now += cycles
         words = problem.strerror or str(problem)
         if not self._trouble:
@@ -227,16 +211,11 @@ class FlightLog:
 
     def _note_spans(self, items: Sequence[Item]) -> None:
         """Notes the time spans to keep."""
-        settings = self._settings
-        for item in items:
-            times = []
-            if isinstance(item, Note) and item.kind == MARK:
-                times.append(self._newest_ns)
-            elif isinstance(item, Batch):
-                times += [each.time_ns for each in item.events if each.kind in KEPT_FOR]
-            self._spans += [
-                (each - int(settings.before_s * _NS), each + int(settings.after_s * _NS)) for each in times
-            ]
+        marks = [self._newest_ns for each in items if isinstance(each, Note) and each.kind == MARK]
+        events = [event for each in items if isinstance(each, Batch) for event in each.events]
+        faults = [each.time_ns for each in events if each.kind in KEPT_FOR]
+        before_ns, after_ns = (int(each * _NS) for each in (self._settings.before_s, self._settings.after_s))
+        self._spans += [(each - before_ns, each + after_ns) for each in (*marks, *faults)]
 
     def _cut(self) -> None:
         """Begins a new file once this one is large or old enough, or a span to keep is over."""

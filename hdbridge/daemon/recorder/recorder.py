@@ -48,6 +48,8 @@ class FlightRecorder:
         """None if the folder could not be created."""
         self._notify_user, self._in_use = notify, in_use
         self._note: str | None = None
+        self._dropped = 0
+        """Cycles dropped because the thread was too slow."""
         self._recorded: dict[str, CompensationSetting] = {}
         self._queue: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self._threads: list[threading.Thread] = []
@@ -75,9 +77,9 @@ class FlightRecorder:
         if self._queue.qsize() < QUEUE_BATCHES:
             self._queue.put(Batch(samples, tuple(events), lost))
             return
-        if not self.flight.counts.dropped:
+        if not self._dropped:
             self._notify("the recorder is too slow: cycles are dropped")
-        self.flight.counts.dropped += len(samples)
+        self._dropped += len(samples)
 
     def put(self, item: ModelUse | Note) -> None:
         """Records a change of model or a note. Both are rare and never dropped."""
@@ -90,11 +92,10 @@ class FlightRecorder:
 
     def state(self) -> messages.RecorderState:
         """Returns the state of the recorder for clients."""
-        counts = self.flight.counts if self.flight is not None else None
         return messages.RecorderState(
-            on=counts is not None,
+            on=self.flight is not None,
             folder=str(self.folder),
-            dropped=counts.dropped + counts.refused if counts is not None else 0,
+            dropped=self._dropped + (self.flight.refused if self.flight is not None else 0),
             note=self._note,
         )
 
@@ -126,7 +127,7 @@ class FlightRecorder:
                     going = False
                 else:
                     flight.put(item)
-            dropped = flight.counts.dropped - reported
+            dropped = self._dropped - reported
             if dropped:
                 flight.put(Note("DROPPED", f"{dropped} cycles were dropped: the recorder was too slow"))
                 reported += dropped
