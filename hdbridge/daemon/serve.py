@@ -69,8 +69,7 @@ async def serve(start: Start, memory: Memory) -> None:
             notify=bridge.core.log.note,
             in_use=lambda: {name: axis.models.in_use for name, axis in bridge.axes.items()},
         )
-        bridge.recorder = recorder.state
-        bridge.marks.append(recorder.mark)
+        bridge.recorder = recorder
         stack.callback(recorder.close)
         following = follow(machine, bridge, recorder, stack)
         sinks: list[Sink] = [Journal([*bridge.axes]), metrics, recorder, *following]

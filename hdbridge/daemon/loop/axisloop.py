@@ -16,17 +16,7 @@ from hdbridge.daemon.loop.feeds import KnotFeed, OuterFeed
 from hdbridge.daemon.loop.follower import Follower
 from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, AxisState, Cause, Happening, refusal, target_of
 from hdbridge.daemon.machinefile import LoadLoopSettings
-from hdbridge.daemon.memory.cells import OuterCells, SettingSlot
-from hdbridge.daemon.memory.channels import Queue
-from hdbridge.daemon.memory.layout import (
-    NO_FAULT,
-    Command,
-    CommandKind,
-    EventKind,
-    Knot,
-    OuterKnot,
-    SampleFlag,
-)
+from hdbridge.daemon.memory import NO_FAULT, Command, CommandKind, EventKind, Memory, SampleFlag
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.feedback import ENABLE_TIMEOUT_S, STOP_TIMEOUT_S, Feedback
 from hdbridge.drive.image import ProcessImage
@@ -57,16 +47,11 @@ class AxisLoop:
         index: int,
         config: AxisConfig,
         load_loop: LoadLoopSettings | None,
-        knots: Queue[Knot],
-        slot: SettingSlot,
+        memory: Memory,
         report: Report,
-        followed: Queue[OuterKnot],
-        outer: OuterCells,
         due_s: Callable[[], float],
     ) -> None:
-        """``followed`` has the gateway's set-points, ``outer`` its states; ``due_s`` returns the due time of
-        the present turn.
-        """
+        """``index`` is its place in ``memory``; ``due_s`` returns the due time of the present turn."""
         self.index = index
         self.config = config
         self.state = AxisState.UNVERIFIED
@@ -80,14 +65,14 @@ class AxisLoop:
         self.broken: frozenset[int] = frozenset()
         """Group whose stream this axis left before its end; the controller stops the others."""
 
-        self._slot, self._report = slot, report
-        slot.use(0)
-        self._feed = KnotFeed(knots, self.set_point)
-        self._outer, self._due_s = OuterFeed(followed), due_s
+        self._slot, self._report = memory.settings[index], report
+        self._slot.use(0)
+        self._feed = KnotFeed(memory.knots[index], self.set_point)
+        self._outer, self._due_s = OuterFeed(memory.followed[index]), due_s
         self._faults = FaultLog(self.supervision, report, config.drive.cycle_s)
         self._period_s = config.drive.cycle_s
         self._follow = self.follower.follow
-        self._outer_cells = outer
+        self._outer_cells = memory.outer[index]
         self._motor_deg = config.motor_encoder.degrees(1)
         encoder = config.load_encoder
         self._load_deg = math.nan if encoder.is_motor_encoder else encoder.degrees(1)

@@ -58,17 +58,7 @@ class Controller:
         self.cycle = cycle
         self.memory = memory
         self.axes = tuple(
-            AxisLoop(
-                index,
-                config,
-                load_loop,
-                memory.knots[index],
-                memory.settings[index],
-                partial(self._report, index),
-                memory.followed[index],
-                memory.outer[index],
-                lambda: cycle.due_s,
-            )
+            AxisLoop(index, config, load_loop, memory, partial(self._report, index), lambda: cycle.due_s)
             for index, (config, load_loop) in enumerate(axes)
         )
         for axis in self.axes:

@@ -25,7 +25,7 @@ from typing import Any, Final, NamedTuple, Self
 import numpy as np
 
 MAGIC: Final = b"hdbridge"
-VERSION: Final = 5
+VERSION: Final = 6
 PAGE: Final = 4096
 LINE: Final = 64
 """Size of a cache line; data of different writers is in different lines."""
@@ -171,7 +171,6 @@ class Command(NamedTuple):
     a: float = 0.0
     b: float = 0.0
     c: float = 0.0
-    d: float = 0.0
     i: int = 0
     j: int = 0
     k: int = 0
@@ -333,8 +332,8 @@ EVENT: Final = struct.Struct(f"@QqqiiqiI{TEXT_BYTES}s{TAIL_CODE}")
 """sequence, cycle, time, axis, kind, id, code, length of the text, text."""
 FRAME: Final = struct.Struct(f"@QqIB3x8s{TAIL_CODE}")
 """sequence, time, identifier, length, data."""
-COMMAND: Final = struct.Struct(f"@Qii4d3q{TAIL_CODE}")
-"""sequence (which is the id), kind, axis, a-d, i-k."""
+COMMAND: Final = struct.Struct(f"@Qii3d3q{TAIL_CODE}")
+"""sequence (which is the id), kind, axis, a-c, i-k."""
 KNOT: Final = struct.Struct(f"@Qq3d{TAIL_CODE}")
 """sequence, stream, time, position, velocity."""
 HEADER: Final = struct.Struct("@8sIIQQQI4x")
@@ -377,16 +376,16 @@ class Layout(NamedTuple):
             end = -(-(offset + slots * slot_bytes) // LINE) * LINE
             return Place(offset, slots, slot_bytes)
 
-        samples = place(SAMPLES_KEPT, sample_struct(axes).size)
-        events = place(EVENTS_KEPT, EVENT.size)
-        incoming = place(INCOMING_KEPT, FRAME.size)
-        outgoing = place(OUTGOING_SLOTS, FRAME.size)
-        commands = place(COMMAND_SLOTS, COMMAND.size)
-        knots = tuple(place(KNOT_SLOTS, KNOT.size) for _ in range(axes))
-        settings = tuple(place(1, SETTING_BYTES) for _ in range(axes))
-        followed = tuple(place(FOLLOWED_SLOTS, KNOT.size) for _ in range(axes))
-        outer = tuple(place(len(OuterCell), LINE) for _ in range(axes))
-        total = -(-end // PAGE) * PAGE
         return cls(
-            axes, samples, events, incoming, outgoing, commands, knots, settings, followed, outer, total
+            axes=axes,
+            samples=place(SAMPLES_KEPT, sample_struct(axes).size),
+            events=place(EVENTS_KEPT, EVENT.size),
+            incoming=place(INCOMING_KEPT, FRAME.size),
+            outgoing=place(OUTGOING_SLOTS, FRAME.size),
+            commands=place(COMMAND_SLOTS, COMMAND.size),
+            knots=tuple(place(KNOT_SLOTS, KNOT.size) for _ in range(axes)),
+            settings=tuple(place(1, SETTING_BYTES) for _ in range(axes)),
+            followed=tuple(place(FOLLOWED_SLOTS, KNOT.size) for _ in range(axes)),
+            outer=tuple(place(len(OuterCell), LINE) for _ in range(axes)),
+            total=-(-end // PAGE) * PAGE,
         )

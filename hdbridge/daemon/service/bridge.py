@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from hdbridge.daemon.machine import Machine
     from hdbridge.daemon.memory import Memory
     from hdbridge.daemon.memory.channels import SampleReader
+    from hdbridge.daemon.recorder.recorder import FlightRecorder
     from hdbridge.daemon.service.lease import Lease
 
 VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
@@ -77,9 +78,7 @@ class ServiceBridge:
             axis.name: ServiceAxis(index, axis, self.core, self._axis_state)
             for index, axis in enumerate(machine.axes)
         }
-        self.recorder: Callable[[], messages.RecorderState] = lambda: messages.RecorderState(on=False)
-        self.marks: list[Callable[[str], None]] = []
-        """Receivers of remarks, such as the recorder."""
+        self.recorder: FlightRecorder | None = None
         self._names = tuple(self.axes)
         self._simulated = simulated
         self._started = datetime.now(UTC)
@@ -248,7 +247,7 @@ class ServiceBridge:
                 busy_us=float(head["busy_us"]) if head is not None else None,
             ),
             lease=reports.lease_state(core.lease, core.timing.clock.now()),
-            recorder=self.recorder(),
+            recorder=self.recorder.state() if self.recorder else messages.RecorderState(on=False),
             warnings=self._warnings(),
         )
 
@@ -319,20 +318,15 @@ class ServiceBridge:
         """Moves several axes so that all begin and end together; ``speed`` is a share of the limits."""
         if not moves:
             raise InputError("a coordinated move without an axis; expected a target for at least one")
-        axes = [self._axis(name) for name in moves]
-        await run_together(holder, axes, moves, speed, wait=wait)
+        for name in moves.keys() - self.axes.keys():
+            raise InputError(f"there is no axis '{name}'; expected one of: {', '.join(self.axes)}")
+        await run_together(holder, [self.axes[name] for name in moves], moves, speed, wait=wait)
 
     def mark(self, text: str, axis: int = -1) -> None:
         """Adds a remark to the event log and the flight recorder, which keeps the time around it."""
         self.core.log.note(text, axis)
-        for hear in self.marks:
-            hear(text)
-
-    def _axis(self, name: str) -> ServiceAxis:
-        axis = self.axes.get(name)
-        if axis is None:
-            raise InputError(f"there is no axis '{name}'; expected one of: {', '.join(self.axes)}")
-        return axis
+        if self.recorder is not None:
+            self.recorder.mark(text)
 
     def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(coroutine)

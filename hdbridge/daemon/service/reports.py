@@ -217,8 +217,6 @@ def _fault(axis: ServiceAxis) -> messages.Fault | None:
 
 def _date(value: object) -> datetime | None:
     """Returns a date of a provenance; None if invalid."""
-    if isinstance(value, datetime):
-        return value if value.tzinfo is not None else value.replace(tzinfo=UTC)
     try:
         date = datetime.fromisoformat(str(value))
     except ValueError:
