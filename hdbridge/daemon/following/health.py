@@ -34,7 +34,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.analysis.readings import jitter_deg
+from hdbridge.analysis.readings import jitter_deg, median_deviation
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import BoolArray, FloatArray
 from hdbridge.axis.model import TransmissionModel
@@ -62,8 +62,6 @@ SWING = 3.0
 """Largest step of the residual while the load oscillates, relative to its wind-up or to the usual step."""
 FADE_S = 0.4
 """Time constant of the load's oscillation."""
-MEDIAN_DIFFERENCE = 1.0 / (0.6745 * np.sqrt(2.0))
-"""Standard deviation of Gaussian values, relative to the median difference of neighbours."""
 ZERO_UNKNOWN: Final = (AxisState.UNVERIFIED, AxisState.LENT, AxisState.LATCHED)
 """States after which the encoders' zeros may have changed."""
 TAIL = 64
@@ -387,8 +385,7 @@ class EncoderHealth:
     def _judge_steps(self, found: Residuals) -> None:
         noise = self._usual(standing=bool(np.all(_standing(found))))
         if len(found) > 1:
-            differences = np.abs(np.diff(found["residual_arcsec"]))
-            noise = max(noise, MEDIAN_DIFFERENCE * float(np.median(differences)))
+            noise = max(noise, median_deviation(np.diff(found["residual_arcsec"])) / math.sqrt(2.0))
         swing = SWING * SOFTEST_S2
         if len(self._swings_s2) >= LEARNING_BLOCKS:
             swing = SWING * float(np.clip(np.quantile(self._swings_s2, 0.9), STIFFEST_S2, SOFTEST_S2))

@@ -145,11 +145,10 @@ class Zero:
     ) -> tuple[FloatArray, FloatArray, float]:
         """Returns the coefficients, their standard errors and the mean square that is left."""
         sigma = self._sigma_arcsec
-        change, _ = ranged_fit(rows, error_arcsec, sigma, information)
-        left = error_arcsec - rows @ change
-        sigma = max(sigma, float(np.sqrt(left @ left / (len(left) - FREE_COLUMNS))))
-        change, covariance = ranged_fit(rows, error_arcsec, sigma, information)
-        left = error_arcsec - rows @ change
+        for _ in range(2):  # the second time with the noise that the first has left
+            change, covariance = ranged_fit(rows, error_arcsec, sigma, information)
+            left = error_arcsec - rows @ change
+            sigma = max(sigma, float(np.sqrt(left @ left / (len(left) - FREE_COLUMNS))))
         errors = np.sqrt(np.diag(covariance) * correlated(left))
         return change, errors, float(left @ left) / len(left)
 
