@@ -107,9 +107,8 @@ class FakeAxis:
         self._moved(holder, "reset")
         self.at = messages.ControlState.DISABLED
 
-    async def home(self, holder: str, run: messages.Home) -> float:
+    async def home(self, holder: str, run: messages.Home) -> None:
         self._moved(holder, "home", run.method)
-        return 0.0
 
     async def move(
         self,

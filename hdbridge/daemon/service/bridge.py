@@ -42,7 +42,7 @@ from hdbridge.errors import HdbridgeError, InputError
 
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Machine
-    from hdbridge.daemon.memory import Memory
+    from hdbridge.daemon.memory import Event, Memory, SampleArray
     from hdbridge.daemon.memory.channels import SampleReader
     from hdbridge.daemon.recorder.recorder import FlightRecorder
     from hdbridge.daemon.service.lease import Lease
@@ -82,9 +82,8 @@ class ServiceBridge:
         self._names = tuple(self.axes)
         self._simulated = simulated
         self._started = datetime.now(UTC)
-        self._seen = 0
         self._bus_up = True
-        self._loop_pid = 0
+        self.core.observer.add(self)
         self._latency = Latency(memory.axes)
         if machine.gateway is not None:
             self.core.observer.add(self._latency)
@@ -110,7 +109,6 @@ class ServiceBridge:
 
         Returns once the control process compensates each axis by its setting, or does not answer.
         """
-        self._loop_pid = self.core.memory.status.loop_pid
         self._start(self._watch())
         for axis in self.axes.values():
             self._start(self._take_over(axis))
@@ -138,12 +136,17 @@ class ServiceBridge:
             await axis.close()
 
     async def _watch(self) -> None:
-        """Reads events and checks the lease, every `PERIOD_S`."""
-        core = self.core
+        """Reads samples and events, checks the lease and notices a new control process, every `PERIOD_S`."""
+        core, status = self.core, self.core.memory.status
+        known = status.loop_pid
         while True:
             core.observer.poll()
-            core.memory.status[Cell.SERVICE_TIME_NS] = time.monotonic_ns()
-            self._look()
+            status[Cell.SERVICE_TIME_NS] = time.monotonic_ns()
+            if (pid := status.loop_pid) and pid != known:
+                if known:
+                    core.log.note("the control process was started again: every axis is disabled")
+                    self._bus_up = True
+                known = pid
             for axis in self.axes.values():
                 try:
                     await axis.motion.end_without_lease()
@@ -151,23 +154,13 @@ class ServiceBridge:
                     core.log.note(f"could not be stopped: {error}", axis.link.index)
             await core.timing.sleep(PERIOD_S)
 
-    def _look(self) -> None:
-        """Evaluates new events: stops, load loops, bus failures and restarts of the control process."""
-        for entry in self.core.log.since(self._seen):
-            self._seen = entry.number
-            event = entry.event
-            if event is None:
-                continue
+    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
+        """Takes the loop's events from the observer: those of an axis, and failures of the bus."""
+        for event in events:
             if event.axis >= 0:
-                self.axes[self._names[event.axis]].hear(entry, event)
+                self.axes[self._names[event.axis]].hear(event)
             elif event.kind in (EventKind.BUS_DOWN, EventKind.BUS_UP):
                 self._bus_up = event.kind is EventKind.BUS_UP
-        pid = self.core.memory.status.loop_pid
-        if pid and pid != self._loop_pid:
-            if self._loop_pid:
-                self.core.log.note("the control process was started again: every axis is disabled")
-                self._bus_up = True
-            self._loop_pid = pid
 
     async def _settle(self, axis: ServiceAxis) -> None:
         """Sends the chosen compensation whenever the control process does not use it."""
@@ -253,7 +246,6 @@ class ServiceBridge:
 
     def _axis_state(self, axis: ServiceAxis) -> messages.AxisState:
         """Returns the state of one axis in the newest cycle."""
-        self._look()
         return reports.axis_state(axis, self._outer(axis))
 
     def _outer(self, axis: ServiceAxis) -> messages.OuterState | None:

@@ -170,7 +170,7 @@ class Commissioning:
             if self._drive.state() is State.FAULT:
                 self._drive.fault_reset()
 
-    def home(self, run: messages.Home) -> tuple[Positions, Arguments]:
+    def home(self, run: messages.Home) -> Arguments:
         """Homes a drive that the control process has lent; power is off afterwards.
 
         Raises like `Drive.home`; even then, the axis stops and its power is off if the drive answers.
@@ -180,7 +180,7 @@ class Commissioning:
                 positions = self._drive.home(**run.model_dump())
             finally:
                 self._drive.disable()
-            return positions, self._seeds(positions)
+            return self._seeds(positions)
 
     def interrupt(self, reason: str) -> None:
         """Interrupts the present request with this reason; a homing axis stops. Thread-safe."""

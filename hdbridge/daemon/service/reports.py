@@ -188,13 +188,12 @@ def axis_state(axis: ServiceAxis, outer: messages.OuterState | None) -> messages
 
 def _fault(axis: ServiceAxis) -> messages.Fault | None:
     """Returns the cause of a latched stop or a drive fault; None without either."""
-    link, stopped = axis.link, axis.stopped
+    link, (event, date) = axis.link, axis.stopped or (None, None)
     code = int(link.value("fault")) if link.core.observer.newest is not None else NO_FAULT
     fault = fault_of(code)
     latched = link.state in STOPPED
     if not latched and link.power is not State.FAULT:
         return None
-    event = stopped.event if stopped is not None else None
     if fault is None and event is not None:
         fault = fault_of(event.code)
     if fault is None and not latched:
@@ -210,7 +209,7 @@ def _fault(axis: ServiceAxis) -> messages.Fault | None:
         text=text,
         hint=hint,
         cycle=event.cycle if event is not None else None,
-        date=stopped.date if stopped is not None else None,
+        date=date,
         needs_verification=link.state is AxisState.LATCHED,
     )
 
