@@ -307,22 +307,11 @@ class Keeper:
         self._control: Child | None = None
         self._loan = Loan(lock) if lock is not None else None
         api = tuple(each.fileno() for each in listeners)
-        self._helpers = [
-            _Helper(
-                "service", programs.service, api, Cell.SERVICE_TIME_NS, Cell.SERVICE_PID, times.service_hung_s
-            )
-        ]
+        service = programs.service, api, Cell.SERVICE_TIME_NS, Cell.SERVICE_PID, times.service_hung_s
+        gateway = programs.gateway, (), Cell.GATEWAY_TIME_NS, Cell.GATEWAY_PID, times.gateway_hung_s
+        self._helpers = [_Helper("service", *service)]
         if start.machine.gateway is not None:
-            self._helpers.append(
-                _Helper(
-                    "gateway",
-                    programs.gateway,
-                    (),
-                    Cell.GATEWAY_TIME_NS,
-                    Cell.GATEWAY_PID,
-                    times.gateway_hung_s,
-                )
-            )
+            self._helpers.append(_Helper("gateway", *gateway))
         self._restarts = {"control": 0, **{each.name: 0 for each in self._helpers}}
         self._ready = False
         self._status = 0
@@ -520,19 +509,18 @@ class Keeper:
                 self._status = self._status or HdbridgeError.exit_status
                 self._control.send(signal.SIGKILL)
             return
-        remaining = [each for each in self._helpers if each.child is not None]
-        number = signal.SIGTERM
-        if self._helpers_told_s is None:
+        number, told_s = signal.SIGTERM, self._helpers_told_s
+        if told_s is None:
             self._helpers_told_s = now_s
-        elif now_s - self._helpers_told_s > self._times.service_stop_s:
+        elif now_s - told_s > self._times.service_stop_s:
             number = signal.SIGKILL
         else:
             return
-        for helper in remaining:
-            assert helper.child is not None
-            if number is signal.SIGKILL:
-                _log.error(f"the {helper.name} does not end", {"after_s": self._times.service_stop_s})
-            helper.child.send(number)
+        for helper in self._helpers:
+            if helper.child is not None:
+                if number is signal.SIGKILL:
+                    _log.error(f"the {helper.name} does not end", {"after_s": self._times.service_stop_s})
+                helper.child.send(number)
 
     def _end_all(self) -> None:
         for child in (self._control, *(each.child for each in self._helpers)):

@@ -159,13 +159,10 @@ class AxisLoop:
         if id_:
             self._report(EventKind.DONE, id_, 0)
 
-    def _happened(self, cause: Cause) -> bool:
-        """Makes the transition for ``cause``; returns True if the state changed."""
-        target = target_of(self.state, cause)
-        if target is None or target is self.state:
-            return False
-        self._enter(target)
-        return True
+    def _happened(self, cause: Cause) -> None:
+        """Makes the transition for ``cause``, if there is one in this state."""
+        if (target := target_of(self.state, cause)) is not None:
+            self._enter(target)
 
     def _enter(self, state: AxisState) -> None:
         """Enters a state: switches power off, quick-stops or ends motion, and answers waiting commands."""

@@ -228,10 +228,7 @@ class ServiceAxis:
     async def _verify(self, *, clear_fault: bool = False) -> None:
         """Boots and verifies the drive, then lets the control process communicate with it."""
         self.is_prepared = False
-        seeds = await self._work(self.commissioning.verify)
-        if clear_fault:
-            await self._work(self.commissioning.clear_fault)
-            seeds = await self._work(self.commissioning.seeds)
+        seeds = await self._work(self.commissioning.verify, clear_fault=clear_fault)
         if self.link.state is AxisState.LATCHED:
             await self.link.do(CommandKind.RESET, i=1)
         await self.link.do(CommandKind.VERIFIED, **seeds)

@@ -7,6 +7,7 @@ does not. The SDO clients and the boot-up run unchanged on `RelayBus`.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Container, Iterator
@@ -83,7 +84,7 @@ class RelayBus(can.BusABC):
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         clock = self._clock
-        deadline_s = clock.now() + (timeout or 0.0)
+        deadline_s = math.inf if timeout is None else clock.now() + timeout
         while True:
             if self._interrupted.is_set():
                 self._interrupted.clear()
@@ -98,9 +99,9 @@ class RelayBus(can.BusABC):
                 )
                 return message, True
             now_s = clock.now()
-            if now_s >= deadline_s and timeout is not None:
+            if now_s >= deadline_s:
                 return None, True
-            clock.sleep_until(min(now_s + POLL_S, deadline_s) if timeout is not None else now_s + POLL_S)
+            clock.sleep_until(min(now_s + POLL_S, deadline_s))
 
     def _next(self) -> RelayedFrame | None:
         """Returns the next frame from one of the axis's nodes."""
@@ -133,13 +134,16 @@ class Commissioning:
         """Identity that the drive reported, else the identity in the axis file."""
         return self._drive.identity
 
-    def verify(self) -> Arguments:
+    def verify(self, *, clear_fault: bool = False) -> Arguments:
         """Boots the drive and compares it with the axis file; power is off afterwards.
 
-        Raises like `Drive.boot`.
+        ``clear_fault`` also resets a fault of the drive, to which the control process sends nothing. Raises
+        like `Drive.boot`.
         """
         with self._asked("it is being booted"):
             self._drive.boot()
+            if clear_fault and self._drive.state() is State.FAULT:
+                self._drive.fault_reset()
             return self._seeds(self._drive.read_positions())
 
     def take_over(self) -> None:
@@ -163,12 +167,6 @@ class Commissioning:
         """Ends the drive's monitoring of the master; power is off already."""
         with self._asked("it is being switched off"):
             self._drive.disable()
-
-    def clear_fault(self) -> None:
-        """Resets a fault of the drive, while the control process sends it nothing."""
-        with self._asked("its fault is being reset"):
-            if self._drive.state() is State.FAULT:
-                self._drive.fault_reset()
 
     def home(self, run: messages.Home) -> Arguments:
         """Homes a drive that the control process has lent; power is off afterwards.
@@ -204,11 +202,6 @@ class Commissioning:
         with self._asked(f"{object_} is being written"):
             self._drive.sdo.write_bytes(wanted.index, wanted.sub, data)
         return wanted
-
-    def seeds(self) -> Arguments:
-        """Reads the drive's present position and statusword."""
-        with self._asked("its position is being read"):
-            return self._seeds(self._drive.read_positions())
 
     def close(self) -> None:
         """Closes the relay bus; the drive stays as it is."""
