@@ -261,11 +261,6 @@ class ServiceAxis:
             await self._work(self.models.activate, version, identity, date)
             await self._use(self.models.chosen)
 
-    @property
-    def unsettled(self) -> bool:
-        """True if the control process does not use the chosen setting."""
-        return not self.models.settled
-
     async def settle(self) -> None:
         """Makes the control process compensate by the chosen setting if it does not."""
         async with self._changing:

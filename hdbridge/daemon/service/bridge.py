@@ -123,7 +123,7 @@ class ServiceBridge:
         await asyncio.sleep(0)
         timing = self.core.timing
         deadline_s = timing.clock.now() + ANSWER_S
-        while any(axis.unsettled for axis in self.axes.values()) and timing.clock.now() < deadline_s:
+        while not all(axis.models.settled for axis in self.axes.values()) and timing.clock.now() < deadline_s:
             await timing.sleep(PERIOD_S)
         return self
 
@@ -165,7 +165,7 @@ class ServiceBridge:
     async def _settle(self, axis: ServiceAxis) -> None:
         """Sends the chosen compensation whenever the control process does not use it."""
         what = "the compensation could not be put back"
-        await self._persist(axis, lambda: axis.unsettled, axis.settle, SETTLE_AGAIN_S, what)
+        await self._persist(axis, lambda: not axis.models.settled, axis.settle, SETTLE_AGAIN_S, what)
 
     async def _verify(self, axis: ServiceAxis) -> None:
         """Boots and verifies the drive whenever necessary. The axis stays disabled."""
