@@ -342,7 +342,6 @@ class Keeper:
         return self._status
 
     def _turn(self, now_s: float) -> None:
-        self._memory.status[Cell.KEEPER_TIME_NS] = time.monotonic_ns()
         self._heed_signals(now_s)
         if self._control is not None and self._control.ended is not None:
             self._control_ended(self._control, now_s)
@@ -372,7 +371,7 @@ class Keeper:
         helper.heartbeat.restart(0)
 
     def _started(self, program: Sequence[str], name: str, listening: tuple[int, ...], now_s: float) -> Child:
-        fd = self._start.hand_over(restarts=self._restarts[name], api_fds=listening)
+        fd = self._start.hand_over(api_fds=listening)
         try:
             child = Child(program, fd, (self._memory.fd, *listening), now_s)
         finally:

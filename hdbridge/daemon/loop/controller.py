@@ -7,7 +7,6 @@ compensation, runs after the RPDOs of one cycle and before the wait for the next
 """
 
 import os
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
@@ -121,7 +120,7 @@ class Controller:
             *values,
         ))  # fmt: skip
         self._turns += 1
-        self.memory.status.turned(self._turns, time.monotonic_ns())
+        self.memory.status[Cell.LOOP_COUNT] = self._turns
 
     def _report(self, axis: int, kind: EventKind, id_: int = 0, code: int = 0, text: str = "") -> None:
         cycle = self.cycle

@@ -126,12 +126,10 @@ def test_status_cells_are_shared(memory: Memory) -> None:
         status = other.status
         assert [
             status.loop_count,
-            status[Cell.LOOP_TIME_NS],
             status[Cell.SERVICE_TIME_NS],
-            status[Cell.KEEPER_TIME_NS],
             status.loop_pid,
             status[Cell.SERVICE_PID],
-        ] == [(1 << 40) + place for place in range(6)]
+        ] == [(1 << 40) + place for place in range(4)]
         assert status[Cell.STOP_ASKED]
 
 
