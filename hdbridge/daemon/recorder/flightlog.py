@@ -16,6 +16,7 @@ import logging
 import os
 import shutil
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -100,7 +101,8 @@ class FlightLog:
         self._spans: list[tuple[int, int]] = []
         """Time spans around faults; ns of the samples' clock."""
         self._models: dict[str, ModelUse] = {}
-        self._waiting: list[Item] = []
+        self.waiting: deque[Item] = deque()
+        """Items since the last flush."""
         self._newest_ns = 0
         self._trouble = ""
         self._refused_now = 0
@@ -118,17 +120,17 @@ class FlightLog:
         self._remove_old()
 
     def put(self, item: Item) -> None:
-        """Takes an item; it is on the disk after the next `flush`."""
-        self._waiting.append(item)
-        if isinstance(item, Batch) and len(item.samples):
-            self._newest_ns = int(item.samples["time_ns"][-1])
+        """Takes an item, in any thread; it is on the disk after the next `flush`."""
+        self.waiting.append(item)
 
     def flush(self) -> None:
         """Writes the items since the last flush."""
-        waiting, self._waiting = self._waiting, []
-        for item in waiting:  # a later file must contain the model as well
+        waiting = [self.waiting.popleft() for _ in range(len(self.waiting))]
+        for item in waiting:
             if isinstance(item, ModelUse):
-                self._models[item.axis] = item
+                self._models[item.axis] = item  # a later file must contain the model as well
+            elif isinstance(item, Batch) and len(item.samples):
+                self._newest_ns = int(item.samples["time_ns"][-1])
         if not waiting and (self._file is None or not self._file.behind):
             return
         cycles = sum(len(each.samples) for each in waiting if isinstance(each, Batch))
