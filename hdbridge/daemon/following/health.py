@@ -300,14 +300,7 @@ class EncoderHealth:
         self._noisy_blocks = 0
         self._bad_s = -math.inf
         self._now_s = 0.0
-        self._tail: SampleArray | None = None
-        """Last samples, which are evaluated again with the next ones."""
-        self._held: tuple[float, float] | None = None
-        """Load reading that does not change, and the motor angle since when."""
-        self._pending: dict[bool, list[Residuals]] = {True: [], False: []}
-        """Samples of the incomplete blocks at rest (True) and in motion (False)."""
-        self._since: tuple[bool, float] = (True, -math.inf)
-        """True at rest, and the time since when."""
+        self.restart()
 
     def reset(self) -> None:
         """Ends a fault, after maintenance or after the encoder's zero was set."""
@@ -317,9 +310,14 @@ class EncoderHealth:
 
     def restart(self) -> None:
         """Forgets the last samples, for example after a change of the predicting model."""
-        self._tail, self._held = None, None
-        self._pending = {True: [], False: []}
+        self._tail: SampleArray | None = None
+        """Last samples, which are evaluated again with the next ones."""
+        self._held: tuple[float, float] | None = None
+        """Load reading that does not change, and the motor angle since when."""
+        self._pending: dict[bool, list[Residuals]] = {True: [], False: []}
+        """Samples of the incomplete blocks at rest (True) and in motion (False)."""
         self._since = (True, -math.inf)
+        """True at rest, and the time since when."""
 
     def take(self, samples: SampleArray) -> EncoderStatus:
         """Judges the next samples of the loop, oldest first: a tenth of a second or more at a time."""
