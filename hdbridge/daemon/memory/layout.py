@@ -18,7 +18,6 @@ sequence number, counted from 1. Any change here requires a new `VERSION`.
 import logging
 import math
 import struct
-from collections.abc import Iterable
 from enum import IntEnum, IntFlag
 from typing import Any, Final, NamedTuple, Self
 
@@ -310,13 +309,8 @@ TAIL_BYTES: Final = 16
 
 def sample_struct(axes: int) -> struct.Struct:
     """Returns the struct for packing a sample of ``axes`` axes."""
-    head, axis = (_codes(kinds) for kinds in ((kind for _, kind in SAMPLE_HEAD), _AXIS_FORMATS))
-    return struct.Struct(f"@{head}{axis * axes}{TAIL_CODE}")
-
-
-def _codes(kinds: Iterable[str]) -> str:
-    """Returns the codes of `struct` for numpy types."""
-    return "".join(np.dtype(each).char for each in kinds)
+    kinds = [kind for _, kind in SAMPLE_HEAD] + axes * list(_AXIS_FORMATS)
+    return struct.Struct(f"@{''.join(np.dtype(each).char for each in kinds)}{TAIL_CODE}")
 
 
 def sample_dtype(axes: int) -> np.dtype[Any]:
