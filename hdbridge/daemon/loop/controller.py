@@ -132,8 +132,7 @@ class Controller:
     def _take_commands(self) -> None:
         take = self.memory.commands.take
         for _ in range(COMMANDS_A_TURN):
-            command = take()
-            if command is None:
+            if (command := take()) is None:
                 break
             self._command(command)
 

@@ -130,12 +130,12 @@ class About:
         }
 
     @classmethod
-    def from_metadata(cls, records: Mapping[str, Mapping[str, str]]) -> Self:
-        """Reads the result of `metadata`; raises InputError if it is not an hdbridge recording."""
+    def from_metadata(cls, records: Mapping[str, Mapping[str, str]], path: Path) -> Self:
+        """Reads the result of `metadata`; raises InputError if ``path`` is not an hdbridge recording."""
         machine = records.get(MACHINE_NAME, {})
         if machine.get("format") != FORMAT:
             raise InputError(
-                f"found {machine.get('format', 'no format')}; expected a flight recording, {FORMAT}"
+                f"{path}: found {machine.get('format', 'no format')}; expected a flight recording, {FORMAT}"
             )
         try:
             axes = sorted(
@@ -151,7 +151,7 @@ class About:
                 int(machine["offset_ns"]),
             )
         except (KeyError, ValueError) as problem:
-            raise InputError(f"its metadata are damaged: {problem}") from None
+            raise InputError(f"{path}: its metadata are damaged: {problem}") from None
 
 
 def axis_topic(name: str) -> str:
