@@ -56,17 +56,16 @@ class RelayBus(can.BusABC):
         self._incoming = core.memory.incoming_reader()
         self._nodes = nodes
         self._waiting: deque[RelayedFrame] = deque()
-        self._interrupted = threading.Event()
-        self._reason = ""
+        self._interruption = ""
+        """Reason for which the present operation is to fail; empty without one."""
 
     def interrupt(self, reason: str) -> None:
         """Makes the present operation fail at its next wait, once, with ``reason``."""
-        self._reason = reason
-        self._interrupted.set()
+        self._interruption = reason
 
     def begin(self) -> None:
         """Begins another operation, discarding an interruption of the last one."""
-        self._interrupted.clear()
+        self._interruption = ""
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Sends a frame. Drops the master's heartbeat, which the control process sends."""
@@ -86,11 +85,10 @@ class RelayBus(can.BusABC):
         clock = self._clock
         deadline_s = math.inf if timeout is None else clock.now() + timeout
         while True:
-            if self._interrupted.is_set():
-                self._interrupted.clear()
-                raise DaemonError(self._reason)
-            frame = self._next()
-            if frame is not None:
+            if reason := self._interruption:
+                self._interruption = ""
+                raise DaemonError(reason)
+            if (frame := self._next()) is not None:
                 message = can.Message(
                     timestamp=frame.time_ns / 1e9,
                     arbitration_id=frame.can_id,
