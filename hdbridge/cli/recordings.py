@@ -64,7 +64,7 @@ class Part:
                 end_ns is not None and about.first_ns > end_ns
             ):
                 return None
-            return read(about.path, (axis_of(about.about, self.axis, path)[1].name,))
+            return read(about.path, (axis_of(about.about, self.axis, path).name,))
 
         found = [each for each in each_flight(paths, wanted) if each is not None]
         if not found:

@@ -307,22 +307,11 @@ class Keeper:
         self._control: Child | None = None
         self._loan = Loan(lock) if lock is not None else None
         api = tuple(each.fileno() for each in listeners)
-        self._helpers = [
-            _Helper(
-                "service", programs.service, api, Cell.SERVICE_TIME_NS, Cell.SERVICE_PID, times.service_hung_s
-            )
-        ]
+        service = programs.service, api, Cell.SERVICE_TIME_NS, Cell.SERVICE_PID, times.service_hung_s
+        gateway = programs.gateway, (), Cell.GATEWAY_TIME_NS, Cell.GATEWAY_PID, times.gateway_hung_s
+        self._helpers = [_Helper("service", *service)]
         if start.machine.gateway is not None:
-            self._helpers.append(
-                _Helper(
-                    "gateway",
-                    programs.gateway,
-                    (),
-                    Cell.GATEWAY_TIME_NS,
-                    Cell.GATEWAY_PID,
-                    times.gateway_hung_s,
-                )
-            )
+            self._helpers.append(_Helper("gateway", *gateway))
         self._restarts = {"control": 0, **{each.name: 0 for each in self._helpers}}
         self._ready = False
         self._status = 0
@@ -353,7 +342,6 @@ class Keeper:
         return self._status
 
     def _turn(self, now_s: float) -> None:
-        self._memory.status[Cell.KEEPER_TIME_NS] = time.monotonic_ns()
         self._heed_signals(now_s)
         if self._control is not None and self._control.ended is not None:
             self._control_ended(self._control, now_s)
@@ -383,7 +371,7 @@ class Keeper:
         helper.heartbeat.restart(0)
 
     def _started(self, program: Sequence[str], name: str, listening: tuple[int, ...], now_s: float) -> Child:
-        fd = self._start.hand_over(restarts=self._restarts[name], api_fds=listening)
+        fd = self._start.hand_over(api_fds=listening)
         try:
             child = Child(program, fd, (self._memory.fd, *listening), now_s)
         finally:
@@ -520,19 +508,18 @@ class Keeper:
                 self._status = self._status or HdbridgeError.exit_status
                 self._control.send(signal.SIGKILL)
             return
-        remaining = [each for each in self._helpers if each.child is not None]
-        number = signal.SIGTERM
-        if self._helpers_told_s is None:
+        number, told_s = signal.SIGTERM, self._helpers_told_s
+        if told_s is None:
             self._helpers_told_s = now_s
-        elif now_s - self._helpers_told_s > self._times.service_stop_s:
+        elif now_s - told_s > self._times.service_stop_s:
             number = signal.SIGKILL
         else:
             return
-        for helper in remaining:
-            assert helper.child is not None
-            if number is signal.SIGKILL:
-                _log.error(f"the {helper.name} does not end", {"after_s": self._times.service_stop_s})
-            helper.child.send(number)
+        for helper in self._helpers:
+            if helper.child is not None:
+                if number is signal.SIGKILL:
+                    _log.error(f"the {helper.name} does not end", {"after_s": self._times.service_stop_s})
+                helper.child.send(number)
 
     def _end_all(self) -> None:
         for child in (self._control, *(each.child for each in self._helpers)):

@@ -90,11 +90,7 @@ class AdaptationSettings(Strict):
     )
 
 
-class _Part(Strict):
-    """Mapping of the file: frozen, no unknown keys, finite numbers."""
-
-
-class LoadLoopSettings(_Part):
+class LoadLoopSettings(Strict):
     """Load loop: a slow integral of the error at the load encoder, in addition to the model."""
 
     gain_1_s: float = Field(0.5, gt=0, le=5, description="share of the error removed per second")
@@ -104,7 +100,7 @@ class LoadLoopSettings(_Part):
     )
 
 
-class AxisEntry(_Part):
+class AxisEntry(Strict):
     """One axis of the machine."""
 
     profile: str = Field(
@@ -120,7 +116,7 @@ class AxisEntry(_Part):
     )
 
 
-class TcpSettings(_Part):
+class TcpSettings(Strict):
     """API over TCP on this machine, for the page, local tools and a reverse proxy."""
 
     port: int = Field(8402, ge=1, le=65_535, description="port of 127.0.0.1")
@@ -130,7 +126,7 @@ class TcpSettings(_Part):
     token_file: str = Field(min_length=1, description="file with the clients' token, mode 600")
 
 
-class ApiSettings(_Part):
+class ApiSettings(Strict):
     """Access of clients to the daemon."""
 
     socket: str | None = Field(
@@ -142,7 +138,7 @@ class ApiSettings(_Part):
     tcp: TcpSettings | None = Field(None, description="additional TCP port; by default none")
 
 
-class GatewaySettings(_Part):
+class GatewaySettings(Strict):
     """The machine as CiA-402 drives on another bus, for its master. Positions are those of the load."""
 
     bus: BusConfig = Field(description="the bus of the other master")
@@ -161,7 +157,7 @@ class GatewaySettings(_Part):
     )
 
 
-class LimitSettings(_Part):
+class LimitSettings(Strict):
     """Limits of the daemon."""
 
     restarts_per_minute: int = Field(
@@ -169,7 +165,7 @@ class LimitSettings(_Part):
     )
 
 
-class MachineFile(_Part):
+class MachineFile(Strict):
     """Content of a machine file."""
 
     schema_: Literal["hdbridge.machine/1"] = Field(

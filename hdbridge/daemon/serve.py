@@ -64,15 +64,12 @@ async def serve(start: Start, memory: Memory) -> None:
         metrics = Metrics()
         recorder = FlightRecorder(
             machine.recorder_folder(),
-            About.of(
-                machine.name, tuple(AxisAbout.of(each.config) for each in machine.axes), machine.cycle_s
-            ),
+            About(machine.name, machine.cycle_s, tuple(AxisAbout.of(each.config) for each in machine.axes)),
             machine.recorder,
             notify=bridge.core.log.note,
             in_use=lambda: {name: axis.models.in_use for name, axis in bridge.axes.items()},
         )
-        bridge.recorder = recorder.state
-        bridge.marks.append(recorder.mark)
+        bridge.recorder = recorder
         stack.callback(recorder.close)
         following = follow(machine, bridge, recorder, stack)
         sinks: list[Sink] = [Journal([*bridge.axes]), metrics, recorder, *following]

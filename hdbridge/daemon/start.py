@@ -61,8 +61,6 @@ class Start:
     """Listening sockets for the service, the Unix one first."""
     page_token: str | None = None
     """Token of the page on the last socket; None without a page."""
-    restarts: int = 0
-    """Number of earlier processes of this kind."""
     log: LogSettings = LogSettings()
 
     def hand_over(self, **changes: object) -> int:

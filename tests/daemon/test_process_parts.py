@@ -43,9 +43,9 @@ def test_a_folder_open_to_others_is_refused(tmp_path: Path) -> None:
 
 def test_a_child_reads_its_start_data() -> None:
     start = Start(Machine.find("article"), memory_fd=7, keeper=os.getpid())
-    fd = start.hand_over(restarts=2, api_fds=(8, 9))
+    fd = start.hand_over(api_fds=(8, 9))
     inherited = Start.inherited([str(fd)])
-    assert (inherited.machine, inherited.restarts, inherited.api_fds) == (start.machine, 2, (8, 9))
+    assert (inherited.machine, inherited.api_fds) == (start.machine, (8, 9))
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(fd)
 

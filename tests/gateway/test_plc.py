@@ -4,6 +4,7 @@ import errno
 import shutil
 import struct
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from support.raised import without_load_encoder
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
+from hdbridge.client.messages import RecorderState
 from hdbridge.daemon.gateway.objects import rest_deg
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import Cell, CommandKind
@@ -200,7 +202,7 @@ async def test_a_lost_sync_is_the_cause_even_if_the_set_points_end_before_it_is_
 
 async def test_a_fault_of_the_gateway_is_reported_once_with_its_cause_and_recorded(bench):
     kept: list[str] = []
-    bench.bridge.marks.append(kept.append)
+    bench.bridge.recorder = SimpleNamespace(mark=kept.append, state=lambda: RecorderState(on=False))
     await bench.enable()
     await swing(bench)
     await bench.wait(0.6)

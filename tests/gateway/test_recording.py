@@ -27,7 +27,7 @@ async def test_a_recording_has_the_targets_and_the_words_of_the_other_master(ben
     await bench.wait(1.0)
     assert bench.bridge.axes["axis1"].state().outer.latency_s is None
     sent, samples = plc.seen, reader.read()[0]
-    about = About.of("cell", (AxisAbout.of(bench.daemon.axes[0].config),), period_s)
+    about = About("cell", period_s, (AxisAbout.of(bench.daemon.axes[0].config),))
     log = FlightLog(tmp_path / "flights", RecorderSettings(), about)
     log.put(Batch(samples))
     log.close()

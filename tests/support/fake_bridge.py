@@ -10,6 +10,7 @@ import asyncio
 import time
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -106,9 +107,8 @@ class FakeAxis:
         self._moved(holder, "reset")
         self.at = messages.ControlState.DISABLED
 
-    async def home(self, holder: str, run: messages.Home) -> float:
+    async def home(self, holder: str, run: messages.Home) -> None:
         self._moved(holder, "home", run.method)
-        return 0.0
 
     async def move(
         self,
@@ -220,6 +220,7 @@ class FakeBridge:
         self.stopped: list[tuple[str, str]] = []
         self.streams: list[FakeStream] = []
         self.logged: list[messages.Event] = []
+        self.core = SimpleNamespace(observer=SimpleNamespace(lost=0))
         self.alive = True
         self.batch_s = 0.005
         self.rows = 5

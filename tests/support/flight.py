@@ -21,10 +21,10 @@ ROOM = 10**12
 def about(axes: int = 1) -> About:
     known = AxisAbout.of(AXIS)
     names = ("demo", "tilt", "roll", "lift", "wrist", "grip")
-    return About.of(
+    return About(
         "cell",
-        tuple(AxisAbout(each, known.ratio, known.text, known.identity) for each in names[:axes]),
         PERIOD_S,
+        tuple(AxisAbout(each, known.ratio, known.text, known.identity) for each in names[:axes]),
     )
 
 

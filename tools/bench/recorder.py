@@ -67,7 +67,7 @@ def _counted(angle_deg: Any, counts: int) -> Any:
 def as_recorded(samples: Any, rate: int, folder: Path) -> tuple[float, int]:
     """Returns the recorder's CPU time, s, and the number of bytes written."""
     axes = samples["axes"].shape[1]
-    about = About.of("bench", tuple(AxisAbout(f"axis{each}", RATIO) for each in range(axes)), 1.0 / rate)
+    about = About("bench", 1.0 / rate, tuple(AxisAbout(f"axis{each}", RATIO) for each in range(axes)))
     settings = RecorderSettings(free_mb=0.0, file_s=86_400.0, file_mb=4000.0)
     log = FlightLog(folder, settings, about)
     begun = time.thread_time()

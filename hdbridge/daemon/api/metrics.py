@@ -33,8 +33,6 @@ class Metrics:
         self.busy = Histogram()
         self.faults: Counter[tuple[int, str]] = Counter()
         """Number of events by axis index and name of the fault."""
-        self.lost = 0
-        """Cycles lost because the observer was too slow."""
 
     def take(self, samples: NDArray[np.void], events: Iterable[Any], lost: int) -> None:
         """Takes samples and events of the loop from the observer."""
@@ -44,7 +42,6 @@ class Metrics:
         for each in events:
             if each.kind == EventKind.FAULT and (fault := fault_of(each.code)) is not None:
                 self.faults[each.axis, fault.name] += 1
-        self.lost += lost
 
 
 class Histogram:
@@ -109,7 +106,8 @@ class _Scrape(Collector):
     """Collector of one scrape."""
 
     def __init__(self, bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> None:
-        self._state, self._metrics, self._traffic = bridge.state(), metrics, traffic
+        self._state, self._lost = bridge.state(), bridge.core.observer.lost
+        self._metrics, self._traffic = metrics, traffic
 
     def collect(self) -> Iterator[Metric]:
         """Yields the metrics of loop, faults, axes and API."""
@@ -127,7 +125,7 @@ class _Scrape(Collector):
         dropped = [((), state.recorder.dropped)]
         yield _counter("recorder_dropped", "Samples that the recorder dropped.", dropped)
         yield _gauge("lease_held", "1 if a client holds the lease.", [((), state.lease.held)])
-        yield _counter("samples_lost", "Cycles lost because the service was too slow.", [((), metrics.lost)])
+        yield _counter("samples_lost", "Cycles lost because the service was too slow.", [((), self._lost)])
         names = [each.name for each in state.axes]
         faults = [
             ((names[axis] if 0 <= axis < len(names) else "", fault), count)

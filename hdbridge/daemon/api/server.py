@@ -194,9 +194,7 @@ def _worth_logging(record: logging.LogRecord) -> bool:
 def _client(transport: asyncio.BaseTransport) -> tuple[str, int] | None:
     connected = transport.get_extra_info("socket")
     peer = peer_of(connected) if connected is not None else None
-    if peer is None:
-        return None
-    return f"uid={peer.uid}", peer.pid
+    return (f"uid={peer.uid}", peer.pid) if peer is not None else None
 
 
 def _config(app: Any, listener: Listener, traffic: Traffic) -> uvicorn.Config:

@@ -9,7 +9,7 @@ clock, because observations contain the time.
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -95,13 +95,12 @@ class Adaptation:
         whole: DriftModel,
         settings: AdaptationSettings,
         sigma_arcsec: float,
-        log: Callable[[Entry], None],
         learned: Learned | None,
     ) -> None:
         """``whole`` is the committed model to which the observations refer; ``sigma_arcsec`` their noise.
 
-        ``log`` takes the lines of the history. ``learned`` is the state of an earlier adaptation of this
-        model. Raises InputError if ``settings`` name a parameter that the model lacks.
+        ``learned`` is the state of an earlier adaptation of this model. Raises InputError if ``settings``
+        name a parameter that the model lacks.
         """
         self.settings = settings
         self.mode: Mode = settings.mode
@@ -110,12 +109,13 @@ class Adaptation:
         self.freeze_reason: Freeze | None = None
         self.windows = 0
         """Number of learned windows."""
+        self.entries: list[Entry] = []
+        """Lines of the history that have not been written yet."""
         self._drift = drift = DriftModel(whole.model, settings.parameters)
         self._columns = drift.columns_in(whole)
         self._estimator = calibrated_estimator(drift, settings)
         self._bounds = bounds_arcsec(drift, settings)
         self._sigma_arcsec = sigma_arcsec
-        self._log = log
         self._now_s = 0.0
         self._window: list[Observation] = []
         self._zero_arcsec: float | None = None
@@ -263,9 +263,9 @@ class Adaptation:
         """Returns the state to preserve over a restart."""
         estimator = self._estimator
         return Learned(
-            estimate=tuple(estimator.estimate.tolist()),
-            covariance=tuple(tuple(row) for row in estimator.covariance.tolist()),
-            applied=tuple(self._used.tolist()),
+            estimate=estimator.estimate.tolist(),
+            covariance=estimator.covariance.tolist(),
+            applied=self._used.tolist(),
             windows=self.windows,
             response=None if self.model.response is self.committed.response else self.model.response,
         )
@@ -449,7 +449,7 @@ class Adaptation:
         return replace(model, uncertainty=uncertainty, provenance=provenance, response=response)
 
     def _log_event(self, event: str, **facts: Any) -> None:
-        self._log({"event": event, "axis_time_s": self._now_s, **facts})
+        self.entries.append({"event": event, "axis_time_s": self._now_s, **facts})
 
 
 def _changes_json(changes: Sequence[Change]) -> dict[str, dict[str, float]]:

@@ -12,13 +12,13 @@ Parameters may be held: their uncertainty is accounted for, but neither they nor
 (Schmidt's consider filter). Without forgetting, the result is that of `analysis.linear` for one batch.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from hdbridge.analysis import intervals
 from hdbridge.analysis.intervals import NORMAL_95, Interval, leaves, nested_half_widths, slopes
 from hdbridge.analysis.linear import Column, Linearised
 from hdbridge.axis.effects import BoolArray, Effect, FloatArray
@@ -65,11 +65,11 @@ class Estimator:
         *,
         retention: float = 1.0,
         held: BoolArray | None = None,
-    ) -> int:
+    ) -> None:
         """Updates the estimate with a batch: rows (n, p), observed (n,), noise standard deviation.
 
-        Returns the number of excited directions. ``retention`` is the share of the old information that
-        remains along them (1 without forgetting). Parameters in ``held`` (p,) do not change.
+        ``retention`` is the share of the old information that remains along excited directions (1 without
+        forgetting). Parameters in ``held`` (p,) do not change.
         """
         free = np.ones(len(self.estimate), dtype=bool) if held is None else ~held
         scale = self.scale[free]
@@ -78,7 +78,7 @@ class Estimator:
         values, vectors = np.linalg.eigh(cross[:, free] * scale)
         seen = values > max(NOTHING * values[-1], 1e-300) if len(values) else np.zeros(0, dtype=bool)
         if not np.any(seen):
-            return 0
+            return
         values, vectors = values[seen], vectors[:, seen]
         excited = values >= EXCITED
         if retention < 1.0 and np.any(excited):
@@ -96,7 +96,6 @@ class Estimator:
         left = np.eye(len(self.estimate)) - gain @ directions
         after = left @ self.covariance @ left.T + (gain / values) @ gain.T
         self.covariance = 0.5 * (after + after.T)
-        return int(np.count_nonzero(excited))
 
 
 def calibrated_estimator(drift: DriftModel, settings: AdaptationSettings) -> Estimator:
@@ -132,8 +131,7 @@ def half_widths(effect: Effect, covariance: FloatArray, before: Mapping[str, Any
     """
     values = dict(leaves(effect.parameters()))
     found = {name: half for name, half in leaves(dict(before)) if name in values}
-    for name, slope in _slopes(effect).items():
-        found[name] = NORMAL_95 * math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+    found |= intervals.half_widths(effect, _columns(effect), covariance)
     return nested_half_widths(
         effect, [Interval(effect.name, name, values[name], half) for name, half in found.items()]
     )
@@ -143,7 +141,8 @@ def _covariance(effect: Effect, uncertainty: Mapping[str, Any], scale: FloatArra
     """Returns the coefficients' covariance from the parameters' half widths, else from the scale."""
     halves = dict(leaves(dict(uncertainty)))
     information = np.diag(1.0 / scale**2)
-    for name, slope in _slopes(effect).items():
+    columns = _columns(effect)
+    for name, slope in slopes(effect, columns, np.full(len(columns), STEP_ARCSEC)).items():
         if name in halves:
             size = float(np.linalg.norm(slope))
             sigma = max(halves[name] / NORMAL_95, LEAST_ARCSEC * size)
@@ -151,10 +150,9 @@ def _covariance(effect: Effect, uncertainty: Mapping[str, Any], scale: FloatArra
     return np.asarray(np.linalg.inv(information))
 
 
-def _slopes(effect: Effect) -> dict[str, FloatArray]:
-    """Returns the derivatives of each parameter with respect to the coefficients, (c,) each."""
-    count = len(effect.coefficients())
-    return slopes(effect, [Column(0, str(number)) for number in range(count)], np.full(count, STEP_ARCSEC))
+def _columns(effect: Effect) -> list[Column]:
+    """Returns the columns of all coefficients of an effect."""
+    return [Column(0, str(number)) for number in range(len(effect.coefficients()))]
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from hdbridge.axis.channels import BY_KEY
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import Response
 from hdbridge.client import messages
-from hdbridge.daemon.following.adaptation import Adaptation, Entry, Proposal
+from hdbridge.daemon.following.adaptation import Adaptation, Proposal
 from hdbridge.daemon.following.health import (
     DRIVEN,
     ZERO_UNKNOWN,
@@ -95,8 +95,6 @@ class Follower:
         self._waiting: list[SampleArray] = []
         self._next_cycle: int | None = None
         self._files: AdaptationFiles | None = None
-        self._entries: list[Entry] = []
-        """Lines of the history that have not been written yet."""
         self._saved_windows = 0
         self._saved_s = -math.inf
         self._now_s = 0.0
@@ -113,9 +111,7 @@ class Follower:
         if self.adaptation is None:
             settings = self._settings.model_copy(update={"mode": mode})
             learned = files.load() if files is not None else None
-            self.adaptation = Adaptation(
-                self._drift, settings, self._sigma_arcsec, self._entries.append, learned
-            )
+            self.adaptation = Adaptation(self._drift, settings, self._sigma_arcsec, learned)
             self._files = files
         else:
             self._zero.forget()
@@ -170,10 +166,10 @@ class Follower:
         if self.adaptation is not None:
             fault = "the supervision has stopped the axis" if np.any(stopped) else status.reason
             proposal = self.adaptation.take(settled, self._now_s, fault, self._zero.rates)
-            proposal = proposal or self._refinement()
+            proposal = proposal or self._refinement(self.adaptation)
             if proposal is not None and proposal.apply:
                 self._applied(proposal)
-            elif self._entries or self._now_s - self._saved_s >= SAVE_S:
+            elif self.adaptation.entries or self._now_s - self._saved_s >= SAVE_S:
                 self.save()
         return Outcome(raised, proposal)
 
@@ -182,10 +178,8 @@ class Follower:
         self.health.restart()
         self._servo.use(model.response)
 
-    def _refinement(self) -> Proposal | None:
+    def _refinement(self, adaptation: Adaptation) -> Proposal | None:
         """Returns the proposal of a refined response if due."""
-        adaptation = self.adaptation
-        assert adaptation is not None
         if adaptation.freeze_reason is not None:
             self._servo.forget_load()
         if not adaptation.may_refine:
@@ -225,10 +219,10 @@ class Follower:
 
     def save(self) -> None:
         """Writes the history, and the state if it has changed."""
-        adaptation, entries = self.adaptation, tuple(self._entries)
-        self._entries.clear()
-        if adaptation is None or not (entries or adaptation.windows != self._saved_windows):
+        adaptation = self.adaptation
+        if adaptation is None or not (adaptation.entries or adaptation.windows != self._saved_windows):
             return
+        entries, adaptation.entries = adaptation.entries, []
         self._saved_s, self._saved_windows = self._now_s, adaptation.windows
         if self._files is not None:
             self._files.write(entries, adaptation.learned())

@@ -34,7 +34,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.analysis.readings import jitter_deg
+from hdbridge.analysis.readings import jitter_deg, median_deviation
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import BoolArray, FloatArray
 from hdbridge.axis.model import TransmissionModel
@@ -62,8 +62,6 @@ SWING = 3.0
 """Largest step of the residual while the load oscillates, relative to its wind-up or to the usual step."""
 FADE_S = 0.4
 """Time constant of the load's oscillation."""
-MEDIAN_DIFFERENCE = 1.0 / (0.6745 * np.sqrt(2.0))
-"""Standard deviation of Gaussian values, relative to the median difference of neighbours."""
 ZERO_UNKNOWN: Final = (AxisState.UNVERIFIED, AxisState.LENT, AxisState.LATCHED)
 """States after which the encoders' zeros may have changed."""
 TAIL = 64
@@ -302,14 +300,7 @@ class EncoderHealth:
         self._noisy_blocks = 0
         self._bad_s = -math.inf
         self._now_s = 0.0
-        self._tail: SampleArray | None = None
-        """Last samples, which are evaluated again with the next ones."""
-        self._held: tuple[float, float] | None = None
-        """Last load reading, and the motor angle at which it last changed; degrees."""
-        self._pending: dict[bool, list[Residuals]] = {True: [], False: []}
-        """Samples of the incomplete blocks at rest (True) and in motion (False)."""
-        self._since: tuple[bool, float] = (True, -math.inf)
-        """True at rest, and the time at which this rest or motion began."""
+        self.restart()
 
     def reset(self) -> None:
         """Ends a fault, after maintenance or after the encoder's zero was set."""
@@ -319,9 +310,14 @@ class EncoderHealth:
 
     def restart(self) -> None:
         """Forgets the last samples, for example after a change of the predicting model."""
-        self._tail, self._held = None, None
-        self._pending = {True: [], False: []}
+        self._tail: SampleArray | None = None
+        """Last samples, which are evaluated again with the next ones."""
+        self._held: tuple[float, float] | None = None
+        """Load reading that does not change, and the motor angle since when."""
+        self._pending: dict[bool, list[Residuals]] = {True: [], False: []}
+        """Samples of the incomplete blocks at rest (True) and in motion (False)."""
         self._since = (True, -math.inf)
+        """True at rest, and the time since when."""
 
     def take(self, samples: SampleArray) -> EncoderStatus:
         """Judges the next samples of the loop, oldest first: a tenth of a second or more at a time."""
@@ -387,8 +383,7 @@ class EncoderHealth:
     def _judge_steps(self, found: Residuals) -> None:
         noise = self._usual(standing=bool(np.all(_standing(found))))
         if len(found) > 1:
-            differences = np.abs(np.diff(found["residual_arcsec"]))
-            noise = max(noise, MEDIAN_DIFFERENCE * float(np.median(differences)))
+            noise = max(noise, median_deviation(np.diff(found["residual_arcsec"])) / math.sqrt(2.0))
         swing = SWING * SOFTEST_S2
         if len(self._swings_s2) >= LEARNING_BLOCKS:
             swing = SWING * float(np.clip(np.quantile(self._swings_s2, 0.9), STIFFEST_S2, SOFTEST_S2))

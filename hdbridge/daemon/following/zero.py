@@ -82,31 +82,28 @@ class Zero:
 
     def __init__(self, drift: DriftModel, sigma_arcsec: float) -> None:
         """``sigma_arcsec`` is the standard deviation of a single sample due to the encoders' counts."""
-        self.rates: list[Rate] = []
-        """Rates of the last fit, one per span with enough observations."""
-        self.moved: Displacement | None = None
-        """Displacement by the last fit; None until the zero is learned."""
         self._judged = bool(drift.model.effects)
         """False without a prediction, because the gear's own error may look like a moving zero."""
         self._sigma_arcsec = COUNTS_SHARE * sigma_arcsec
         self._at = 2 + drift.zero
         scale = calibrated_estimator(drift, AdaptationSettings()).scale
         self._information = np.concatenate([[0.0, SPEED_ARCSEC**-2], scale**-2])
-        self._recent: deque[Observation] = deque()
         self._judged_s = 0.0
-        self._suspicions = 0
-        self._learned: tuple[Displacement, FloatArray] | None = None
-        """Zero, and coefficients of the disc, when they were learned."""
+        self.restart()
 
     def restart(self) -> None:
         """Learns the zero again, because the drive was verified or homed."""
         self.forget()
-        self._learned = self.moved = None
+        self.moved: Displacement | None = None
+        """Displacement at the last judgement; None until the zero is learned."""
+        self._learned: tuple[Displacement, FloatArray] | None = None
+        """Zero, and coefficients of the disc, when they were learned."""
 
     def forget(self) -> None:
         """Forgets the observations, but not the zero that was learned."""
-        self.rates.clear()
-        self._recent.clear()
+        self.rates: list[Rate] = []
+        """Rates at the last judgement, one per span with enough observations."""
+        self._recent: deque[Observation] = deque()
         self._suspicions = 0
 
     def take(self, observations: Sequence[Observation]) -> tuple[EncoderFault, str] | None:
@@ -145,11 +142,10 @@ class Zero:
     ) -> tuple[FloatArray, FloatArray, float]:
         """Returns the coefficients, their standard errors and the residual mean square."""
         sigma = self._sigma_arcsec
-        change, _ = ranged_fit(rows, error_arcsec, sigma, information)
-        left = error_arcsec - rows @ change
-        sigma = max(sigma, float(np.sqrt(left @ left / (len(left) - FREE_COLUMNS))))
-        change, covariance = ranged_fit(rows, error_arcsec, sigma, information)
-        left = error_arcsec - rows @ change
+        for _ in range(2):  # the second pass uses the residual noise of the first
+            change, covariance = ranged_fit(rows, error_arcsec, sigma, information)
+            left = error_arcsec - rows @ change
+            sigma = max(sigma, float(np.sqrt(left @ left / (len(left) - FREE_COLUMNS))))
         errors = np.sqrt(np.diag(covariance) * correlated(left))
         return change, errors, float(left @ left) / len(left)
 

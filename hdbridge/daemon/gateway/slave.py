@@ -313,11 +313,10 @@ class Gateway:
             for sub, read in enumerate(load.values(), start=1):
                 node.dictionary[BRIDGE, sub].bind(read)
             self.axes[axis.name], self.nodes[axis.name] = load, node
-        self._served = tuple(self.nodes.values())
 
     def handle(self, message: can.Message, now_s: float) -> None:
         self._look(now_s)
-        for node in self._served:
+        for node in self.nodes.values():
             node.handle(message, now_s)
 
     def poll(self, now_s: float) -> None:
@@ -328,7 +327,7 @@ class Gateway:
             if message is None:
                 break
             now_s = self._clock.now()
-            for node in self._served:
+            for node in self.nodes.values():
                 node.handle(message, now_s)
         self.run_until(now_s)
 
@@ -341,11 +340,11 @@ class Gateway:
 
     def next_event_s(self) -> float:
         """Returns the latest time of the next poll."""
-        return min(node.next_event_s() for node in self._served)
+        return min(node.next_event_s() for node in self.nodes.values())
 
     def bus_failed(self) -> None:
         """Handles a failure of the outer interface: each axis stops as selected by its 6007h."""
-        for node in self._served:
+        for node in self.nodes.values():
             node.bus_failed()
 
     def _look(self, now_s: float) -> None:

@@ -95,50 +95,52 @@ class Trace:
         self.mistakes: Counter[str] = Counter()
         """Number of occurrences of each piece of advice."""
         self._begun_s: float | None = None
+        self._time_s = 0.0
+        """Time of the present frame."""
         self._lines: list[Line] = []
 
     # ---------------------------------------------------------------- frames
 
     def take(self, frame: Frame) -> list[Line]:
         """Takes a frame; returns the resulting lines."""
-        self._lines = []
+        self._lines, self._time_s = [], frame.time_s
         if self._begun_s is None:
             self._begun_s = frame.time_s
         can_id, data, node = frame.can_id, frame.data, self._node
         if can_id == 0x000 and len(data) >= 2 and data[1] in (0, node):
-            self._say(frame.time_s, f"NMT {_NMT.get(data[0], f'command {data[0]}')}")
+            self._say(f"NMT {_NMT.get(data[0], f'command {data[0]}')}")
         elif can_id == self._value(0x1005) & 0x7FF:
-            self._on_sync(frame.time_s)
+            self._on_sync()
         elif can_id == 0x700 + node and data:
-            self._on_own_heartbeat(frame.time_s, data[0])
+            self._on_own_heartbeat(data[0])
         elif can_id & 0x780 == 0x700:
             self._heartbeat_s[can_id & 0x7F] = frame.time_s
         elif can_id == 0x600 + node and len(data) == 8:
             self._on_request(data)
         elif can_id == 0x580 + node and len(data) == 8:
-            self._on_answer(frame.time_s, data)
+            self._on_answer(data)
         elif can_id == 0x7E5 and len(data) == 8:
             self._lss = data
         elif can_id == 0x7E4 and len(data) == 8:
-            self._on_lss_answer(frame.time_s, data)
+            self._on_lss_answer(data)
         elif can_id == self._value(0x1014) & 0x7FF and len(data) == 8:
             code = int.from_bytes(data[:2], "little")
-            self._say(frame.time_s, f"EMCY {gateway_error(code)}" if code else "EMCY: error reset")
+            self._say(f"EMCY {gateway_error(code)}" if code else "EMCY: error reset")
         else:
             self._on_pdo(frame)
-        self._watch(frame.time_s)
+        self._watch()
         return self._lines
 
-    def _say(self, time_s: float, text: str, advice: str = "") -> None:
-        self._lines.append(Line(time_s, text, advice))
+    def _say(self, text: str, advice: str = "") -> None:
+        self._lines.append(Line(self._time_s, text, advice))
         if advice:
             self.mistakes[advice] += 1
 
-    def _say_once(self, time_s: float, key: str, text: str, advice: str) -> None:
+    def _say_once(self, key: str, text: str, advice: str) -> None:
         """Reports a lasting mistake once, until `_over`."""
         if key not in self._reported:
             self._reported.add(key)
-            self._say(time_s, text, advice)
+            self._say(text, advice)
 
     def _over(self, key: str) -> None:
         self._reported.discard(key)
@@ -153,19 +155,19 @@ class Trace:
         elif command >> 5 == 2:
             self._pending = index, sub, None
 
-    def _on_answer(self, time_s: float, data: bytes) -> None:
+    def _on_answer(self, data: bytes) -> None:
         command, index, sub = _MULTIPLEXER.unpack_from(data)
         pending, self._pending = self._pending, None
         if command == 0x80:
-            self._on_abort(time_s, index, sub, int.from_bytes(data[4:], "little"), pending)
+            self._on_abort(index, sub, int.from_bytes(data[4:], "little"), pending)
         elif command == 0x60 and pending is not None and pending[2] is not None:
-            self._on_written(time_s, index, sub, pending[2])
+            self._on_written(index, sub, pending[2])
         elif command & 0xE2 == 0x42:
             raw = data[4 : 8 - (command >> 2 & 3 if command & 1 else 0)]
-            self._on_value(time_s, index, int.from_bytes(raw, "little"), sub)
+            self._on_value(index, int.from_bytes(raw, "little"), sub)
 
     def _on_abort(
-        self, time_s: float, index: int, sub: int, code: int, pending: tuple[int, int, bytes | None] | None
+        self, index: int, sub: int, code: int, pending: tuple[int, int, bytes | None] | None
     ) -> None:
         what = self._name(index, sub)
         if pending is not None and pending[2] is not None:
@@ -183,37 +185,37 @@ class Trace:
         ):
             advice = f"expected {variable.min} to {variable.max}"
         text = SdoAbortedError.CODES.get(code, "manufacturer-specific")
-        self._say(time_s, f"{what}: refused with {code:08X}h ({text})", advice)
+        self._say(f"{what}: refused with {code:08X}h ({text})", advice)
 
-    def _on_written(self, time_s: float, index: int, sub: int, raw: bytes) -> None:
+    def _on_written(self, index: int, sub: int, raw: bytes) -> None:
         value = self._number(index, sub, raw)
         if index == 0x6040:
-            self._on_controlword(time_s, value & 0xFFFF)
+            self._on_controlword(value & 0xFFFF)
             return
         if index == 0x607A:
-            self._on_target(time_s, value)
+            self._on_target(value)
             return
         self._values[index, sub] = self.written[index, sub] = value
-        self._say(time_s, self._assignment(index, sub, value))
+        self._say(self._assignment(index, sub, value))
 
-    def _on_value(self, time_s: float, index: int, value: int, sub: int) -> None:
+    def _on_value(self, index: int, value: int, sub: int) -> None:
         if index == 0x6041:
-            self._on_statusword(time_s, value)
+            self._on_statusword(value)
         elif (index, sub) in ((0x6064, 0), (0x6502, 0)):
             self._values[index, sub] = value
             if index == 0x6064:
                 self._position = wrap_int32(value)
 
-    def _on_lss_answer(self, time_s: float, data: bytes) -> None:
+    def _on_lss_answer(self, data: bytes) -> None:
         """Reports a change by LSS, and a node that was found; inquiries change nothing."""
         command, value = self._lss[:2]
         if data[0] in (0x44, 0x4F, 0x50):
-            self._say_once(time_s, f"LSS {data[0]}", _LSS_FOUND[data[0]], "")
+            self._say_once(f"LSS {data[0]}", _LSS_FOUND[data[0]], "")
         elif data[0] == command and command in _LSS:
             name, advice = _LSS[command]
             words = f"LSS {name}" + f" {value}" * (command == 0x11)
             refused = f": refused with error {data[1]}" if data[1] else ""
-            self._say(time_s, words + refused, advice if refused else "")
+            self._say(words + refused, advice if refused else "")
 
     # ---------------------------------------------------------------- PDO and SYNC
 
@@ -237,43 +239,41 @@ class Trace:
             if len(frame.data) != length:
                 key = f"length of {frame.can_id:03X}h"
                 self._say_once(
-                    frame.time_s, key, f"RPDO {frame.can_id:03X}h has {len(frame.data)} bytes",
+                    key, f"RPDO {frame.can_id:03X}h has {len(frame.data)} bytes",
                     f"{length} bytes are mapped in {index + 0x200:04X}h",
                 )  # fmt: skip
                 return
             if self._nmt not in (None, 0x05):
                 state = _NMT_STATES.get(self._nmt or 0, "reset")
-                self._say_once(
-                    frame.time_s, "early", f"RPDO {frame.can_id:03X}h in {state}",
-                    "RPDOs count in OPERATIONAL only: NMT start first",
-                )  # fmt: skip
+                advice = "RPDOs count in OPERATIONAL only: NMT start first"
+                self._say_once("early", f"RPDO {frame.can_id:03X}h in {state}", advice)
         place = 0
         for index_, sub, size in mapping:
             value = int.from_bytes(frame.data[place : place + size], "little")
             place += size
             if index_ == 0x6040:
-                self._on_controlword(frame.time_s, value)
+                self._on_controlword(value)
             elif index_ == 0x607A:
-                self._on_target(frame.time_s, wrap_int32(value))
+                self._on_target(wrap_int32(value))
             else:
-                self._on_value(frame.time_s, index_, value, sub)
+                self._on_value(index_, value, sub)
 
-    def _on_sync(self, time_s: float) -> None:
-        before_s, self._sync_s = self._sync_s, time_s
+    def _on_sync(self) -> None:
+        before_s, self._sync_s = self._sync_s, self._time_s
         self._over("no SYNC")
         if before_s is None:
             return
-        interval_s = time_s - before_s
+        interval_s = self._time_s - before_s
         usual_s = self.period_s
         self._intervals_s = [*self._intervals_s[-999:], interval_s]
         if usual_s is not None and interval_s > _LATE * usual_s and len(self._intervals_s) > 10:
             self._say(
-                time_s, f"SYNC after {1000 * interval_s:.1f} ms, usually {1000 * usual_s:.2f} ms",
+                f"SYNC after {1000 * interval_s:.1f} ms, usually {1000 * usual_s:.2f} ms",
                 "SYNC must be periodic: four periods without it stop the axis in a cyclic mode (8700h)",
             )  # fmt: skip
         if self._enabled_cyclic and not self._rpdos_since_sync:
             self._say_once(
-                time_s, "no RPDO", "SYNC without an RPDO while enabled in a cyclic mode",
+                "no RPDO", "SYNC without an RPDO while enabled in a cyclic mode",
                 "send a target before every SYNC; without one the axis stops at the last",
             )  # fmt: skip
         elif self._rpdos_since_sync:
@@ -297,16 +297,16 @@ class Trace:
     def _enabled_cyclic(self) -> bool:
         return self._state is State.OPERATION_ENABLED and self._value(0x6060) in _CYCLIC
 
-    def _on_controlword(self, time_s: float, word: int) -> None:
+    def _on_controlword(self, word: int) -> None:
         before, self._word = self._word, word
         if not word & 0x80:
             self._reset_since_s = None
             self._over("reset")
         elif self._reset_since_s is None:
-            self._reset_since_s = time_s
-        elif word != before or (self._state is State.FAULT and time_s - self._reset_since_s > 0.2):
+            self._reset_since_s = self._time_s
+        elif word != before or (self._state is State.FAULT and self._time_s - self._reset_since_s > 0.2):
             self._say_once(
-                time_s, "reset", f"controlword {word:04X}h: fault reset held",
+                "reset", f"controlword {word:04X}h: fault reset held",
                 "bit 7 acts by its rising edge, and no other command acts while it is set: take it back to 0",
             )  # fmt: skip
         if word == before:
@@ -318,7 +318,7 @@ class Trace:
             advice = "the drive is in fault: an edge of bit 7 resets it"
         elif word & 0x8F == 0x0F and self._state in _READY and self._value(0x6060) in _CYCLIC:
             advice = self._start_advice()
-        self._say(time_s, f"controlword {word:04X}h: {_command(word)}", advice)
+        self._say(f"controlword {word:04X}h: {_command(word)}", advice)
 
     def _start_advice(self) -> str:
         if not self._targets or self._position is None:
@@ -328,19 +328,17 @@ class Trace:
             return ""
         return f"the target is {off} increments from 6064h: set it to the actual position before enabling"
 
-    def _on_statusword(self, time_s: float, word: int) -> None:
+    def _on_statusword(self, word: int) -> None:
         state = decode(word & 0xFFFF)
         if state is not self._state:
-            self._say(time_s, f"statusword {word:04X}h: {state.value}")
+            self._say(f"statusword {word:04X}h: {state.value}")
             self._state = state
             self._targets = self._targets[-1:]
 
-    def _on_target(self, time_s: float, target: int) -> None:
+    def _on_target(self, target: int) -> None:
         low, high = self._value(0x607D, 1), self._value(0x607D, 2)
         if low < high and not low <= target <= high:
-            self._say_once(
-                time_s, "limit", f"607Ah = {target}", f"the software limits (607Dh) are {low} to {high}"
-            )
+            self._say_once("limit", f"607Ah = {target}", f"the software limits (607Dh) are {low} to {high}")
         else:
             self._over("limit")
         if self._enabled_cyclic and self._targets and (period_s := self.period_s):
@@ -349,37 +347,37 @@ class Trace:
             if fastest and speed > 1.01 * fastest:
                 step = target - self._targets[-1]
                 self._say_once(
-                    time_s, "speed", f"607Ah moved by {step} in one SYNC: {speed:.0f} inc/s",
+                    "speed", f"607Ah moved by {step} in one SYNC: {speed:.0f} inc/s",
                     f"the axis is not faster than 607Fh = {fastest} inc/s; it lags behind such targets",
                 )  # fmt: skip
             else:
                 self._over("speed")
         self._targets = [target]
 
-    def _on_own_heartbeat(self, time_s: float, state: int) -> None:
+    def _on_own_heartbeat(self, state: int) -> None:
         if state == 0:
             self._values = _defaults(self._od)
             self.written.clear()
-            self._say(time_s, "boot-up: parameters that were not saved (1010h) are those of the EDS")
+            self._say("boot-up: parameters that were not saved (1010h) are those of the EDS")
         elif state & 0x7F != self._nmt:
-            self._say(time_s, f"NMT state {_NMT_STATES.get(state & 0x7F, f'{state:02X}h')}")
+            self._say(f"NMT state {_NMT_STATES.get(state & 0x7F, f'{state:02X}h')}")
         self._nmt = state & 0x7F or 0x7F
 
-    def _watch(self, time_s: float) -> None:
+    def _watch(self) -> None:
         """Checks for missing frames."""
         assert self._begun_s is not None
         heard_s = self._sync_s if self._sync_s is not None else self._begun_s
-        if self._enabled_cyclic and time_s - heard_s > _QUIET_S:
+        if self._enabled_cyclic and self._time_s - heard_s > _QUIET_S:
             self._say_once(
-                time_s, "no SYNC", f"no SYNC for {_QUIET_S:g} s while enabled in a cyclic mode",
+                "no SYNC", f"no SYNC for {_QUIET_S:g} s while enabled in a cyclic mode",
                 "cyclic modes need SYNC; 1005h has its identifier",
             )  # fmt: skip
         word = self.written.get((0x1016, 1), 0)
         watched, wanted_s = word >> 16 & 0x7F, 1e-3 * (word & 0xFFFF)
         beat_s = self._heartbeat_s.get(watched, self._begun_s)
-        if watched and wanted_s and time_s - beat_s > max(_QUIET_S, wanted_s):
+        if watched and wanted_s and self._time_s - beat_s > max(_QUIET_S, wanted_s):
             self._say_once(
-                time_s, "heartbeat",
+                "heartbeat",
                 f"1016h:01 expects node {watched} every {1000 * wanted_s:.0f} ms; none is heard",
                 "let the master send its heartbeat, or write 0 to 1016h:01",
             )  # fmt: skip

@@ -17,17 +17,7 @@ from hdbridge.daemon.loop.feeds import KnotFeed, OuterFeed
 from hdbridge.daemon.loop.follower import Follower
 from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, AxisState, Cause, Happening, refusal, target_of
 from hdbridge.daemon.machinefile import LoadLoopSettings
-from hdbridge.daemon.memory.cells import OuterCells, SettingSlot
-from hdbridge.daemon.memory.channels import Queue
-from hdbridge.daemon.memory.layout import (
-    NO_FAULT,
-    Command,
-    CommandKind,
-    EventKind,
-    Knot,
-    OuterKnot,
-    SampleFlag,
-)
+from hdbridge.daemon.memory import NO_FAULT, Command, CommandKind, EventKind, Memory, SampleFlag
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.feedback import ENABLE_TIMEOUT_S, STOP_TIMEOUT_S, Feedback
 from hdbridge.drive.image import ProcessImage
@@ -58,16 +48,11 @@ class AxisLoop:
         index: int,
         config: AxisConfig,
         load_loop: LoadLoopSettings | None,
-        knots: Queue[Knot],
-        slot: SettingSlot,
+        memory: Memory,
         report: Report,
-        followed: Queue[OuterKnot],
-        outer: OuterCells,
         due_s: Callable[[], float],
     ) -> None:
-        """``followed`` has the gateway's set-points, ``outer`` its states; ``due_s`` returns the due time of
-        the present turn.
-        """
+        """``index`` is its place in ``memory``; ``due_s`` returns the due time of the present turn."""
         self.index = index
         self.config = config
         self.state = AxisState.UNVERIFIED
@@ -81,14 +66,14 @@ class AxisLoop:
         self.broken: frozenset[int] = frozenset()
         """Group whose stream this axis left before its end; the controller stops the others."""
 
-        self._slot, self._report = slot, report
-        slot.use(0)
-        self._feed = KnotFeed(knots, self.set_point)
-        self._outer, self._due_s = OuterFeed(followed), due_s
+        self._slot, self._report = memory.settings[index], report
+        self._slot.use(0)
+        self._feed = KnotFeed(memory.knots[index], self.set_point)
+        self._outer, self._due_s = OuterFeed(memory.followed[index]), due_s
         self._faults = FaultLog(self.supervision, report, config.drive.cycle_s)
         self._period_s = config.drive.cycle_s
         self._follow = self.follower.follow
-        self._outer_cells = outer
+        self._outer_cells = memory.outer[index]
         self._motor_deg = config.motor_encoder.degrees(1)
         encoder = config.load_encoder
         self._load_deg = math.nan if encoder.is_motor_encoder else encoder.degrees(1)
@@ -175,13 +160,10 @@ class AxisLoop:
         if id_:
             self._report(EventKind.DONE, id_, 0)
 
-    def _happened(self, cause: Cause) -> bool:
-        """Makes the transition for ``cause``; returns True if the state changed."""
-        target = target_of(self.state, cause)
-        if target is None or target is self.state:
-            return False
-        self._enter(target)
-        return True
+    def _happened(self, cause: Cause) -> None:
+        """Makes the transition for ``cause``, if there is one in this state."""
+        if (target := target_of(self.state, cause)) is not None:
+            self._enter(target)
 
     def _enter(self, state: AxisState) -> None:
         """Enters a state: switches power off, quick-stops or ends motion, and answers waiting commands."""

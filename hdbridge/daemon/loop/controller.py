@@ -7,7 +7,6 @@ compensation, runs after the RPDOs of one cycle and before the wait for the next
 """
 
 import os
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
@@ -58,17 +57,7 @@ class Controller:
         self.cycle = cycle
         self.memory = memory
         self.axes = tuple(
-            AxisLoop(
-                index,
-                config,
-                load_loop,
-                memory.knots[index],
-                memory.settings[index],
-                partial(self._report, index),
-                memory.followed[index],
-                memory.outer[index],
-                lambda: cycle.due_s,
-            )
+            AxisLoop(index, config, load_loop, memory, partial(self._report, index), lambda: cycle.due_s)
             for index, (config, load_loop) in enumerate(axes)
         )
         for axis in self.axes:
@@ -131,7 +120,7 @@ class Controller:
             *values,
         ))  # fmt: skip
         self._turns += 1
-        self.memory.status.turned(self._turns, time.monotonic_ns())
+        self.memory.status[Cell.LOOP_COUNT] = self._turns
 
     def _report(self, axis: int, kind: EventKind, id_: int = 0, code: int = 0, text: str = "") -> None:
         cycle = self.cycle
@@ -143,8 +132,7 @@ class Controller:
     def _take_commands(self) -> None:
         take = self.memory.commands.take
         for _ in range(COMMANDS_A_TURN):
-            command = take()
-            if command is None:
+            if (command := take()) is None:
                 break
             self._command(command)
 

@@ -90,22 +90,19 @@ class OuterFeed:
 
     def __init__(self, knots: Queue[OuterKnot]) -> None:
         self._knots = knots
-        self._series = 0
-        self._patience_s = 0.0
+        self.begin(0, 0.0, 0.0, 0.0)
+
+    def begin(self, series: int, patience_s: float, time_s: float, position_deg: float) -> None:
+        """Begins at rest; ``patience_s`` is the maximum time at rest without a set-point."""
+        self._series, self._patience_s = series, patience_s
         self.received_s = math.nan
         """Time of reception of the newest set-point; NaN before the first."""
         self.spacing_s = 0.0
         """Time between the last two set-points, at most `LONGEST_SPACING_S`."""
-        self._first = True
-        self._last_s = self._last_deg = self._rate_deg_s = self._end_s = 0.0
-        """Time and position of the last set-point, the velocity to it, and the time limit for the next."""
-
-    def begin(self, series: int, patience_s: float, time_s: float, position_deg: float) -> None:
-        """Begins at rest; ``patience_s`` is the maximum time at rest without a set-point."""
-        self._series, self._patience_s, self.received_s = series, patience_s, math.nan
-        self._first, self._last_deg, self._rate_deg_s, self.spacing_s = True, position_deg, 0.0, 0.0
-        self._last_s = -math.inf
+        self._last_s, self._last_deg, self._rate_deg_s = -math.inf, position_deg, 0.0
+        """Time and position of the last set-point, and the velocity to it."""
         self._end_s = time_s + FIRST_KNOT_S
+        """Time at which the set-points end."""
 
     def at(self, time_s: float) -> float | None:
         """Returns the position at a time, which must not decrease; None once the set-points have ended."""
@@ -120,7 +117,7 @@ class OuterFeed:
                 continue
             if math.isnan(position_deg):
                 return None
-            if self._first or due_s > self._last_s:
+            if due_s > self._last_s:
                 self._take(time_s, due_s, position_deg)
                 self.received_s = received_s
         if time_s > self._end_s:
@@ -130,9 +127,9 @@ class OuterFeed:
 
     def _take(self, time_s: float, due_s: float, position_deg: float) -> None:
         """Continues with the next set-point; the first is approached from the present time."""
-        begin_s = time_s if self._first else self._last_s
+        begin_s = time_s if self._last_s == -math.inf else self._last_s
         length_s, step_deg = due_s - begin_s, position_deg - self._last_deg
-        self._first, self._last_s, self._last_deg = False, due_s, position_deg
+        self._last_s, self._last_deg = due_s, position_deg
         self._rate_deg_s = step_deg / length_s if length_s > 0.0 else 0.0
         self.spacing_s = length_s if length_s < LONGEST_SPACING_S else LONGEST_SPACING_S
         patience_s = self._patience_s

@@ -63,17 +63,15 @@ class Cell(IntEnum):
     """Status cells, each in its own cache line."""
 
     LOOP_COUNT = 0
-    LOOP_TIME_NS = 1
-    SERVICE_TIME_NS = 2
-    KEEPER_TIME_NS = 3
-    LOOP_PID = 4
-    SERVICE_PID = 5
-    STOP_ASKED = 6
-    GATEWAY_TIME_NS = 7
-    GATEWAY_PID = 8
-    BUS_WANTED = 9
+    SERVICE_TIME_NS = 1
+    LOOP_PID = 2
+    SERVICE_PID = 3
+    STOP_ASKED = 4
+    GATEWAY_TIME_NS = 5
+    GATEWAY_PID = 6
+    BUS_WANTED = 7
     """Service: 1 while it waits for the release of the bus to another program."""
-    BUS_LENT = 10
+    BUS_LENT = 8
     """Keeper: time at which it released the interface to another program (``time.monotonic_ns``); 0 if not
     lent."""
 
@@ -109,16 +107,6 @@ class Status(Cells):
     def loop_pid(self) -> int:
         """Process id of the control process; 0 if none runs."""
         return self[Cell.LOOP_PID]
-
-    def turned(self, count: int, time_ns: int) -> None:
-        """Records the end of a turn."""
-        cells = self._cells
-        cells[_LOOP_COUNT] = count
-        cells[_LOOP_TIME] = time_ns
-
-
-_LOOP_COUNT: Final = Cell.LOOP_COUNT * _STRIDE
-_LOOP_TIME: Final = Cell.LOOP_TIME_NS * _STRIDE
 
 
 class OuterCells(Cells):

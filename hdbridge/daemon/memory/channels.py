@@ -213,11 +213,6 @@ class Queue(_Slots[T]):
     def __len__(self) -> int:
         return int(self._head[0] - self._tail[0])
 
-    @property
-    def free(self) -> int:
-        """Free places in the queue."""
-        return self._slots - len(self)
-
     def add(self, item: T) -> int:
         """Adds an item, on the producer's side; returns its sequence number, or 0 if the queue is full."""
         with self._producing:
@@ -271,8 +266,7 @@ class Queue(_Slots[T]):
         """Removes and returns the next item; None if there is none."""
         item = self.peek()
         if item is not None:
-            self._misses = 0
-            self._tail[0] += 1
+            self.drop()
         return item
 
     def clear(self) -> None:
@@ -287,12 +281,12 @@ class MailboxFullError(HdbridgeError):
 class Mailbox(Queue[Command]):
     """Commands from the service to the loop; bounded, so that a faulty service cannot flood the loop."""
 
-    def post(self, kind: CommandKind, axis: int = -1, *numbers: float, **fields: float) -> int:
+    def post(self, kind: CommandKind, axis: int = -1, **fields: float) -> int:
         """Posts a command with the fields a to k; returns its id, used in the loop's events.
 
         Raises `MailboxFullError` if the queue is full.
         """
-        id_ = self.add(Command(0, kind, axis, *numbers, **fields))  # type: ignore[arg-type]
+        id_ = self.add(Command(0, kind, axis, **fields))  # type: ignore[arg-type]
         if not id_:
             raise MailboxFullError(
                 f"the control loop has not taken the {COMMAND_SLOTS} commands that wait; it hangs or is "

@@ -18,14 +18,13 @@ sequence number, counted from 1. Any change here requires a new `VERSION`.
 import logging
 import math
 import struct
-from collections.abc import Iterable
 from enum import IntEnum, IntFlag
 from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 
 MAGIC: Final = b"hdbridge"
-VERSION: Final = 5
+VERSION: Final = 6
 PAGE: Final = 4096
 LINE: Final = 64
 """Size of a cache line, bytes; data of different writers is in different lines."""
@@ -171,7 +170,6 @@ class Command(NamedTuple):
     a: float = 0.0
     b: float = 0.0
     c: float = 0.0
-    d: float = 0.0
     i: int = 0
     j: int = 0
     k: int = 0
@@ -311,13 +309,8 @@ TAIL_BYTES: Final = 16
 
 def sample_struct(axes: int) -> struct.Struct:
     """Returns the struct for packing a sample of ``axes`` axes."""
-    head, axis = (_codes(kinds) for kinds in ((kind for _, kind in SAMPLE_HEAD), _AXIS_FORMATS))
-    return struct.Struct(f"@{head}{axis * axes}{TAIL_CODE}")
-
-
-def _codes(kinds: Iterable[str]) -> str:
-    """Returns the codes of `struct` for numpy types."""
-    return "".join(np.dtype(each).char for each in kinds)
+    kinds = [kind for _, kind in SAMPLE_HEAD] + axes * list(_AXIS_FORMATS)
+    return struct.Struct(f"@{''.join(np.dtype(each).char for each in kinds)}{TAIL_CODE}")
 
 
 def sample_dtype(axes: int) -> np.dtype[Any]:
@@ -333,8 +326,8 @@ EVENT: Final = struct.Struct(f"@QqqiiqiI{TEXT_BYTES}s{TAIL_CODE}")
 """sequence, cycle, time, axis, kind, id, code, length of the text, text."""
 FRAME: Final = struct.Struct(f"@QqIB3x8s{TAIL_CODE}")
 """sequence, time, identifier, length, data."""
-COMMAND: Final = struct.Struct(f"@Qii4d3q{TAIL_CODE}")
-"""sequence (which is the id), kind, axis, a-d, i-k."""
+COMMAND: Final = struct.Struct(f"@Qii3d3q{TAIL_CODE}")
+"""sequence (which is the id), kind, axis, a-c, i-k."""
 KNOT: Final = struct.Struct(f"@Qq3d{TAIL_CODE}")
 """sequence, stream, time, position, velocity."""
 HEADER: Final = struct.Struct("@8sIIQQQI4x")
@@ -377,16 +370,16 @@ class Layout(NamedTuple):
             end = -(-(offset + slots * slot_bytes) // LINE) * LINE
             return Place(offset, slots, slot_bytes)
 
-        samples = place(SAMPLES_KEPT, sample_struct(axes).size)
-        events = place(EVENTS_KEPT, EVENT.size)
-        incoming = place(INCOMING_KEPT, FRAME.size)
-        outgoing = place(OUTGOING_SLOTS, FRAME.size)
-        commands = place(COMMAND_SLOTS, COMMAND.size)
-        knots = tuple(place(KNOT_SLOTS, KNOT.size) for _ in range(axes))
-        settings = tuple(place(1, SETTING_BYTES) for _ in range(axes))
-        followed = tuple(place(FOLLOWED_SLOTS, KNOT.size) for _ in range(axes))
-        outer = tuple(place(len(OuterCell), LINE) for _ in range(axes))
-        total = -(-end // PAGE) * PAGE
         return cls(
-            axes, samples, events, incoming, outgoing, commands, knots, settings, followed, outer, total
+            axes=axes,
+            samples=place(SAMPLES_KEPT, sample_struct(axes).size),
+            events=place(EVENTS_KEPT, EVENT.size),
+            incoming=place(INCOMING_KEPT, FRAME.size),
+            outgoing=place(OUTGOING_SLOTS, FRAME.size),
+            commands=place(COMMAND_SLOTS, COMMAND.size),
+            knots=tuple(place(KNOT_SLOTS, KNOT.size) for _ in range(axes)),
+            settings=tuple(place(1, SETTING_BYTES) for _ in range(axes)),
+            followed=tuple(place(FOLLOWED_SLOTS, KNOT.size) for _ in range(axes)),
+            outer=tuple(place(len(OuterCell), LINE) for _ in range(axes)),
+            total=-(-end // PAGE) * PAGE,
         )

@@ -36,15 +36,14 @@ Columns = Mapping[str, NDArray[Any]]
 _NS: Final = 1e9
 
 
-def axis_of(about: About, name: str | None, where: Path) -> tuple[int, AxisAbout]:
-    """Returns index and description of the named or only axis; else raises InputError with the names."""
-    names = [each.name for each in about.axes]
-    if name is None and len(names) == 1:
-        return 0, about.axes[0]
-    if name not in names:
+def axis_of(about: About, name: str | None, where: Path) -> AxisAbout:
+    """Returns the description of the named or only axis; else raises InputError with the names."""
+    found = [each for each in about.axes if name in {None, each.name}]
+    if len(found) != 1:
         which = "which axis?" if name is None else f"no axis '{name}';"
-        raise InputError(f"{where}: {which} expected --axis with one of: {', '.join(names)}")
-    return names.index(name), about.axes[names.index(name)]
+        names = ", ".join(each.name for each in about.axes)
+        raise InputError(f"{where}: {which} expected --axis with one of: {names}")
+    return found[0]
 
 
 def exported(
@@ -61,7 +60,7 @@ def exported(
     """
     if not flights:
         raise InputError("no flight recording; expected at least one")
-    known = [axis_of(each.about, axis, each.path)[1] for each in flights]
+    known = [axis_of(each.about, axis, each.path) for each in flights]
     for flight, each in zip(flights, known, strict=True):
         if each.ratio != known[0].ratio:
             raise InputError(

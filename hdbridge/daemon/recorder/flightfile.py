@@ -12,7 +12,7 @@ import logging
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -111,14 +111,9 @@ class About:
     machine: str
     period_s: float
     axes: tuple[AxisAbout, ...]
-    versions: Mapping[str, str]
+    versions: Mapping[str, str] = field(default_factory=versions_here)
     offset_ns: int = 0
     """Time of day minus the clock of the samples, ns."""
-
-    @classmethod
-    def of(cls, machine: str, axes: tuple[AxisAbout, ...], period_s: float) -> Self:
-        """Returns the description of a machine served by this process."""
-        return cls(machine, period_s, axes, versions_here())
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """Returns the metadata records by name."""
@@ -135,12 +130,12 @@ class About:
         }
 
     @classmethod
-    def from_metadata(cls, records: Mapping[str, Mapping[str, str]]) -> Self:
-        """Reads the result of `metadata`; raises InputError if it is not an hdbridge recording."""
+    def from_metadata(cls, records: Mapping[str, Mapping[str, str]], path: Path) -> Self:
+        """Reads the result of `metadata`; raises InputError if ``path`` is not an hdbridge recording."""
         machine = records.get(MACHINE_NAME, {})
         if machine.get("format") != FORMAT:
             raise InputError(
-                f"found {machine.get('format', 'no format')}; expected a flight recording, {FORMAT}"
+                f"{path}: found {machine.get('format', 'no format')}; expected a flight recording, {FORMAT}"
             )
         try:
             axes = sorted(
@@ -156,7 +151,7 @@ class About:
                 int(machine["offset_ns"]),
             )
         except (KeyError, ValueError) as problem:
-            raise InputError(f"its metadata are damaged: {problem}") from None
+            raise InputError(f"{path}: its metadata are damaged: {problem}") from None
 
 
 def axis_topic(name: str) -> str:

@@ -16,9 +16,10 @@ import logging
 import os
 import shutil
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import chain, count
 from pathlib import Path
@@ -68,18 +69,6 @@ class Note(NamedTuple):
 Item = Batch | ModelUse | Note
 
 
-@dataclass(slots=True)
-class Counts:
-    """Counts since the recorder began."""
-
-    recorded: int = 0
-    """Cycles on the disk."""
-    dropped: int = 0
-    """Cycles dropped because the recorder was too slow."""
-    refused: int = 0
-    """Cycles not written because the disk was full."""
-
-
 def free_bytes(folder: Path) -> int:
     """Returns the free bytes on the disk of ``folder``."""
     return shutil.disk_usage(folder).free
@@ -112,13 +101,13 @@ class FlightLog:
         self._spans: list[tuple[int, int]] = []
         """Time spans around faults; ns of the samples' clock."""
         self._models: dict[str, ModelUse] = {}
-        self._waiting: list[Item] = []
+        self.waiting: deque[Item] = deque()
+        """Items since the last flush."""
         self._newest_ns = 0
         self._trouble = ""
         self._refused_now = 0
-        self._behind = 0
-        """Number of cycles in a chunk that is not yet on the disk."""
-        self.counts = Counts()
+        self.refused = 0
+        """Cycles not written because the disk was full."""
         folder.mkdir(parents=True, exist_ok=True)
 
     def mend(self) -> None:
@@ -131,21 +120,22 @@ class FlightLog:
         self._remove_old()
 
     def put(self, item: Item) -> None:
-        """Takes an item; it is on the disk after the next `flush`."""
-        self._waiting.append(item)
-        if isinstance(item, Batch) and len(item.samples):
-            self._newest_ns = int(item.samples["time_ns"][-1])
+        """Takes an item, in any thread; it is on the disk after the next `flush`."""
+        self.waiting.append(item)
 
     def flush(self) -> None:
         """Writes the items since the last flush."""
-        waiting, self._waiting = self._waiting, []
-        for item in waiting:  # a later file must contain the model as well
+        waiting = [self.waiting.popleft() for _ in range(len(self.waiting))]
+        for item in waiting:
             if isinstance(item, ModelUse):
-                self._models[item.axis] = item
+                self._models[item.axis] = item  # a later file must contain the model as well
+            elif isinstance(item, Batch) and len(item.samples):
+                self._newest_ns = int(item.samples["time_ns"][-1])
         if not waiting and (self._file is None or not self._file.behind):
             return
         cycles = sum(len(each.samples) for each in waiting if isinstance(each, Batch))
         size = cycles * (1 + len(self._about.axes)) * MESSAGE_BYTES
+        self._note_spans(waiting)
         try:
             if self._free(self.folder) < size + self._settings.free_mb * _MB:
                 raise OSError(f"less than {self._settings.free_mb:g} MB are free")
@@ -156,15 +146,11 @@ class FlightLog:
             for item in waiting:
                 if not (begins and isinstance(item, ModelUse)):  # a new file begins with the models
                     self._write(file, item)
-            self._behind, cycles = self._behind + cycles, 0
+            cycles = 0  # in the file's chunk from now on, even if this flush fails
             file.flush()
         except OSError as problem:
-            self._note_spans(waiting)
             self._refuse(cycles, problem)
             return
-        self._note_spans(waiting)
-        self.counts.recorded += self._behind
-        self._behind = 0
         self._recovered()
         self._cut()
 
@@ -205,7 +191,7 @@ class FlightLog:
 
     def _refuse(self, cycles: int, problem: OSError) -> None:
         """Counts cycles that cannot be written, and reports the first failure."""
-        self.counts.refused += cycles
+        self.refused += cycles
         self._refused_now += cycles
         words = problem.strerror or str(problem)
         if not self._trouble:
@@ -227,16 +213,11 @@ class FlightLog:
 
     def _note_spans(self, items: Sequence[Item]) -> None:
         """Notes the time spans to keep."""
-        settings = self._settings
-        for item in items:
-            times = []
-            if isinstance(item, Note) and item.kind == MARK:
-                times.append(self._newest_ns)
-            elif isinstance(item, Batch):
-                times += [each.time_ns for each in item.events if each.kind in KEPT_FOR]
-            self._spans += [
-                (each - int(settings.before_s * _NS), each + int(settings.after_s * _NS)) for each in times
-            ]
+        marks = [self._newest_ns for each in items if isinstance(each, Note) and each.kind == MARK]
+        events = [event for each in items if isinstance(each, Batch) for event in each.events]
+        faults = [each.time_ns for each in events if each.kind in KEPT_FOR]
+        before_ns, after_ns = (int(each * _NS) for each in (self._settings.before_s, self._settings.after_s))
+        self._spans += [(each - before_ns, each + after_ns) for each in (*marks, *faults)]
 
     def _cut(self) -> None:
         """Begins a new file once this one is large or old enough, or a span to keep is over."""

@@ -176,8 +176,8 @@ def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
                 metadata[record.name] = record.metadata
             elif isinstance(record, Footer):
                 finished = True
+    about = About.from_metadata(metadata, path)
     try:
-        about = About.from_metadata(metadata)
         chosen = [each.name for each in about.axes if axes is None or each.name in axes]
         machine = MACHINE.decode(messages[MACHINE_TOPIC])
         return Flight(
@@ -203,10 +203,7 @@ def overview(path: Path) -> Flight:
         except (*TORN, OSError):
             return replace(read(path, ()), finished=False)
         size = os.fstat(file.fileno()).st_size
-    try:
-        about = About.from_metadata(metadata)
-    except InputError as problem:
-        raise InputError(f"{path}: {problem}") from None
+    about = About.from_metadata(metadata, path)
     counted = summary.statistics
     (machine,) = (number for number, each in summary.channels.items() if each.topic == MACHINE_TOPIC)
     cycles = counted.channel_message_counts.get(machine, 0)

@@ -5,11 +5,9 @@ than its thread can process is dropped, counted and reported. `flightlog` does t
 """
 
 import logging
-import queue
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -17,7 +15,7 @@ from hdbridge.client import messages
 from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.memory import Event, SampleArray
 from hdbridge.daemon.recorder.flightfile import About
-from hdbridge.daemon.recorder.flightlog import MARK, Batch, FlightLog, Item, ModelUse, Note, free_bytes
+from hdbridge.daemon.recorder.flightlog import MARK, Batch, FlightLog, ModelUse, Note, free_bytes
 from hdbridge.daemon.setting import CompensationSetting
 
 FLUSH_S: Final = 1.0
@@ -48,8 +46,10 @@ class FlightRecorder:
         """None if the folder could not be created."""
         self._notify_user, self._in_use = notify, in_use
         self._note: str | None = None
+        self._dropped = 0
+        """Cycles dropped because the thread was too slow."""
         self._recorded: dict[str, CompensationSetting] = {}
-        self._queue: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
+        self._ended = threading.Event()
         self._threads: list[threading.Thread] = []
         try:
             flight = FlightLog(folder, settings or RecorderSettings(), about, notify=self._notify, free=free)
@@ -72,17 +72,17 @@ class FlightRecorder:
                 self.put(ModelUse(axis, version, setting.compensating.dump()))
         if self.flight is None:
             return
-        if self._queue.qsize() < QUEUE_BATCHES:
-            self._queue.put(Batch(samples, tuple(events), lost))
+        if len(self.flight.waiting) < QUEUE_BATCHES:
+            self.flight.put(Batch(samples, tuple(events), lost))
             return
-        if not self.flight.counts.dropped:
+        if not self._dropped:
             self._notify("the recorder is too slow: cycles are dropped")
-        self.flight.counts.dropped += len(samples)
+        self._dropped += len(samples)
 
     def put(self, item: ModelUse | Note) -> None:
         """Records a change of model or a note. Both are rare and never dropped."""
         if self.flight is not None:
-            self._queue.put(item)
+            self.flight.put(item)
 
     def mark(self, text: str = "") -> None:
         """Records a mark and keeps the time around it, like that around a fault."""
@@ -90,17 +90,16 @@ class FlightRecorder:
 
     def state(self) -> messages.RecorderState:
         """Returns the state of the recorder for clients."""
-        counts = self.flight.counts if self.flight is not None else None
         return messages.RecorderState(
-            on=counts is not None,
+            on=self.flight is not None,
             folder=str(self.folder),
-            dropped=counts.dropped + counts.refused if counts is not None else 0,
+            dropped=self._dropped + (self.flight.refused if self.flight is not None else 0),
             note=self._note,
         )
 
     def close(self) -> None:
         """Finishes the file; returns once it is on the disk."""
-        self._queue.put(None)
+        self._ended.set()
         for thread in self._threads:
             thread.join()
 
@@ -116,24 +115,14 @@ class FlightRecorder:
             _log.exception("unfinished recordings could not be mended")
 
     def _run(self, flight: FlightLog) -> None:
-        due_s = time.monotonic() + FLUSH_S
-        reported = 0
-        going = True
-        while going:
-            with suppress(queue.Empty):
-                item = self._queue.get(timeout=max(due_s - time.monotonic(), 0.01))
-                if item is None:
-                    going = False
-                else:
-                    flight.put(item)
-            dropped = flight.counts.dropped - reported
-            if dropped:
+        begun_s, reported, ended = time.monotonic(), 0, False
+        while not ended:
+            ended = self._ended.wait(max(begun_s + FLUSH_S - time.monotonic(), 0.0))
+            begun_s = time.monotonic()
+            if dropped := self._dropped - reported:
                 flight.put(Note("DROPPED", f"{dropped} cycles were dropped: the recorder was too slow"))
                 reported += dropped
-            if time.monotonic() < due_s and going:
-                continue
-            due_s = time.monotonic() + FLUSH_S
             try:
-                flight.flush() if going else flight.close()
+                flight.close() if ended else flight.flush()
             except Exception:
                 _log.exception("the recorder failed; it continues")

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from hdbridge.daemon.machine import Axis
     from hdbridge.daemon.memory import Event
     from hdbridge.daemon.service.core import Core
-    from hdbridge.daemon.service.eventlog import Entry
     from hdbridge.daemon.service.following import Following
     from hdbridge.daemon.setting import CompensationSetting
 
@@ -58,8 +57,8 @@ class ServiceAxis:
         self.is_prepared = False
         """True if `prepare` has done the SDO transfers before power-on, and nothing has invalidated them."""
         self.motion = AxisMotion(self.link, self.check_may)
-        self.stopped: Entry | None = None
-        """Last stop, once the axis is at rest; None before."""
+        self.stopped: tuple[Event, datetime] | None = None
+        """Last stop and its time of day, once the axis is at rest; None before."""
         self.loop_doubt = "the reason is in the log of an earlier service"
         """Text of the last event of the load loop."""
         self.following: Following | None = None
@@ -78,10 +77,10 @@ class ServiceAxis:
         """Returns the state of the axis in the newest cycle."""
         return self._report(self)
 
-    def hear(self, entry: Entry, event: Event) -> None:
-        """Takes an event of the axis, with its entry in the log."""
+    def hear(self, event: Event) -> None:
+        """Takes an event of the axis."""
         if event.kind is EventKind.STOPPED:
-            self.stopped = entry
+            self.stopped = event, datetime.now(UTC)
         elif event.kind is EventKind.STATE and event.code in STOPPED:
             self.stopped = None  # the reason is reported once the axis is at rest
         elif event.kind is EventKind.LOAD_LOOP:
@@ -214,29 +213,25 @@ class ServiceAxis:
             await self._verify()
         self.core.log.note("the drive was verified; the axis is disabled", self.link.index)
 
-    async def home(self, holder: str, run: messages.Home) -> float:
-        """Homes by a method of 6098h; returns the load angle afterwards. Disabled before and after."""
+    async def home(self, holder: str, run: messages.Home) -> None:
+        """Homes by a method of 6098h. The axis is disabled before and after."""
         self.check_may(holder)
         async with self._alone("the axis is being homed"):
             self.is_prepared = False
             await self.link.do(CommandKind.LEND)
             try:
-                positions, seeds = await self._work(self.commissioning.home, run)
+                seeds = await self._work(self.commissioning.home, run)
             except BaseException:
                 # The position may be lost, so the drive must be verified again.
                 with suppress(HdbridgeError):
                     await self.link.do(CommandKind.RELEASE)
                 raise
             await self.link.do(CommandKind.UNLEND, **seeds)
-            return positions.load_deg
 
     async def _verify(self, *, clear_fault: bool = False) -> None:
         """Boots and verifies the drive, then lets the control process communicate with it."""
         self.is_prepared = False
-        seeds = await self._work(self.commissioning.verify)
-        if clear_fault:
-            await self._work(self.commissioning.clear_fault)
-            seeds = await self._work(self.commissioning.seeds)
+        seeds = await self._work(self.commissioning.verify, clear_fault=clear_fault)
         if self.link.state is AxisState.LATCHED:
             await self.link.do(CommandKind.RESET, i=1)
         await self.link.do(CommandKind.VERIFIED, **seeds)
@@ -268,11 +263,6 @@ class ServiceAxis:
             date = datetime.now(UTC)
             await self._work(self.models.activate, version, identity, date)
             await self._use(self.models.chosen)
-
-    @property
-    def unsettled(self) -> bool:
-        """True if the control process does not use the chosen setting."""
-        return not self.models.settled
 
     async def settle(self) -> None:
         """Sends the chosen setting to the control process unless that uses it already."""

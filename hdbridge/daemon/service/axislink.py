@@ -99,12 +99,10 @@ class AxisLink:
         await self.until(lambda: observer.cycle > answer.cycle, ANSWER_S)
         return answer
 
-    async def begin(self, activity: Activity, kind: CommandKind, **arguments: Unpack[Arguments]) -> Event:
+    async def begin(self, activity: Activity, kind: CommandKind, **arguments: Unpack[Arguments]) -> None:
         """Runs `do` for the command that begins the motion of an activity."""
         activity.since = self.core.log.newest
-        answer = await self.do(kind, **arguments)
-        activity.command_id = answer.id
-        return answer
+        activity.command_id = (await self.do(kind, **arguments)).id
 
     async def until(self, found: Callable[[], bool], within_s: float) -> bool:
         """Waits until ``found()`` is True, checking each cycle; returns False after ``within_s``."""

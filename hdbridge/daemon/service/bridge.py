@@ -42,8 +42,9 @@ from hdbridge.errors import HdbridgeError, InputError
 
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Machine
-    from hdbridge.daemon.memory import Memory
+    from hdbridge.daemon.memory import Event, Memory, SampleArray
     from hdbridge.daemon.memory.channels import SampleReader
+    from hdbridge.daemon.recorder.recorder import FlightRecorder
     from hdbridge.daemon.service.lease import Lease
 
 VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
@@ -77,15 +78,12 @@ class ServiceBridge:
             axis.name: ServiceAxis(index, axis, self.core, self._axis_state)
             for index, axis in enumerate(machine.axes)
         }
-        self.recorder: Callable[[], messages.RecorderState] = lambda: messages.RecorderState(on=False)
-        self.marks: list[Callable[[str], None]] = []
-        """Receivers of remarks, such as the recorder."""
+        self.recorder: FlightRecorder | None = None
         self._names = tuple(self.axes)
         self._simulated = simulated
         self._started = datetime.now(UTC)
-        self._seen = 0
         self._bus_up = True
-        self._loop_pid = 0
+        self.core.observer.add(self)
         self._latency = Latency(memory.axes)
         if machine.gateway is not None:
             self.core.observer.add(self._latency)
@@ -111,7 +109,6 @@ class ServiceBridge:
 
         Returns once the control process compensates each axis by its setting, or does not answer.
         """
-        self._loop_pid = self.core.memory.status.loop_pid
         self._start(self._watch())
         for axis in self.axes.values():
             self._start(self._take_over(axis))
@@ -126,7 +123,7 @@ class ServiceBridge:
         await asyncio.sleep(0)
         timing = self.core.timing
         deadline_s = timing.clock.now() + ANSWER_S
-        while any(axis.unsettled for axis in self.axes.values()) and timing.clock.now() < deadline_s:
+        while not all(axis.models.settled for axis in self.axes.values()) and timing.clock.now() < deadline_s:
             await timing.sleep(PERIOD_S)
         return self
 
@@ -139,12 +136,17 @@ class ServiceBridge:
             await axis.close()
 
     async def _watch(self) -> None:
-        """Reads events and checks the lease, every `PERIOD_S`."""
-        core = self.core
+        """Reads samples and events, checks the lease and notices a new control process, every `PERIOD_S`."""
+        core, status = self.core, self.core.memory.status
+        known = status.loop_pid
         while True:
             core.observer.poll()
-            core.memory.status[Cell.SERVICE_TIME_NS] = time.monotonic_ns()
-            self._look()
+            status[Cell.SERVICE_TIME_NS] = time.monotonic_ns()
+            if (pid := status.loop_pid) and pid != known:
+                if known:
+                    core.log.note("the control process was started again: every axis is disabled")
+                    self._bus_up = True
+                known = pid
             for axis in self.axes.values():
                 try:
                     await axis.motion.end_without_lease()
@@ -152,28 +154,18 @@ class ServiceBridge:
                     core.log.note(f"could not be stopped: {error}", axis.link.index)
             await core.timing.sleep(PERIOD_S)
 
-    def _look(self) -> None:
-        """Evaluates new events: stops, load loops, bus failures and restarts of the control process."""
-        for entry in self.core.log.since(self._seen):
-            self._seen = entry.number
-            event = entry.event
-            if event is None:
-                continue
+    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
+        """Takes the loop's events from the observer: those of an axis, and failures of the bus."""
+        for event in events:
             if event.axis >= 0:
-                self.axes[self._names[event.axis]].hear(entry, event)
+                self.axes[self._names[event.axis]].hear(event)
             elif event.kind in (EventKind.BUS_DOWN, EventKind.BUS_UP):
                 self._bus_up = event.kind is EventKind.BUS_UP
-        pid = self.core.memory.status.loop_pid
-        if pid and pid != self._loop_pid:
-            if self._loop_pid:
-                self.core.log.note("the control process was started again: every axis is disabled")
-                self._bus_up = True
-            self._loop_pid = pid
 
     async def _settle(self, axis: ServiceAxis) -> None:
         """Sends the chosen compensation whenever the control process does not use it."""
         what = "the compensation could not be put back"
-        await self._persist(axis, lambda: axis.unsettled, axis.settle, SETTLE_AGAIN_S, what)
+        await self._persist(axis, lambda: not axis.models.settled, axis.settle, SETTLE_AGAIN_S, what)
 
     async def _verify(self, axis: ServiceAxis) -> None:
         """Boots and verifies the drive whenever necessary. The axis stays disabled."""
@@ -248,13 +240,12 @@ class ServiceBridge:
                 busy_us=float(head["busy_us"]) if head is not None else None,
             ),
             lease=reports.lease_state(core.lease, core.timing.clock.now()),
-            recorder=self.recorder(),
+            recorder=self.recorder.state() if self.recorder else messages.RecorderState(on=False),
             warnings=self._warnings(),
         )
 
     def _axis_state(self, axis: ServiceAxis) -> messages.AxisState:
         """Returns the state of one axis in the newest cycle."""
-        self._look()
         return reports.axis_state(axis, self._outer(axis))
 
     def _outer(self, axis: ServiceAxis) -> messages.OuterState | None:
@@ -319,20 +310,15 @@ class ServiceBridge:
         """Moves several axes so that all begin and end together; ``speed`` is a share of the limits."""
         if not moves:
             raise InputError("a coordinated move without an axis; expected a target for at least one")
-        axes = [self._axis(name) for name in moves]
-        await run_together(holder, axes, moves, speed, wait=wait)
+        for name in moves.keys() - self.axes.keys():
+            raise InputError(f"there is no axis '{name}'; expected one of: {', '.join(self.axes)}")
+        await run_together(holder, [self.axes[name] for name in moves], moves, speed, wait=wait)
 
     def mark(self, text: str, axis: int = -1) -> None:
         """Adds a remark to the event log and the flight recorder, which keeps the time around it."""
         self.core.log.note(text, axis)
-        for hear in self.marks:
-            hear(text)
-
-    def _axis(self, name: str) -> ServiceAxis:
-        axis = self.axes.get(name)
-        if axis is None:
-            raise InputError(f"there is no axis '{name}'; expected one of: {', '.join(self.axes)}")
-        return axis
+        if self.recorder is not None:
+            self.recorder.mark(text)
 
     def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(coroutine)

@@ -7,6 +7,7 @@ does not. The SDO clients and the boot-up run unchanged on `RelayBus`.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Container, Iterator
@@ -55,17 +56,16 @@ class RelayBus(can.BusABC):
         self._incoming = core.memory.incoming_reader()
         self._nodes = nodes
         self._waiting: deque[RelayedFrame] = deque()
-        self._interrupted = threading.Event()
-        self._reason = ""
+        self._interruption = ""
+        """Reason for which the present operation is to fail; empty without one."""
 
     def interrupt(self, reason: str) -> None:
         """Makes the present operation fail at its next wait, once, with ``reason``."""
-        self._reason = reason
-        self._interrupted.set()
+        self._interruption = reason
 
     def begin(self) -> None:
         """Begins another operation, discarding an interruption of the last one."""
-        self._interrupted.clear()
+        self._interruption = ""
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Sends a frame. Drops the master's heartbeat, which the control process sends."""
@@ -83,13 +83,12 @@ class RelayBus(can.BusABC):
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         clock = self._clock
-        deadline_s = clock.now() + (timeout or 0.0)
+        deadline_s = math.inf if timeout is None else clock.now() + timeout
         while True:
-            if self._interrupted.is_set():
-                self._interrupted.clear()
-                raise DaemonError(self._reason)
-            frame = self._next()
-            if frame is not None:
+            if reason := self._interruption:
+                self._interruption = ""
+                raise DaemonError(reason)
+            if (frame := self._next()) is not None:
                 message = can.Message(
                     timestamp=frame.time_ns / 1e9,
                     arbitration_id=frame.can_id,
@@ -98,9 +97,9 @@ class RelayBus(can.BusABC):
                 )
                 return message, True
             now_s = clock.now()
-            if now_s >= deadline_s and timeout is not None:
+            if now_s >= deadline_s:
                 return None, True
-            clock.sleep_until(min(now_s + POLL_S, deadline_s) if timeout is not None else now_s + POLL_S)
+            clock.sleep_until(min(now_s + POLL_S, deadline_s))
 
     def _next(self) -> RelayedFrame | None:
         """Returns the next frame from one of the axis's nodes."""
@@ -133,13 +132,16 @@ class Commissioning:
         """Identity that the drive reported, else the identity in the axis file."""
         return self._drive.identity
 
-    def verify(self) -> Arguments:
+    def verify(self, *, clear_fault: bool = False) -> Arguments:
         """Boots the drive and compares it with the axis file; power is off afterwards.
 
-        Raises like `Drive.boot`.
+        ``clear_fault`` also resets a fault of the drive, to which the control process sends nothing. Raises
+        like `Drive.boot`.
         """
         with self._asked("it is being booted"):
             self._drive.boot()
+            if clear_fault and self._drive.state() is State.FAULT:
+                self._drive.fault_reset()
             return self._seeds(self._drive.read_positions())
 
     def take_over(self) -> None:
@@ -164,13 +166,7 @@ class Commissioning:
         with self._asked("it is being switched off"):
             self._drive.disable()
 
-    def clear_fault(self) -> None:
-        """Resets a fault of the drive, while the control process sends it nothing."""
-        with self._asked("its fault is being reset"):
-            if self._drive.state() is State.FAULT:
-                self._drive.fault_reset()
-
-    def home(self, run: messages.Home) -> tuple[Positions, Arguments]:
+    def home(self, run: messages.Home) -> Arguments:
         """Homes a drive that the control process has lent; power is off afterwards.
 
         Raises like `Drive.home`; even then, the axis stops and its power is off if the drive answers.
@@ -180,7 +176,7 @@ class Commissioning:
                 positions = self._drive.home(**run.model_dump())
             finally:
                 self._drive.disable()
-            return positions, self._seeds(positions)
+            return self._seeds(positions)
 
     def interrupt(self, reason: str) -> None:
         """Interrupts the present request with this reason; a homing axis stops. Thread-safe."""
@@ -204,11 +200,6 @@ class Commissioning:
         with self._asked(f"{object_} is being written"):
             self._drive.sdo.write_bytes(wanted.index, wanted.sub, data)
         return wanted
-
-    def seeds(self) -> Arguments:
-        """Reads the drive's present position and statusword."""
-        with self._asked("its position is being read"):
-            return self._seeds(self._drive.read_positions())
 
     def close(self) -> None:
         """Closes the relay bus; the drive stays as it is."""

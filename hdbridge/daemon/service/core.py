@@ -22,7 +22,6 @@ class Arguments(TypedDict, total=False):
     a: float
     b: float
     c: float
-    d: float
     i: int
     j: int
     k: int

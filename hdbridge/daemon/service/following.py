@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, ParamSpec, TypeVar
+from typing import Any, Final
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.client import messages
@@ -30,8 +30,6 @@ MAX_BATCHES: Final = 500
 DIAGNOSED: Final = frozenset({Verdict.RECALIBRATE, Verdict.SOMETHING_CHANGED})
 """Verdicts that start a diagnosis."""
 _log = logging.getLogger(__name__)
-_Params = ParamSpec("_Params")
-_Result = TypeVar("_Result")
 
 
 class Following:
@@ -111,10 +109,8 @@ class Following:
         """Stores the adaptation's state, after processing the waiting samples."""
         self._do(self._save).result()
 
-    def _do(
-        self, function: Callable[_Params, _Result], *args: _Params.args, **kwargs: _Params.kwargs
-    ) -> Future[_Result]:
-        done = self._worker.submit(function, *args, **kwargs)
+    def _do(self, function: Callable[..., None], *args: object) -> Future[None]:
+        done = self._worker.submit(function, *args)
         done.add_done_callback(_log_failure)
         return done
 
@@ -158,9 +154,9 @@ class Following:
             self._taken += 1
 
     def _revert(self) -> None:
-        proposal = self._follower.revert() if self._follower is not None else None
-        if proposal is not None and self._follower is not None:
-            self._report(Outcome([], proposal), self._follower.model)
+        follower = self._follower
+        if follower is not None and (proposal := follower.revert()) is not None:
+            self._report(Outcome([], proposal), follower.model)
             self._publish()
 
     def _save(self) -> None:

@@ -8,7 +8,7 @@ the machine. Reading, stopping and quick-stopping require no lease.
 import math
 import secrets
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from hmac import compare_digest
 
 from hdbridge.errors import InputError, LeaseError
@@ -27,6 +27,7 @@ class Holder:
     """Time at which it was taken; lease's clock."""
     expires_s: float
     """Time at which the lease expires without a further request; infinite for the gateway."""
+    token: str = field(repr=False)
 
 
 class Lease:
@@ -36,23 +37,16 @@ class Lease:
         """``now`` returns the seconds of a monotonic clock."""
         self.timeout_s = timeout_s
         self._now = now
-        self._token: str | None = None
-        self._client = ""
-        self._taken_s = self._heard_s = 0.0
-        self._lasts = False
+        self._holder: Holder | None = None
         self.doing: Callable[[], str] = lambda: ""
         """Returns a description of the present motions, for refusals; empty at rest."""
 
     @property
     def holder(self) -> Holder | None:
         """Present holder; None if the lease is free."""
-        if not self._lasts and self._now() >= self._heard_s + self.timeout_s:
-            self._token = None
-        if self._token is None:
-            return None
-        return Holder(
-            self._client, self._taken_s, math.inf if self._lasts else self._heard_s + self.timeout_s
-        )
+        if self._holder is not None and self._now() >= self._holder.expires_s:
+            self._holder = None
+        return self._holder
 
     def take(self, client: str, *, force: bool = False, lasts: bool = False) -> str:
         """Takes the lease and returns its token.
@@ -67,40 +61,40 @@ class Lease:
                 f"lease: invalid client name {client[:LONGEST_NAME]!r}; expected 1 to {LONGEST_NAME} "
                 "characters"
             )
-        holder = self.holder
+        holder, now_s = self.holder, self._now()
         if holder is not None and not force:
-            left_s = holder.expires_s - self._now()
+            left_s = holder.expires_s - now_s
             until, advice = f"; it runs out in {left_s:.1f} s unless it is renewed", "wait, or repeat"
-            if self._lasts:
+            if math.isinf(left_s):
                 until, advice = " as long as the gateway runs", "to stop its axes and take it, repeat"
             raise LeaseError(
                 f"'{holder.client}' holds the right to move{until}{self._doing()}; {advice} the command with "
                 "--force"
             )
-        self._token, self._client, self._lasts = secrets.token_urlsafe(TOKEN_BYTES), client, lasts
-        self._taken_s = self._heard_s = self._now()
-        return self._token
+        expires_s = math.inf if lasts else now_s + self.timeout_s
+        self._holder = Holder(client, now_s, expires_s, secrets.token_urlsafe(TOKEN_BYTES))
+        return self._holder.token
 
     def release(self, token: str) -> None:
         """Releases the lease. Raises LeaseError like `check`, so only its holder can release it."""
         self.check(token)
-        self._token = None
+        self._holder = None
 
     def check(self, token: str) -> None:
         """Raises LeaseError unless ``token`` is the present holder's; extends the lease by its time-out."""
         holder = self.holder
         if holder is None:
             raise LeaseError("the lease is free or has expired: take it first")
-        assert self._token is not None
-        if not compare_digest(token.encode(), self._token.encode()):
+        if not compare_digest(token.encode(), holder.token.encode()):
             raise LeaseError(
                 f"'{holder.client}' holds the right to move{self._doing()}; take the lease first"
             )
-        self._heard_s = self._now()
+        if math.isfinite(holder.expires_s):
+            self._holder = replace(holder, expires_s=self._now() + self.timeout_s)
 
     def holds(self, token: str) -> bool:
         """Returns True if ``token`` is the present holder's; does not extend the lease."""
-        return self.holder is not None and token == self._token
+        return (holder := self.holder) is not None and token == holder.token
 
     def _doing(self) -> str:
         doing = self.doing()

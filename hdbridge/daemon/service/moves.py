@@ -252,13 +252,8 @@ async def run_together(
     if wait:
         await asyncio.shield(following)  # the move is supervised even if its client disconnects
     else:
-        following.add_done_callback(_heard)
-
-
-def _heard(future: asyncio.Future[None]) -> None:
-    """Retrieves the unawaited result of a move, which is in the event log."""
-    if not future.cancelled():
-        future.exception()
+        # Retrieves the result that nobody awaits; it is in the event log.
+        following.add_done_callback(lambda done: done.cancelled() or done.exception())
 
 
 async def _follow(waiting: dict[ServiceAxis, list[Knot]], activities: Mapping[ServiceAxis, Activity]) -> None:

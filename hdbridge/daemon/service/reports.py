@@ -11,13 +11,12 @@ from hdbridge.axis.channels import BY_KEY
 from hdbridge.client import messages
 from hdbridge.daemon.loop.faultlog import fault_of
 from hdbridge.daemon.loop.states import STOPPED, AxisState
-from hdbridge.daemon.memory import NO_FAULT, Event, EventKind, OuterCell, SampleFlag
+from hdbridge.daemon.memory import NO_FAULT, EventKind, OuterCell, SampleFlag
 from hdbridge.daemon.service.axislink import reset_hint, stop_hint
 from hdbridge.daemon.service.eventlog import Entry
 from hdbridge.drive.emergencies import gateway_error
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import ROWS, Fault, Reaction
-from hdbridge.motion import MotionMode
 from hdbridge.units import ARCSEC_PER_DEG
 
 if TYPE_CHECKING:
@@ -42,48 +41,28 @@ _FLAGS: Final = {
     if each.name in {"AT_REST", "COMPENSATING", "LIMITED", "MEMORY_KNOWN", "CHANGING", "UNDERRUN"}
 }
 """Flags of a sample that `messages.AxisState` has under the same name, in lower case."""
-_KINDS: Final = {kind: messages.EventKind[kind.name] for kind in EventKind}
 
 
 def event_message(entry: Entry, names: Sequence[str]) -> messages.Event:
     """Returns the message for an entry of the event log; ``names`` are those of the axes."""
     axis = names[entry.axis] if 0 <= entry.axis < len(names) else None
-    event = entry.event
-    if event is None:
-        return messages.Event(
-            sequence=entry.number,
-            kind=messages.EventKind.NOTE,
-            date=entry.date,
-            axis=axis,
-            text=entry.text,
-        )
-    fault = fault_of(event.code) if event.kind is EventKind.FAULT else None
-    hint = ROWS[fault].hint if fault is not None else None
-    if event.kind is EventKind.STOPPED:
-        hint = stop_hint(event, axis or "AXIS")
+    event, kind, cycle, text, hint = entry.event, messages.EventKind.NOTE, None, entry.text, None
+    if event is not None:
+        kind, cycle, fault = messages.EventKind[event.kind.name], event.cycle, fault_of(event.code)
+        match event.kind:
+            case EventKind.STATE:
+                text = STATES[event.code].value
+            case EventKind.MOTION_ENDED:
+                text = MODES[event.code].value
+            case EventKind.FAULT if fault is not None:
+                detail = f" ({text})" if text else ""
+                text = f"{fault.value}{detail}: {Reaction(event.id).name.lower().replace('_', ' ')}"
+                hint = ROWS[fault].hint
+            case EventKind.STOPPED:
+                hint = stop_hint(event, axis or "AXIS")
     return messages.Event(
-        sequence=entry.number,
-        kind=_KINDS[event.kind],
-        date=entry.date,
-        cycle=event.cycle,
-        axis=axis,
-        text=_words(event, fault),
-        hint=hint,
+        sequence=entry.number, kind=kind, date=entry.date, cycle=cycle, axis=axis, text=text, hint=hint
     )
-
-
-def _words(event: Event, fault: Fault | None) -> str:
-    """Returns the text of an event."""
-    match event.kind:
-        case EventKind.STATE:
-            return STATES[event.code].value
-        case EventKind.MOTION_ENDED:
-            return MotionMode(event.code).name.lower()
-        case EventKind.FAULT if fault is not None:
-            detail = f" ({event.text})" if event.text else ""
-            return f"{fault.value}{detail}: {Reaction(event.id).name.lower().replace('_', ' ')}"
-        case _:
-            return event.text
 
 
 def lease_state(lease: Lease, now_s: float) -> messages.LeaseState:
@@ -188,13 +167,12 @@ def axis_state(axis: ServiceAxis, outer: messages.OuterState | None) -> messages
 
 def _fault(axis: ServiceAxis) -> messages.Fault | None:
     """Returns the cause of a latched stop or a drive fault; None without either."""
-    link, stopped = axis.link, axis.stopped
+    link, (event, date) = axis.link, axis.stopped or (None, None)
     code = int(link.value("fault")) if link.core.observer.newest is not None else NO_FAULT
     fault = fault_of(code)
     latched = link.state in STOPPED
     if not latched and link.power is not State.FAULT:
         return None
-    event = stopped.event if stopped is not None else None
     if fault is None and event is not None:
         fault = fault_of(event.code)
     if fault is None and not latched:
@@ -210,15 +188,13 @@ def _fault(axis: ServiceAxis) -> messages.Fault | None:
         text=text,
         hint=hint,
         cycle=event.cycle if event is not None else None,
-        date=stopped.date if stopped is not None else None,
+        date=date,
         needs_verification=link.state is AxisState.LATCHED,
     )
 
 
 def _date(value: object) -> datetime | None:
     """Returns a date of a provenance; None if invalid."""
-    if isinstance(value, datetime):
-        return value if value.tzinfo is not None else value.replace(tzinfo=UTC)
     try:
         date = datetime.fromisoformat(str(value))
     except ValueError:

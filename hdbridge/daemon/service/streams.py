@@ -105,7 +105,7 @@ class ServiceStream:
         """Passes on set-points; waits while the buffer is full. Raises if the stream has ended."""
         self._check_open()
         if self._knots is None:
-            await self._link.until(lambda: True, 0.0)
+            self._link.core.observer.poll()
             self._knots = Knots(self._number, self._link.value("load_target_deg"))
         await self._hand_over(self._knots.add(points))
         if not self._has_begun and self._last_s >= LEAD_S:

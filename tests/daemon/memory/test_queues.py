@@ -17,7 +17,7 @@ from hdbridge.errors import InputError
 
 
 def test_a_command_arrives_with_its_id_and_its_numbers(memory: Memory) -> None:
-    id_ = memory.commands.post(CommandKind.MOVE, 1, 12.5, float("nan"), 3.0, i=-(1 << 62), j=5, k=6)
+    id_ = memory.commands.post(CommandKind.MOVE, 1, a=12.5, b=float("nan"), c=3.0, i=-(1 << 62), j=5, k=6)
     command = memory.commands.take()
     assert command is not None
     assert (command.id, command.kind, command.axis, command.a) == (id_, CommandKind.MOVE, 1, 12.5)
@@ -77,14 +77,14 @@ def test_knots_of_two_axes_do_not_mix_and_are_bounded(memory: Memory) -> None:
     first, second = memory.knots
     wanted = [Knot(1, 0.004 * place, float(place), 0.5) for place in range(KNOT_SLOTS + 5)]
     assert first.put(wanted) == KNOT_SLOTS
-    assert first.free == 0
+    assert len(first) == KNOT_SLOTS
     assert second.put(wanted[:1]) == 1
     for each in (first, second):
         assert each.peek() == each.peek() == wanted[0]
         each.drop()
     assert first.peek() == wanted[1]
     assert second.peek() is None
-    assert first.free == 1
+    assert len(first) == KNOT_SLOTS - 1
     first.clear()
     assert first.peek() is None
 
@@ -122,9 +122,9 @@ class MailboxMachine(RuleBasedStateMachine):
         for value in range(burst):
             if len(self.waiting) == COMMAND_SLOTS:
                 with pytest.raises(MailboxFullError, match="has not taken the 256 commands"):
-                    self.memory.commands.post(CommandKind.MOVE, 0, float(value))
+                    self.memory.commands.post(CommandKind.MOVE, 0, a=float(value))
                 return
-            id_ = self.memory.commands.post(CommandKind.MOVE, 0, float(value))
+            id_ = self.memory.commands.post(CommandKind.MOVE, 0, a=float(value))
             assert id_ > self.last
             self.last = id_
             self.waiting.append((id_, float(value)))

@@ -32,7 +32,7 @@ def main(kind: str, *arguments: str) -> int:
         time.sleep(0.05)
         own = {"control": Cell.LOOP_PID, "service": Cell.SERVICE_PID, "gateway": Cell.GATEWAY_PID}
         status[own[kind]] = os.getpid()
-        say(f"{kind} {os.getpid()} {start.restarts}")
+        say(f"{kind} {os.getpid()}")
         while not signals and not (kind == "control" and status[Cell.STOP_ASKED]):
             if kind == "control":
                 status[Cell.LOOP_COUNT] = status.loop_count + 1

@@ -121,7 +121,6 @@ def test_a_dead_or_hanging_process_is_replaced_and_the_other_continues(keeper: C
         os.kill(kept.until_begun("service", times), number)
     kept.until_begun("service", times=3)
     assert len(kept.pids("control")) == 1
-    assert [line.split()[2] for line in kept.said if line.startswith("service")] == ["0", "1", "2"]
     kept.until_notified("STATUS=holds article; service restarted 2 times")
 
     os.kill(kept.until_begun("control"), signal.SIGSTOP)

@@ -48,7 +48,6 @@ def test_recordings_read_back_unchanged(tmp_path):
     assert [(each.axis, each.version, each.text) for each in flight.models] == [
         ("tilt", "7", "schema: hdbridge.model/1\n")
     ]
-    assert log.counts.recorded == 3 * SECOND
 
 
 def test_recordings_are_standard_mcap(tmp_path):

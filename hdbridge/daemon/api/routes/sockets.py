@@ -175,9 +175,9 @@ def columns(
     return Samples.model_construct(
         time_s=(samples["time_ns"] / 1e9).tolist(),
         cycle=samples["cycle"].tolist(),
-        late_us=_plain(samples["late_us"]),
-        busy_us=_plain(samples["busy_us"]),
-        bus_load=[*_plain(samples["bus_load"])],
+        late_us=samples["late_us"].tolist(),
+        busy_us=samples["busy_us"].tolist(),
+        bus_load=samples["bus_load"].tolist(),
         skipped=samples["skipped"].tolist(),
         axes={
             name: _axis(samples["axes"][:, place])
@@ -195,7 +195,3 @@ def _axis(rows: NDArray[Any]) -> AxisColumns:
     return AxisColumns.model_construct(
         state=[_STATES[each] for each in rows["state"].tolist()], error_arcsec=error_arcsec.tolist(), **found
     )
-
-
-def _plain(column: NDArray[Any]) -> list[float]:
-    return [float(each) for each in column.astype(float)]
