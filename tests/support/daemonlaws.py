@@ -101,7 +101,7 @@ class Laws:
         if function == 0x200:
             self.axes[node].take(data)
         elif can_id == 0x000 or function == 0x600:
-            self.relayed += (can_id, data[0]) != PRE_OPERATIONAL
+            self.relayed += (can_id, *data[:1]) != PRE_OPERATIONAL
             nodes = {data[1]} if can_id == 0x000 else {node}
             assert nodes <= set(self.axes)
         else:
