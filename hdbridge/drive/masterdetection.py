@@ -1,4 +1,4 @@
-"""Detection of another master on the bus, by listening before the first frame is sent.
+"""Detection of another master on the bus, by listening before this master sends its first frame.
 
 A reset, and on some drives even an SDO request, stops an axis that another master is moving. A master
 therefore listens first, for as long as the slowest other master may be silent. The relevant frames are those
@@ -66,7 +66,7 @@ class MasterDetector:
     def listen(self, link: Link, duration_s: float, then: Callable[[Frame], object] = lambda _: None) -> None:
         """Listens for a duration; ``then`` also receives every frame.
 
-        Frames that were already waiting do not count, because their master may be gone.
+        Frames that were already queued do not count, because their master may have left the bus.
         """
         for old in link.drain():
             self._note(old)

@@ -1,7 +1,7 @@
 """Writes of the boot-up, as a list for review before execution. Pure.
 
 Every row contains the object, its value, the reason, and the field of the axis file from which it comes. The
-boot-up reads each object first, writes those with another value, in this order, and reads them back.
+boot-up reads each object first, writes the objects whose value differs, in this order, and reads them back.
 `hdbridge.drive.bootplan` leaves missing objects that are optional in CiA 402 to the drive.
 """
 
@@ -23,7 +23,7 @@ from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG
 
 SYNCHRONOUS: Final = 1
-"""Transmission type: sent, or applied, at every SYNC."""
+"""Transmission type of a PDO that is sent (TPDO) or applied (RPDO) at every SYNC."""
 RPDO_TIMEOUT_CYCLES: Final = 4
 """Number of cycles without a set-point after which the drive stops (but not before 10 ms)."""
 _COB_COMPARED: Final = PDO_INVALID | 0x7FF
@@ -51,8 +51,8 @@ class PlannedWrite:
     kept: int = 0
     """Mask of the bits that keep the drive's value."""
     composed: bool = False
-    """True for several numbers in one object. The limits of the EDS are ignored, because vendors state them
-    for one number."""
+    """True if the object packs several numbers. The limits of the EDS are ignored, because vendors state the
+    limits for a single number."""
     without: str = ""
     """Consequence if the drive keeps its own value; empty if hdbridge requires this value."""
     exact: bool = False
