@@ -95,7 +95,8 @@ class AxisCycle:
         self.flushing = True
         """True from `begin` until the next cycle has read the queued frames, which are not judged."""
         self.changed: Callable[[], None] = _nobody
-        """Called when the identifiers or the state of the axis change, which takes effect in the next cycle.
+        """Called when the identifiers or the state of the axis change; the change takes effect in the next
+        cycle.
         """
 
         self._traffic = Traffic(image, self.monitor, 0.0)

@@ -39,7 +39,7 @@ class Routes(NamedTuple):
 
 
 def routes(axes: Sequence[AxisCycle]) -> Routes:
-    """Returns the routes for the present states of the axes; also sets each axis's ``needed``."""
+    """Returns the routes for the current states of the axes; also sets each axis's ``needed``."""
     slots: dict[int, Slot] = {}
     listeners: dict[int, AxisCycle] = {}
     awaited, bits = 0, FRAME_BITS[0]
