@@ -1,4 +1,4 @@
-"""Damped mass on a spring with a moving base: exact step for linear motion of the base."""
+"""Exact time step of a damped mass on a spring whose base moves linearly."""
 
 import math
 from typing import NamedTuple, Protocol
@@ -7,7 +7,7 @@ from hdbridge.sim.state import state
 
 
 class Step(NamedTuple):
-    """State transition of (distance from the base, its rate) over one step."""
+    """State transition of the distance from the base and its rate over one step."""
 
     distance_by_distance: float
     distance_by_rate: float
@@ -26,7 +26,7 @@ class Oscillator(Protocol):
 
 @state
 class Transition:
-    """`Step` as part of the simulation's state."""
+    """`Step` as a class of the simulation's state."""
 
     distance_by_distance: float
     distance_by_rate: float
