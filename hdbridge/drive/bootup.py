@@ -327,7 +327,7 @@ class BootUp:
         return read_only or not self._axis.states(row.field)
 
     def _write(self, row: PlannedWrite) -> None:
-        """Writes one object and compares the value read back."""
+        """Writes one object, reads it back and compares the two values."""
         sdo = self._clients[row.node_id]
         value = row.value
         try:

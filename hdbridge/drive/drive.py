@@ -357,7 +357,7 @@ class Drive:
         """Makes the drive monitor the master's heartbeat only while power may be on.
 
         Without power nothing can move, and the master may be busy reading or writing files. The drive starts
-        monitoring with the first heartbeat after this object was written.
+        monitoring with the first heartbeat after object 1016h was written.
         """
         if self.can_set(objects.HEARTBEAT_CONSUMER):
             self.sdo.store(objects.HEARTBEAT_CONSUMER, master_heartbeat(self.axis) if expected else 0)

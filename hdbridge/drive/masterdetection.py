@@ -16,8 +16,8 @@ from hdbridge.errors import BusInUseError
 LONGEST_CYCLE_S: Final = 0.255
 """Longest SYNC period that a drive accepts: 255 ms in 60C2h; s."""
 PERIODS: Final = 2
-"""Listening time in periods of the slowest cycle or of the heartbeat, whichever is longer. Two, because a
-frame may have been sent just before."""
+"""Listening time in periods of the slowest cycle or of the heartbeat, whichever is longer. There are two,
+because the last frame may have been sent just before listening started."""
 DEFAULT_MASTER_ID: Final = 127
 """Default node id of a master's heartbeat (77Fh), unless its axis file sets another."""
 _RPDOS: Final = (objects.COB_RPDO1, 0x300, 0x400, 0x500)

@@ -43,7 +43,7 @@ class PlannedWrite:
     value: int
     why: str
     field: str = ""
-    """Field of the axis file that determines the value; empty without one."""
+    """Field of the axis file that determines the value; empty if no field does."""
     type: IntegerType | None = None
     """Integer type; None if the EDS or the profile determines it."""
     compared: int = _EVERYTHING
@@ -60,7 +60,7 @@ class PlannedWrite:
     pdo: int = 0
     """Communication parameter of the PDO that the row configures; the rows of a PDO are consecutive."""
     passing: bool = False
-    """True if the object holds the value only while its PDO is being changed."""
+    """True if the object has the value only while its PDO is being changed."""
 
     def __str__(self) -> str:
         """For example ``605Ah:00 = 6 (6h): what a quick stop does [drive.quick_stop_option]``."""
@@ -172,7 +172,9 @@ def _pdos(axis: AxisConfig, od: ObjectDictionary | None, pdos: Layouts) -> Itera
 
 
 def _carried(axis: AxisConfig, layout: Layout) -> list[str]:
-    """Returns the key of the axis file that chose each entry of a PDO; empty without one."""
+    """Returns, for each entry of a PDO, the key of the axis file that requests the object; empty if no key
+    does.
+    """
     encoder = axis.load_encoder.source
     keys = {(encoder.index, encoder.subindex): "load_encoder.source"}
     for key, channel in axis.channels.items():
@@ -202,7 +204,7 @@ def _invalid(
 def _pdo(layout: Layout, communication: int, mapping: int, fields: list[str]) -> Iterator[PlannedWrite]:
     """Yields the rows of one PDO in the order of CiA 301: invalid, empty, entries, count, valid.
 
-    ``fields`` are the keys of the axis file that chose the entries; empty without one.
+    ``fields`` are the keys of the axis file that request the entries (see `_carried`).
     """
     node_id, number, can_id, codec, every, _ = layout
     field = next(filter(None, fields), "")
