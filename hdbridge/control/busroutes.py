@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 Slot = tuple[int, Callable[[bytes], None], "AxisCycle"]
 """One TPDO of a cycle: its bit in the mask of all TPDOs, the function that takes its data (`PdoLengthError`
-if the length is wrong), and its axis. A plain tuple unpacks in a third of the time of a named one."""
+if the length is wrong), and its axis. A plain tuple is unpacked in a third of the time that a named tuple
+takes."""
 
 
 class Routes(NamedTuple):
