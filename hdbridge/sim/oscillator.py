@@ -38,7 +38,7 @@ class Transition:
 
 
 def transition(truth: Oscillator | None, step_s: float) -> Transition:
-    """Returns the exact step of an oscillator; without one, the step of a mass fixed to its base."""
+    """Returns the exact step of an oscillator; for None, the step of a mass fixed to its base."""
     if truth is None:
         return Transition(Step(0.0, 0.0, 0.0, 0.0))
     return Transition(exact_step(math.tau * truth.frequency_hz, truth.damping_ratio, step_s))

@@ -26,7 +26,9 @@ integral may rest."""
 
 @state
 class MovingAverage:
-    """Moving average of the demand, from its integral now and one duration ago."""
+    """Moving average of the demand, computed from the integral of the demand now and one averaging time
+    ago.
+    """
 
     _duration_s: float
     _integral: float
