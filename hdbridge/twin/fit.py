@@ -565,11 +565,11 @@ def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
 # legs.
 
 BANDWIDTHS: Final = ((25.0, 100.0), (80.0, 300.0), (200.0, 800.0))
-"""Position gain, 1/s, and velocity gain over the total inertia, rad/s: a geared axis with a soft load, an
-ordinary load, and a stiff load."""
+"""Position gain, 1/s, and ratio of velocity gain to total inertia, rad/s, for a geared axis with a soft load,
+with an ordinary load and with a stiff load."""
 REJECTIONS: Final = ("speed", "position", "observer")
-"""Block that compensates friction and load torque: the integral of the speed error (PI velocity loop) or of
-the position error (PIV), or a disturbance observer."""
+"""Alternatives for the block that compensates friction and load torque: the integral of the speed error (PI
+velocity loop) or of the position error (PIV), or a disturbance observer."""
 INTEGRAL: Final = 3.0
 """Integral time times the bandwidth of the velocity loop (symmetric optimum: 2 to 4)."""
 SLOW_INTEGRAL: Final = 30.0
@@ -578,9 +578,9 @@ integral."""
 OBSERVED: Final = 0.9
 """Start value of the fraction of the disturbance that the observer compensates: nearly all."""
 FILTER_MS: Final = 0.5
-"""Speed and torque filter at the start: half to twice the period of common velocity loops."""
+"""Start value of the speed and torque filters: half to twice the period of common velocity loops."""
 SHORT_MS: Final = 0.1
-"""Negligible command filter: a fifth of a substep."""
+"""Time constant of a negligible command filter: a fifth of a substep."""
 VELOCITY_FEEDFORWARD: Final = 0.9
 """Start value, between no feed-forward (rare) and feed-forward of the full speed."""
 FEW_STEPS = 3
@@ -666,9 +666,9 @@ def by_halving(
 def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
     """Yields the servo structures from which fits start.
 
-    An acceleration feed-forward uses the filtered demand, or differences over whole SYNC cycles, which is a
-    moving average of one cycle. A lag beyond the longest possible dead time is attributed to the command
-    filter.
+    An acceleration feed-forward uses the filtered demand, or differences over whole SYNC cycles, which
+    corresponds to a moving average over one cycle. A lag beyond the longest possible dead time is attributed
+    to the command filter.
     """
     longest_ms = min(MOST_DEAD_CYCLES * cycle_ms, DEAD_TIME.most)
     reaction = (REACTION,) if truth.gear.hysteresis else ()

@@ -214,7 +214,7 @@ class Moved:
 
     @property
     def sentence(self) -> str:
-        """Change in words."""
+        """Describes the change: values before and after, and the interval if there is one."""
         unit = f" {self.unit}" if self.unit else ""
         moved = f"{self.name} {figure(self.before, 3)} -> {figure(self.after, 3)}{unit}"
         if math.isnan(self.lower):
@@ -235,7 +235,7 @@ class Finding:
 
     @property
     def text(self) -> str:
-        """Change in words."""
+        """Describes the changes of the parameters, and the inseparable causes if there are any."""
         moved = "; ".join(each.sentence for each in self.parameters)
         rest = f", or {' or '.join(self.aliases)}: {self.move} would separate them" if self.aliases else ""
         return f"{moved}{rest}"

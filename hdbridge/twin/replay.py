@@ -374,7 +374,7 @@ def legs_of(recording: Recording) -> tuple[Segment, ...]:
 
 
 def _legs_of_command(part: Record) -> Iterator[Segment]:
-    """Yields the legs of a part by its command, or the whole part without one."""
+    """Yields the legs of a part, as derived from its command; the whole part if it has no command."""
     time_s, target = part.time_s, part.motor_target_deg
     cuts, moved_s = [float(time_s[0])], [float(time_s[-1])]
     if target is not None and len(part) > 2:

@@ -83,7 +83,7 @@ class _Part:
     """Change of the truth's ambient temperature since the start of the part."""
     reading_c: FloatArray
     rows: NDArray[np.intp]
-    """Indices of the times whose readings count."""
+    """Indices of the times whose readings are fitted."""
     firsts: NDArray[np.intp]
     """Index into `rows` of the first of each run of equal readings."""
 
@@ -211,7 +211,7 @@ def _body(goal_c: FloatArray, start_c: float, time_s: float) -> FloatArray:
 def _parts(
     recording: Recording, truth: Truth, friction_j: FloatArray, torque_squares: FloatArray
 ) -> list[_Part]:
-    """Prepares the continuous parts; skips those that are too short or without readings that count.
+    """Prepares the continuous parts; skips parts that are too short or have only held-out readings.
 
     The losses are accumulated by row: ``friction_j`` is the friction's work, ``torque_squares`` the time
     integral of the squared ratio of torque to rated torque, s.

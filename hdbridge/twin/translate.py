@@ -205,7 +205,9 @@ def orders(key: str, effect: Any, draft: Draft) -> None:
 
 
 def direction_phase(effect: effects.DirectionPhase, draft: Draft) -> None:
-    """Sets two flanks. The model's orders are the mean of both flanks; the plant's are those of one flank."""
+    """Sets the two flanks of the teeth. The model's orders are the mean of both flanks; the plant's orders
+    are those of one flank.
+    """
     held, flanks = list[str](), list[dict[str, Any]]()
     for each in draft.gear.get("motor_orders", ()):
         shift = math.radians(each["order"] * effect.shift_deg)
@@ -501,7 +503,9 @@ def compliance(effect: effects.Compliance, draft: Draft) -> None:
 
 
 def inertial_windup(effect: effects.InertialWindup, draft: Draft) -> None:
-    """Sets J / K of the load on its spring, minus the wind-up of the load encoder's coupling."""
+    """Sets the load's inertia or the spring's stiffness according to the effect's J / K, after subtracting
+    that of the load encoder's coupling.
+    """
     seconds2 = effect.inertia_over_stiffness_s2
     coupling = draft.part("load", "encoder").get("coupling")
     if coupling:

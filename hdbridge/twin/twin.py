@@ -105,12 +105,14 @@ class Twin:
 
 SIGNALS: Final = (LOAD_ERROR, FOLLOWING_ERROR, MOTOR_TORQUE, TEMPERATURE)
 LEAST_GAIN: Final = 0.01
-"""Minimum reduction of the mean ratio of the differences; smaller reductions are due to noise."""
+"""Minimum mean reduction of the differences for a twin to count as better; smaller reductions are due to
+noise."""
 EQUAL: Final = 0.01
 """Fraction of the noise below which differences count as equal, because a few held-out readings may all
 agree."""
 WORSE: Final = 1.1
-"""Ratio of the differences after and before above which a signal counts as worse, if it exceeds its noise."""
+"""Ratio of a signal's difference after the fit to that before, above which the signal counts as worse if the
+difference also exceeds its noise."""
 DECADE: Final = 10.0
 """Maximum ratio of a motor's inertia to the usual inertia for its rated torque, and of load to motor inertia
 seen by the motor. The inertias of servo motors of equal torque differ by a factor of three to five
