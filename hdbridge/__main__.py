@@ -12,7 +12,7 @@ for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 def main() -> None:
     """Runs the command line; Ctrl-C while hdbridge is loading does not print a traceback."""
     try:
-        from hdbridge.cli import main as run  # noqa: PLC0415 - loading takes a second; Ctrl-C may come meanwhile
+        from hdbridge.cli import main as run  # noqa: PLC0415 - loading takes a second, and Ctrl-C may come
 
         run()
     except KeyboardInterrupt:
