@@ -22,7 +22,7 @@ from hdbridge.twin.parameters import BY_NAME, Parameter, by_cause, coordinates
 from hdbridge.units import figure
 
 CHECK_S = 17.0
-"""Duration of the pieces into which a check divides a longer recording."""
+"""Total duration of the pieces of a longer recording that a check uses."""
 NOTICEABLE = 2.5
 """Change of a parameter that a recording must reveal, in units of the parameter's least change. If the
 recording does not reveal it, the parameter's cause is reported as not observable."""

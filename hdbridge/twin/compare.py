@@ -1,6 +1,7 @@
 """Comparison of a measured and a simulated record of the same commands.
 
-Each difference is given with the noise of the measured channel, which a simulation cannot undercut. Pure.
+Each difference is given together with the noise of the measured channel, which is the smallest difference
+that a simulation can reach. Pure.
 """
 
 from __future__ import annotations

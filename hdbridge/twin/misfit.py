@@ -60,8 +60,8 @@ recording, unless both are known (because the gear has no such state, or from th
 LONGEST_LEG_S = 2.0
 """Maximum length of a leg; a longer one is split, because residuals further apart are uncorrelated."""
 COARSE_S = 17.0
-"""Duration of the pieces for the first steps of a fit: a sweep, steps and a sine of the plan `dynamics`,
-each after its run-in."""
+"""Total duration of the pieces for the first steps of a fit: a sweep, steps and a sine of the plan
+`dynamics`, each after its run-in."""
 WITHOUT_MOTION = frozenset({"standstill", "reference", "settle"})
 """Kinds of legs that do not add to the variety of motion of a coarse fit."""
 HELD_OUT = 4

@@ -91,7 +91,7 @@ def continuous(record: Record) -> list[slice]:
 
 
 def just_on(record: Record, row: int) -> bool:
-    """Returns True if the drive has just been switched on at a row, because it has no torque yet.
+    """Returns True if the drive has just been switched on at a row, as the absence of torque shows.
 
     Also returns True for a record without torque, on the assumption that power is on only during a procedure.
     """
@@ -157,8 +157,8 @@ def begins_in_motion(part: Record) -> bool:
 def unknown_rows(record: Record, count_deg: float) -> NDArray[np.bool_]:
     """Returns the mask of rows in which the load may still ring from an unknown motion.
 
-    Such a motion precedes a recording that begins (or resumes) in motion, and the switch-off after a
-    procedure that ended in motion. ``count_deg`` is one motor count.
+    The motion is unknown before a group of consecutive parts that begins in motion, and before a part whose
+    command differs from that at the end of the previous part. ``count_deg`` is one motor count.
     """
     target, time_s = record.motor_target_deg, record.time_s
     unknown = np.zeros(len(record), dtype=np.bool_)

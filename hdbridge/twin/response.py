@@ -36,7 +36,7 @@ between them."""
 ROUNDS: Final = 2
 """Number of fits of the demand's response; the second corrects for friction."""
 MAX_MISFIT_RATIO: Final = 0.97
-"""A response is kept if it reduces the misfit at least to this fraction."""
+"""A response is kept if it reduces the misfit to less than this fraction."""
 
 
 def with_response(replays: Replays, fitted: Fitted) -> Fitted:

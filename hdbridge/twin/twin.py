@@ -111,8 +111,7 @@ EQUAL: Final = 0.01
 """Fraction of the noise below which differences count as equal, because a few held-out readings may all
 agree."""
 WORSE: Final = 1.1
-"""Ratio of a signal's difference after the fit to that before, above which the signal counts as worse if the
-difference also exceeds its noise."""
+"""A signal counts as worse if its difference has grown by more than this factor and exceeds its noise."""
 DECADE: Final = 10.0
 """Maximum ratio of a motor's inertia to the usual inertia for its rated torque, and of load to motor inertia
 seen by the motor. The inertias of servo motors of equal torque differ by a factor of three to five
@@ -187,7 +186,8 @@ def replays_only(twin: Twin) -> str:
 
 
 def better(before: Comparison, after: Comparison) -> Verdict:
-    """Compares the rms differences of load error, following error, torque and (if recorded) temperature.
+    """Decides whether the rms differences of load error, following error, torque and (if recorded)
+    temperature have become smaller.
 
     Uses the held-out legs, or all legs if none are held out.
     """
