@@ -83,9 +83,7 @@ class Pdo:
         count = self._dictionary.value(self._mapping, 0)
         try:
             entries = self._entries(count)
-        except (
-            SdoAbortError
-        ):  # a default mapping of the EDS that this drive cannot map: the PDO does not exist
+        except SdoAbortError:  # a default of the EDS that cannot be mapped: the PDO does not exist
             self._dictionary[self._mapping, 0].value = 0
             self._dictionary[self._communication, 1].value |= INVALID
             self.valid, entries = False, []
