@@ -1,7 +1,7 @@
 """Simulated axis as seen by a drive's firmware: loops, motor, gear, load and two encoders.
 
-Deterministic: the same truth, seed and commands yield the same numbers bit for bit. It has no clock; each
-call advances it by whole substeps.
+Deterministic: the same truth, seed and commands yield the same numbers bit for bit. The machine has no clock;
+each call advances it by whole substeps.
 """
 
 import math

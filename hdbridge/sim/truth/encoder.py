@@ -107,7 +107,9 @@ class TrueCable(Strict):
 
 
 class TrueSensorWarming(Strict):
-    """Warming of the encoder with the square of its speed, which no temperature channel measures."""
+    """Warming of the encoder, which grows with the square of its speed; no temperature channel measures
+    it.
+    """
 
     arcsec_at_10_deg_s: float = Field(
         ge=-3_600, le=3_600, description="final shift in long motion at 10 degrees per second"
