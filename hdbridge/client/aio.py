@@ -246,9 +246,7 @@ class AsyncClient:
             async with self._lock:
                 self._holding -= 1
                 if self._holding == 0:
-                    with suppress(
-                        DaemonError
-                    ):  # the lease has ended or the daemon has exited, so there is nothing to release
+                    with suppress(DaemonError):  # lease or daemon no longer exists: nothing to release
                         await self.ask("DELETE", "/lease", LeaseState)
                     self._grant = None
 
