@@ -1,4 +1,4 @@
-"""hdbridge: a CANopen CiA-402 master that makes a harmonic-drive axis point to its commanded angle.
+"""hdbridge: a CANopen CiA-402 master that makes a harmonic-drive axis reach its commanded angle.
 
 These names are the library's public interface. docs/api.md describes each, and they change only with a note
 in the changelog. Each is loaded on first use, so importing hdbridge costs nothing. Everything else may change
@@ -110,7 +110,9 @@ def __dir__() -> list[str]:
 
 
 class _FrontDoor(ModuleType):
-    """Keeps `hdbridge.simulated` the function, because importing the module of that name would replace it."""
+    """Makes `hdbridge.simulated` always the function, although importing the module of the same name would
+    replace it.
+    """
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not (isinstance(value, ModuleType) and name in __all__):

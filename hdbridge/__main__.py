@@ -4,15 +4,15 @@ import os
 import sys
 
 # Threads in linear algebra cost more than they gain, because the matrices are small; on a busy computer they
-# cost several times the work. Users who want threads set these variables.
+# cost several times the work. Users who want threads can set these variables.
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")
 
 
 def main() -> None:
-    """Runs the command line; Ctrl-C during loading is not an error in hdbridge."""
+    """Runs the command line; Ctrl-C while hdbridge is loading does not print a traceback."""
     try:
-        from hdbridge.cli import main as run  # noqa: PLC0415 - loading takes a second, in which Ctrl-C may come
+        from hdbridge.cli import main as run  # noqa: PLC0415 - loading takes a second, and Ctrl-C may come
 
         run()
     except KeyboardInterrupt:

@@ -5,7 +5,7 @@ from can.typechecking import Channel
 
 
 class DataFrame(can.Message):
-    """Data frame with an 11-bit identifier; not to be modified after sending.
+    """Data frame with an 11-bit identifier; must not be modified after sending.
 
     A python-can bus accepts it like any message. Its deep copy is cheap, because python-can's virtual bus
     makes one for each receiver.

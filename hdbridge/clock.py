@@ -1,4 +1,4 @@
-"""Time for the control loop: a monotonic clock that is passed in rather than looked up.
+"""Clock of the control loop: a monotonic clock that is passed to its users rather than imported.
 
 Wall clocks step and drift, so no deadline in hdbridge depends on them.
 """
@@ -11,7 +11,7 @@ class Clock(Protocol):
     """Monotonic clock with waiting."""
 
     def now(self) -> float:
-        """Returns seconds on a monotonic clock of arbitrary zero."""
+        """Returns the time of this clock in seconds, from an arbitrary origin."""
         ...
 
     def sleep_until(self, deadline_s: float) -> None:

@@ -2,7 +2,7 @@
 
     HdbridgeError
     ├── InputError        2   a file, option or value is wrong: nothing was written, nothing moved
-    ├── BusError          3   the CAN interface cannot be opened, or went away
+    ├── BusError          3   the CAN interface cannot be opened, or has disappeared
     │   └── BusInUseError     another master is heard on it or holds its lock: nothing was sent
     ├── DriveError        4   the drive is absent, refuses, is not the expected one, or reports a fault
     │   ├── SdoError          an object could not be read or written
@@ -37,7 +37,7 @@ class InputError(HdbridgeError):
 
 
 class BusError(HdbridgeError):
-    """The CAN interface cannot be opened or has gone away."""
+    """The CAN interface cannot be opened or has disappeared."""
 
     exit_status = 3
 
@@ -61,7 +61,7 @@ class IdentityError(DriveError):
 
 
 class TransitionError(DriveError):
-    """A CiA-402 transition is not allowed in the present state, or did not happen in time."""
+    """A CiA-402 transition is not allowed in the current state, or did not happen in time."""
 
 
 class SafetyStop(HdbridgeError):  # noqa: N818 - it says what happened
@@ -76,7 +76,7 @@ class SafetyStop(HdbridgeError):  # noqa: N818 - it says what happened
 
 
 class OutputError(HdbridgeError):
-    """A file could not be written after all, for example on a full disk; the old file remains."""
+    """A file could not be written, for example because the disk is full; the old file remains."""
 
     exit_status = 6
 

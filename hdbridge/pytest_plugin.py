@@ -27,7 +27,7 @@ _HELP: Final = {
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Adds ``--hdbridge-...`` and the same keys to the ini file."""
+    """Adds the options ``--hdbridge-...`` and ini-file keys with the same meaning."""
     group = parser.getgroup("hdbridge", "simulated CiA-402 drive (fixture hdbridge_drive)")
     for name, what in _HELP.items():
         help_text = f"{what}; default {_DEFAULTS[name]}" if _DEFAULTS[name] else what
@@ -71,10 +71,11 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, Any, None]:
 
 
 def _wanted(request: pytest.FixtureRequest) -> dict[str, Any]:
-    """Collects the settings from the marker, the command line, the ini file and the defaults.
+    """Collects the settings from the marker, the command line, the ini file and the defaults, in this order
+    of precedence.
 
-    The order is that of precedence. A relative path starts at the test's folder, the working folder, or the
-    ini file's folder.
+    A relative path is relative to the test's folder (marker), the working folder (command line) or the ini
+    file's folder.
     """
     config = request.config
     marks: dict[str, Any] = {}
@@ -103,7 +104,7 @@ def _wanted(request: pytest.FixtureRequest) -> dict[str, Any]:
 
 
 def _seed(value: Any) -> Any:
-    """Converts to an integer if possible; other values are reported later."""
+    """Converts a seed to an integer if possible; invalid values are reported later."""
     try:
         return int(value) if isinstance(value, str) else value
     except ValueError:

@@ -1,4 +1,4 @@
-"""Simulated axis in one line, for a first try, a test, or a script without hardware.
+"""Simulates an axis with one line of code, for a first try, a test, or a script without hardware.
 
 with simulated(axis) as drive:          # a real one: open_bus(axis.bus) as bus, Drive(bus, axis) as drive
     drive.boot()
@@ -23,9 +23,9 @@ def simulated(
     """Yields the drive of an axis, simulated in this process and faster than real time; not booted yet.
 
     ``truth`` describes the axis (docs/ci.md); the default is the ``twin.yaml`` next to the axis file, or else
-    the ``truth.yaml``. ``changed`` are keys of its sections that differ, such as ``gear={"backlash_arcsec":
-    10}``. The same truth and seed give the same frames, bit for bit. Raises `InputError` for a missing or
-    invalid truth.
+    the ``truth.yaml``. ``changed`` overrides keys in sections of the truth, such as
+    ``gear={"backlash_arcsec": 10}``. The same truth and seed give the same frames, bit for bit. Raises
+    `InputError` for a missing or invalid truth.
     """
     # Loaded here, because a master of a real drive needs no simulation.
     from hdbridge.drive import Drive  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""Units of the project, and the constants between them.
+"""Units of the project, and their conversion constants.
 
 Angles are degrees, multi-turn, never wrapped. Gear errors are arcseconds *at the load*. A name contains its
 unit (``motor_deg``, ``offset_arcsec``, ``cycle_s``).
@@ -51,7 +51,9 @@ def _ending(name: str) -> str:
 
 
 def figure(value: float, digits: int = 4) -> str:
-    """Formats a number with ``digits`` significant digits; no exponent from a ten-thousandth to a million."""
+    """Formats a number with ``digits`` significant digits; uses no exponent between a ten-thousandth and a
+    million.
+    """
     if not 1e-4 <= abs(value) < 1e6:
         return f"{value:.{digits}g}"
     decimals = digits - 1 - math.floor(math.log10(abs(value)))
@@ -60,8 +62,8 @@ def figure(value: float, digits: int = 4) -> str:
 
 
 def with_interval(value: float, half_width: float) -> tuple[str, str]:
-    """Formats a number and the half width of its interval, which has two digits and determines the
-    decimals.
+    """Formats a number and the half width of its interval, which has two significant digits and determines
+    the number of decimals.
     """
     if not (math.isfinite(half_width) and half_width > 0.0):
         return figure(value), figure(half_width)

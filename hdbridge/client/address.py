@@ -17,7 +17,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Unix socket, or URL with its token."""
+    """Address of a daemon: a Unix socket, or a URL with its token."""
 
     socket: Path | None = None
     url: str = "http://hdbridge"
@@ -94,13 +94,13 @@ def _url(given: str, token: str | None) -> Address:
 
 
 def _sockets(environment: Mapping[str, str]) -> list[Path]:
-    """Returns the sockets with a listener, in trusted folders."""
+    """Returns the sockets in trusted folders on which a process listens."""
     found: list[Path] = []
     for folder in (session_folder(environment), SYSTEM_FOLDER):
         if _is_trusted(folder):
             for place, inside, names in os.walk(folder, followlinks=True):  # files may vanish meanwhile
                 if Path(place) != folder:
-                    inside.clear()  # one level of folders
+                    inside.clear()  # searches only one level of subfolders
                 found += [Path(place, name) for name in names if name.endswith(".sock")]
     return [path for path in sorted(found) if _listens(path)]
 

@@ -8,8 +8,8 @@
         for target_deg in (10, 20, 30):
             print((await axis.move(target_deg)).error_arcsec)
 
-Motion requires the lease. A method that moves an axis holds it for its duration, unless `AsyncClient.lease`
-already holds it. All errors are those of `hdbridge.errors`.
+Motion requires the lease. A method that moves an axis takes the lease for its duration, unless
+`AsyncClient.lease` already holds it. All errors are those of `hdbridge.errors`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ FAILURES: Final = (OSError, EOFError, ConnectionClosed, InvalidHandshake)
 """Exceptions of a WebSocket."""
 POLL_S: Final = 0.1
 JOG_S: Final = 0.5
-"""Time-out of a jog after the client's last request."""
+"""Time after the client's last request at which a jog ends; s."""
 RENEWALS: Final = 3
 """Lease renewals per time-out."""
 MESSAGE_MAXIMUM: Final = 32 << 20
@@ -62,8 +62,8 @@ class AsyncClient:
     """Client of a daemon, which must be closed or used as a context manager.
 
     ``address`` is a Unix socket, a URL or a machine's name; without it, `hdbridge.client.address.find` finds
-    the daemon. ``token`` is required over TCP; others see ``name`` while the client holds the lease. Safe for
-    concurrent use.
+    the daemon. ``token`` is required over TCP; other clients see ``name`` while this client holds the lease.
+    Safe for concurrent use.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class AsyncClient:
     async def coordinated(
         self, targets_deg: Mapping[str, float], *, speed: float = 1.0, wait: bool = True
     ) -> MachineState:
-        """Moves axes so that all begin and end together; ``speed`` is a share of their limits."""
+        """Moves axes so that all begin and end together; ``speed`` is a fraction of their limits."""
         body = messages.Coordinated.given(targets_deg=dict(targets_deg), speed=speed, wait=wait)
         return await self.ask("POST", "/coordinated", MachineState, body, moving=True, waits=True)
 
@@ -147,7 +147,7 @@ class AsyncClient:
 
     @asynccontextmanager
     async def lease(self, *, force: bool = False) -> AsyncIterator[LeaseGrant]:
-        """Holds the lease within the block, renewing it meanwhile.
+        """Holds and renews the lease within the block.
 
         A nested block reuses the lease. Raises LeaseError if another client holds it.
         """
@@ -246,7 +246,7 @@ class AsyncClient:
             async with self._lock:
                 self._holding -= 1
                 if self._holding == 0:
-                    with suppress(DaemonError):  # the lease or the daemon is gone: nothing to release
+                    with suppress(DaemonError):  # lease or daemon no longer exists: nothing to release
                         await self.ask("DELETE", "/lease", LeaseState)
                     self._grant = None
 
@@ -283,7 +283,7 @@ class AsyncAxis:
         return await self.client.ask("GET", self._path, AxisState)
 
     async def enable(self) -> AxisState:
-        """Switches power on at rest; boots and verifies the drive first if that was not done."""
+        """Switches power on at rest; boots and verifies the drive first if necessary."""
         return await self._post("enable", waits=True)
 
     async def disable(self) -> AxisState:
@@ -314,7 +314,7 @@ class AsyncAxis:
         acceleration_deg_s2: float | None = None,
         wait: bool = True,
     ) -> AxisState:
-        """Moves to a load angle in degrees; a present motion is redirected without a stop."""
+        """Moves to a load angle in degrees; a motion under way is redirected without a stop."""
         body = messages.Move.given(
             target_deg=target_deg,
             velocity_deg_s=velocity_deg_s,
@@ -324,10 +324,11 @@ class AsyncAxis:
         return await self._post("move", body, waits=True)
 
     async def jog(self, velocity_deg_s: float, duration_s: float | None = None) -> AxisState:
-        """Turns at a speed for a duration, then brakes; without one, must be called again within `JOG_S`.
+        """Turns at a speed for a duration, then brakes; without a duration, must be called again within
+        `JOG_S`.
 
-        Raises LeaseError without a duration unless the lease is held, because the lease, and with it the jog,
-        would end with this call.
+        Without a duration, raises LeaseError unless the lease is held, because the lease, and with it the
+        jog, would end with this call.
         """
         body = messages.Jog.given(velocity_deg_s=velocity_deg_s, timeout_s=JOG_S)
         if duration_s is None:
@@ -341,7 +342,9 @@ class AsyncAxis:
             return await self.stop()
 
     async def queue(self, points: Sequence[messages.QueueItem | float], *, wait: bool = True) -> AxisState:
-        """Appends way points (load angles, or with their own limits) and waits until the last is reached."""
+        """Appends way points (load angles, or items with their own limits) and waits until the last one is
+        reached.
+        """
         items = [
             each.model_dump() if isinstance(each, messages.QueueItem) else {"target_deg": each}
             for each in points
@@ -370,10 +373,11 @@ class AsyncAxis:
 
     @asynccontextmanager
     async def stream(self, timeout_s: float = JOG_S) -> AsyncIterator[AsyncStream]:
-        """Follows the set-points that are put within the block; at its end, the axis rests at the last one.
+        """Follows the set-points that are put within the block; at the end of the block, the axis rests at
+        the last one.
 
-        The first set-point is the axis's position. The axis brakes if no point is left for ``timeout_s``, or
-        if the block raises an error.
+        The first set-point must be the axis's position. The axis brakes if no point is left for
+        ``timeout_s``, or if the block raises an error.
         """
         begin = messages.StreamBegin.given(lease="", timeout_s=timeout_s)
         async with self.client.lease() as grant, self.client.connected(f"{self._path}/stream") as link:
@@ -387,7 +391,7 @@ class AsyncAxis:
         return await self._post("compensate", messages.Compensate.given(scheme=scheme))
 
     async def activate_model(self, version: int | str) -> AxisState:
-        """Activates a model: its number in the history, ``pending`` or ``active``."""
+        """Activates a model, given by its number in the history, or by ``pending`` or ``active``."""
         return await self._post("model", messages.ActivateModel.given(version=version), waits=True)
 
     async def load_loop(self, on: bool) -> AxisState:
@@ -399,7 +403,7 @@ class AsyncAxis:
         return await self._post("adaptation", messages.Adapt.given(mode=mode))
 
     async def adaptation_back(self) -> AxisState:
-        """Discards the changes by the adaptation, which only observes from then on."""
+        """Discards the changes made by the adaptation, which only observes from then on."""
         return await self._delete("adaptation")
 
     async def read(self, object_: str) -> SdoValue:

@@ -20,7 +20,7 @@ _PRINTABLE: Final = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"
 """Text without characters that move a terminal's cursor, start a log line or reverse the writing
 direction."""
 Real = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-"""Number, not its text; NaN and infinity are refused."""
+"""Number (a string is refused); NaN and infinity are refused."""
 Angle = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e7, le=1e7)]
 """Degrees at the load, multi-turn; the axis's own limits are narrower."""
 Speed = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=1e5)]

@@ -49,7 +49,9 @@ class _Thread:
         self._loop = begun.result()
 
     def end(self) -> None:
-        """Ends the thread soon. Does not wait, because the garbage collector may call it in this thread."""
+        """Requests the end of the thread without waiting for it, because the garbage collector may call this
+        method in this thread.
+        """
         if self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._ended.set)
 
@@ -194,7 +196,7 @@ class Client:
 
     @contextmanager
     def lease(self, *, force: bool = False) -> Iterator[LeaseGrant]:
-        """Holds the lease within the block, renewing it meanwhile.
+        """Holds and renews the lease within the block.
 
         A nested block reuses the lease. Raises LeaseError if another client holds it.
         """

@@ -27,7 +27,7 @@ check: Final = CHECKS.check
 _EDS: Final = "CiA 306"
 _SHOWN: Final = 5
 _COMMANDS: Final = frozenset({0x1003, 0x1010, 0x1011, 0x6040, 0x6060, 0x607A, 0x60C1})
-"""Objects whose values are not parameters, or whose download has a side effect."""
+"""Objects whose values are not parameters, or whose download has side effects."""
 _PDO_PARAMETERS: Final = (0x1400, 0x1BFF)
 _INTEGERS: Final = datatypes.INTEGER_TYPES
 

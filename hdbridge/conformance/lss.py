@@ -25,7 +25,9 @@ _Function = Callable[[NodeTester, list[int]], None]
 
 
 def _ask(t: NodeTester, command: int, *values: int, number: int | None = None) -> bytes | None:
-    """Sends a request, with a 32-bit number before the bytes if given; returns the answer or None."""
+    """Sends a request with ``values`` as its data bytes, after a 32-bit ``number`` if given; returns the
+    answer or None.
+    """
     data = bytes(values) if number is None else struct.pack("<I", number) + bytes(values)
     since = t.mark()
     t.send(_REQUEST, (bytes((command,)) + data).ljust(8, b"\0"))
@@ -46,13 +48,15 @@ def _select(t: NodeTester, identity: list[int]) -> bytes | None:
 
 
 def _answered(t: NodeTester, answer: bytes | None, command: int, *values: int) -> None:
-    """Fails unless the answer is ``command`` with these bytes."""
+    """Fails unless the answer consists of ``command`` and ``values``."""
     found = None if answer is None else answer[: 1 + len(values)]
     t.equal("no answer" if found is None else found, bytes((command, *values)))
 
 
 def _check(name: str, text: str, *, stores: bool = False) -> Callable[[_Function], None]:
-    """Decorates the function of a check, which begins in configuration state and ends in waiting state."""
+    """Decorates the function of a check, which begins in LSS configuration state and ends in LSS waiting
+    state.
+    """
 
     def add(function: _Function) -> None:
         @CHECKS.check(f"lss.{name}", text, "CiA 305", stores=stores)
@@ -68,14 +72,14 @@ def _check(name: str, text: str, *, stores: bool = False) -> Callable[[_Function
 
 
 def _numbered(t: NodeTester, identity: list[int], node_id: int) -> None:
-    """Sets the node id that becomes valid at the next reset of the communication."""
+    """Sets a new node id, which becomes valid at the next reset of the communication."""
     _select(t, identity)
     _answered(t, _ask(t, 0x11, node_id), 0x11, 0)
 
 
 def _back(t: NodeTester, identity: list[int], now: int) -> None:
-    """Restores the node's own node id; sends all requests before it waits, so that the user's stop cannot
-    prevent them.
+    """Restores the node's own node id; sends all requests before it waits, so that the user cannot end the
+    run before they are sent.
     """
     requests = [struct.pack("<BI3x", 0x40 + part, number) for part, number in enumerate(identity)]
     since = len(t.log)

@@ -1,4 +1,6 @@
-"""Checks of CiA 402 with power: states, options, moves, cyclic targets, homing, with small motions."""
+"""Checks of CiA 402 that need power and small motions: states, option codes, moves, cyclic targets,
+homing.
+"""
 
 import struct
 from collections.abc import Callable
@@ -366,7 +368,7 @@ def _enable_slowly(t: NodeTester) -> None:
 
 
 def _direction(t: NodeTester, distances: int) -> int:
-    """Returns 1 or -1, the direction in which the software limits leave room for this many distances."""
+    """Returns 1 or -1, the direction in which the software limits leave room for this many test distances."""
     if not t.has(0x607D, 1):
         return 1
     low, high = (t.read(0x607D, sub, signed=True) for sub in (1, 2))
@@ -496,7 +498,7 @@ def _(t: NodeTester) -> None:
 
 
 def _there_and_back(t: NodeTester, extra: int) -> tuple[int, int]:
-    """Sends a second set-point, back to the start, during the first move.
+    """Sends a second set-point, which leads back to the start, during the first move.
 
     Returns the largest distance from the start, and the distance of the first set-point.
     """
@@ -652,7 +654,9 @@ class _Stream:
         self.cycle(5)
 
     def move(self, side: int = 0) -> float:
-        """Moves by one test distance in 0.5 s, by default to the side with space; returns the step."""
+        """Moves by one test distance in 0.5 s, by default in the direction in which the limits leave room;
+        returns the step per cycle.
+        """
         step = (side or _direction(self.t, 2)) * self.t.travel * _CYCLE_S / 0.5
         self.cycle(50, step)
         return step
@@ -814,7 +818,7 @@ def _homing(method: int) -> None:
 
 
 def _home_back(t: NodeTester, position: int, offset: int) -> None:
-    """Homes again, so that positions are as before the check."""
+    """Homes again, so that the position values are the same as before the check."""
     _home(t, position)
     t.control(0x0F)
     t.put(0x607C, 0, offset, 4)

@@ -215,7 +215,7 @@ def _fixed_mapping(first: int) -> None:
         for place in range(1, count + 1):
             answer = t.answer(expedited(first + 0x200, place, _word(index, sub, bits)))
             if answer[0] == 0x80:
-                return  # refused at the entry
+                return  # refused when the entry was written
         t.aborts(expedited(first + 0x200, 0, bytes((count,))), _TOO_LONG, "number of mapped objects")
 
     @check(
@@ -461,14 +461,18 @@ class _Reception:
         self._t.send(self.can_id, self.data() if data is None else data)
 
     def holds(self, value: int, when: str, found: int | None = None) -> None:
-        """Checks ``found``, or by default the object's value after the node had time to process a frame."""
+        """Fails unless ``found`` equals ``value``; by default ``found`` is read once the node had time to
+        process a frame.
+        """
         if found is None:
             self._t.wait(0.02)
             found = self.read()
         self._t.equal(found, value, f"{self.index:04X}h:{self.sub:02X} {when}")
 
     def after(self, data: bytes) -> int:
-        """Returns the object's value after an RPDO of wrong length, then ends the error by a correct RPDO."""
+        """Sends an RPDO of wrong length and returns the object's value; then ends the error with a correct
+        RPDO.
+        """
         self.send(data)
         self._t.wait(0.02)
         found = self.read()

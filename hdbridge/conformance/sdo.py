@@ -196,7 +196,7 @@ def _(t: NodeTester) -> None:
 
 
 def _is_served(t: NodeTester) -> None:
-    """Fails unless a request is answered; repeats it if the first one only ends the old transfer."""
+    """Fails unless a request is answered; repeats the request if the first one only ends an old transfer."""
     answer = t.ask(upload_request(0x1000))
     if answer is None or answer[0] == 0x80:
         answer = t.answer(upload_request(0x1000))
@@ -305,7 +305,9 @@ def _(t: NodeTester) -> None:
 
 
 def _downloads(t: NodeTester, request: Callable[[int, int, bytes], list[bytes]]) -> None:
-    """Writes a different value with these requests and reads it back; restores the old value."""
+    """Writes a different value with the requests that ``request`` builds, and reads it back; restores the old
+    value.
+    """
     index, sub, size = _number(t)
     before = t.upload(index, sub)
     value = ((int.from_bytes(before, "little") + 100) & 0x7FFF).to_bytes(size, "little")
@@ -511,7 +513,9 @@ def _begin_block_download(t: NodeTester, size: int, *, crc: bool) -> tuple[int, 
 
 
 def _block_download(t: NodeTester, *, crc: bool, spoil: int = 0, skipped: bool = False) -> bytes:
-    """Downloads the present value of an object in one block; returns the answer to the end."""
+    """Downloads the current value of an object in one block; returns the answer to the end of the
+    transfer.
+    """
     index, sub, size = _number(t)
     data = t.upload(index, sub)
     server_crc, size = _begin_block_download(t, 0, crc=crc)

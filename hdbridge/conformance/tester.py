@@ -1,6 +1,6 @@
 """Tester: frames, SDO, PDO configuration and power states for the checks.
 
-The tester works at the level of frames, because a check must also do what a correct master never does.
+The tester works at the level of frames, because a check must also send what a correct master never sends.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ POWER_STATES: Final = {
     FAULT: "fault",
 }
 ENABLING: Final = ((READY_TO_SWITCH_ON, 0x06), (SWITCHED_ON, 0x07), (OPERATION_ENABLED, 0x0F))
-"""Power states on the way to OPERATION ENABLED, each with the controlword that leads to it."""
+"""Power states on the way to OPERATION ENABLED, each with the controlword that leads to the state."""
 _SIGNED: Final = frozenset(datatypes.SIGNED_TYPES)
 _HEARTBEAT_MS: Final = 40
 _Found = TypeVar("_Found")
@@ -151,7 +151,7 @@ class Timing:
     """Time-outs and tolerances of the tests; s."""
 
     answer_s: float = 0.5
-    """Maximum time to an SDO answer or another immediate reaction."""
+    """Maximum time to an SDO answer or any other immediate reaction."""
     boot_s: float = 10.0
     """Maximum time to the boot-up message, and from there to the first SDO answer."""
     power_s: float = 10.0
@@ -180,7 +180,7 @@ class NodeTester:
         self.link, self.node_id, self.od = link, node_id, od
         self.timing = timing or Timing()
         self.log: list[Frame] = []
-        """Every frame received since the start of the present check."""
+        """Every frame received since the start of the current check."""
         self._travel, self._stopped = travel, stopped
         self._undo: list[tuple[int, int, bytes]] = []
         self._existing: dict[tuple[int, int], bool] = {}
@@ -188,7 +188,8 @@ class NodeTester:
         self.start_position: int | None = None
         """6064h before the first check."""
         self.powered = False
-        """True if a controlword that may switch power on was sent and not revoked."""
+        """True if a controlword that may switch power on has been sent, and power has not been switched off
+        since."""
         self.may_power = False
         """True during a check with permission to move."""
 
@@ -211,7 +212,7 @@ class NodeTester:
         self.link.bus.send(message)
 
     def mark(self) -> int:
-        """Returns the present end of the log, after adding the frames that have already arrived."""
+        """Returns the index of the end of the log, after adding the frames that have already arrived."""
         self.wait(0.0)
         return len(self.log)
 
@@ -231,13 +232,14 @@ class NodeTester:
         return frame is not None or self.now < end_s
 
     def heard(self, can_id: int, since: int = 0) -> list[Frame]:
-        """Returns the frames with an identifier received since a place in the log."""
+        """Returns the frames with this identifier from index ``since`` of the log on."""
         return [frame for frame in self.log[since:] if frame.can_id == can_id]
 
     def hears(self, can_id: int, timeout_s: float | None = None, since: int | None = None) -> Frame | None:
-        """Returns the first frame with an identifier since a place in the log, by default from now on.
+        """Returns the first frame with this identifier from index ``since`` of the log on, by default from
+        now on.
 
-        Waits for it if necessary; returns None on time-out.
+        Waits for the frame if necessary; returns None on time-out.
         """
         place = len(self.log) if since is None else since
         end_s = self.now + (self.timing.answer_s if timeout_s is None else timeout_s)
@@ -265,14 +267,14 @@ class NodeTester:
 
     @staticmethod
     def true(condition: _Found | None, found: object, expected: object) -> _Found:
-        """Fails unless the condition holds; returns it."""
+        """Fails unless the condition is true; returns its value."""
         if not condition:
             raise FailedError(str(found), str(expected))
         return condition
 
     @staticmethod
     def need(condition: _Found | None, reason: str) -> _Found:
-        """Ends the check as not applicable unless the condition holds; returns it."""
+        """Ends the check as not applicable unless the condition is true; returns its value."""
         if not condition:
             raise NotApplicableError(reason)
         return condition
@@ -283,7 +285,7 @@ class NodeTester:
         return self.need(self.od, "no EDS is given")
 
     def near(self, found_s: float, expected_s: float, what: str) -> None:
-        """Fails unless a period or delay is within the tolerance."""
+        """Fails unless a measured period or delay is within the tolerance."""
         if abs(found_s - expected_s) > 0.1 * expected_s + self.timing.jitter_s:
             self.fail(f"{what} {1000 * found_s:.1f} ms", f"{1000 * expected_s:.1f} ms")
 
@@ -351,7 +353,7 @@ class NodeTester:
         self.send(0x080, b"" if counter is None else bytes((counter,)))
 
     def emergencies(self, since: int) -> list[int]:
-        """Returns the codes of the EMCY messages since a place in the log."""
+        """Returns the codes of the EMCY messages from index ``since`` of the log on."""
         frames = self.heard(0x080 + self.node_id, since)
         return [struct.unpack_from("<H", frame.data)[0] for frame in frames if len(frame.data) == 8]
 
@@ -452,7 +454,7 @@ class NodeTester:
         return int.from_bytes(self.upload(index, sub), "little", signed=signed)
 
     def put(self, index: int, sub: int, value: int, size: int) -> None:
-        """Downloads an integer of ``size`` bytes, which is not undone at the end of the check."""
+        """Downloads an integer of ``size`` bytes; the change is not undone at the end of the check."""
         self.download(index, sub, pack(value, size))
 
     def write(self, index: int, sub: int, value: int, size: int) -> None:
@@ -518,7 +520,7 @@ class NodeTester:
         raise NotApplicableError("no object is known that can be written, read and mapped without effect")
 
     def other_value(self, index: int, sub: int, bits: int) -> int:
-        """Returns a value that differs from the present one by 1."""
+        """Returns a value that differs by 1 from the object's current value."""
         now = int.from_bytes(self.upload(index, sub), "little")
         return now - 1 if now > 1 else now + 1
 
@@ -556,7 +558,7 @@ class NodeTester:
             self.reaches(state)
 
     def stays(self, state: int, duration_s: float = 0.05) -> None:
-        """Fails if the power state is or becomes a different one."""
+        """Fails if the power state is not ``state`` throughout this duration."""
         end_s = self.now + duration_s
         while True:
             found = self.power_state()

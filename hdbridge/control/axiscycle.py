@@ -95,7 +95,8 @@ class AxisCycle:
         self.flushing = True
         """True from `begin` until the next cycle has read the queued frames, which are not judged."""
         self.changed: Callable[[], None] = _nobody
-        """Called when the identifiers or the state of the axis change, which takes effect in the next cycle.
+        """Called when the identifiers or the state of the axis change; the change takes effect in the next
+        cycle.
         """
 
         self._traffic = Traffic(image, self.monitor, 0.0)
@@ -315,7 +316,7 @@ class AxisCycle:
     # ---------------------------------------------------------------- parts of a cycle
 
     def _react(self, count: int, data: Frames | None, before: Feedback) -> Frames | None:
-        """Completes a cycle if there is a new fault, a fault in the last cycle, or a latched stop."""
+        """Completes a cycle with a new fault, with a fault in the cycle before, or with a latched stop."""
         power, stop = self.image.power, self.supervision.stop
         reaction = self._judge(count)
         if reaction is Reaction.QUICK_STOP:
@@ -336,7 +337,9 @@ class AxisCycle:
         return reaction
 
     def _latch(self) -> None:
-        """Stops the set-points; the axis will restart with a disabled drive."""
+        """Stops sending set-points to the axis, and gives up the aim of enabling it, so it restarts
+        disabled.
+        """
         self.image.power.quick_stop()
         if not self.silent:
             self.silence()
@@ -351,7 +354,9 @@ class AxisCycle:
                 self.changed()
 
     def _believable(self, last: Feedback, count: int) -> bool:
-        """Returns False if the positions contradict the last good ones; also records a following error."""
+        """Returns False if the positions contradict the last good ones; also records an excessive following
+        error.
+        """
         image, plausibility = self.image, self._plausibility
         motor = image.motor_counts
         cycles = count - self._good_cycle

@@ -1,6 +1,6 @@
 """Bench: runs procedures on a real or simulated drive, and records the measurements.
 
-Code and procedures are the same for both; only bus and clock of the drive differ.
+Code and procedures are the same for both; only the drive's bus and clock differ.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def run_moves(
 ) -> Outcome:
     """Runs the legs of a procedure in sequence, without pauses; returns its outcome.
 
-    ``place_deg`` returns the present load target; ``leg`` runs a move along its path and returns its samples.
+    ``place_deg`` returns the current load target; ``leg`` runs a move along its path and returns its samples.
     """
     done_s = 0.0
     steps = procedure.moves(view)
@@ -130,8 +130,8 @@ def axis_view(axis: AxisConfig) -> AxisView:
 def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation:
     """Returns the compensation for a model, with the limits and the cycle time of the axis file.
 
-    Raises InputError if the model is bound to another gear, axis or drive, or if an effect needs a channel
-    that the control loop lacks.
+    Raises InputError if the model is bound to a different gear, axis or drive, or if an effect needs a
+    channel that the control loop lacks.
     """
     model.check_bound_to(axis)
     for name, channels in missing_channels(compensable(model.effects), online_channels(axis)).items():
@@ -208,11 +208,12 @@ class Bench:
         seconds are kept, at most twice as many.
 
         Raises InputError before any motion if the procedure would leave the axis's limits or if the
-        compensation's model is bound to another gear, axis or drive. Raises SafetyStop if the supervision
+        compensation's model is bound to a different gear, axis or drive. Raises SafetyStop if the supervision
         stops the axis, and KeyboardInterrupt if interrupted; `record` then returns the samples up to the
         stop.
         """
-        # Every motion with a model begins here: check it against the connected drive, not only the axis file.
+        # Every motion with a model begins here: check the model against the connected drive, not only the
+        # axis file.
         self._compensation.model.check_bound_to(self._drive.axis, self._drive.identity)
         standing_deg = self._drive.read_positions().motor_deg / self.view.ratio
         rehearsal = rehearse(procedure, self.view, standing_deg)
@@ -269,7 +270,7 @@ class Bench:
         _log.info("run ended", {name: value for name, value in facts.items() if value})
 
     def record(self) -> Record:
-        """Returns the samples of the present procedure so far.
+        """Returns the samples of the current procedure so far.
 
         A channel that failed during the run is left out, because held values would look like measurements.
         """
@@ -278,12 +279,12 @@ class Bench:
 
     @property
     def legs(self) -> tuple[Segment, ...]:
-        """Moves of the present procedure so far."""
+        """Moves of the current procedure so far."""
         return tuple(Segment(kind=each.kind, start_s=each.start_s, end_s=each.end_s) for each in self._legs)
 
     @property
     def fault_counts(self) -> tuple[FaultCount, ...]:
-        """Faults of the present procedure so far, including one that stopped it, and skipped periods."""
+        """Faults of the current procedure so far, including the one that stopped it, and skipped periods."""
         return self._fault_counter.fault_counts(self.cycle.skipped)
 
     def _enable(self) -> None:
@@ -327,7 +328,7 @@ class Bench:
         )
 
     def _leg(self, move: Move, path: Path) -> Sequence[Sample]:
-        """Runs one move, cycle by cycle, from the present load target; returns its samples."""
+        """Runs one move, cycle by cycle, from the current load target; returns its samples."""
         samples: list[Sample] = []
         tick, image, interrupted = self.cycle.tick, self._image, self._interrupted
         command, hold, counts_for = (

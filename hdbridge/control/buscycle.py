@@ -4,12 +4,12 @@
 
 * *drain*: frames queued since the last cycle do not belong to this cycle. Heartbeats and emergencies are
   noted; TPDOs are stale and are discarded after a check of their statusword.
-* *stop*: a drive puts its last RPDO into force with SYNC, whatever happened in between. That RPDO is
+* *stop*: a drive applies its last RPDO at SYNC, whatever has happened since it was sent. That RPDO is
   therefore replaced by a quick stop before the first SYNC, after a stall of this process beyond the drive's
   time-out, and after a fault that stops an axis. Drives of silent axes are put into PRE-OPERATIONAL instead.
-* *receive*: until every TPDO of every axis has arrived, or the window closes. The newest of each identifier
-  wins. TPDOs of the optional channels are awaited if they come with every SYNC and are not lost; otherwise
-  they are accepted whenever they arrive.
+* *receive*: until every TPDO of every axis has arrived, or the window closes. The newest frame of each
+  identifier counts. TPDOs of the optional channels are awaited if they come with every SYNC and are not lost;
+  otherwise they are accepted whenever they arrive.
 * *check*: axis by axis, by the fault table of `hdbridge.drive.supervision`.
 * *RPDOs*: built from this cycle's feedback; each is sent before the next axis is checked.
 * *heartbeat*: the master's heartbeat is sent only by this loop, so the drives notice a stalled loop.
@@ -141,8 +141,8 @@ class BusCycle:
     def join(self, axis: AxisCycle) -> None:
         """Adds an axis, which stays silent until its ``begin``. Must not be called within a cycle.
 
-        Raises InputError if another axis uses one of its identifiers, or if it requires another cycle time or
-        master.
+        Raises InputError if another axis uses one of its identifiers, or if it requires a different cycle
+        time or master.
         """
         config = axis.image.axis
         if config.drive.cycle_s != self.period_s:
@@ -171,7 +171,7 @@ class BusCycle:
                 axis.begin()
 
     def relink(self, link: Link) -> None:
-        """Continues on another link, after the bus failed and was reopened.
+        """Continues on a new link, after the bus failed and was reopened.
 
         The axes stay latched: each must be verified, released (`AxisCycle.reset`) and begun.
         """
@@ -210,7 +210,7 @@ class BusCycle:
                     try:
                         self._send(*frame)
                     except TransmitBufferFull as error:
-                        # A stale set-point is worse than none: it is not resent, and the axes stop.
+                        # A stale set-point is worse than none, so the frame is not resent, and the axes stop.
                         self._no_room(f"RPDO: {error}")
             for axis in self._listening:
                 axis.listen(count, time_s, got & axis.needed == axis.needed)
@@ -364,7 +364,7 @@ class BusCycle:
         return got
 
     def _note_missing(self, got: int, spoilt: dict[int, int]) -> None:
-        """Records missing TPDOs and TPDOs of wrong length as faults of the axis that awaits them."""
+        """Records missing TPDOs and TPDOs of wrong length as faults of their axis."""
         for can_id, length in spoilt.items():
             bit, _, axis = self._slots[can_id]
             if axis.awaited:
@@ -384,7 +384,9 @@ class BusCycle:
                     axis.pending.append((Fault.LOST_TPDO, ", ".join(lost)))
 
     def _other(self, frame: Frame) -> None:
-        """Passes a frame that is not awaited to its axis and to ``on_frame``, and records bus faults."""
+        """Forwards a frame that the cycle does not wait for to its axis and to ``on_frame``; records bus
+        faults.
+        """
         self._period_bits += FRAME_BITS[len(frame.data)]
         axis = self._listeners.get(frame.can_id)
         if axis is not None:
@@ -397,7 +399,7 @@ class BusCycle:
             self.on_frame(frame)
 
     def _heartbeat(self, now: float) -> None:
-        """Sends the master's heartbeat when due; a missed heartbeat is not made up for."""
+        """Sends the master's heartbeat when due; a missed heartbeat is not sent later."""
         self._heartbeat_s += self._heartbeat_period_s
         if self._heartbeat_s <= now:
             self._heartbeat_s = now + self._heartbeat_period_s

@@ -1,8 +1,8 @@
 """Converts bus logs of any tool to recordings, for `fit` and `diagnose`.
 
 Reads the formats of python-can. The PDO mapping is taken from the SDO traffic in the log, else from the axis
-file. Any master is supported. A sample consists of the data sent for one SYNC, at the time of that SYNC;
-without SYNC, of one frame with both encoders. Nothing is interpolated.
+file. The log may come from any master. A sample consists of the data sent for one SYNC, at the time of that
+SYNC; without SYNC, the data of one frame with both encoders. Nothing is interpolated.
 """
 
 from __future__ import annotations
@@ -271,7 +271,7 @@ class _Bus:
     # -- PDO ----------------------------------------------------------------------------------------------
 
     def _mapped_image(self) -> ProcessImage:
-        """Returns the process image for the present mapping."""
+        """Returns the process image for the current mapping."""
         if self._image is None:
             pdos = self._layouts()
             self._image = ProcessImage(self._axis, self._od, pdos)

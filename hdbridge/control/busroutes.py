@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 Slot = tuple[int, Callable[[bytes], None], "AxisCycle"]
 """One TPDO of a cycle: its bit in the mask of all TPDOs, the function that takes its data (`PdoLengthError`
-if the length is wrong), and its axis. A plain tuple unpacks in a third of the time of a named one."""
+if the length is wrong), and its axis. A plain tuple is unpacked in a third of the time that a named tuple
+takes."""
 
 
 class Routes(NamedTuple):
@@ -39,7 +40,7 @@ class Routes(NamedTuple):
 
 
 def routes(axes: Sequence[AxisCycle]) -> Routes:
-    """Returns the routes for the present states of the axes; also sets each axis's ``needed``."""
+    """Returns the routes for the current states of the axes; also sets each axis's ``needed``."""
     slots: dict[int, Slot] = {}
     listeners: dict[int, AxisCycle] = {}
     awaited, bits = 0, FRAME_BITS[0]

@@ -12,7 +12,8 @@ from hdbridge.axis.effects.motion import MEASURED
 from hdbridge.axis.model import TransmissionModel
 
 _POINTS = 20_000
-"""Maximum number of points per direction: every other motor degree over 800 load degrees at a ratio of 50."""
+"""Maximum number of points per direction: one point every two motor degrees over 800 load degrees at a ratio
+of 50."""
 
 
 def cap_remark(axis: AxisConfig, model: TransmissionModel) -> str | None:

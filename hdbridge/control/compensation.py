@@ -1,13 +1,13 @@
 """Inverse of the transmission model: computes the motor target that brings the load to its target.
 
 The compensated motor angle solves ``theta_M / N + w TE(theta_M) = theta_L``, where TE is the model's error
-from its present state and w the ramp's weight. Three choices matter:
+from its current state and w the ramp's weight. Three choices matter:
 
-* The model's input is the commanded angle, never a measured one. Near a reversal the slope of the elastic law
-  is infinite, and one count of encoder noise would become several arcseconds.
-* The root is bracketed. The left side rises with theta_M as long as the error cannot fall more steeply than
-  the gear rises, so the root is unique. Any other model is refused, except that the slope of backlash is
-  reduced. A plain fixed-point iteration does not converge near a reversal.
+* The model's input is the commanded angle, never a measured one. At a reversal, the slope of the elastic
+  hysteresis is infinite, and one count of encoder noise would become several arcseconds.
+* The root is bracketed. The left side rises with theta_M as long as the error cannot fall faster than
+  ``theta_M / N`` rises; the root is then unique. Any other model is refused, except that the slope of
+  backlash is reduced. A plain fixed-point iteration does not converge near a reversal.
 * The model's state changes only when a command is issued (`Compensation.command`), with the angle issued,
   after caps and ramps.
 
@@ -39,10 +39,12 @@ from hdbridge.units import ARCSEC_PER_DEG
 _TOLERANCE_ARCSEC = 5e-7
 _STEEPEST_FALL = 0.9
 _SAFE = 0.9
-"""Fraction of the steepest allowed fall to which the slope of backlash is reduced; the rest is a margin."""
+"""Fraction of the steepest permitted fall that the sum may use after the slope of backlash is reduced; the
+rest is a margin."""
 _NOWHERE = Moment()
 _TURNS = 32
-"""Number of reversals of the issued path that are kept, to initialise a model that takes over."""
+"""Number of reversals of the issued path that are kept, to initialise a model that takes over from this
+one."""
 LOSABLE = frozenset(each for each in MEASURED if each.axis_key)
 """Channels with their own sensors, which can be lost."""
 
@@ -56,7 +58,7 @@ class CompensationLimits:
     slew_arcsec_s: float = 20_000.0
     """Cap on the rate of the correction, arcsec at the load per second."""
     ramp_s: float = 0.5
-    """Time over which the correction is faded in or out."""
+    """Time over which the correction fades in or out."""
 
 
 class _Faded(Tracker):
@@ -100,7 +102,7 @@ class Inverse:
             if sensed := each.needs() & LOSABLE:
                 trackers[place] = faded = _Faded(trackers[place], sensed)
                 self.faded.append(faded)
-        # Effects that are the same at every motor angle, such as wind-up, are evaluated once per cycle.
+        # Effects that do not depend on the motor angle, such as wind-up, are evaluated once per cycle.
         level = [isinstance(each, Level) for each in trackers]
         self._offsets = [each for each, is_level in zip(trackers, level, strict=True) if is_level]
         self._enter(_NOWHERE)
@@ -122,7 +124,7 @@ class Inverse:
         """True if advancing to the same angle again changes nothing."""
         self.needs = frozenset[Channel]().union(*(each.needs() for each in model.effects))
         """Channels that the effects need."""
-        # Without channels the error at rest does not change, so it is not evaluated again.
+        # Without channels, the error does not change at rest, so it is not evaluated again.
         bent = (each for each, is_level in zip(model.effects, level, strict=True) if not is_level)
         self._timeless = not any(each.needs() for each in bent)
         self.memory_deg = self._tracker.memory_deg
@@ -130,7 +132,7 @@ class Inverse:
         self._forward: bool | None = None
         """True if the last motion was forward; None before the first motion."""
         self._known = not self.memory_deg
-        """True if an earlier run in one direction was longer than the memory."""
+        """True if an earlier run in one direction was longer than the memory, or if the model has none."""
         self._turns = deque([0.0], _TURNS)
         """Motor angles of the start and the reversals of the issued path."""
 
@@ -141,7 +143,7 @@ class Inverse:
 
     @property
     def path_deg(self) -> list[float]:
-        """Motor angles of the start, the reversals and the present end of the issued path, degrees."""
+        """Motor angles of the start, the reversals and the current end of the issued path, degrees."""
         return [*self._turns, self._motor_deg]
 
     @property
@@ -203,7 +205,7 @@ class Inverse:
         return error + self._offset
 
     def _turn(self, forward: bool) -> None:
-        """Records a reversal at the present angle."""
+        """Records a reversal at the current angle."""
         if self._forward is not None:
             self._known = self.memory_known
             self._turns.append(self._motor_deg)
@@ -214,7 +216,7 @@ class Inverse:
         change.
 
         ``weight`` scales the error (0: uncompensated). Accurate to 1e-6 arcsec at the load, or to the last
-        bit of the motor angle if a steep law makes that coarser.
+        bit of the motor angle if the error is so steep that one bit exceeds this.
         """
         peek, slope, last = self._tracker.peek, self._slope, self._motor_deg
         self._peeked = None
@@ -238,7 +240,7 @@ class Inverse:
                 break
             s1 = (f1 - f0) / (x1 - x0)
             bend = (x1 - x0) * (s1 - s0) / (x1 - before) if x1 != before else 0.0
-            # Points before a reversal do not predict the slope after it, so only the chord is used.
+            # Points before a reversal do not predict the slope after the reversal, so only the chord is used.
             s = s1 + bend if -0.5 < bend / s1 < 1.0 else s1
             before, x0, x1, f0, s0 = x0, x1, x1 - f1 / s, f1, s1
         # Left side minus right side rises by at least `slope - weight * fall` per degree: bounds the root.
@@ -277,9 +279,9 @@ def _gentle(effects: tuple[Effect, ...], start: Start, steepest: float) -> tuple
     """Returns trackers of the effects, and a bound on the steepest fall of their sum, arcsec per motor
     degree.
 
-    The load rests while the motor crosses backlash. The error then falls as steeply as the gear rises, or
-    more steeply if noise made the fitted backlash too narrow. If the sum would fall more steeply than
-    ``steepest``, the slope of backlash is reduced to what the other effects leave.
+    The load rests while the motor crosses backlash. The error then falls as fast as the motor angle divided
+    by the ratio rises, or faster if noise made the fitted backlash too narrow. If the sum would fall more
+    steeply than ``steepest``, the slope of backlash is reduced to the margin that the other effects leave.
     """
     trackers = [each.tracker(start) for each in effects]
     fall = fall_bound(effects)
@@ -311,10 +313,10 @@ class Compensation:
     def __init__(self, model: TransmissionModel, limits: CompensationLimits, period_s: float) -> None:
         """``period_s`` is the control cycle.
 
-        Raises InputError if the model's response was measured with another cycle time.
+        Raises InputError if the model's response was measured with a different cycle time.
         """
         self.model = model
-        """Model that is inverted; `Bench` rejects a model of another axis, gear or drive."""
+        """Model that is inverted; `Bench` rejects the model of a different axis, gear or drive."""
         self._inverse = Inverse(model)
         self._ratio = model.ratio
         self.maximum_arcsec = limits.maximum_arcsec
@@ -440,7 +442,7 @@ class Compensation:
         self._inverse.advance(motor_deg, moment)
 
     def take_over(self, other: Compensation, moment: Moment = _NOWHERE) -> None:
-        """Continues from another compensation, along the path that the other has issued; for a new object.
+        """Makes this new compensation continue from another one, along the path that the other has issued.
 
         Effects with memory receive the state that results from this path, as far back as the path is kept.
         """

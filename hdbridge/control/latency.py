@@ -120,7 +120,7 @@ RULE: Final = (
     f"{100 * RULE_SHARE:g} % of it and none by more than {100 * RULE_MAXIMUM_SHARE:g} %"
 )
 ENOUGH: Final = 10_000
-"""Minimum number of wake-ups for determining the worst ten-thousandth."""
+"""Minimum number of wake-ups needed to determine the latest ten-thousandth."""
 
 
 def sustains(histogram: Histogram, period_s: float) -> bool:
@@ -160,7 +160,9 @@ class LatencyReport:
 
     @property
     def sustained_s(self) -> float | None:
-        """Shortest measured period that the computer sustains with all longer ones; None without one."""
+        """Shortest measured period that the computer sustains together with all longer ones; None if there is
+        none.
+        """
         best = None
         for each in reversed(self.measurements):
             if not each.sustained:

@@ -1,19 +1,19 @@
-"""Slow loop over the load encoder: removes the mean error at rest that the model leaves.
+"""Slow loop closed over the load encoder: removes the mean error at rest that the model leaves.
 
-The compensation is feed-forward, so an aged model leaves an undetected error. This loop integrates the error
-(load target minus load encoder) at rest and adds the result to the load target. In motion the error is mostly
-delay, and the value is held. The value is bounded and its slew is limited. It fades out in three cases, with
-the reason in `LoadLoop.doubt`:
+The compensation is feed-forward, so the error left by an outdated model goes undetected. This loop integrates
+the error (load target minus load encoder) at rest and adds the result to the load target. In motion the error
+is mostly delay, and the value is held. The value is bounded and its slew is limited. It fades out in three
+cases, with the reason in `LoadLoop.doubt`:
 
     the error is too large             more than twice the bound; ends when it is smaller
     the load encoder moved at rest     without the motor; ends when it has moved back
     the load encoder does not follow   the motor, which the loop moves at rest; ends when it follows
 
 The last two compare the load encoder with the load angle from motor encoder and model. A difference is
-explained up to one count of each encoder at the load plus the noise of the difference. In the last case the
-slack is added, which is the possible error of the model's hysteresis. The noise is measured at rest, and a
-slow drift of the load against the motor is tracked. If a doubt about the encoder does not end where it arose,
-it ends when the two have agreed at rest after motion in both directions.
+explained up to one count of each encoder at the load plus the noise of the difference. In the last case, the
+possible error of the model's hysteresis (the slack) is added to this limit. The noise is measured at rest,
+and a slow drift of the load against the motor is tracked. If a doubt about the encoder does not end at the
+position where it arose, it ends when both encoders have agreed at rest after motion in both directions.
 
 Pure: no clock, no bus.
 """
@@ -36,8 +36,8 @@ _NOISE_S: Final = 1.0
 _DRIFT_S: Final = 600.0
 """Time constant for tracking a drift of the load against the motor at rest."""
 _AGREED_S: Final = 1.0
-"""Time at rest for which a load encoder that has moved back must stay there to end a doubt; doubled at each
-further doubt."""
+"""Time at rest for which a load encoder that has moved back must keep its position to end a doubt; doubled at
+each further doubt."""
 _AGREED_MAX_S: Final = 600.0
 _SIGMAS: Final = 8.0
 """Maximum deviation that counts as noise, in standard deviations."""
@@ -133,13 +133,14 @@ class LoadLoop:
         """Mean absolute deviation of the difference from its average at rest, minus that of the motor."""
         self._noise_readings = 0
         self._reference = self._rest_motor = 0.0
-        """Averages when the axis came to rest; during a doubt about the encoder, those before the doubt."""
+        """Averages when the axis came to rest; during a doubt about the encoder, the averages before the
+        doubt."""
         self._doubt = ""
         self._beyond = False
         """True if the doubt is about the size of the error rather than the encoder."""
         self._jumped = self._jumped_most = self._off = 0.0
-        """During a doubt about the encoder: sum of its moves at rest, the greatest such sum, and the
-        greatest disagreement."""
+        """During a doubt about the encoder: sum of the load encoder's moves at rest, the greatest such sum,
+        and the greatest disagreement between the encoders."""
         self._agreeing = 0
         """Number of readings since the sum of the load encoder's moves at rest became small."""
         self._agreed = frozenset[int]()
@@ -147,7 +148,7 @@ class LoadLoop:
 
     @property
     def value_arcsec(self) -> float:
-        """Present addition to the load target."""
+        """Current addition to the load target."""
         return self._value
 
     @property
@@ -205,7 +206,7 @@ class LoadLoop:
     # ---------------------------------------------------------------- at rest
 
     def _settle(self, error: float, difference: float, motor: float) -> None:
-        """Adds a reading during settling to the averages, which forget the first readings."""
+        """Adds a reading during settling to the averages, in which the first readings lose their weight."""
         self._outliers = 0
         self._average(error, difference, motor, max(self._share, 1.0 / self._standing))
         if self._standing < self._settled:
@@ -218,7 +219,7 @@ class LoadLoop:
             self._end()
 
     def _observe(self, error: float, difference: float, motor: float) -> None:
-        """Adds a reading at rest, after the load has settled."""
+        """Evaluates a reading at rest, after the load has settled; starts or ends a doubt."""
         deviation = difference - self._difference
         explained = self._explained() + 2.0 * abs(motor - self._motor)
         if abs(deviation) > explained:

@@ -39,7 +39,7 @@ class Prefilter:
         first, per_cycle = lead.lead_cycles, lead.per_cycle
         ahead = [first - j / per_cycle for j in range(per_cycle - 1, -1, -1)]
         self._reaches = tuple((s, 0.5 * s * (s + 1.0)) for s in ahead)
-        """For each new prediction, the factors of the target's last step and of the step's last change."""
+        """Factors of the target's last step, and of the last change of this step, for each new prediction."""
         self._full_step = lead.full_speed_deg_s * period_s
         self._last: float | None = None
         self._step = 0.0
@@ -52,7 +52,7 @@ class Prefilter:
         self._step = 0.0
 
     def take_over(self, other: Prefilter | None, correction_arcsec: float) -> None:
-        """Continues from another filter; starts with this correction if they differ in form."""
+        """Continues from another filter; starts with this correction if the two filters differ in form."""
         self.reset(correction_arcsec)
         if other is not None and (other._reaches, len(other._weights)) == (self._reaches, len(self._weights)):
             self._predicted = other._predicted.copy()
@@ -69,7 +69,7 @@ class Prefilter:
         """Returns the filtered correction of this cycle, arcsec.
 
         ``correction_arcsec`` belongs to the load target ``load_deg``; ``predict`` returns the correction at
-        another load target without changing any state.
+        any load target without changing any state.
         """
         step = 0.0 if self._last is None else load_deg - self._last
         change = step - self._step if self._last is not None else 0.0

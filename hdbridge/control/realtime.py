@@ -1,6 +1,7 @@
-"""Process settings for a punctual loop: no garbage collection, real-time priority, locked memory.
+"""Process settings for a loop that wakes up on time: no garbage collection, real-time priority, locked
+memory.
 
-All settings are restored on exit. Settings that the system refuses are reported but not required. The loop
+All settings are restored on exit. Settings that the system refuses are reported but not required: the loop
 then runs with the granted settings, and its lateness histogram shows the result.
 """
 

@@ -1,7 +1,7 @@
-"""Benches for procedures, on a drive mastered by this process or on an axis held by another process.
+"""Benches for procedures, on a drive whose master is this process, or on an axis held by another process.
 
-Calibration, improvement and the comparison of schemes require only this: the axis file, the identity of the
-drive, and benches for procedures.
+Calibration, improvement and the comparison of schemes require only the axis file, the identity of the drive,
+and benches for procedures.
 """
 
 from __future__ import annotations

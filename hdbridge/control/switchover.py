@@ -1,11 +1,11 @@
-"""Change of the model in motion without a jump of the target; takes the place of a single `Compensation`.
+"""Changes the model in motion without a jump of the target; used in place of a single `Compensation`.
 
 During a change both models follow the issued angle. The correction is blended from the old model to the new
 one with a weight that rises over the ramp time, within the slew limit and the caps. The new model begins on
 the last issued path, which also determines the state of its hysteresis.
 
-A scheme (none, synchronous, hysteresis, both) is a model with other effects, so schemes are switched in the
-same way.
+A scheme (none, synchronous, hysteresis, both) is a model with a different set of effects, so schemes are
+switched in the same way.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Correction:
     """Compensation that can be exchanged for another; it has the same interface.
 
     Without a change, ``command`` and ``hold`` are those of the compensation itself, at no additional cost.
-    During a change they are other functions, so they must be looked up in each cycle.
+    During a change these attributes hold different functions, so they must be looked up in each cycle.
     """
 
     __slots__ = ("_limited", "_new", "_now", "_weight", "command", "hold")
@@ -87,7 +87,7 @@ class Correction:
     def change(self, new: Compensation) -> None:
         """Changes to a new compensation from the next command on; `changing` is True until that is complete.
 
-        Raises InputError, without any effect, for another gear ratio and while a change is under way.
+        Raises InputError, without any effect, for a different gear ratio and while a change is under way.
         """
         if self._new is not None:
             raise InputError("a change of the model is under way: wait until it is done")

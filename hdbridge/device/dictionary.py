@@ -1,6 +1,6 @@
 """The object dictionary of the simulated drive: the objects that its EDS declares, and their values.
 
-An entry holds a stored value, or is bound to a function that returns the drive's present value. A write is
+An entry holds a stored value, or is bound to a function that returns the drive's current value. A write is
 checked for access, length and range as required by CiA 301, and then by the entry's guard, which may refuse
 it. PDO mappings are compiled from entries once (``pdo.py``), so the cyclic path only reads stored values and
 calls bound functions.
@@ -75,7 +75,7 @@ class SdoAbortError(Exception):
 
 
 def only(*allowed: int) -> Callable[[int], None]:
-    """Returns a guard that refuses all values except these."""
+    """Returns a guard that refuses all values except ``allowed``."""
 
     def check(value: int) -> None:
         if value not in allowed:
@@ -94,7 +94,9 @@ class Entry:
     """
 
     def __init__(self, variable: ODVariable, own: ODVariable | None = None) -> None:
-        """``own`` is the same object in the bundled EDS; its default is used if the drive's EDS has none."""
+        """``own`` is the same object in the bundled EDS, whose default is used if the drive's EDS has
+        none.
+        """
         self.index: Final[int] = variable.index
         self.sub: Final[int] = variable.subindex
         self.name: Final[str] = variable.name
@@ -147,12 +149,12 @@ class Entry:
         return self.bound if self.bound is not None else self.number
 
     def number(self) -> int:
-        """Returns the present value of an integer entry."""
+        """Returns the current value of an integer entry."""
         value: int = self.value if self.bound is None else self.bound()
         return value
 
     def read(self) -> bytes:
-        """Returns the present value as an SDO server sends it."""
+        """Returns the current value as an SDO server sends it."""
         if not self.readable:
             raise SdoAbortError(Abort.WRITE_ONLY)
         if self.codec is None:
@@ -277,7 +279,7 @@ class Dictionary:
         self._note_indices()
 
     def value(self, index: int, sub: int = 0) -> int:
-        """Returns the present value of an integer entry."""
+        """Returns the current value of an integer entry."""
         return self._entries[index, sub].number()
 
     def renumber(self, before: int, after: int) -> None:
@@ -287,14 +289,18 @@ class Dictionary:
                 entry.default += after - before
 
     def restore(self, first: int = 0x0000, last: int = 0xFFFF) -> None:
-        """Restores the default of every entry in this range of indices, without calling the guards."""
+        """Restores the default of every entry from index ``first`` to ``last``, without calling the
+        guards.
+        """
         for entry in self._entries.values():
             if first <= entry.index <= last:
                 entry.value = entry.default
 
 
 def _is_vendors(variable: ODVariable, own: ODVariable) -> bool:
-    """Returns True for a manufacturer-specific object of another type, with the same index by chance."""
+    """Returns True for a manufacturer-specific object that has the same index by chance, but a different
+    type.
+    """
     return _VENDORS[0] <= variable.index <= _VENDORS[1] and variable.data_type != own.data_type
 
 

@@ -27,7 +27,7 @@ class ErrorCode(IntEnum):
 
 
 class Emergency:
-    """EMCY producer. An error is reported once, stays active, and is cleared once."""
+    """EMCY producer. An error is reported once, when it occurs, and stays active until it is cleared."""
 
     def __init__(self, dictionary: Dictionary, send: Callable[[int, bytes], None]) -> None:
         self._dictionary = dictionary

@@ -28,7 +28,7 @@ class Faults:
     duplicate_tpdos: int = 0
     """The next n TPDOs are sent twice."""
     hold_tpdos: int = 0
-    """The next n TPDOs are delayed by one SYNC and sent after the fresh ones."""
+    """The next n TPDOs are delayed by one SYNC and sent after the TPDOs of that SYNC."""
     reverse_tpdos: int = 0
     """The TPDOs of the next n SYNCs are sent in reverse order."""
     mute_heartbeat: bool = False

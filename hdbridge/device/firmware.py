@@ -171,7 +171,7 @@ class Firmware:
         return word
 
     def _delay_status(self) -> None:
-        """Keeps 6041h and 6061h at their present values for the delay after a command."""
+        """Keeps 6041h and 6061h at their current values for the delay after a command."""
         if self._status_delay_s:
             if self._old_status_s <= 0.0:
                 self._old_statusword, self._old_mode = self._statusword(), self._mode.number

@@ -1,6 +1,6 @@
 """LSS slave (CiA 305): selection by identity, node id, bit timing, fast scan.
 
-It does no I/O and changes nothing that is in use: a new node id is pending until the node resets its
+It does no I/O and does not change the node id in use: a new node id is pending until the node resets its
 communication, so no command of the LSS master disturbs an axis in operation.
 """
 
@@ -39,8 +39,8 @@ class LssSlave:
         """True in LSS configuration state, False in LSS waiting state."""
         self._identity, self._stores, self._bit_rate_bps = identity, stores, bit_rate_bps
         self._next = self._scanned = 0
-        """Next command in a sequence of requests that has agreed so far; number of the identity part under
-        scan."""
+        """Next command expected in a sequence of identity requests that have all matched so far, else 0;
+        index of the identity part that the fast scan is determining."""
 
     def respond(self, request: bytes) -> bytes | None:
         """Returns the answer to a request; None for a request that is not answered."""
@@ -105,10 +105,10 @@ class LssSlave:
             return _NUMBER.pack(command, self._part(command - 0x5A))
         if command == 0x5E:
             return _answer(command, self.node_id)
-        return None  # 15h: the bit timing in use stays
+        return None  # 15h: the bit timing in use does not change
 
     def _fast_scan(self, number: int, bit: int, part: int, following: int) -> bytes | None:
-        """Answers if ``number`` agrees with the identity part under scan in the bits from ``bit`` upwards."""
+        """Answers if ``number`` agrees with the scanned identity part in the bits from ``bit`` upwards."""
         if bit == _RESTART_SCAN:
             self._scanned = 0
         elif bit < 32 and part == self._scanned and part < 4 and following < 4:

@@ -16,7 +16,7 @@ from hdbridge.device.profile import Profile, move
 INDEX_PULSE: Final = {33: -1, 34: 1}
 """Homing methods that move to the next index pulse, and their directions."""
 HOMING_METHODS: Final = (*INDEX_PULSE, 35, 37)
-"""Supported homing methods; 35 is the old number of 37."""
+"""Supported homing methods; 35 is the former number of method 37."""
 
 _NEW: Final = int(Control.NEW_SET_POINT)
 _IMMEDIATELY: Final = int(Control.CHANGE_IMMEDIATELY)
@@ -27,7 +27,7 @@ _BIT_13: Final = int(Status.MODE_13)
 
 
 class Mode:
-    """Operating mode in OPERATION ENABLED. The base class is mode 0, 'no mode', and holds the position."""
+    """Operating mode in OPERATION ENABLED. The base class is mode 0 ('no mode') and holds the position."""
 
     number: ClassVar[int] = 0
 
@@ -35,7 +35,7 @@ class Mode:
         self.motion = motion
 
     def enter(self) -> None:
-        """Starts the mode at the present demand, at rest."""
+        """Starts the mode at the current demand, at rest."""
 
     def resume(self) -> None:
         """Continues after a halt."""
@@ -219,7 +219,7 @@ class ProfilePosition(_Planned):
 
 
 class Homing(_Planned):
-    """HM: methods 33 and 34 move to the next index pulse, 35 and 37 use the present position.
+    """HM: methods 33 and 34 move to the next index pulse, 35 and 37 use the current position.
 
     The position found is assigned the value of 607Ch (home offset). There is one index pulse per motor turn.
     """

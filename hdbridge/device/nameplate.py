@@ -7,7 +7,8 @@ from hdbridge.device.dictionary import Dictionary
 
 LOAD_OBJECT: Final = (0x60E4, 1)
 MOTOR_POSITION: Final = (0x6064, 0)
-"""Position actual value, always of the motor; an axis file that uses it has no load encoder."""
+"""Position actual value, which is always that of the motor. As ``load_object`` it means that the axis has no
+load encoder."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Nameplate:
     """Index and sub-index of the load encoder's object."""
 
     def engrave(self, dictionary: Dictionary) -> None:
-        """Writes these values to the dictionary, as present values and as defaults."""
+        """Writes these values to the dictionary, as current values and as defaults."""
         # Positions are motor counts. If gear ratio or feed is missing, they do not include the gear.
         motor_turns, load_turns = self.gear_motor_turns, self.gear_load_turns
         if (0x6091, 1) not in dictionary or (0x6092, 1) not in dictionary:

@@ -1,6 +1,6 @@
 """Simulated drive as a CANopen node: NMT, heartbeats, SYNC, PDOs, SDO and EMCY around the firmware.
 
-Upon SYNC, the node first sends its synchronous TPDOs with the present values, then applies the synchronous
+Upon SYNC, the node first sends its synchronous TPDOs with the current values, then applies the synchronous
 RPDOs received since the last SYNC, then runs its axis for exactly one period of object 60C2h. (Some drives
 apply RPDOs first; `Behaviour` has this and other choices.) Before the first SYNC, and when SYNC is missing
 for one and a half periods, the axis runs on the node's clock instead, so a drive without a master can still
@@ -33,7 +33,7 @@ from hdbridge.device.syncclock import SyncClock
 
 PDO_COUNT: Final = 512
 LONGEST_CATCH_UP_S: Final = 1.0
-"""Maximum delay for which a late poll catches up; s."""
+"""Maximum delay that a late poll makes up for; s."""
 
 FRAMES_PER_POLL: Final = 64
 
@@ -49,7 +49,7 @@ _AFTER_ERROR: Final = {0: NmtState.PRE_OPERATIONAL, 2: NmtState.STOPPED}
 
 
 class DriveNode:
-    """A CiA-402 drive on ``bus``, moving ``machine``.
+    """A CiA-402 drive on ``bus``, which moves ``machine``.
 
     ``bus`` is any python-can bus, and only this node may read it; ``eds_path`` declares the objects;
     ``clock`` is the node's clock; ``nameplate`` distinguishes drives, ``behaviour`` their firmware. ``stage``
@@ -82,7 +82,7 @@ class DriveNode:
         self.faults = Faults()
         self.lost_frames = 0
         self.period_begins_s = clock.now()
-        """Start of the present period of the axis, on the node's clock."""
+        """Start of the current period of the axis, on the node's clock."""
         self.dictionary = Dictionary(Path(eds_path), node_id)
         self._clock = clock
         self._now_s = clock.now()
@@ -172,7 +172,7 @@ class DriveNode:
 
     @property
     def has_sync(self) -> bool:
-        """True while the node supervises SYNC and it is not lost."""
+        """True while the node supervises SYNC and SYNC is not lost."""
         return self._sync_due_s < _NEVER
 
     def sync_is_late(self, now_s: float) -> bool:
@@ -237,7 +237,7 @@ class DriveNode:
         self._listen()
 
     def _listen(self) -> None:
-        """Assigns a handler to each CAN identifier that the node receives in its present state."""
+        """Assigns a handler to each CAN identifier that the node receives in its current state."""
         takers: dict[int | None, Callable[[bytearray, float], None]] = {REQUEST: self._on_lss}
         self._takers = takers
         if self.node_id == UNCONFIGURED:

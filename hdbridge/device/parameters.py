@@ -41,7 +41,7 @@ class StoredParameters:
             entry.guard = check
 
     def restore(self, first: int = 0x0000, last: int = 0xFFFF) -> None:
-        """Restores the stored values, else the defaults, in this range of indices."""
+        """Restores the stored values, else the defaults, of the indices from ``first`` to ``last``."""
         self._dictionary.restore(first, last)
         for (index, sub), value in self._stored.items():
             if first <= index <= last and (index, sub) in self._dictionary:

@@ -72,7 +72,7 @@ class Pdo:
         self._changed()
 
     def compile(self) -> None:
-        """Reads the present parameters from the dictionary and compiles the mapping."""
+        """Reads the current parameters from the dictionary and compiles the mapping."""
         can_id = self._parameter(1)
         self.valid = not can_id & INVALID
         self.can_id = can_id & 0x7FF
@@ -83,7 +83,7 @@ class Pdo:
         count = self._dictionary.value(self._mapping, 0)
         try:
             entries = self._entries(count)
-        except SdoAbortError:  # this drive cannot map a default of the EDS: the PDO does not exist
+        except SdoAbortError:  # a default of the EDS that cannot be mapped: the PDO does not exist
             self._dictionary[self._mapping, 0].value = 0
             self._dictionary[self._communication, 1].value |= INVALID
             self.valid, entries = False, []
@@ -131,7 +131,9 @@ class Pdo:
         return self._dictionary.value(self._communication, 1) & ~INVALID
 
     def _check_fixed(self, sub: int, value: int) -> None:
-        """Refuses a different value while the PDO exists; some masters write the present value again."""
+        """Refuses a different value while the PDO exists; the current value is accepted, because some masters
+        write it again.
+        """
         if self.valid and value != self._parameter(sub):
             raise SdoAbortError(Abort.STATE)
 
@@ -154,14 +156,14 @@ class TransmitPdo(Pdo):
 
     def __init__(self, dictionary: Dictionary, number: int, changed: Callable[[], None]) -> None:
         self.pack: Callable[[], bytes] = bytes
-        """Returns the present mapped values."""
+        """Function that returns the data of the TPDO, packed from the current values."""
         self.sent: bytes | None = None
         self.sent_s = -float("inf")
         self.syncs_to_go = 1
         self.sync_start = 0
         """SYNC counter at which the PDO starts (SYNC start value); 0 once it has started."""
         self.on_sync: Callable[[], bytes | None] = bytes
-        """Returns the data to send upon a SYNC, or None if the PDO is not due at this SYNC."""
+        """Function that returns the data to send upon a SYNC, or None if the PDO is not due at this SYNC."""
         super().__init__(dictionary, 0x1800 + number - 1, 0x1A00 + number - 1, changed)
 
     def _may_map(self, entry: Entry) -> bool:
@@ -174,7 +176,7 @@ class TransmitPdo(Pdo):
         self.restart()
 
     def restart(self) -> None:
-        """Discards the data last sent, as on entering NMT state OPERATIONAL."""
+        """Forgets the data last sent, as on entering NMT state OPERATIONAL."""
         self.sent = None
         self.sent_s = -float("inf")
         self.syncs_to_go = max(1, self.transmission_type)
@@ -243,11 +245,11 @@ class ReceivePdo(Pdo):
     def _link(self, entries: list[Entry]) -> None:
         self._writers = tuple(entry.writer() for entry in entries)
         self.length, self._unpack_from = self._codec.size, self._codec.unpack_from
-        self.pending = None  # data of another mapping are discarded
+        self.pending = None  # data received with the previous mapping are discarded
         self.restart()
 
     def restart(self) -> None:
-        """Disarms the deadline and, unless the drive holds it, discards the data waiting for SYNC."""
+        """Disarms the deadline, and discards the data waiting for SYNC unless the drive keeps them."""
         if not self._holds:
             self.pending = None
         self.deadline_s = float("inf")
@@ -273,7 +275,7 @@ def _format(entry: Entry) -> str:
 
 
 def _packer(codec: struct.Struct, readers: Sequence[Callable[[], int]]) -> Callable[[], bytes]:
-    """Returns a function that packs the readers' values; unrolled, it takes half the time of a loop."""
+    """Returns a function that packs the readers' values; the unrolled code takes half the time of a loop."""
     called = {f"read{place}": reader for place, reader in enumerate(readers)}
     pack: Callable[[], bytes] = eval(
         f"lambda: pack({', '.join(f'{name}()' for name in called)})", {"pack": codec.pack, **called}

@@ -56,7 +56,7 @@ class _Builder:
             self._add(Segment(change / signed, self.position, self.velocity, signed), velocity)
 
     def cruise(self, distance: float) -> None:
-        """Continues at the present velocity over ``distance``, in its direction."""
+        """Continues at the current velocity, in its direction, over ``distance``."""
         if self.velocity and distance > 0.0:
             duration = distance / abs(self.velocity)
             self._add(Segment(duration, self.position, self.velocity, 0.0), self.velocity)

@@ -55,13 +55,13 @@ class SdoServer:
         self._block = _Block.NONE
         self._block_size = _MOST_SEGMENTS
         self._sequence = 0
-        """Number of segments of the present block received in order."""
+        """Number of segments of the current block received in order."""
         self._checks_crc = False
         self._sent = 0
         """Number of acknowledged bytes of a block upload."""
 
     def reset(self) -> None:
-        """Discards the present transfer."""
+        """Discards the current transfer."""
         self._entry, self._block = None, _Block.NONE
 
     def respond(self, request: bytes) -> list[bytes]:

@@ -1,4 +1,4 @@
-"""Time and period of SYNC without its reception jitter."""
+"""Filters the reception jitter out of the time and period of SYNC."""
 
 from typing import Final
 
@@ -7,24 +7,25 @@ SHORTEST_PERIOD_S: Final = 0.000_5
 _GAIN: Final = 0.05
 """Final gain of the time correction; the gain of the period is half its square."""
 _ASTRAY: Final = 0.5
-"""Deviation above which tracking restarts at the present SYNC; periods."""
+"""Deviation above which tracking restarts at the current SYNC; periods."""
 _ANOTHER: Final = 0.1
 _AGREEING: Final = 3
-"""Number of successive intervals that agree within `_ANOTHER` but differ from the period; then the period
-is set to the last of them."""
+"""Number of successive intervals that agree within `_ANOTHER` but differ from the period, after which the
+period is set to the last of them."""
 
 
 class SyncClock:
-    """Second-order tracking filter, in which a constant drift between two clocks leaves no error.
+    """Second-order tracking filter, which follows a constant drift between two clocks without error.
 
-    It begins with a least-squares line through all SYNCs and ends with fixed gains.
+    Its gains are initially those of a least-squares line through all SYNCs, and constant later.
     """
 
     def __init__(self, period_s: float) -> None:
         self.period_s = period_s
         self.time_s = self._received_s = -float("inf")
         self._interval_s = self.jitter_s = 0.0
-        """Mean absolute deviation of SYNC from its filtered time, over about the last 20 SYNCs."""
+        """Last interval between two SYNCs; mean absolute deviation of SYNC from its filtered time, over about
+        the last 20 SYNCs."""
         self._count = self._agreeing = 0
 
     def take(self, now_s: float) -> None:

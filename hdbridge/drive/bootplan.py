@@ -17,7 +17,7 @@ from hdbridge.errors import InputError
 
 @dataclass(frozen=True, slots=True)
 class OmittedObject:
-    """Object that the boot-up leaves to the drive, or that the drive cannot provide."""
+    """Object whose value the boot-up leaves to the drive, or that the drive cannot provide."""
 
     index: int
     sub: int
@@ -44,8 +44,8 @@ def plan(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[PlannedWr
 
 
 def left_to_drive(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[OmittedObject]:
-    """Returns the objects that `plan` leaves to the drive, and the missing objects that the control cycle
-    can do without.
+    """Returns the objects whose values `plan` leaves to the drive, and the missing objects that the control
+    cycle does not need.
     """
     od = dictionary_of(axis) if od is None else od
     if od is None:
@@ -148,7 +148,9 @@ def _value_of_6502h(od: ObjectDictionary) -> int:
 
 
 def _not_read(axis: AxisConfig, od: ObjectDictionary) -> Iterator[OmittedObject]:
-    """Yields the objects that the control cycle and the boot-up would read but the drive cannot provide."""
+    """Yields the optional objects that the control cycle and the boot-up would read, but that the drive
+    cannot provide.
+    """
     absent = layouts(axis, od).absent
     for address, consequence in (
         (objects.POSITION_DEMAND, "the last target sent is used instead"),

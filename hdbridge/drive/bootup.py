@@ -57,7 +57,8 @@ class BootReport:
     names: dict[str, str]
     """Device name and versions (1008h, 1009h, 100Ah), if the drive provides them."""
     modes: tuple[Mode, ...]
-    """Supported modes of operation among those used here; all of them if the drive does not report 6502h."""
+    """Modes used by hdbridge that the drive supports; all of these modes if the drive does not report
+    6502h."""
     state: State
     held: tuple[PlannedWrite, ...] = ()
     """Planned values that the drive now holds."""
@@ -73,7 +74,7 @@ class BootUp:
     """Boots one drive.
 
     ``clients`` maps node ids to SDO clients: the drive's, and that of a separate load encoder.
-    ``others_heard`` are the other nodes already heard on the bus.
+    ``others_heard`` are the ids of other nodes that have already been heard on the bus.
     """
 
     def __init__(
@@ -259,7 +260,7 @@ class BootUp:
             pass
 
     def _configure(self, rows: list[PlannedWrite]) -> None:
-        """Configures a PDO unless it is already as planned, because a correct configuration may be
+        """Configures a PDO unless it is already configured as planned, because a correct configuration may be
         read-only.
         """
         lasting = [row for row in rows if not row.passing]
@@ -285,7 +286,7 @@ class BootUp:
         return found is not None and row.holds(found)
 
     def _read(self, row: PlannedWrite) -> int | None:
-        """Returns the present value; None for a write-only object."""
+        """Returns the object's current value; None for a write-only object."""
         sdo = self._clients[row.node_id]
         variable = find(sdo.od, row.index, row.sub)
         if variable is not None and not variable.readable:
@@ -326,7 +327,7 @@ class BootUp:
         return read_only or not self._axis.states(row.field)
 
     def _write(self, row: PlannedWrite) -> None:
-        """Writes one object and compares the value read back."""
+        """Writes one object, reads it back and compares the two values."""
         sdo = self._clients[row.node_id]
         value = row.value
         try:

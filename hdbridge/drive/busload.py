@@ -97,7 +97,7 @@ def check_bus_load(axes: Sequence[AxisConfig], bitrate_bps: int | None = None) -
 
 
 def _load_at(axes: Sequence[AxisConfig], rate: int, cycle_s: float) -> float:
-    """Returns the bus load of the axes at another cycle time."""
+    """Returns the bus load of the axes at a given bit rate and cycle time."""
     return cycle_bits([_with_cycle(axis, 1e3 * cycle_s) for axis in axes]) / (rate * cycle_s)
 
 

@@ -1,7 +1,8 @@
-"""Commands the drive by SDO, outside the control cycle: walks its states and waits for its statusword.
+"""Commands the drive by SDO, outside the control cycle: walks through its power states and waits for the
+statusword.
 
 While waiting, it fulfils the master's duties: it processes heartbeats and emergencies, and sends the master's
-own heartbeat, without which the drive stops.
+own heartbeat, because the drive stops without it.
 """
 
 from collections.abc import Callable
@@ -115,7 +116,7 @@ class Commander:
         )
 
     def walk(self, target: State) -> None:
-        """Walks to a state, one controlword at a time, each confirmed by the statusword."""
+        """Walks to a state, one controlword at a time; the statusword must confirm each step."""
         state = self.state()
         self.image.power.go(target)
         if state is State.NOT_READY_TO_SWITCH_ON:
@@ -131,7 +132,7 @@ class Commander:
         self.wait_for(f"state '{state.value}'", lambda word: decode(word) is state, STEP_TIMEOUT_S)
 
     def set_mode(self, mode: Mode) -> None:
-        """Sets the mode of operation and waits until 6061h shows it."""
+        """Sets the mode of operation and waits until 6061h reports this mode."""
         self.sdo.store(objects.MODE, mode)
         deadline_s = self.link.now() + STEP_TIMEOUT_S
         while (shown := self.sdo.fetch(objects.MODE_DISPLAY)) != mode:

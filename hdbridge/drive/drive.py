@@ -107,8 +107,8 @@ class Drive:
         """Boots the drive up to OPERATIONAL with power off; docs/architecture.md describes each step.
 
         By default (``reset``) the node's communication is reset first, so that it starts from known settings.
-        Raises `DriveError` if the drive is absent or refuses, `IdentityError` if it is another drive or
-        scales differently, `BusInUseError` before anything is sent if another master is heard, and
+        Raises `DriveError` if the drive is absent or refuses, `IdentityError` if it is a different drive or
+        has a different scaling, `BusInUseError` before anything is sent if another master is heard, and
         `BusError`.
         """
         self.listen()
@@ -124,7 +124,7 @@ class Drive:
     def take_over(self) -> BootReport:
         """Takes over a drive that another process on this computer has booted, whatever its state.
 
-        Compares it with the axis file and raises like `boot`; writes nothing.
+        Compares the drive with the axis file and raises like `boot`; writes nothing to the drive.
         """
         self.listen()
         self.report = BootUp(self.link, self.monitor, self.axis, self._clients).look()
@@ -341,7 +341,7 @@ class Drive:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Closes the drive; a failure to disable it is raised, or added as a note to the present error."""
+        """Closes the drive; a failure to disable it is raised, or added as a note to the current error."""
         problems = self.close()
         if not problems:
             return
@@ -356,8 +356,8 @@ class Drive:
     def _expect_master(self, expected: bool) -> None:
         """Makes the drive monitor the master's heartbeat only while power may be on.
 
-        Without power nothing can move, and the master may be busy with files. The drive starts monitoring
-        with the first heartbeat after this object was written.
+        Without power nothing can move, and the master may be busy reading or writing files. The drive starts
+        monitoring with the first heartbeat after object 1016h was written.
         """
         if self.can_set(objects.HEARTBEAT_CONSUMER):
             self.sdo.store(objects.HEARTBEAT_CONSUMER, master_heartbeat(self.axis) if expected else 0)

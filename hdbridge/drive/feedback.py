@@ -24,7 +24,7 @@ class Feedback(NamedTuple):
     fresh: bool
     """False if a TPDO was missing or implausible; the values are then the last good values."""
     readings: tuple[float | None, ...]
-    """Last good reading of each channel of the axis file; None without one."""
+    """Last good reading of each channel of the axis file; None for a channel without a good reading."""
 
 
 ENABLE_TIMEOUT_S: Final = 2.0

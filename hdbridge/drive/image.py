@@ -160,8 +160,8 @@ class ProcessImage:
     def accept(self, can_id: int, data: bytes) -> bool:
         """Takes a frame; returns True if it is one of the image's TPDOs.
 
-        Raises `PdoLengthError` if its length is wrong. Of several frames with one identifier the newest wins.
-        A rejected frame changes nothing.
+        Raises `PdoLengthError` if its length is wrong. If several frames have the same identifier, the newest
+        takes effect. A rejected frame changes nothing.
         """
         handler = self._handlers.get(can_id)
         if handler is None:
@@ -239,8 +239,8 @@ class ProcessImage:
     # -- sent frames --------------------------------------------------------------------------------------
 
     def _packer(self, layout: Layout, od: ObjectDictionary | None) -> Callable[[int, int], tuple[int, bytes]]:
-        """Returns a function that builds an RPDO frame from controlword and target, either of which may be
-        in another RPDO.
+        """Returns a function that builds an RPDO frame from controlword and target, either of which may be in
+        a different RPDO.
 
         A read-only mapping may contain other objects. The mode of operation then has the value for the cycle;
         all others have their value from the EDS, or 0 if the EDS states none.
@@ -281,7 +281,7 @@ class ProcessImage:
         """Returns the RPDOs with the controlword of ``power`` and the target.
 
         Raises `InputError` if the target is outside the limits. Before power is enabled, `pack_rpdo_idle`
-        must be used, because the axis may stand anywhere.
+        must be used, because the axis may be outside the limits.
         """
         self.check_target(target_counts)
         return self._pack(target_counts)
@@ -297,7 +297,7 @@ class ProcessImage:
     def pack_rpdo_stop(self) -> Frames:
         """Returns the RPDOs with *quick stop* and the actual position, regardless of the aim of ``power``.
 
-        They enable no drive in any state, and they replace RPDOs that a drive has buffered.
+        They enable no drive in any state, and they replace any RPDO that a drive has buffered.
         """
         word, target_counts = Command.QUICK_STOP.word, wrap_int32(self.motor_counts)
         return tuple([frame(word, target_counts) for frame in self._packers])

@@ -126,12 +126,12 @@ def _folder() -> Path:
 
 
 def _open(path: Path) -> int:
-    """Opens the lock file for reading only, which suffices for locking, because another user may own it."""
+    """Opens the lock file for reading only, because another user may own it; this suffices for locking."""
     flags = os.O_RDONLY | os.O_NOFOLLOW
     try:
         try:
             handle = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o644)
-            os.fchmod(handle, 0o644)  # regardless of the umask: another user may be next
+            os.fchmod(handle, 0o644)  # regardless of the umask: another user may take the lock next
         except FileExistsError:
             return os.open(path, flags)
         return handle

@@ -5,7 +5,7 @@ A drive with configurable mappings uses
     TPDO1 180h+id  statusword, position, torque        8 bytes
     TPDO2 280h+id  load encoder, position demand       8 bytes (4 if the load encoder has its own node id)
     TPDO3 380h+id  load torque, temperature            if the axis has them; length of its objects
-    TPDO4 480h+id  temperature                         if it comes less often than the load torque
+    TPDO4 480h+id  temperature                         if it is sent less often than the load torque
     RPDO1 200h+id  controlword, target                 6 bytes
 
 A read-only mapping is used unchanged if it contains a needed object; the remaining objects go into the other
@@ -346,8 +346,8 @@ def _check_needed(
 
 
 def _source_complaints(axis: AxisConfig, od: ObjectDictionary, offers: Sequence[_Offer]) -> Iterator[str]:
-    """Yields an error for each load encoder or channel object that is missing, of another type or not
-    mappable.
+    """Yields an error for each load encoder or channel object that is missing, has a different type or cannot
+    be mapped.
     """
     sources: dict[str, Source | ChannelSource] = {}
     if axis.load_encoder.source.node is None:

@@ -1,8 +1,8 @@
 """Raw CAN frames in and out: the only module of the master that uses python-can.
 
-It runs in the control cycle, so it adds little to the back end's own call. Every interface failure becomes a
-`BusError` that names the interface. Frames that CANopen does not use are dropped and counted. Every deadline
-refers to the monotonic clock that was passed in.
+It runs in the control cycle, so it adds little time to the back end's own call. Every interface failure
+becomes a `BusError` that names the interface. Frames that CANopen does not use are dropped and counted. Every
+deadline refers to the monotonic clock that was passed in.
 """
 
 import errno
@@ -199,8 +199,8 @@ class Link:
 def _mark(bus: can.BusABC) -> str | None:
     """Returns the channel name that marks this bus's own frames on a back end that echoes them, else None.
 
-    Such a back end transports the channel with the frame, so echoes are identified reliably: an equal frame
-    of another master has another mark, or none. All links of a bus share one mark.
+    Such a back end transports the channel with the frame, so echoes are identified reliably: an identical
+    frame from another master has a different mark, or none. All links of a bus share one mark.
     """
     if type(bus).__name__ not in _ECHOING:
         return None

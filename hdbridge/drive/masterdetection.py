@@ -1,4 +1,4 @@
-"""Detection of another master on the bus, by listening before the first frame is sent.
+"""Detection of another master on the bus, by listening before this master sends its first frame.
 
 A reset, and on some drives even an SDO request, stops an axis that another master is moving. A master
 therefore listens first, for as long as the slowest other master may be silent. The relevant frames are those
@@ -16,8 +16,8 @@ from hdbridge.errors import BusInUseError
 LONGEST_CYCLE_S: Final = 0.255
 """Longest SYNC period that a drive accepts: 255 ms in 60C2h; s."""
 PERIODS: Final = 2
-"""Listening time in periods of the slowest cycle or of the heartbeat, whichever is longer. Two, because a
-frame may have been sent just before."""
+"""Listening time in periods of the slowest cycle or of the heartbeat, whichever is longer. There are two,
+because the last frame may have been sent just before listening started."""
 DEFAULT_MASTER_ID: Final = 127
 """Default node id of a master's heartbeat (77Fh), unless its axis file sets another."""
 _RPDOS: Final = (objects.COB_RPDO1, 0x300, 0x400, 0x500)
@@ -66,7 +66,7 @@ class MasterDetector:
     def listen(self, link: Link, duration_s: float, then: Callable[[Frame], object] = lambda _: None) -> None:
         """Listens for a duration; ``then`` also receives every frame.
 
-        Frames that were already waiting do not count, because their master may be gone.
+        Frames that were already queued do not count, because their master may have left the bus.
         """
         for old in link.drain():
             self._note(old)

@@ -71,7 +71,7 @@ class ProfileMove:
         acceleration_deg_s2: float | None,
         timeout_s: float | None,
     ) -> Self:
-        """Builds a move; angles, speeds and accelerations are at the load and default to the axis's limits.
+        """Builds a move. All values are at the load; speed and acceleration default to the axis's limits.
 
         Raises `InputError` if a value is not finite or outside the limits. Without ``timeout_s`` the time-out
         is computed from the travel.

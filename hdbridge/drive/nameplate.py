@@ -153,7 +153,7 @@ def _polarity(axis: AxisConfig, readings: Readings) -> Iterator[str]:
 def _load_counts(axis: AxisConfig, readings: Readings) -> Iterator[str]:
     """Compares the resolution of a load encoder at 60E4h (60E6h over 60EBh) with the axis file.
 
-    The drive may give it per turn of the load or of the motor.
+    The drive may state the resolution per turn of the load or of the motor.
     """
     source, counts = axis.load_encoder.source, axis.load_encoder.counts_per_turn
     if source.node is not None or source.index != objects.ADDITIONAL_POSITIONS:

@@ -1,7 +1,7 @@
 """Objects of CiA 301 and CiA 402 that the master uses: address, type, name. Data only.
 
-The key is (index, sub-index). If the EDS of a drive states another type than the profile, the EDS takes
-precedence, because the drive answers according to it.
+The key is (index, sub-index). If the EDS of a drive states a different type from the profile, the EDS takes
+precedence, because the drive answers according to its EDS.
 """
 
 from dataclasses import dataclass

@@ -38,7 +38,9 @@ class PdoEntry:
 
     @property
     def is_gap(self) -> bool:
-        """True for padding: a data type in place of an object, which a drive's own mapping may contain."""
+        """True for padding: a data type mapped in place of an object; a drive's own mapping may contain
+        it.
+        """
         return self.index < _FIRST_OBJECT
 
     @property

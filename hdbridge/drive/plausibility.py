@@ -14,7 +14,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 OVERSPEED: Final = 1.5
 """Factor by which a quick stop, an overshoot or a resonance may exceed the axis's velocity limit."""
 FLOOR_ARCSEC: Final = 180.0
-"""Load movement per cycle that vibration and noise may cause, whatever the axis's limit."""
+"""Load movement that vibration and noise may cause, whatever the axis's velocity limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,10 +23,10 @@ class Plausibility:
 
     motor_floor_counts: float
     motor_step_counts: float
-    """Maximum movement of the motor encoder per cycle, in addition to its floor."""
+    """Maximum movement of the motor encoder per cycle, in addition to ``motor_floor_counts``."""
     load_floor_counts: float
     load_step_counts: float
-    """Maximum movement of the load encoder per cycle, in addition to its floor."""
+    """Maximum movement of the load encoder per cycle, in addition to ``load_floor_counts``."""
     following_counts: float
     """Maximum difference between the motor position and the drive's demand."""
 

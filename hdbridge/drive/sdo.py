@@ -75,7 +75,8 @@ class _Channel(CanopenSdoClient):
         self.monitor = monitor
         self.timeout_s = DEFAULT_TIMEOUT_S
         self.transfer_ends_s = 0.0
-        """Deadline of the whole transfer, because a node could answer every segment in time but never end."""
+        """Deadline of the whole transfer, because a node could answer every segment in time but never end the
+        transfer."""
         self.unsolicited_answers = 0
 
     def send_request(self, request: bytes | bytearray) -> None:

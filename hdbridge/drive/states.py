@@ -3,7 +3,7 @@
 This module contains the states, the rows of the decoding and transition tables, and the functions that follow
 from these rows alone: decoding, the commands permitted in each state, the path between two states, the
 diagram. It has no bus, clock, objects or modes of operation, and no policy of *when* to move, which belongs
-to `drive.py` and to the cycle. A drive that behaves differently requires another row, not an `if`.
+to `drive.py` and to the cycle. A drive that behaves differently requires an additional row, not an `if`.
 
 The rows are those of CiA 402-2, with its transition numbers. Three transitions are never part of an automatic
 path: leaving a fault (15) and resuming from a quick stop (16), which must be requested explicitly, and a
@@ -211,8 +211,8 @@ _WORDS: Final = {state: {aim: _word(state, aim) for aim in State} for state in S
 class PowerWalk:
     """Walks a drive through its states, taking one statusword and returning one controlword at a time.
 
-    It only pursues its aim. A drive that leaves 'operation enabled' on its own is not enabled again, and a
-    fault is reset only on request. A call that raises changes nothing.
+    It only walks towards its target state. A drive that leaves 'operation enabled' on its own is not enabled
+    again, and a fault is reset only on request. A call that raises changes nothing.
     """
 
     def __init__(self) -> None:
@@ -258,7 +258,7 @@ class PowerWalk:
         return state
 
     def go(self, target: State) -> None:
-        """Sets the target state; raises `TransitionError` if no path leads there from the present state."""
+        """Sets the target state; raises `TransitionError` if no path leads there from the current state."""
         controlword_for(self._state, target)
         self._aim = target
         self.dropped = None

@@ -2,7 +2,7 @@
 
 The cycle reports its faults, and the table returns the reaction. A stop is latched. Only `Supervision.reset`
 releases it, and after a `Reaction.LATCH` only when the drive has been fully verified again. The table is
-data: a fault with another reaction is another row, not an `if`.
+data: a fault with a different reaction requires a new row, not an `if`.
 """
 
 from collections import deque
@@ -57,7 +57,9 @@ class Fault(Enum):
 
 
 class Row(NamedTuple):
-    """Reactions to one fault: ``first`` at once, ``then`` from the ``threshold``-th consecutive cycle on."""
+    """Reactions to one fault: ``first`` immediately, ``then`` from the ``threshold``-th consecutive cycle
+    with this fault.
+    """
 
     fault: Fault
     first: Reaction
@@ -162,7 +164,7 @@ class Supervision:
     def judge(self, cycle: int, faults: Iterable[tuple[Fault, str]]) -> Reaction:
         """Returns the reaction to one cycle's faults, each with its detail; a good cycle has none.
 
-        Once latched, the reaction stays the same, however good the cycle. Two consecutive cycles without
+        Once latched, the reaction persists even through cycles without faults. Two consecutive cycles without
         usable feedback cause a stop, whichever faults caused the loss.
         """
         previous, self._runs = self._runs, {}
@@ -219,7 +221,7 @@ class Supervision:
         )
 
     def _emergencies(self, since_cycle: int) -> list[str]:
-        """Returns the first emergencies that came with the stop, which are the drive's own explanation."""
+        """Returns the first emergencies that came with the stop, in which the drive explains the stop."""
         said = [
             event.detail
             for event in self.events

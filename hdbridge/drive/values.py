@@ -72,7 +72,7 @@ class Object:
         return data.hex(" ")
 
     def encode(self, text: str) -> bytes:
-        """Encodes a value written as text; `InputError` if it is of another type or out of range."""
+        """Encodes a value written as text; `InputError` if it has a different type or is out of range."""
         if self.integer is not None:
             return self.integer.encode(self._integer(text, self.integer))
         if self.data_type == datatypes.BOOLEAN:

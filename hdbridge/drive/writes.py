@@ -1,7 +1,7 @@
 """Writes of the boot-up, as a list for review before execution. Pure.
 
 Every row contains the object, its value, the reason, and the field of the axis file from which it comes. The
-boot-up reads each object first, writes those with another value, in this order, and reads them back.
+boot-up reads each object first, writes the objects whose value differs, in this order, and reads them back.
 `hdbridge.drive.bootplan` leaves missing objects that are optional in CiA 402 to the drive.
 """
 
@@ -23,7 +23,7 @@ from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG
 
 SYNCHRONOUS: Final = 1
-"""Transmission type: sent, or applied, at every SYNC."""
+"""Transmission type of a PDO that is sent (TPDO) or applied (RPDO) at every SYNC."""
 RPDO_TIMEOUT_CYCLES: Final = 4
 """Number of cycles without a set-point after which the drive stops (but not before 10 ms)."""
 _COB_COMPARED: Final = PDO_INVALID | 0x7FF
@@ -43,7 +43,7 @@ class PlannedWrite:
     value: int
     why: str
     field: str = ""
-    """Field of the axis file that determines the value; empty without one."""
+    """Field of the axis file that determines the value; empty if no field does."""
     type: IntegerType | None = None
     """Integer type; None if the EDS or the profile determines it."""
     compared: int = _EVERYTHING
@@ -51,8 +51,8 @@ class PlannedWrite:
     kept: int = 0
     """Mask of the bits that keep the drive's value."""
     composed: bool = False
-    """True for several numbers in one object. The limits of the EDS are ignored, because vendors state them
-    for one number."""
+    """True if the object packs several numbers. The limits of the EDS are ignored, because vendors state the
+    limits for a single number."""
     without: str = ""
     """Consequence if the drive keeps its own value; empty if hdbridge requires this value."""
     exact: bool = False
@@ -60,7 +60,7 @@ class PlannedWrite:
     pdo: int = 0
     """Communication parameter of the PDO that the row configures; the rows of a PDO are consecutive."""
     passing: bool = False
-    """True if the object holds the value only while its PDO is being changed."""
+    """True if the object has the value only while its PDO is being changed."""
 
     def __str__(self) -> str:
         """For example ``605Ah:00 = 6 (6h): what a quick stop does [drive.quick_stop_option]``."""
@@ -172,7 +172,9 @@ def _pdos(axis: AxisConfig, od: ObjectDictionary | None, pdos: Layouts) -> Itera
 
 
 def _carried(axis: AxisConfig, layout: Layout) -> list[str]:
-    """Returns the key of the axis file that chose each entry of a PDO; empty without one."""
+    """Returns, for each entry of a PDO, the key of the axis file that requests the object; empty if no key
+    does.
+    """
     encoder = axis.load_encoder.source
     keys = {(encoder.index, encoder.subindex): "load_encoder.source"}
     for key, channel in axis.channels.items():
@@ -202,7 +204,7 @@ def _invalid(
 def _pdo(layout: Layout, communication: int, mapping: int, fields: list[str]) -> Iterator[PlannedWrite]:
     """Yields the rows of one PDO in the order of CiA 301: invalid, empty, entries, count, valid.
 
-    ``fields`` are the keys of the axis file that chose the entries; empty without one.
+    ``fields`` are the keys of the axis file that request the entries (see `_carried`).
     """
     node_id, number, can_id, codec, every, _ = layout
     field = next(filter(None, fields), "")

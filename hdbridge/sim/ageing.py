@@ -1,7 +1,7 @@
 """Ageing: gradual changes in the gear over hours of work, linear from switch-on; see `hdbridge.sim.gear`.
 
 Stiffening grease and settling preload change the hysteresis loop; wear of the teeth changes the tooth error.
-Each piece is evaluated once per substep, in order of time.
+Each object advances by one substep whenever it is evaluated.
 """
 
 import math
@@ -31,7 +31,7 @@ class Age:
 
 @state
 class AgeFactor:
-    """Factor by which the elastic hysteresis has grown with age."""
+    """Factor that multiplies the elastic hysteresis and grows with age."""
 
     _age: Age
     _growth: float
@@ -46,7 +46,7 @@ class AgeFactor:
 
 @state
 class WornTeeth:
-    """Tooth error over the motor angle that wear adds with age."""
+    """Additional tooth error, a function of the motor angle, that grows with age."""
 
     by_motor_only: ClassVar[bool] = False
     _age: Age

@@ -1,7 +1,7 @@
 """Simulated axis, cycle by cycle: servo loops, temperature, and the encoder readings at the end of a cycle.
 
-It contains all computations of `hdbridge.sim.machine` in a cycle except noise, so it can be compiled as a
-whole and advanced by one call per cycle.
+The class `Axis` contains all computations of `hdbridge.sim.machine` in a cycle except noise, so it can be
+compiled as a whole and advanced by one call per cycle.
 """
 
 import math
@@ -48,7 +48,8 @@ class Measured(NamedTuple):
     true_load_deg: float
     """True load angle, for tests."""
     true_output_deg: float
-    """True output of the gear before its spring, for tests: the angle at which the load comes to rest."""
+    """True output angle of the gear before its spring, for tests; an unloaded load comes to rest at this
+    angle."""
 
 
 @state
@@ -146,7 +147,7 @@ class Axis:
         self.loops.hold(torque_nm)
 
     def _prepare(self, limit_nm: float, outer_nm: float) -> None:
-        """Passes the slowly varying inputs to the loops, for the next cycle."""
+        """Passes the inputs that change only between cycles to the loops."""
         self.loops.take(self.heat.body_c, self.heat.friction_factor, limit_nm, self._lost_deg(), outer_nm)
 
     def _readings(self, elapsed_s: float, noise_deg: float, outer_nm: float) -> Measured:

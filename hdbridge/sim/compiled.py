@@ -3,7 +3,7 @@
 An object of the classes that `hdbridge.sim.state` declares is laid out as a numpy record, attribute by
 attribute, and numba compiles the classes' methods for such records. The physics is therefore written only
 once. If an attribute may belong to one of several classes (a hysteresis law, a cause of transmission error),
-its record has space for each, and a field for the kind.
+its record has space for each of these classes, and a field for the actual class.
 
 Results are identical bit for bit, because nothing is reordered or fused (no ``fastmath``), and exp, sin and
 similar functions are those of the C library that Python uses. An axis that cannot be laid out
@@ -47,7 +47,7 @@ class Kinds(NamedTuple):
     room: int
     """Maximum length of a tuple of attributes with this protocol."""
     neutral: float
-    """Value that an unused place in such a tuple returns."""
+    """Value that an unused element of such a tuple returns."""
 
 
 KINDS: Final[dict[Any, Kinds]] = {
@@ -150,7 +150,7 @@ def _entry_point(plant: Any, room: int, name: str) -> Callable[..., Any]:
 
 @cache
 def _methods() -> dict[str, Any]:
-    """Returns numba's dispatchers of the methods, cached on disk for the present sources."""
+    """Returns numba's dispatchers of the methods, cached on disk for the current source code."""
     with _registering:
         _register()
     version = _version()
@@ -275,7 +275,7 @@ def _layout_of(plant: Any, room: int) -> Any:
             _UNIONS[numba.from_dtype(union)] = declared
             return union
         cls = plant if declared is Plant else declared
-        mark = (f"is_{cls.__name__}", np.dtype("u1"))  # makes each class's layout unique
+        mark = (f"is_{cls.__name__}", np.dtype("u1"))  # makes the layout of each class unique
         record = np.dtype([mark, *((n, layout(each)) for n, each in _attributes(cls).items())], align=True)
         _CLASSES[numba.from_dtype(record)] = cls
         return record
@@ -347,8 +347,9 @@ def _register() -> None:
 def _name_in_code(record: types.Record) -> tuple[str, tuple[str]]:
     """Returns the name of a record in compiled functions, derived from its contents.
 
-    Numba itself numbers the types of each process. Two layouts compiled by two processes could then have the
-    same name, and a process that loads both from disk would run the code of one on the data of the other.
+    Numba itself numbers the types separately in each process. Two layouts compiled by two processes could
+    then have the same name, and a process that loads both from disk would run the code of one on the data of
+    the other.
     """
     return "Record", (hashlib.sha256(record.name.encode()).hexdigest()[:32],)
 
@@ -392,7 +393,7 @@ def _dispatch(protocol: Any, name: str) -> Any:
 
 
 def _of_the_c_library(function: Any) -> None:
-    """Makes numba call the C function that Python calls, because numba has none of its own."""
+    """Makes numba call the C function that Python calls, because numba does not implement this function."""
     same = types.ExternalFunction(function.__name__, types.float64(types.float64, types.float64))
 
     @overload(function, strict=False)  # type: ignore[untyped-decorator]

@@ -20,7 +20,7 @@ from hdbridge.sim.truth.encoder import (
 from hdbridge.units import ARCSEC_PER_DEG
 
 BACK_DEG: Final = 0.05
-"""Load travel over which a cable's drag reverses."""
+"""Load travel after a reversal over which the drag of a cable changes sign."""
 
 
 class ReadingError(Protocol):
@@ -89,7 +89,7 @@ class Signals:
 
 @state
 class Cable:
-    """Cable that is taut beyond an angle and twists the encoder's body, which reduces the reading."""
+    """Cable that is taut beyond an angle; it then twists the encoder's body, which reduces the reading."""
 
     _drag: float
     _from_deg: float
@@ -118,7 +118,9 @@ class Cable:
 
 @state
 class SensorWarming:
-    """Reading shift proportional to the square of the speed, with a lag, as the encoder warms and cools."""
+    """Shift of the reading with the encoder's warming: proportional to the square of the speed, with a
+    lag.
+    """
 
     _exponent: float
     _goal: float
@@ -192,7 +194,7 @@ class Late:
         self.begin(start_deg)
 
     def begin(self, shaft_deg: float) -> None:
-        """Resets to a shaft that has always stood at this angle."""
+        """Resets the delay to a shaft that has always been at this angle."""
         self._oldest = 0
         self.deg = shaft_deg
         for place in range(self._kept):
@@ -235,13 +237,14 @@ class FixedErrors:
 
 @state
 class Body:
-    """Movement of the load encoder's body due to the travel of its shaft.
+    """Shift of the load encoder's reading by its cable and its warming, which depend on the travel of its
+    shaft.
 
-    It has a state, so it must be updated once per substep; it may be read at any time.
+    The shift has a state, so it must be updated once per substep; it may be read at any time.
     """
 
     deg: float
-    """Present shift of the reading."""
+    """Current shift of the reading."""
     moves: bool
     _errors: tuple[ReadingError, ...]
 

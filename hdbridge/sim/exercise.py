@@ -1,6 +1,6 @@
 """Moves the simulated axis without a bus and records its encoders.
 
-This generates records in bulk, at least 250 times faster than real time, with the same loops, mechanics and
+Generates records in bulk, at least 250 times faster than real time, with the same loops, mechanics and
 encoders as the drive with firmware. All moves begin and end at rest, with continuous speed.
 """
 
@@ -30,7 +30,7 @@ class Readings(NamedTuple):
 
 
 class Exercise:
-    """Moves one machine, with one demand per cycle; distances are motor degrees from its present position."""
+    """Moves one machine, with one demand per cycle; distances are motor degrees from its current position."""
 
     def __init__(self, machine: Machine, cycle_s: float = 0.004, cycles_per_sample: int = 1) -> None:
         self.machine = machine
@@ -72,7 +72,7 @@ class Exercise:
         even_s = max(0.0, distance / speed - ramp_s) if speed else 0.0
 
         def ramped(seconds: Floats | float) -> Floats:
-            """Returns the distance after a time of acceleration."""
+            """Returns the distance covered after a given time of acceleration."""
             return 0.5 * speed * (seconds - ramp_s / math.pi * np.sin(math.pi * seconds / ramp_s))
 
         def way(seconds: Floats) -> Floats:
@@ -86,7 +86,9 @@ class Exercise:
             self.lead(way, 2.0 * ramp_s + even_s, distance_deg)
 
     def sine(self, amplitude_deg: float, frequency_hz: float, periods: float) -> None:
-        """Oscillates as 1 - cos, between the present position and twice the amplitude from it."""
+        """Oscillates as 1 - cos, between the current position and a position at twice the amplitude from
+        it.
+        """
         turn = math.tau * frequency_hz
         self.lead(lambda seconds: amplitude_deg * (1.0 - np.cos(turn * seconds)), periods / frequency_hz)
 

@@ -1,7 +1,7 @@
 """Switches the simulated axis to compiled code as soon as that pays off, if numba is installed.
 
-numba comes with the extra ``hdbridge[fast]``. Loading it takes a second, and compiling takes another twelve
-the first time on a computer; compiled code is kept on disk. A process therefore begins in Python and switches
+numba comes with the extra ``hdbridge[fast]``. Loading numba takes a second, and the first compilation on a
+computer takes twelve more; compiled code is kept on disk. A process therefore begins in Python and switches
 to the compiled axis after enough substeps to pay for compiling. The results are the same.
 """
 
@@ -25,8 +25,8 @@ FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 PAYS_AFTER_SUBSTEPS: Final = 140_000
-"""Number of substeps after which compiling pays off: each takes 10 microseconds in Python, and loading the
-compiled axis takes 1.4 s. A control cycle of 4 ms has eight substeps."""
+"""Number of substeps after which compiling pays off: each substep takes 10 microseconds in Python, and
+loading the compiled axis takes 1.4 s. A control cycle of 4 ms has eight substeps."""
 SWITCH: Final = "HDBRIDGE_COMPILE"
 """Environment variable that disables compilation if it is ``0``."""
 _PROOF_CYCLES: Final = 100
@@ -49,7 +49,7 @@ waiting: Final = _Waiting()
 
 
 def compiled_axis(axis: Axis) -> AnyAxis:
-    """Returns the axis compiled in its present state, or the axis itself if that is not possible."""
+    """Returns the axis compiled in its current state, or the axis itself if compiling is not possible."""
     if os.environ.get(SWITCH) == "0" or importlib.util.find_spec("numba") is None:
         return axis
     from hdbridge.sim import compiled  # noqa: PLC0415 - takes half a second and needs numba

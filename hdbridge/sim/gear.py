@@ -29,7 +29,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 
 class Factor(Protocol):
-    """Factor by which the size of a cause is multiplied."""
+    """Factor that multiplies the contribution of a cause."""
 
     def factor(self, now: Conditions) -> float:
         """Advances by one substep and returns the factor under these conditions."""
@@ -51,9 +51,9 @@ class Piece(Protocol):
 
 @state
 class MotorOrders:
-    """Tooth error over motor angle, or over the angle between wave generator and flexspline.
+    """Tooth error as a function of the motor angle, or of the angle between wave generator and flexspline.
 
-    It may also depend on the loaded flank, the torque and the temperature.
+    The error may also depend on the loaded flank, the torque and the temperature.
     """
 
     by_motor_only: bool
@@ -91,14 +91,14 @@ class MotorOrders:
             size *= factor.factor(now)
         error, slope = self._orders.at(angle_deg * self._rad_per_deg)
         grown = self._growth_per_nm * abs(now.torque_nm)
-        # Torque T does only half of the work T * error on an error that grows with T; see `plant`.
+        # The growth of the error with the torque counts only by half in the reaction (see `plant`).
         now.slope_arcsec += slope * self._turns * (1.0 + 0.5 * grown) * size
         return error * (1.0 + grown) * size
 
 
 @state
 class LoadOrders:
-    """Tooth error over load angle."""
+    """Tooth error as a function of the load angle."""
 
     by_motor_only: ClassVar[bool] = False
     _orders: Orders
@@ -120,7 +120,7 @@ class ElasticHysteresis:
     _loop_arcsec: float
     _loop_deg: float
     _loop_slope: float
-    """Change of the loop over the last travel, arcsec per radian."""
+    """Slope of the loop over the last travel of the motor, arcsec per radian."""
     _reaction: float
 
     def __init__(self, law: Law, factors: tuple[Factor, ...], reaction: float) -> None:
@@ -162,7 +162,9 @@ class ZeroDrift:
 
 @state
 class SlowZeroDrift:
-    """Shift of the output with the temperature of a housing, which lags the measured temperature."""
+    """Shift of the output proportional to the temperature of a housing, which lags the measured
+    temperature.
+    """
 
     by_motor_only: ClassVar[bool] = False
     _ambient_c: float

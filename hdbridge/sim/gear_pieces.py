@@ -1,6 +1,7 @@
 """Causes of transmission error in the gear other than orders and hysteresis; see `hdbridge.sim.gear`.
 
-Each piece is evaluated once per substep, in order of time, so pieces with a state advance by one substep.
+Each piece is evaluated once per substep, in order of time, so a piece with a state advances by one substep
+per evaluation.
 """
 
 import math
@@ -26,7 +27,7 @@ SLIDING_DEG_S: Final = 0.5
 
 @state
 class Flank:
-    """Loaded flank of the teeth, -1 to 1, over the motor's travel."""
+    """Loaded flank of the teeth, from -1 to 1, which changes with the motor's travel."""
 
     _last_deg: float
     _share: float
@@ -127,7 +128,7 @@ class Creep:
     """Kelvin-Voigt elements in series, each yielding to the teeth's drag and to the load.
 
     The drag acts against the motion while the motor turns, and ceases at standstill, so the output continues
-    to creep after a stop. A torque at the load acts for as long as it lasts.
+    to creep after a stop. A torque at the load acts on the elements for as long as it lasts.
     """
 
     by_motor_only: ClassVar[bool] = False
@@ -193,7 +194,7 @@ class Jumps:
 
 @state
 class Damage:
-    """Damaged teeth: smooth bumps over load angle."""
+    """Damaged teeth: smooth bumps of the error at certain load angles."""
 
     by_motor_only: ClassVar[bool] = False
     _at_deg: tuple[float, ...]
@@ -218,7 +219,9 @@ class Damage:
 
 @state
 class Roller:
-    """Roller on the motor's hub: an error over its own angle, largest at the load angle of the contact."""
+    """Roller on the motor's hub: an error that varies with the roller's own angle, largest at the load angle
+    of the contact.
+    """
 
     by_motor_only: ClassVar[bool] = False
     _amplitude: float

@@ -14,7 +14,7 @@ class Heat:
     body_c: float
     """Temperature of motor and gear."""
     friction_factor: float
-    """Motor friction at the present temperature, relative to the friction in the truth file."""
+    """Motor friction at the current temperature, relative to the friction in the truth file."""
     since_s: float
     """Time since the axis was switched on."""
     _ambient_c: float

@@ -1,4 +1,4 @@
-"""Elastic hysteresis of the gear: lead of its output, over the motor's travel.
+"""Elastic hysteresis of the gear: lead of its output as a function of the motor's travel.
 
 Each law is rate-independent and advances from one motor angle to the next. The output leads in the direction
 of motion, so a closed loop of the motor angle has a positive area, the integral of error over angle.
@@ -23,7 +23,9 @@ class Law(Protocol):
 
 
 def law_of(truth: Hysteresis | None, motor_deg: float) -> Law | None:
-    """Returns the law of a truth file in its initial state at a motor angle, or None."""
+    """Returns the hysteresis law of a truth file in its initial state at a motor angle; None without
+    hysteresis.
+    """
     if isinstance(truth, RollingFriction):
         return RollingFrictionLaw(truth, motor_deg)
     if isinstance(truth, MaxwellSlip):
@@ -35,7 +37,7 @@ def law_of(truth: Hysteresis | None, motor_deg: float) -> Law | None:
 
 @state
 class RollingFrictionLaw:
-    """Law of the article, continuous at reversals.
+    """Rolling-friction law of the article, continuous at reversals.
 
     After a reversal at angle a with error e the error is ``e + s 2 offset g(x)``, limited to ``s offset``; s
     is the direction and ``x = |motor - a| / width``, at most 1. ``g(x) = (x^(n-1) - (n-1) x) / (2-n)``, and

@@ -1,8 +1,8 @@
 """Mechanics with a multi-stage spring, a dead zone behind it, and torques on the load.
 
-Gravity, drag and vibration act on the load as a torque that is constant within a substep, and so does the
-deviation of the spring from its linear first stage. The linear step therefore stays exact, and the load comes
-to rest exactly where the torques balance.
+Gravity, drag and vibration act on the load as a torque that is constant within a substep; the deviation of
+the spring from its linear first stage is treated in the same way. The linear step therefore stays exact, and
+the load comes to rest exactly where the torques balance.
 """
 
 import math
@@ -217,7 +217,9 @@ class LoadedPlant(Plant):
         return min(limit, max(-limit, held))
 
     def _play(self, load_deg: float) -> float:
-        """Returns the angle of the coupling's near side, which the load drags along beyond the play."""
+        """Returns the angle of the coupling's near side, which the load drags along once it has crossed the
+        play.
+        """
         played = min(load_deg + self._play_deg, max(load_deg - self._play_deg, self._played_deg))
         self._played_deg = played
         return played

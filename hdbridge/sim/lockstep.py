@@ -1,7 +1,7 @@
 """Simulated bench without real time: master and simulated drives in one thread, on one virtual clock.
 
 The master uses ``LockstepBus`` and sleeps on ``VirtualClock``. The drives run whenever the master sends or
-waits: a frame is answered before ``send`` returns, and time passes only while the master waits, from one
+waits: every frame is answered before ``send`` returns, and time passes only while the master waits, from one
 drive event to the next. Nothing really sleeps, there are no races, and the same run always has the same
 frames. The frames are real python-can messages over python-can ``virtual`` buses.
 """
@@ -31,7 +31,7 @@ from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
 
 LONGEST_WAIT_S: Final = 3600.0
-"""Virtual time after which a ``recv`` without a time-out gives up."""
+"""Virtual time after which a ``recv`` without a time-out raises an error; s."""
 
 
 class Node(Protocol):
@@ -141,7 +141,7 @@ class _PolledBus(VirtualBus):
 
 
 class LockstepBus(can.BusABC):
-    """Master's end of a virtual channel whose other participants run in ``clock.nodes``.
+    """Master's end of a virtual channel; its other participants are run by the clock (``clock.nodes``).
 
     ``recv`` is overridden as a whole, because that of the base class measures its time-out by the wall clock.
     """
@@ -152,7 +152,7 @@ class LockstepBus(can.BusABC):
         self._clock = clock
         super().__init__(channel=channel, **kwargs)
         self.private = False
-        """True if the channel is known only to the master and the drives of the clock."""
+        """True if only the master and the clock's nodes know the channel."""
         self.channel_info = "the simulated bus"
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
@@ -295,7 +295,7 @@ def simulated_benches(
         raise InputError(f"two simulated drives are node {twice}; give each a node id of its own")
     private = channel is None
     channel = channel or f"hdbridge-{uuid4()}"
-    may_compile = clock is None  # another clock may be tied to real time
+    may_compile = clock is None  # a clock of the caller may be tied to real time
     clock = clock if clock is not None else VirtualClock()
     with ExitStack() as stack:
         if may_compile:

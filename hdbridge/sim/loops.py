@@ -82,11 +82,11 @@ class Loops:
         return self.servo.engage(self._seen_deg(self.plant.now.motor_deg), self.plant.motor_deg_s)
 
     def sampled_motor_deg(self) -> float:
-        """Returns the motor's angle at the time of its encoder's sample."""
+        """Returns the motor angle at the time at which its encoder is sampled."""
         return self._late_motor.deg if self._with_late_motor else self.plant.now.motor_deg
 
     def sampled_load_deg(self) -> float:
-        """Returns the angle of the load encoder's shaft at the time of the sample."""
+        """Returns the angle of the load encoder's shaft at the time at which the encoder is sampled."""
         return self._late_load.deg if self._with_late_load else self.plant.encoder_deg
 
     def begin_demand(self, demand_deg: float) -> None:
@@ -101,7 +101,7 @@ class Loops:
         self.torque_nm += off_nm
 
     def follow(self, demand_deg: float, demand_deg_s: float, substeps: int) -> None:
-        """Runs some substeps in closed loop, in which the demand moves linearly."""
+        """Runs some substeps in closed loop, during which the demand moves linearly."""
         servo, plant, dt = self.servo, self.plant, self.dt_s
         now = plant.now
         torque = squares = 0.0

@@ -1,7 +1,7 @@
 """Simulated axis as seen by a drive's firmware: loops, motor, gear, load and two encoders.
 
-Deterministic: the same truth, seed and commands yield the same numbers bit for bit. It has no clock; each
-call advances it by whole substeps.
+Deterministic: the same truth, seed and commands yield the same numbers bit for bit. The machine has no clock;
+each call advances it by whole substeps.
 """
 
 import math
@@ -21,7 +21,9 @@ FloatArray = fast.FloatArray
 
 
 class Cycles(NamedTuple):
-    """Measurements of a machine at the end of many cycles, named as its attributes; shape (n,) each."""
+    """Measurements at the end of each of many cycles, named like the machine's attributes; shape (n,)
+    each.
+    """
 
     motor_reading: FloatArray
     load_reading: FloatArray
@@ -34,7 +36,7 @@ class Cycles(NamedTuple):
 class Machine:
     """Servo axis, initially at rest at angle zero with its power stage off.
 
-    It has the attributes of `Measured`.
+    Its attributes include those of `Measured`.
     """
 
     def __init__(self, truth: Truth, seed: int, *, may_compile: bool = False, loaded: bool = False) -> None:
@@ -87,9 +89,9 @@ class Machine:
         """Runs many closed-loop cycles, each from the previous demand, with the same results as `follow`.
 
         ``counts`` contains the demand at the start of the first and at the end of each cycle, shape (n + 1,);
-        ``substeps`` the substeps of each cycle; ``outer_nm`` the external torque on the load in each, in
-        addition to its weight; ``held_nm`` the torque with which the loops hold the axis before each,
-        positive forward, or NaN for no change.
+        ``substeps`` the substeps of each cycle; ``outer_nm`` the external torque on the load in each cycle,
+        in addition to its weight; ``held_nm`` the torque with which the loops hold the axis before each
+        cycle, positive forward, or NaN for no change.
         """
         outer_nm = np.zeros(len(substeps)) if outer_nm is None else outer_nm
         held_nm = np.full(len(substeps), np.nan) if held_nm is None else held_nm

@@ -1,4 +1,4 @@
-"""Damped mass on a spring with a moving base: exact step for linear motion of the base."""
+"""Exact time step of a damped mass on a spring whose base moves linearly."""
 
 import math
 from typing import NamedTuple, Protocol
@@ -7,7 +7,7 @@ from hdbridge.sim.state import state
 
 
 class Step(NamedTuple):
-    """State transition of (distance from the base, its rate) over one step."""
+    """State transition of the distance from the base and its rate over one step."""
 
     distance_by_distance: float
     distance_by_rate: float
@@ -26,7 +26,7 @@ class Oscillator(Protocol):
 
 @state
 class Transition:
-    """`Step` as part of the simulation's state."""
+    """`Step` as a class of the simulation's state."""
 
     distance_by_distance: float
     distance_by_rate: float
@@ -38,7 +38,7 @@ class Transition:
 
 
 def transition(truth: Oscillator | None, step_s: float) -> Transition:
-    """Returns the exact step of an oscillator; without one, the step of a mass fixed to its base."""
+    """Returns the exact step of an oscillator; for None, the step of a mass fixed to its base."""
     if truth is None:
         return Transition(Step(0.0, 0.0, 0.0, 0.0))
     return Transition(exact_step(math.tau * truth.frequency_hz, truth.damping_ratio, step_s))

@@ -1,6 +1,6 @@
-"""Virtual clock that never runs ahead of real time, for simulated drives under observation.
+"""Virtual clock that never runs ahead of real time, for simulated drives that a user watches.
 
-If the computer is late, virtual time is equally late. Nothing is skipped, and a long delay is not made up
+If the computer is late, virtual time is equally late. No event is skipped, and a long delay is not made up
 for. A stall of the computer is therefore not a fault on a simulated bus.
 """
 
@@ -13,7 +13,8 @@ from hdbridge.errors import InputError
 from hdbridge.sim.lockstep import VirtualClock
 
 FORGIVEN_S: Final = 0.1
-"""Longest delay in real time that is made up for; after a longer delay the pace restarts."""
+"""Longest delay in real time that is made up for; after a longer delay, pacing restarts from the current
+time."""
 
 
 class PacedClock(VirtualClock):

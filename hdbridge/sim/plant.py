@@ -10,16 +10,17 @@ angle, e the tooth error and h the hysteresis,
     V = K w^2 / 2,  w = q/N + e(q) + h - p:     torque on the load  -dV/dp = K w = T
                                                 torque on the motor -dV/dq = -T (1/N + de/dq)
 
-(Lagrange's equations; Goldstein, Classical Mechanics, chapter 1). So the tooth error changes the momentary
-ratio in the reaction as in the angles, by up to some per cent. The hysteresis is not a function of the motor
-angle. If K h is the friction torque by which the teeth drag the output along, it acts on both by the nominal
-ratio. If sticking contacts displace the output instead, they do no work, and dh/dq contributes to the
-reaction too: ``gear.hysteresis_reaction`` is the fraction that does so. If the error grows with the torque,
-e (1 + g |T|), the spring has the stiffness K / (1 - K g e) in the direction of the torque, and
-dV/dq = T (1/N + (1 + g |T| / 2) de/dq). An error over the load angle would change the torque on the load by
-less than a thousandth; this is neglected.
+(Lagrange's equations; Goldstein, Classical Mechanics, chapter 1). The tooth error therefore changes the
+momentary ratio for the reaction in the same way as for the angles, by up to some per cent. The hysteresis is
+not a function of the motor angle. If K h is the friction torque by which the teeth drag the output along, it
+acts on motor and load with the nominal ratio. If sticking contacts displace the output instead, they do no
+work, and dh/dq contributes to the reaction too: ``gear.hysteresis_reaction`` is the fraction that does so. If
+the error grows with the torque, e (1 + g |T|), the spring has the stiffness K / (1 - K g e) in the direction
+of the torque, and dV/dq = T (1/N + (1 + g |T| / 2) de/dq). An error over the load angle would change the
+torque on the load by less than a thousandth; this is neglected.
 
-`Plant` has a linear spring and a load without external torques; `hdbridge.sim.loaded_plant` has the rest.
+`Plant` has a linear spring and a load without external torques; `hdbridge.sim.loaded_plant` has all other
+properties.
 """
 
 import math
@@ -44,7 +45,7 @@ class Plant:
     output_deg: float
     encoder_deg: float
     loss_j: float
-    """Friction work at the motor shaft since it was last reset."""
+    """Friction work at the motor shaft since this attribute was last reset."""
     outer_nm: float
     """External torque on the load, in addition to its weight; only `LoadedPlant` applies it."""
     _arm: float
@@ -75,7 +76,7 @@ class Plant:
         self._ratio = gear.ratio
         self._stiffness = gear.stiffness_nm_per_rad * RAD_PER_DEG
         self._damping = gear.damping_nm_s_per_rad * RAD_PER_DEG
-        # Spring torque, averaged over a step, per sum of the motor speeds at the two ends of the step.
+        # Mean spring torque over a step, divided by the sum of the motor speeds at the two ends of the step.
         self._arm = (self._stiffness * dt / 4.0 + self._damping / 2.0) / gear.ratio
         self._inertia = motor.inertia_kg_m2 * RAD_PER_DEG / dt
         self._drag = self._cold_drag = motor.viscous_nm_s_per_rad * RAD_PER_DEG
@@ -190,7 +191,9 @@ class Plant:
         self._encoder_rate = rate + step.rate_by_distance * ahead + step.rate_by_rate * slip
 
     def _apply_friction(self, before: float, load: float, speed: float, loss: float) -> tuple[float, float]:
-        """Applies Coulomb friction at the load: reduces its speed, or holds it if the friction suffices."""
+        """Applies Coulomb friction at the load: reduces the load's speed, or holds the load if the friction
+        suffices.
+        """
         if abs(speed) <= loss:
             return before, 0.0
         loss = math.copysign(loss, speed)

@@ -1,7 +1,7 @@
 """Measured response of a drive in addition to its loops: finite impulse responses, so always stable.
 
-The command's speed and direction of each control cycle change the demand of the loops and the reported
-torque. Both are unchanged once the command has been at rest for the length of the responses.
+The speed and direction of the command in the latest control cycles change the demand of the loops and the
+reported torque. Both changes are zero once the command has been at rest for the length of the responses.
 """
 
 from typing import Any

@@ -4,8 +4,8 @@ The blocks in order: moving average and two lags of the demand, position P, velo
 (whose integral may sum the position error instead: PIV), feed-forwards, disturbance observer, notch, torque
 filter, limit.
 
-Like real drives of this class, it closes its loops on an interpolated encoder, so the motor settles in the
-middle of the commanded count and not anywhere within it.
+Like a real drive of this class, the simulated drive closes its loops on an interpolated encoder, so the motor
+settles in the middle of the commanded count rather than anywhere within it.
 """
 
 import math
@@ -26,7 +26,9 @@ integral may rest."""
 
 @state
 class MovingAverage:
-    """Moving average of the demand, from its integral now and one duration ago."""
+    """Moving average of the demand, computed from the integral of the demand now and one averaging time
+    ago.
+    """
 
     _duration_s: float
     _integral: float
@@ -44,7 +46,7 @@ class MovingAverage:
         self._late_integral.begin(0.0)
 
     def mean_deg(self) -> float:
-        """Returns the present mean of the demand."""
+        """Returns the current mean of the demand."""
         return self._start_deg + (self._integral - self._late_integral.deg) / self._duration_s
 
     def add_up(self, demand_deg: float, duration_s: float) -> None:
@@ -171,7 +173,9 @@ class Servo:
         self.engage(0.0, 0.0)
 
     def engage(self, motor_deg: float, motor_deg_s: float) -> float:
-        """Starts at the motor's position, without torque or error; returns its angle as seen by the loops."""
+        """Starts the loops at the motor's position, without torque or error; returns the angle that they
+        measure.
+        """
         self._measured = self._interpolated(motor_deg)
         self._reference = self._last_reference = self._measured
         self._reference_speed = self.measured_deg_s = motor_deg_s
@@ -187,7 +191,7 @@ class Servo:
         return self._measured
 
     def shift(self, torque_nm: float) -> None:
-        """Adds ``torque_nm`` as a constant disturbance to integral and observer."""
+        """Changes the integral and the observer as for an additional constant disturbance ``torque_nm``."""
         self._integral += (1.0 - self._observed_share) * torque_nm
         self._observed_nm += torque_nm
         if self._with_filters:
@@ -210,8 +214,9 @@ class Servo:
             average.add_up(demand_deg + 0.5 * dt * demand_deg_s, dt)
             demand_deg, demand_deg_s = before_deg, (average.mean_deg() - before_deg) / dt
 
-        # Reference: the demand after two equal lags, stepped exactly. It never overshoots a demand that
-        # does not reverse, and its speed and acceleration stay finite at the steps of a demand in counts.
+        # Reference: the demand after two equal lags, stepped exactly. The reference never overshoots a demand
+        # that does not reverse, and its speed and acceleration stay finite at the steps of a demand in
+        # counts.
         reference, speed = self._reference, self._reference_speed
         w, decay = self._filter, self._decay
         behind = reference - demand_deg + 2.0 * demand_deg_s / w
@@ -266,7 +271,7 @@ class Servo:
         return torque
 
     def _load_torque(self, reference_speed: float) -> float:
-        """Returns the mean torque over the substep with which a load on a spring follows the reference."""
+        """Returns the mean torque over the substep that makes a load on a spring follow the reference."""
         step, ahead, speed = self._load_model, self._load_ahead, self._load_speed
         slip = speed - reference_speed
         self._load_ahead = step.distance_by_distance * ahead + step.distance_by_rate * slip

@@ -22,7 +22,7 @@ def state(cls: type[T]) -> type[T]:
 
 @state
 class Conditions:
-    """Present conditions of the gear, updated by the plant."""
+    """Current conditions of the gear, updated by the plant."""
 
     motor_deg: float
     load_deg: float

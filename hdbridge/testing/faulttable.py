@@ -1,8 +1,8 @@
-"""Faults of a simulated drive by name: one row each.
+"""Faults of a simulated drive by name, as a table with one row per fault.
 
-They cause the faults of the fault table in docs/reliability.md, by actions of the drive, its encoders, other
-nodes and the interface. Faults of the program itself (a target that is not a number, a full disk) must be
-caused by the program.
+Actions of the drive, its encoders, other nodes and the interface cause the faults listed in
+docs/reliability.md. Faults of the program itself (a target that is not a number, a full disk) must be caused
+by the program.
 """
 
 import struct
@@ -33,7 +33,7 @@ class Reach:
     another: Callable[[], AbstractContextManager[can.BusABC]]
     """Opens the bus for another node."""
     port: Port | None
-    """Program's interface, if it is in this process."""
+    """CAN interface of the program under test; None if the program is in another process."""
     bus: str
     """Name of the bus, for messages."""
 
@@ -53,7 +53,7 @@ class Reach:
         return lambda: setattr(settings, name, before)
 
     def mute(self, can_id: int) -> End:
-        """Suppresses all frames with an identifier."""
+        """Suppresses all frames of the drive with this identifier."""
         settings = self.drive.faults
         settings.muted_ids |= {can_id}
 
@@ -64,20 +64,20 @@ class Reach:
 
     @property
     def interface(self) -> Port:
-        """Program's interface, for rows that require it."""
+        """CAN interface of the program under test, for faults that require one in this process."""
         assert self.port is not None
         return self.port
 
 
 def _nothing() -> None:
-    """Ends an instantaneous fault by doing nothing."""
+    """Does nothing; the end of an instantaneous fault."""
 
 
 Make = Callable[..., End]
 
 
 class Needs(Enum):
-    """Requirements that not every bus meets."""
+    """Requirement of a fault that not every bus meets."""
 
     NOTHING = "nothing"
     INTERFACE = "the program's interface, in this process"
@@ -376,11 +376,12 @@ OF_THE_PROGRAM: Final = (
     "the target is not a number within the limits",
     "a load torque or temperature is missing",
 )
-"""Rows of the fault table without a fault here: faults of the program, and consequences of other faults."""
+"""Entries of the fault table in docs/reliability.md that this module cannot cause: faults of the program, and
+consequences of other faults."""
 
 
 def find(name: str) -> Row:
-    """Returns the fault with a name; raises `InputError` with the nearest name."""
+    """Returns the fault with this name; raises `InputError` with the most similar name."""
     __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
     row = FAULTS.get(name)
     if row is None:

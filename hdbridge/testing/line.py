@@ -35,7 +35,7 @@ EXAMPLES: Final = (VIRTUAL, LOCKSTEP, "socketcan:vcan0", "udp_multicast:239.74.1
 
 @dataclass(frozen=True)
 class BusChoice:
-    """Bus of this process, or an interface of python-can with its channel."""
+    """Choice of bus: a bus within this process, or an interface of python-can with its channel."""
 
     interface: str
     channel: str = ""
@@ -87,7 +87,7 @@ class Settings:
     ) -> Self:
         """Loads and checks the settings; raises a one-line `InputError`.
 
-        ``folder`` is the base of relative paths, by default the present folder. Without ``truth``, the
+        ``folder`` is the base of relative paths, by default the working folder. Without ``truth``, the
         profile's ``twin.yaml`` is used if it exists, else its ``truth.yaml``. ``firmware`` contains keys of
         the truth file's section of that name.
         """
@@ -119,7 +119,7 @@ def _behaviour(keys: Mapping[str, Any]) -> Behaviour:
 
 
 LONGEST_WAIT_S: Final = 0.005
-"""Maximum delay of a requested fault in real time; s."""
+"""Maximum delay of a requested fault on a bus in real time; s."""
 MAX_BUS_WAIT_S: Final = 600.0
 """Maximum wait for a bus of the computer that other tests are using; s."""
 
@@ -133,13 +133,13 @@ class Line:
 
     choice: BusChoice
     interface: str
-    """Interface name for the program, used with the channel."""
+    """Name of the python-can interface that the program opens, together with the channel."""
     channel: str
     clock: Clock
     opened: Callable[[], AbstractContextManager[can.BusABC]]
     """Opens the bus for a node."""
     port: Port | None = None
-    """Program's interface, if it is in this process."""
+    """CAN interface of the program under test; None if the program is in another process."""
     nodes: list[WatchedDrive] = field(default_factory=list)
 
     def note(self, kind: str, text: str) -> None:

@@ -1,8 +1,8 @@
-"""Program's end of a simulated bus in this process: a python-can interface called ``hdbridge``.
+"""The program's end of a simulated bus in this process: a python-can interface called ``hdbridge``.
 
-A program opens it like any other, by interface and channel. Its failures are those of SocketCAN: an interface
-that goes down raises ENETDOWN once in ``recv`` and on each ``send``; a deleted interface must be opened
-again.
+A program opens this interface like any other, by interface name and channel. It fails in the same way as
+SocketCAN: an interface that goes down raises ENETDOWN once in ``recv`` and on each ``send``; a deleted
+interface must be opened again.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class StallingClock(VirtualClock):
     """Delay to be added to the next wait; s."""
 
     def step(self, deadline_s: float) -> bool:
-        """Steps like `VirtualClock`; a requested stall adds to the elapsed time."""
+        """Steps like `VirtualClock`; a requested stall is added to the elapsed time."""
         going_on = super().step(deadline_s)
         if self.stall_s > 0.0:
             until_s, self.stall_s = self.now() + self.stall_s, 0.0

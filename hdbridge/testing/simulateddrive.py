@@ -19,10 +19,10 @@ POLL_S: Final = 0.005
 
 
 class DriveTime:
-    """Drive time with the interface of the module ``time``; all other names come from that module.
+    """Drive time with the interface of the module ``time``, which provides all other names.
 
-    In real time, it is the module's own time. In lockstep ``sleep`` runs the drive for that time and returns
-    at once. ``monkeypatch.setattr(program, "time", drive.time)`` makes a program use it.
+    In real time, it is the module's own time. In lockstep, ``sleep`` runs the simulation for that time and
+    returns at once. ``monkeypatch.setattr(program, "time", drive.time)`` makes a program use it.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -73,7 +73,8 @@ class SimulatedDrive:
         self.channel: Final = line.channel
         """Channel for ``can.Bus``."""
         self.in_process: Final = settings.bus.in_process
-        """True if the bus is accessible only to this process; else a separate program can be the master."""
+        """True if the bus is accessible only to this process; if False, a separate program can be the
+        master."""
         self.lockstep: Final = settings.bus.interface == LOCKSTEP
         """True if time passes only while the program waits."""
         self.node_id: Final = node.node_id
@@ -96,7 +97,7 @@ class SimulatedDrive:
 
     @property
     def truth(self) -> TrueState:
-        """Present true angles of motor and load."""
+        """Current true angles of motor and load."""
         with self._node.lock:
             return self._node.true_state()
 
@@ -164,8 +165,8 @@ class SimulatedDrive:
         """Causes a fault at once, after ``after_s`` of drive time, or when the load passes ``beyond_deg``.
 
         It ends ``for_s`` after it began, at the end of a ``with`` block, or by ``.end()``. Raises
-        `InputError` for an unknown name or argument, with the nearest one, and if the fault is impossible on
-        this bus.
+        `InputError` if the fault is impossible on this bus, and for an unknown name or argument, with the
+        most similar valid one.
         """
         __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
         row = find(name)
@@ -184,7 +185,7 @@ class SimulatedDrive:
             made, lambda: row.begin(self._reach, checked), Trigger(after_s, beyond_deg), for_s
         )
         if self.lockstep:
-            for node in self._line.nodes:  # frames of another node reach them as well
+            for node in self._line.nodes:  # frames from another node reach the drives as well
                 node.poll(self._clock.now())
         return made
 

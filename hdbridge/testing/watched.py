@@ -24,16 +24,17 @@ from hdbridge.units import ARCSEC_PER_DEG
 EVENTS: Final = 10_000
 FRAMES: Final = 1_000
 PERIODS: Final = 250_000
-"""Maximum number of entries kept; older ones are dropped. The periods cover 1000 s at 4 ms."""
+"""Maximum numbers of events, frames and periods kept; older ones are dropped. The periods cover 1000 s at 4
+ms."""
 
 SHOWN_EVENTS: Final = 40
 SHOWN_FRAMES: Final = 12
-"""Number of entries shown in the report of a failed test."""
+"""Numbers of events and frames shown in the report of a failed test."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """Event at ``time_s`` of the drive's time, with a ``kind`` and a text.
+    """Event at the drive time ``time_s``, with a ``kind`` and a text.
 
     Kinds: ``state`` (power states of CiA 402), ``nmt``, ``emcy``, ``fault`` (start and end of a requested
     fault), ``bus`` (the program opens or closes its end), ``note`` (from the test).
@@ -158,7 +159,7 @@ class Trigger:
 
     after_s: float = 0.0
     beyond_deg: float | None = None
-    """Load angle to be passed, from either side."""
+    """Load angle at which the fault begins, passed from either side."""
 
 
 @dataclass
@@ -179,7 +180,8 @@ class _ScheduledAction:
 
 
 class WatchedDrive(DriveNode):
-    """Drive of `hdbridge.sim` with a `History`, and with faults that begin and end in its own time.
+    """Simulated drive with a `History`, and with faults that begin and end at given times of the drive's
+    clock.
 
     Thread-safe.
     """
@@ -208,7 +210,7 @@ class WatchedDrive(DriveNode):
 
     @property
     def time_s(self) -> float:
-        """Time since its creation, s."""
+        """Time since the drive was created, s."""
         return self._clock.now() - self._begin_s
 
     def note(self, kind: str, text: str) -> None:
@@ -216,7 +218,7 @@ class WatchedDrive(DriveNode):
         self.history.events.append(Event(self.time_s, kind, text))
 
     def true_state(self) -> TrueState:
-        """Returns the present true state of the axis."""
+        """Returns the current true state of the axis."""
         machine = self.machine
         return TrueState(self.time_s, machine.true_motor_deg, machine.true_load_deg, self.ratio)
 
@@ -261,7 +263,7 @@ class WatchedDrive(DriveNode):
 
         def bind(read: Callable[[], int] | None) -> None:
             entry.bound = read
-            for pdo in self._tpdos:  # compiled mappings hold the old source
+            for pdo in self._tpdos:  # compiled mappings still read the old source
                 pdo.compile()
 
         bind(lambda: value)

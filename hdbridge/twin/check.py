@@ -1,8 +1,8 @@
 """Detects changes of an axis since its twin was made, and names their causes.
 
 The misfit to a new recording is compared with the misfit of the twin's fit. The latter equals the noise if
-the twin has the axis's values and is larger if the twin replays another drive, so both kinds of twin are
-checked in the same way.
+the twin has the axis's values, and is larger if the twin merely replays the motion; both kinds of twin are
+therefore checked in the same way.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from hdbridge.twin.parameters import BY_NAME, Parameter, by_cause, coordinates
 from hdbridge.units import figure
 
 CHECK_S = 17.0
-"""Duration of the pieces into which a check divides a longer recording."""
+"""Total duration of the pieces of a longer recording that a check uses."""
 NOTICEABLE = 2.5
-"""Change of a parameter that a recording must reveal, in units of its least change. If a recording does not,
-the parameter's cause is reported as not observable."""
+"""Change of a parameter that a recording must reveal, in units of the parameter's least change. If the
+recording does not reveal it, the parameter's cause is reported as not observable."""
 WARMTH = "temperature"
 OWN = ("load friction", WARMTH, "current limit", "velocity feed-forward")
-"""Parameters that a check fits in addition to those of a fit. The temperature is left out if both the twin
-and the recording contain it."""
+"""Parameters that a check fits in addition to those fitted for a twin. The temperature is left out if both
+the twin and the recording contain it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,13 +38,13 @@ class Check:
 
     changes: tuple[Finding, ...]
     growth_before: Mapping[str, float]
-    """Ratio, by channel, of the twin's misfit to this recording and to its own recordings."""
+    """Ratio, by channel, of the twin's misfit on this recording to its misfit on its own recordings."""
     growth_after: Mapping[str, float]
     """Ratio as in `growth_before`, but for the twin with the changes."""
     unseen: tuple[str, ...] = ()
-    """Causes whose changes, however large, would not show in this motion or with this twin."""
+    """Causes whose noticeable changes (`NOTICEABLE`) would not show in this motion or with this twin."""
     blind: bool = False
-    """True if no change of any cause would show."""
+    """True if no noticeable change of any cause would show."""
 
     @property
     def sentence(self) -> str:
@@ -113,11 +113,11 @@ def check(
 
 
 def _shows(replays: Replays, twin: Truth, own: Sequence[Parameter], was: Mapping[str, Any]) -> bool:
-    """Returns True if the recording reveals a noticeable change of at least one of the parameters.
+    """Returns True if the recording reveals a noticeable change of at least one of the parameters ``own``.
 
-    A change is revealed if the twin with this change, in either direction, no longer explains the recording.
+    A change is revealed if the twin no longer explains the recording after this change, whatever its sign.
     The twin's own residual may hide a change or add to it, so the changed twin is compared with the recording
-    rather than with the twin.
+    rather than with the unchanged twin.
     """
     for each in own:
         (now,) = coordinates(twin, [each])

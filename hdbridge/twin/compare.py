@@ -1,7 +1,7 @@
 """Comparison of a measured and a simulated record of the same commands.
 
-Each difference is given with the noise of the measured channel, which is the lower limit for a simulation.
-Pure.
+Each difference is given together with the noise of the measured channel, which is the smallest difference
+that a simulation can reach. Pure.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from hdbridge.twin.replay import standing, unknown_rows
 from hdbridge.units import ARCSEC_PER_DEG
 
 # ----------------------------------------------------------------
-# A signal of both records over time, and its spectra. Pure.
+# One signal in both records, over time and as spectra. Pure.
 
 SPECTRUM_SAMPLES: Final = 1024
 SHORTEST: Final = 32
-"""Minimum samples of a part for a spectrum."""
+"""Minimum number of samples in a part for a spectrum."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """A signal of both records over time."""
+    """One signal in both records, over time."""
 
     time_s: FloatArray
     measured: FloatArray
@@ -92,7 +92,7 @@ SETTLED_ARCSEC: Final = 10.0
 """Amplitude about the rest position below which a load has settled, arcsec: three motor counts at 8000 counts
 per turn and ratio 50."""
 SETTLED_NOISE: Final = 5.0
-"""Minimum of the amplitude below which a load has settled, in units of the noise of the load reading."""
+"""Lower limit for the amplitude below which a load has settled, in units of the noise of the load reading."""
 OVER_S: Final = 0.04
 """Window of the rms amplitude: half a period of the slowest ringing, 15 Hz."""
 SHORTEST_SWING: Final = 4
@@ -111,10 +111,10 @@ def settling_s(time_s: FloatArray, load_arcsec: FloatArray, noise_arcsec: float,
 def scatter_s(
     time_s: FloatArray, load_arcsec: FloatArray, noise_arcsec: float, band: float, noises: Sequence[float]
 ) -> float:
-    """Returns the standard deviation, s, of the difference of two settling times that is due to noise alone.
+    """Returns the standard deviation, due to noise alone, of the difference of two settling times; s.
 
-    ``noises`` are the noise levels of the two records, arcsec. The estimate uses `DRAWS` random samples of
-    each.
+    ``noises`` are the noise levels of the two records, arcsec. The estimate uses `DRAWS` random samples at
+    each noise level.
     """
     rng = np.random.default_rng(0)
     own = settling_s(time_s, load_arcsec, noise_arcsec, band)
@@ -139,7 +139,7 @@ def _rest_arcsec(load_arcsec: FloatArray) -> float:
 
 Rows = NDArray[np.bool_]
 ALL: Final = "all"
-"""Kind of leg for the whole record."""
+"""Pseudo-kind of leg: the whole record."""
 LOAD_ERROR, FOLLOWING_ERROR, MOTOR_TORQUE = "load_error", "following_error", "motor_torque"
 TEMPERATURE: Final = "temperature"
 SETTLING_TIME, OVERSHOOT = "settling_time", "overshoot"
@@ -155,7 +155,7 @@ TITLES: Final[Mapping[str, str]] = {
 }  # fmt: skip
 
 STAND_S: Final = 0.2
-"""Minimum rest of the command after a motion for a stop to count."""
+"""Minimum time for which the command stands still after a motion for the stop to be evaluated."""
 MAX_SETTLING_S: Final = 1.0
 """Maximum time after a stop in which settling is evaluated; servo axes of this kind settle in tenths of a
 second."""
@@ -176,12 +176,13 @@ class Row:
     """Kind of the legs, or `ALL`."""
     unit: str
     measured: float
-    """Rms of a signal (the load error's about its mean); mean of a settling time or overshoot; a noise."""
+    """Rms of a signal (of the load error about its mean), mean of a settling time or overshoot, or a noise
+    level."""
     simulated: float
     difference: float
     """Rms difference of samples or stops; for a noise, the absolute difference."""
     noise: float
-    """Difference expected between two equal axes: the noise of the measured channel or of the figure."""
+    """Expected difference between two identical axes: the noise of the measured channel or of the figure."""
     count: int
     """Number of samples or stops."""
 
@@ -192,7 +193,7 @@ class Row:
 
     @property
     def share(self) -> float:
-        """Difference as a share of the measured value."""
+        """Difference as a fraction of the measured value."""
         return self.difference / self.measured if self.measured else math.inf if self.difference else 0.0
 
 
@@ -217,10 +218,10 @@ class Comparison:
 def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio: float) -> Comparison:
     """Compares two records by kind of leg and as a whole.
 
-    Both records must have the same rows. Offsets between the encoders' zeros, and between command and motor
-    at rest, are removed in each part of the measured record. Rows in which the load may still ring from an
-    unknown motion are excluded, and so is the torque of a motor at standstill. InputError if the numbers of
-    rows differ or there is no command.
+    Both records must have the same rows. In each part of the measured record, zero offsets between the
+    encoders, and between command and motor at rest, are removed. Rows in which the load may still ring from
+    an unknown motion are excluded, and so is the torque of a motor at standstill. InputError if the numbers
+    of rows differ or there is no command.
     """
     if len(measured) != len(simulated):
         raise InputError(
@@ -268,7 +269,7 @@ def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio:
 
 
 def _signals(record: Record, ratio: float, parts: Sequence[slice]) -> dict[str, FloatArray]:
-    """Returns the signals of a record by name, the load error of each part about its mean."""
+    """Returns the signals of a record by name; the load error of each part is relative to its mean."""
     error = record.transmission_error_arcsec(ratio).copy()
     for part in parts:
         error[part] -= np.mean(error[part])
@@ -283,7 +284,7 @@ def _signals(record: Record, ratio: float, parts: Sequence[slice]) -> dict[str, 
 
 
 def _groups(time_s: FloatArray, legs: Sequence[Segment], known: Rows) -> dict[str, Rows]:
-    """Returns the mask of the known rows of each kind of leg, the whole record first."""
+    """Returns the mask of the known rows of the whole record and of each kind of leg."""
     groups = {ALL: known}
     for leg in legs:
         inside = groups.setdefault(leg.kind, np.zeros(len(time_s), dtype=np.bool_))
@@ -315,8 +316,8 @@ def _of_signal(
         apart = rms(one[inside] - other[inside])
         noise = noise_of(one, inside, parts)
         if name == TEMPERATURE:
-            # A replay starts at a rounded reading, so both roundings add up to one step at most. A constant
-            # reading does not reveal the step size.
+            # A replay starts at a rounded reading, so the two rounding errors add up to at most one step. A
+            # constant reading does not reveal the size of a step.
             noise *= math.sqrt(12.0)
             if not noise:
                 return
@@ -348,7 +349,7 @@ def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
 
 
 def least_change(changes: FloatArray, values: FloatArray) -> float:
-    """Returns the smallest change of a reading above rounding errors."""
+    """Returns the smallest change between readings that exceeds rounding errors."""
     beyond, size = 1e-9 * float(np.max(np.abs(values), initial=1.0)), np.abs(changes)
     return float(np.min(size, where=size > beyond, initial=math.inf))
 
@@ -366,7 +367,7 @@ class _Stop(NamedTuple):
 
 
 def _stops(loads: Trace, command_deg: FloatArray, moves: Rows, parts: Sequence[slice]) -> Iterator[_Stop]:
-    """Yields the stops, where the command comes to rest after a motion and stays at rest.
+    """Yields the stops, at which the command comes to rest after a motion and stays at rest.
 
     ``loads`` are the load angles in arcsec, ``moves`` is the mask of rows in which the command moves.
     """

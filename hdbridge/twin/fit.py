@@ -1,9 +1,9 @@
 """Fits the plant's parameters to recordings: regressions first, then least squares over replays.
 
 The residuals of following error, torque and load angle are scaled by each channel's own deviation. A weak
-prior about the start holds parameters that the motion does not show. The misfit has several minima, so a fit
-has several starts. The covariance allows for residuals correlated within a leg, because model errors are not
-white noise.
+prior about the start values determines the parameters that the motion does not show. The misfit has several
+minima, so a fit has several starts. The covariance allows for residuals correlated within a leg, because
+model errors are not white noise.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ from hdbridge.twin.replay import MOVING_DEG_S, demand_deg
 FILTER, DEAD_TIME = BY_NAME["command filter"], BY_NAME["servo dead time"]
 LIMIT: Final = BY_NAME["current limit"]
 HELD_ROWS = 3
-"""Minimum number of rows at the highest torque for a limit; a mere peak lasts one or two."""
+"""Minimum number of rows at the highest torque for it to count as a limit; a mere peak lasts one or two
+rows."""
 LATEST_S = 0.1
 """Maximum lag of the motor behind the demand, s."""
 
@@ -107,7 +108,7 @@ def _held_nm(data: Data) -> float:
 def lag_s(data: Data) -> float:
     """Estimates the motor's lag behind the demand, s: following error divided by speed (least squares)."""
     lag = 0.0
-    for _ in range(2):  # the second time with the command delayed by the lag
+    for _ in range(2):  # the second iteration delays the command by the lag
         products = squares = 0.0
         for piece in data.pieces:
             commands = piece.commands
@@ -123,8 +124,8 @@ def lag_s(data: Data) -> float:
 
 
 # ----------------------------------------------------------------
-# Conversion of the gear's elastic loop between the plant's hysteresis laws: a calibration's model has one
-# law, whose shape may differ from the gear's.
+# Conversion of the gear's elastic loop between the plant's hysteresis laws: a calibration's model has only
+# one law, and the shape of its loop may differ from the gear's.
 
 LOOP: Final = ("loop offset", "loop width", "loop yield", "loop exponent")
 """Parameters of all hysteresis laws; each law has only some of them."""
@@ -133,30 +134,33 @@ LAWS: Final[Mapping[str, dict[str, float]]] = {
     "bouc_wen": {"offset_arcsec": 1.0, "yield_deg": 1.0},
     "dahl": {"offset_arcsec": 1.0, "yield_deg": 1.0},
 }
-"""Unit loops of the laws with few parameters; the exponent of the first is that of a published gear."""
+"""Unit loops of the hysteresis laws with few parameters; the first exponent is that of a published gear."""
 LONG = 20.0
 """Travel after which each loop is saturated, in loop widths."""
 _TRUE: Final[TypeAdapter[Hysteresis]] = TypeAdapter(Hysteresis)
 
 
 def loop_parameters(truth: Truth) -> tuple[Parameter, ...]:
-    """Returns the loop parameters of the law of this truth."""
+    """Returns the parameters of the hysteresis law of this truth."""
     return tuple(each for each in named(*LOOP) if value_in(truth, each) is not None)
 
 
 def by_each_law(truth: Truth) -> list[Truth]:
-    """Returns the truth, and the truth with each other law; an empty list for a gear without a loop."""
+    """Returns the truth, and its variants with every other hysteresis law; an empty list for a gear without a
+    loop.
+    """
     own = truth.gear.hysteresis
     if own is None:
         return []
     if own.law == "rolling_friction":
-        # A fit may reduce the loop below its initial state, which has no effect after some travel.
+        # A fit may make the loop smaller than its initial state, which has no effect after some travel
+        # anyway.
         truth = _with_loop(truth, own.model_copy(update={"start_arcsec": 0.0}))
     return [truth, *(_with_loop(truth, _like(own, law)) for law in LAWS if law != own.law)]
 
 
 def by_law_of(truth: Truth, other: Truth) -> Truth:
-    """Returns the truth with its loop converted to the law of another truth."""
+    """Returns the truth with its loop converted to the hysteresis law of the truth ``other``."""
     own, law = truth.gear.hysteresis, other.gear.hysteresis
     if own is None or law is None or own.law == law.law:
         return truth
@@ -164,7 +168,9 @@ def by_law_of(truth: Truth, other: Truth) -> Truth:
 
 
 def _like(own: Hysteresis, law: str) -> Hysteresis:
-    """Returns a loop of another law with the same height and the same travel to half crossing."""
+    """Returns a loop of the hysteresis law ``law`` with the same height and the same travel to half
+    crossing.
+    """
     unit: dict[str, Any] = {"law": law, **LAWS[law]}
     travel_deg = _half_crossed_deg(own) / _half_crossed_deg(_TRUE.validate_python(unit))
     size = "width_deg" if "width_deg" in unit else "yield_deg"
@@ -201,11 +207,12 @@ def _with_loop(truth: Truth, loop: Hysteresis) -> Truth:
 # Uncertainty of the coordinates: information from the slopes, and a jackknife over legs.
 
 JACKKNIFE_RIDGE = 1e-9
-"""Regularisation of the jackknife: share of the information that no single leg may contribute alone."""
+"""Regularisation of the jackknife: fraction of the information that no single leg may contribute alone."""
 
 
 def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
-    """Returns principal directions of the coordinates as columns, shape (p, p), scaled to unit information.
+    """Returns the principal directions of the coordinates as columns, shape (p, p), scaled to unit
+    information.
 
     A long valley of the misfit is one of these directions. The covariance may inflate each direction
     separately; inflating each *coordinate* would lose the well-known combinations of two coordinates.
@@ -218,12 +225,12 @@ def sandwich(slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], sprea
     """Returns the covariance of the coordinates for correlated residuals within independent legs, (p, p).
 
     It is a jackknife over legs: the shift of the fit when one leg is left out (Bell and McCaffrey, Survey
-    Methodology 28, 2002). A leg that a replay cannot follow shifts the fit in every direction that the others
-    leave undetermined, and has small residuals itself.
+    Methodology 28, 2002). A leg that a replay cannot follow shifts the fit in every direction that the other
+    legs leave undetermined, although its own residuals stay small.
 
-    Variances are estimated by principal direction, because a few legs do not determine more. Each is at least
-    that of independent residuals of the present size and at most the prior's. The part of the residuals that
-    the slopes can still explain is removed first, because it is not scatter between legs.
+    Variances are estimated by principal direction, because a few legs do not determine more. Each variance is
+    at least that of independent residuals of the same size, and at most that of the prior. The part of the
+    residuals that the slopes can still explain is removed first, because it is not scatter between legs.
     """
     along = principal(slopes, spread)
     rows = slopes @ along
@@ -251,28 +258,30 @@ def eigen(slopes: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArra
 # ----------------------------------------------------------------
 
 STEP = 0.01
-"""Step of the first Jacobian's finite differences, in spreads of a parameter."""
+"""Finite-difference step of the first Jacobian, in units of a parameter's spread."""
 RESIDUAL_CHANGE = 1.0
-"""Norm of the change of the scaled residuals that determines the later difference steps: one standard
-deviation, the smallest visible change."""
+"""Norm of the change of the scaled residuals at which the later difference steps aim: one standard deviation,
+the smallest visible change."""
 MAX_DIFFERENCE = 0.1
-"""Maximum length of a difference step, in spreads, because the valley of the misfit is curved."""
+"""Maximum length of a difference step, in spreads; longer steps leave the curved valley of the misfit."""
 WIDE_FACTOR = 3.0
-"""Factor of the difference steps for intervals, which are two-sided. A sticking motor breaks away
+"""Factor for the (two-sided) difference steps from which intervals are computed. A sticking motor breaks away
 differently in each replay, so slopes over short differences are too steep and intervals too narrow."""
 MAX_RESIDUAL_CHANGE = 1.0
-"""Change of the scaled residuals (rms) above which the loops at the end of a difference count as unstable."""
+"""Rms change of the scaled residuals above which the servo loops count as unstable at the end of a difference
+step."""
 SHORTENING = 0.1
-"""Factor by which a difference is shortened if its change exceeds `MAX_RESIDUAL_CHANGE`."""
+"""Factor by which a difference step is shortened if the residuals change by more than
+`MAX_RESIDUAL_CHANGE`."""
 STEPS_PER_ROUND = 4
 """Number of steps between two estimates of the residuals' scales."""
 BOUND_MARGIN = 1e-6
 """Minimum distance to the bounds, in spreads, as required by `scipy.optimize.least_squares`."""
 MIN_COST_DECREASE = 1.0
-"""Fall of half the sum of squares in a round below which a fit ends."""
+"""A fit ends when half the sum of squares decreases by less than this in a round."""
 HUBER_THRESHOLD = 4.0
-"""Residual, in scales, above which a residual is down-weighted, because a motor that slips elsewhere is not
-evidence."""
+"""Residuals above this multiple of their scale are down-weighted, because a motor that breaks away at a
+different position is not evidence."""
 
 Progress = Callable[[float], None]
 
@@ -286,7 +295,7 @@ class Fitted:
     prior: FloatArray
     """Prior mean of the parameters' coordinates, shape (p,)."""
     place: FloatArray
-    """Coordinates of the parameters, shape (p,)."""
+    """Fitted point: coordinates of the parameters, shape (p,)."""
     covariance: FloatArray
     """Covariance of the coordinates, shape (p, p)."""
     scales: Scales
@@ -307,10 +316,11 @@ class Fitted:
 
     @property
     def loss(self) -> float:
-        """Negative log likelihood of the fitted readings with the fit's own scales, which must include
-        resolutions.
+        """Negative log likelihood of the fitted readings, computed with the fit's own scales, which must
+        include resolutions.
 
-        The likelihood ratio of two fits of the same readings is the exponential of the difference.
+        The likelihood ratio of two fits to the same readings is the exponential of the difference between
+        their losses.
         """
         half, outlier_probability = (
             each[self.rows] for each in self.scales.halves(len(self.rows) // len(CHANNELS))
@@ -354,7 +364,7 @@ class _Problem:
         self._found: dict[bytes, dict[str, FloatArray]] = {}
 
     def found(self, place: FloatArray) -> dict[str, FloatArray]:
-        """Returns the residuals by channel, replaying each place only once."""
+        """Returns the residuals by channel; does not replay the last point again."""
         key = place.tobytes()
         if key not in self._found:
             self._found = {key: self._replayed([place])[0]}
@@ -366,7 +376,7 @@ class _Problem:
         return np.concatenate([left, (place - self.prior) / self.spread])
 
     def slopes(self, place: FloatArray, *, wide: bool = False) -> FloatArray:
-        """Returns the derivatives of the softened residuals by the coordinates, shape (n, p)."""
+        """Returns the derivatives of the softened residuals with respect to the coordinates, shape (n, p)."""
         moves = np.diag(STEP * self.spread) if self.along is None else _moves(self.along, self.spread)
         now = self.scale.scaled(self.found(place))[self.rows]
         slopes = slopes_at(self._scaled, now, place, moves, (self.low, self.high), wide=wide)
@@ -374,7 +384,7 @@ class _Problem:
         return self.along
 
     def stepped(self, place: FloatArray, steps: int) -> FloatArray:
-        """Returns the best place after up to ``steps`` trust-region steps, the first of which has the length
+        """Returns the best point after up to ``steps`` trust-region steps, the first of which has the length
         of a spread.
         """
         left, prior = 1 + steps, np.eye(len(place))
@@ -431,7 +441,8 @@ def solve(
     grow with the residuals on the way to the minimum; by default they are estimated from the residuals before
     each round. Held-out legs count only with ``everything``. ``near`` is a fit of the same parameters that
     provides the directions of the first differences. With ``wide``, the covariance uses wide differences.
-    Without ``linear``, the covariance is that of the prior, and the Jacobian that of the last place but one.
+    Without ``linear``, the covariance is that of the prior, and the Jacobian that of the point before the
+    last step.
     """
     data = replays.data
     rows = fitted_rows(data, everything=everything)
@@ -515,11 +526,11 @@ def slopes_at(
     *,
     wide: bool,
 ) -> FloatArray:
-    """Returns finite-difference derivatives of the scaled residuals at ``place``, shape (n, p).
+    """Returns finite-difference derivatives of the scaled residuals at the point ``place``, shape (n, p).
 
-    ``seen`` evaluates residuals at places, ``now`` are those at ``place``. Differences are taken along the
-    moves, in the direction with more distance to the bounds; ``wide`` differences, for intervals, are
-    `WIDE_FACTOR` times as long and two-sided.
+    ``seen`` evaluates the residuals at several points, ``now`` are the residuals at ``place``. Differences
+    are taken along the moves, in the direction with more distance to the bounds; ``wide`` differences, for
+    intervals, are `WIDE_FACTOR` times as long and two-sided.
     """
     both = [
         [np.clip(place + way * move, *bounds) for way in (1.0, -1.0)]
@@ -554,31 +565,32 @@ def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
 # legs.
 
 BANDWIDTHS: Final = ((25.0, 100.0), (80.0, 300.0), (200.0, 800.0))
-"""Position gain, 1/s, and velocity gain over the total inertia, rad/s: a geared axis with a soft load, an
-ordinary load, and a stiff load."""
+"""Position gain, 1/s, and ratio of velocity gain to total inertia, rad/s, for a geared axis with a soft load,
+with an ordinary load and with a stiff load."""
 REJECTIONS: Final = ("speed", "position", "observer")
-"""Block that compensates friction and load torque: the integral of the speed error (PI velocity loop) or of
-the position error (PIV), or a disturbance observer."""
+"""Alternatives for the block that compensates friction and load torque: the integral of the speed error (PI
+velocity loop) or of the position error (PIV), or a disturbance observer."""
 INTEGRAL: Final = 3.0
 """Integral time times the bandwidth of the velocity loop (symmetric optimum: 2 to 4)."""
 SLOW_INTEGRAL: Final = 30.0
-"""Integral time times the bandwidth of the velocity loop, with an observer, which leaves little to the
+"""Integral time times the bandwidth of the velocity loop if there is an observer, which leaves little to the
 integral."""
 OBSERVED: Final = 0.9
-"""Start value of the observer's share of the disturbance: nearly all."""
+"""Start value of the fraction of the disturbance that the observer compensates: nearly all."""
 FILTER_MS: Final = 0.5
-"""Speed and torque filter at the start: half to twice the period of common velocity loops."""
+"""Start value of the speed and torque filters: half to twice the period of common velocity loops."""
 SHORT_MS: Final = 0.1
-"""Negligible command filter: a fifth of a substep."""
+"""Time constant of a negligible command filter: a fifth of a substep."""
 VELOCITY_FEEDFORWARD: Final = 0.9
-"""Start value between none (rare) and the full speed."""
+"""Start value, between no feed-forward (rare) and feed-forward of the full speed."""
 FEW_STEPS = 3
-"""Maximum number of steps of a fit from each start between two halvings."""
+"""Maximum number of steps for each start between two halvings."""
 MAX_COST_RATIO: Final = 2.0
 """Ratio of a start's cost to the lowest cost, after the same number of steps, above which a start is dropped
-even if it is in the better half. The starts that won on three foreign servos had at most 1.8."""
+even if it is in the better half. On three servos of a different structure, the winning starts had ratios of
+at most 1.8."""
 MAX_MISFIT_RATIO: Final = 0.97
-"""Maximum ratio of the misfits with and without a block for keeping the block; superfluous parameters gain
+"""Maximum ratio of the misfits with and without a block for keeping the block; a superfluous block gains
 less."""
 MECHANICS: Final = (
     "motor inertia", "Coulomb friction", "viscous friction", "friction's rise at rest", "Stribeck speed",
@@ -589,9 +601,9 @@ SERVOS: Final = (
     "servo dead time", "speed filter", "torque filter", "load encoder delay",
 )  # fmt: skip
 EQUAL_MOTORS: Final = 4.0
-"""Maximum ratio of the motor's inertia to the start's, or its inverse. Servo motors of equal torque differ
-by a factor of three to five (catalogues). Without this limit, observers and filters could replace the
-inertia."""
+"""Maximum ratio of the motor's inertia to the start's, or its inverse. The inertias of servo motors of equal
+torque differ by a factor of three to five (catalogues). Without this limit, observers and filters could take
+over the role of the inertia in the fit."""
 NOTCH: Final = ("notch frequency", "notch depth", "notch width")
 AVERAGE: Final = "moving average"
 FRICTION: Final = "friction feed-forward"
@@ -604,7 +616,7 @@ PLACES: Final = (0.7, 1.0, 1.4)
 
 
 Start = tuple[Truth, tuple[Parameter, ...]]
-"""Truth from which a fit of a servo structure starts, and the parameters to fit."""
+"""Start of the fit of a servo structure: the truth, and the parameters to fit."""
 
 
 def in_best_structure(
@@ -612,8 +624,8 @@ def in_best_structure(
 ) -> Fitted:
     """Fits the servo structure that explains a few legs best, and adds blocks that held-out legs confirm.
 
-    The fitted servo ``near`` is compared only with the best of the ``others``, because these need some steps
-    first.
+    The fitted servo ``near`` is compared only with the best of the ``others``, because the others need some
+    steps first.
     """
     scale = Scales(units(few.data))
     begun = [by_halving(few, each, scale) for each in ([(near.truth, near.parameters)], [*others]) if each]
@@ -633,9 +645,9 @@ def by_halving(
 ) -> Fitted:
     """Fits from each start for a few steps, continues with the better half, and repeats until one is left.
 
-    Successive halving (Jamieson and Talwalkar, AISTATS 2016) does not lose a start with a longer way to a
-    better minimum to one that is already near its minimum. All legs count, because a few held-out legs do not
-    decide between servos with equally many parameters.
+    Successive halving (Jamieson and Talwalkar, AISTATS 2016) does not drop a start that is far from a better
+    minimum in favour of one that is already near its own minimum. All legs count, because a few held-out legs
+    do not decide between servos with equally many parameters.
     """
 
     def led(start: Start) -> Fitted:
@@ -654,9 +666,9 @@ def by_halving(
 def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
     """Yields the servo structures from which fits start.
 
-    An acceleration feed-forward uses the filtered demand, or differences over whole SYNC cycles, which is a
-    moving average of one cycle. A lag beyond the longest possible dead time is attributed to the command
-    filter.
+    An acceleration feed-forward uses the filtered demand, or differences over whole SYNC cycles, which
+    corresponds to a moving average over one cycle. A lag beyond the longest possible dead time is attributed
+    to the command filter.
     """
     longest_ms = min(MOST_DEAD_CYCLES * cycle_ms, DEAD_TIME.most)
     reaction = (REACTION,) if truth.gear.hysteresis else ()
@@ -727,12 +739,12 @@ def more_blocks(best: Fitted) -> Iterator[Start]:
 
 
 # ----------------------------------------------------------------
-# Alternative start values, because the misfit may have other minima there.
+# Alternative start values, near which the misfit may have other minima.
 
 FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
-"""Start values of the load's resonance frequency, because a fit finds only the nearest minimum."""
+"""Start values of the load's resonance frequency; a fit finds only the nearest minimum."""
 FILTER_SHARES = (0.25, 0.5, 0.75, 0.9)
-"""Start values of the command filter's share of the lag."""
+"""Start values of the fraction of the lag that is due to the command filter."""
 INERTIA_FACTORS = (0.25, 0.5, 2.0, 4.0)
 """Factors for start values of the motor's inertia, which is visible only just after each new demand."""
 
@@ -760,7 +772,8 @@ def lags(truth: Truth) -> list[Truth]:
 
 
 def delays(truth: Truth) -> list[Truth]:
-    """Returns variants of the truth with the dead time in every other possible substep, and the same lag.
+    """Returns variants of the truth with the same lag and the dead time in each of the other possible
+    substeps.
 
     The demand changes slope at the start of a cycle, and a torque lasts for a substep. A change within a
     substep is spread over two substeps, as by a filter, so the misfit over the dead time has a minimum in
@@ -773,12 +786,14 @@ def delays(truth: Truth) -> list[Truth]:
 
 
 def neighbours(truth: Truth) -> list[Truth]:
-    """Returns the truths of `delays` with a dead time that is one substep shorter or longer."""
+    """Returns those variants of `delays` whose dead time is one substep shorter or longer."""
     return [each for each in delays(truth) if abs(_substep(each) - _substep(truth)) == 1]
 
 
 def inertias(truth: Truth) -> list[Truth]:
-    """Returns variants of the truth with other motor inertias; a spring too stiff for them is softened."""
+    """Returns variants of the truth with different motor inertias; a spring that is too stiff for an inertia
+    is softened.
+    """
     motor = [BY_NAME["motor inertia"]]
     (now,) = coordinates(truth, motor)
     return [at_coordinates(truth, motor, [now + math.log(factor)]) for factor in INERTIA_FACTORS]
@@ -795,17 +810,17 @@ def _lag_ms(truth: Truth) -> float:
 
 
 def _with_dead_time(truth: Truth, dead_time_ms: float) -> Truth:
-    """Returns the truth with another dead time and the same lag."""
+    """Returns the truth with the given dead time and the same lag."""
     return with_values(truth, _divided(_lag_ms(truth), dead_time_ms))
 
 
 def _divided(lag_ms: float, dead_time_ms: float) -> dict[str, float]:
-    """Returns dead time and command filter that together cause this lag, by parameter name."""
+    """Returns dead time and command filter by parameter name; together they cause this lag."""
     return {FILTER.name: 0.5 * (lag_ms - dead_time_ms), DEAD_TIME.name: dead_time_ms}
 
 
 def feedforwards(truth: Truth, usual: Truth) -> list[Truth]:
-    """Returns variants of the truth with other load feed-forward frequencies.
+    """Returns variants of the truth with different load feed-forward frequencies.
 
     The feed-forward inertias of motor and load keep their sum and are divided as in ``usual``.
     """
@@ -821,8 +836,8 @@ def feedforwards(truth: Truth, usual: Truth) -> list[Truth]:
 def exchanged(truth: Truth) -> Truth:
     """Returns the truth with position gain and inverse integral time exchanged.
 
-    In motion the loop is the same, because its response depends only on their sum and product. The misfit
-    therefore has two minima.
+    In motion both truths have the same loop, because its response depends only on the sum and the product of
+    the two. The misfit therefore has two minima.
     """
     servo = truth.servo
     return with_values(
@@ -847,10 +862,10 @@ MIN_LOG_LIKELIHOOD_RATIO = 8.0
 MIN_Z_SCORE = 4.0
 """Minimum change of the first parameter of a group of `OPTIONAL_GROUPS`, standard deviations."""
 TRIAL_STEPS = 6
-"""Steps of a trial fit with added parameters; several, because the Stribeck speed is visible only once the
-rise is not zero."""
+"""Steps of a trial fit with added parameters; one step is not enough, because the Stribeck speed is visible
+only once the rise of the friction is not zero."""
 LOOP_STEPS = 10
-"""Steps of a trial fit of each loop law on a few legs, with all other parameters held."""
+"""Steps of the trial fit of each hysteresis law on a few legs, with all other parameters fixed."""
 
 
 def with_optional_groups(replays: Replays, best: Fitted) -> Fitted:
@@ -878,11 +893,11 @@ def _warms(data: Data) -> bool:
 
 
 def with_loop(replays: Replays, best: Fitted) -> Fitted | None:
-    """Returns the fit with another loop law of the gear; None if no law is better.
+    """Returns the fit with a better hysteresis law of the gear, or None.
 
-    This is the case if the load's residuals are as small as those of the true axis, or if no law reduces
-    them. Each law is fitted to a few legs, with all other parameters held. To be called again after a new
-    fit, because another law may then be the best.
+    None means that the load's residuals are already as small as those of the true axis, or that no law
+    reduces them significantly. Each law is fitted to a few legs, with all other parameters fixed. Must be
+    called again after a new fit, because a different law may then be the best.
     """
     noise, few = expected(replays.data), replays.rough
     if best.scales.deviation[LOAD] <= noise.deviation[LOAD]:
@@ -902,8 +917,9 @@ def with_loop(replays: Replays, best: Fitted) -> Fitted | None:
 def with_limit(replays: Replays, best: Fitted, usual: Truth) -> Fitted:
     """Fits the drive's torque limit if the recording shows it, else sets the usual limit.
 
-    Until then, the fit uses the highest recorded torque as the limit (`start_of`). It is the drive's limit,
-    rather than merely the torque required by the motion, if a replay without it has larger residuals.
+    Before this step, the fit uses the highest recorded torque as the limit if the recording holds it
+    (`start_of`). This torque is the drive's limit, rather than merely the torque that the motion requires, if
+    a replay without the limit has significantly larger residuals.
     """
     highest = free_value(usual, LIMIT)
     if free_value(best.truth, LIMIT) >= highest or LIMIT in best.parameters:
@@ -925,21 +941,21 @@ def _cost(replays: Replays, truth: Truth, best: Fitted) -> float:
 # ----------------------------------------------------------------
 
 FIT_S = 60.0
-"""Duration of the pieces of a longer recording that are fitted, with all kinds of motion if possible,
-because a thousand replays of a quarter of an hour would take hours."""
+"""Total duration of the pieces of a longer recording that are fitted, with all kinds of motion if possible; a
+thousand replays of a quarter of an hour would take hours."""
 MORE_STEPS = 10
-"""Steps from an alternative start over the whole recording."""
+"""Maximum number of steps from an alternative start, over the whole recording."""
 STEPS = 30
-"""Maximum steps over the whole recording."""
+"""Maximum number of steps over the whole recording."""
 EXCESS_RATIO = 1.1
-"""Ratio to the true axis's residuals above which a fit has excess residuals; scales are not known more
-accurately."""
+"""Ratio to the true axis's residuals above which a fit has excess residuals; the scales themselves are not
+known more accurately."""
 OPTIONAL = (
     "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay",
     "encoder coupling", "friction growth", "moving average", REACTION, *LOOP,
 )  # fmt: skip
-"""Parameters fitted only on request or if significant, because ordinary motion does not show them, others
-can replace them, or a calibration has determined them."""
+"""Parameters fitted only on request or if significant, because ordinary motion does not show them, other
+parameters have the same effect, or a calibration has determined them."""
 
 
 def free_parameters(truth: Truth, more: Sequence[str] = ()) -> tuple[Parameter, ...]:
@@ -957,8 +973,8 @@ def fit(replays: Replays, progress: Progress = lambda _: None) -> Fitted:
     """Fits the parameters, starting from the truth with which the recordings were prepared.
 
     If the residuals with this truth's servo are many times the noise, other servo structures are tried as
-    well. If they exceed the noise slightly, blocks are added. Ctrl-C ends the fit at the best place so far,
-    if any.
+    well. If a channel remains unexplained afterwards, blocks are added. Ctrl-C ends the fit at the best point
+    so far, if there is one.
     """
     reached: list[Fitted] = []
     try:
@@ -1006,12 +1022,12 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
 def _polished(replays: Replays, near: Fitted, begun: Truth, keep: Callable[[Fitted], None]) -> Fitted:
     """Continues a fit near the noise on all legs, and adds the parts that the recording shows."""
     data = replays.data
-    # The residuals of a wrong simulation are no estimate of the noise: they would reduce the weight of the
-    # very channel that shows the error.
+    # The expected scales are used, because the residuals of a wrong simulation do not estimate the noise and
+    # would reduce the weight of the very channel that shows the error.
     best = continued(replays, near, STEPS, known=expected(data), near=near)
     best = _ended(replays, best)
     keep(best)
-    laws = len(LAWS)  # maximum number of changes
+    laws = len(LAWS)  # maximum number of changes of the law
     while True:
         best = _in_best_minimum(replays, best, begun)
         wider = with_optional_groups(replays, best)
@@ -1026,19 +1042,21 @@ def _polished(replays: Replays, near: Fitted, begun: Truth, keep: Callable[[Fitt
         laws, best = laws - 1, other
     best = _ended(replays, with_limit(replays, best, data.base))
     keep(best)
-    # Wide differences only for the covariance: near a minimum the loops may be unstable.
+    # Wide differences are used for the covariance only, because the servo loops may be unstable near a
+    # minimum.
     return continued(replays, best, 0, near=best, wide=True)
 
 
 def _linearised(replays: Replays, found: Fitted) -> Fitted:
-    """Returns a fit at the same place, with the scales of its residuals on these recordings."""
+    """Returns a fit at the same point, with the scales of its residuals on these recordings."""
     return solve(replays, found.truth, found.parameters, 0)
 
 
 def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
     """Moves the fit to significantly better minima until none is found.
 
-    This step comes last, because these places are equally good until the other parameters are known.
+    The fit must be near a minimum, because the alternatives are equally good until the other parameters are
+    known.
     """
     few, noise = replays.rough, expected(replays.rough.data)
     least = least_deviation(replays.data) | {LOAD: noise.deviation[LOAD]}

@@ -1,4 +1,4 @@
-"""Residuals between a recording and its replay, by channel: their noise, their scales, and the conclusions.
+"""Residuals between a recording and its replay, by channel: noise, scales, misfit, and the verdict on a twin.
 
 The replay has no noise, unrounded encoders and torque, and loops that close on a much finer encoder, so the
 residuals are smooth in the plant's parameters. The scale of each channel accounts for rounding and noise.
@@ -56,14 +56,14 @@ CHANNELS = (FOLLOWING, TORQUE, LOAD)
 Mask = NDArray[np.bool_]
 UNKNOWN_DEG = 60.0
 """Motor travel after which the elastic state and the loops' integral no longer depend on the time before the
-recording, unless they are known (from a gear without such a state, or from the holding torque)."""
+recording, unless both are known (because the gear has no such state, or from the holding torque)."""
 LONGEST_LEG_S = 2.0
 """Maximum length of a leg; a longer one is split, because residuals further apart are uncorrelated."""
 COARSE_S = 17.0
-"""Duration of the pieces for the first steps of a fit: a sweep, steps and a sine of the plan `dynamics`,
-each after its run-in."""
+"""Total duration of the pieces for the first steps of a fit: a sweep, steps and a sine of the plan
+`dynamics`, each after its run-in."""
 WITHOUT_MOTION = frozenset({"standstill", "reference", "settle"})
-"""Kinds of legs that alone do not qualify a piece for a coarse fit."""
+"""Kinds of legs that do not add to the variety of motion of a coarse fit."""
 HELD_OUT = 4
 
 
@@ -75,7 +75,7 @@ class Piece:
     measured: Mapping[str, FloatArray]
     """Following error in motor degrees, torque in Nm and load angle in arcsec, by channel."""
     counts: Mapping[str, Mask]
-    """Mask of the rows that count, by channel."""
+    """Mask of the rows that are used, by channel."""
     leg: NDArray[np.intp]
     """Leg number of each row, from zero."""
     kind: tuple[str, ...]
@@ -106,7 +106,7 @@ class Data:
 
     @cached_property
     def counts(self) -> dict[str, Mask]:
-        """Mask of the rows that count, by channel."""
+        """Mask of the rows that are used, by channel."""
         return {name: np.concatenate([each.counts[name] for each in self.pieces]) for name in CHANNELS}
 
     @cached_property
@@ -143,10 +143,10 @@ def held_out_legs(recording: Recording) -> tuple[Segment, ...]:
 
 
 def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
-    """Prepares a recording, with long parts in stretches; InputError without a command or with another
-    ratio.
+    """Prepares a recording, with long parts divided into stretches; InputError without a command or with a
+    different gear ratio.
 
-    Up to `RUN_IN_S` of the recording before a stretch is replayed as its run-in and does not count.
+    Up to `RUN_IN_S` of the recording before a stretch is replayed as its run-in and is not compared.
     """
     recording.record.check_ratio(axis.gear.ratio)
     record, legs, held = recording.record, legs_of(recording), held_out_legs(recording)
@@ -165,7 +165,7 @@ def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
 
 
 def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
-    """Selects pieces of about ``wanted_s`` in total, with as many kinds of motion as possible, then with
+    """Selects pieces of about ``wanted_s`` in total, first for as many kinds of motion as possible, then for
     different temperatures.
     """
     pieces, left, taken = data.pieces, [*range(len(data.pieces))], list[int]()
@@ -201,12 +201,12 @@ def traces_of(data: Data, truth: Truth) -> dict[str, FloatArray]:
 
 
 def residuals(data: Data, truth: Truth) -> dict[str, FloatArray]:
-    """Returns measured minus simulated by channel over all rows, shape (n,); zero for rows that do not
-    count.
+    """Returns measured minus simulated by channel over all rows, shape (n,); zero for rows that are not used.
 
-    Zero offsets are removed in each piece: the load angle's zero is independent of the motor's, and a
-    constant following error of more than a count at rest means that the command has another zero. The part of
-    the load residual that follows from the motor's is removed, because a lag of the motor delays the load.
+    Zero offsets are removed in each piece: the zero offset of the load angle is independent of that of the
+    motor, and a constant following error of more than a count at rest means that the command has a different
+    zero offset. The part of the load residual that follows from the motor's is removed, because a lag of the
+    motor delays the load.
     """
     shown = traces_of(data, truth)
     found = {name: data.measured[name] - shown[name] for name in CHANNELS}
@@ -228,7 +228,7 @@ def beyond(values: FloatArray, least: float) -> FloatArray:
 
 
 def _without_motor_part(data: Data, following: FloatArray, load: FloatArray) -> FloatArray:
-    """Returns the load's residuals without the part due to the motor and without their zeros.
+    """Returns the load's residuals without the part due to the motor, about their median in each piece.
 
     The motor's residuals enter with a regression coefficient between 0 and 1, which is one if the loops are
     wrong and both shafts are late. The motor encoder's rounding is excluded.
@@ -241,7 +241,7 @@ def _without_motor_part(data: Data, following: FloatArray, load: FloatArray) -> 
 
 
 def _about(centre: Callable[[FloatArray], Any], load: FloatArray, data: Data) -> FloatArray:
-    """Subtracts the centre of each piece from a column of the load; zero for rows that do not count."""
+    """Subtracts the centre of each piece from a column of the load; zero for rows that are not used."""
     left, counts = np.zeros(len(load)), data.counts[LOAD]
     for rows in data.parts:
         inside = counts[rows]
@@ -286,7 +286,7 @@ def _piece(
     axis: AxisConfig,
     base: Truth,
 ) -> Piece:
-    """Prepares a part; only ``judged`` rows that are not ``unknown`` count."""
+    """Prepares a part; only ``judged`` rows that are not ``unknown`` are used."""
     commands = commands_of(part, axis, base)
     leg, kinds = _legs(part, legs)
     out = np.zeros(len(part), dtype=np.bool_)
@@ -308,7 +308,8 @@ def _piece(
         TORQUE: torque if torque is not None else np.zeros(len(part)),
         LOAD: part.load_position_deg * ARCSEC_PER_DEG,
     }
-    # The rest position within a count is one reading, not one for each row; likewise for the load.
+    # At rest, the position within a count is unknown but constant. All rows of a rest therefore count as a
+    # single load reading, and the following error is not used.
     again = np.append(rests[:-1] & rests[1:], False)
     counts = {
         FOLLOWING: judged & ~(unknown | rests),
@@ -328,7 +329,9 @@ def has_memory(truth: Truth) -> bool:
 
 
 def _legs(part: Record, legs: Sequence[Segment]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
-    """Returns the leg number of each row, from zero, and the legs' kinds; gaps belong to the leg before."""
+    """Returns the leg number of each row, from zero, and the legs' kinds; the gap after a leg belongs to this
+    leg.
+    """
     starts: list[tuple[float, str]] = []
     for each in legs:
         if each.end_s >= part.time_s[0] and each.start_s <= part.time_s[-1]:
@@ -379,10 +382,10 @@ class Replays:
 # Likelihood of a rounded reading under an unrounded simulation.
 
 FINE = 1e-3
-"""Half the resolution, in standard deviations, below which rounding is negligible."""
+"""Rounding is negligible if half the resolution is below this, in standard deviations."""
 OUTLIER_SHARE = 0.02
-"""Share of outliers among the readings. The break-away of a stuck motor and its position at switch-on are
-not evidence of a simulation error or of a parameter."""
+"""Expected fraction of outliers among the readings. The break-away of a stuck motor and its position at
+switch-on are evidence neither of a simulation error nor of a parameter."""
 
 
 def deviance_residuals(
@@ -412,7 +415,7 @@ def deviance_residuals(
 
 
 def surprisal(size: FloatArray, half: FloatArray, outlier_probability: FloatArray) -> FloatArray:
-    """Returns the negative log probability of a reading at distance ``size`` >= 0."""
+    """Returns the negative log probability of a reading at a distance ``size`` >= 0 from the simulation."""
     nearer = log_ndtr(half - size)
     inside = nearer + np.log1p(-np.exp(np.minimum(log_ndtr(-size - half) - nearer, -1e-12)))
     with np.errstate(divide="ignore"):
@@ -444,7 +447,8 @@ def deviation(off: FloatArray, step: float, least: float) -> tuple[float, float]
 # Scales of the residuals: standard deviation of a simulation's error by channel.
 
 MAX_CORRECTED_SHARE = 1.5
-"""Maximum share of a speed error that a velocity loop corrects within a step; it is unstable at two."""
+"""Maximum fraction of a speed error that a velocity loop corrects within a step; a loop is unstable at
+two."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -478,7 +482,7 @@ class Scales:
 
     @property
     def noise(self) -> dict[str, float]:
-        """Standard deviation with rounding included as noise."""
+        """Standard deviation of the noise by channel, rounding included."""
         return {name: float(np.hypot(self.deviation[name], self.step[name] / 12.0**0.5)) for name in CHANNELS}
 
 
@@ -507,9 +511,9 @@ def least_deviation(data: Data) -> dict[str, float]:
 def _torque_noise_nm(truth: Truth, off_rad: float) -> float:
     """Returns the rms torque of the velocity loop due to independent reading errors of this rms.
 
-    Speed is the readings' difference over the step, and the motor responds within the next step. The transfer
-    function is K (1 - 1/z)^2 / (dt (1 - (1 - a)/z)) with a = K dt / J; the result is its norm times the
-    error.
+    Speed is the difference of two readings divided by the step, and the motor responds within the next step.
+    The transfer function is K (1 - 1/z)^2 / (dt (1 - (1 - a)/z)) with a = K dt / J; the result is its norm
+    times the error.
     """
     gain, step_s = truth.servo.velocity_gain_nm_s_per_rad, truth.substep_s
     share = min(gain * step_s / truth.motor.inertia_kg_m2, MAX_CORRECTED_SHARE)
@@ -553,8 +557,8 @@ def noise_in_motion(data: Data) -> dict[str, float]:
 def expected(data: Data) -> Scales:
     """Returns the expected scales of the residuals of the true axis, by channel.
 
-    For following error and torque this is the rounding, because third differences of a torque are mostly
-    motion. The load encoder's noise beyond its rounding is estimated from the recording.
+    For following error and torque this is the rounding, because third differences of a torque result mostly
+    from motion. The load encoder's noise beyond its rounding is estimated from the recording.
     """
     return Scales(noise_floor(data) | {LOAD: noise_in_motion(data)[LOAD]})
 
@@ -562,7 +566,7 @@ def expected(data: Data) -> Scales:
 def with_load_noise(truth: Truth, residuals_arcsec: FloatArray) -> Truth:
     """Returns the truth with the load encoder's noise, from differences of residuals between rows.
 
-    ``residuals_arcsec`` are the load's residuals, zero for rows that do not count. Rounding is subtracted.
+    ``residuals_arcsec`` are the load's residuals, zero for rows that are not used. Rounding is subtracted.
     """
     encoder = truth.load_.encoder
     inside = residuals_arcsec != 0.0
@@ -579,7 +583,7 @@ def with_load_noise(truth: Truth, residuals_arcsec: FloatArray) -> Truth:
 # Misfit of a twin.
 
 Misfit = Mapping[str, Mapping[str, float]]
-"""Rms of the residuals by channel, in its unit, and kind of leg."""
+"""Rms of the residuals by channel (in its unit) and by kind of leg."""
 
 
 def misfit_of(
@@ -604,7 +608,7 @@ def signals_of(data: Data) -> dict[str, FloatArray]:
 
 
 SHARE: Final = 0.01
-"""Minimum scale of a channel's misfit, as a share of its rms signal."""
+"""Minimum scale of a channel's misfit, as a fraction of its rms signal."""
 
 
 def units(data: Data) -> dict[str, float]:
@@ -617,7 +621,7 @@ def units(data: Data) -> dict[str, float]:
 
 
 def judged_rows(data: Data) -> dict[str, Mask]:
-    """Returns the mask of the rows that judge a twin, by channel: held-out rows, or else all."""
+    """Returns the mask of the rows on which a twin is judged, by channel: the held-out rows, or else all."""
     return {
         name: counts & data.out if np.any(counts & data.out) else counts
         for name, counts in data.counts.items()
@@ -631,7 +635,7 @@ def misfit(data: Data, left: Mapping[str, FloatArray]) -> float:
 
 
 # ----------------------------------------------------------------
-# Verdict on the values of a twin, from what it leaves on held-out legs.
+# Verdict on the values of a twin, from its residuals on held-out legs.
 
 NOISE_LEVEL: Final = 1.3
 """Maximum rms residual of an explained channel, in units of the noise in motion. Replays of the true values
@@ -640,18 +644,20 @@ MOST_NOISE: Final = 3.0
 """Maximum rms residual of an explained channel, in units of the noise, if it is also at most `MOST_SHARE` of
 the signal. Axis 620, whose intervals contain 1 of 18 true values, leaves 2.9 to 28 with its true values."""
 MOST_SHARE: Final = 0.05
-"""Maximum share for `MOST_NOISE`: rms residual over rms signal."""
+"""Maximum rms residual for `MOST_NOISE`, as a fraction of the rms signal."""
 
 
 class Values(StrEnum):
     """Origin of the values of a truth; `provenance.values` in its file."""
 
     USUAL = "usual"
-    """Assumed for axes of this kind."""
+    """Not fitted: the usual values of axes of this kind."""
     AXIS = "axis"
-    """Fitted, with residuals within the noise."""
+    """Fitted, and the twin explains every channel (`ChannelResidual.explained`): the values are those of the
+    axis."""
     REPLAY = "replay"
-    """Fitted, but a channel has larger residuals: a different drive with similar motion."""
+    """Fitted, but the fit was interrupted or at least one channel has larger residuals: the twin replays the
+    motion, but its values belong to a different drive."""
 
     @classmethod
     def of(cls, truth: Truth) -> Values | None:
@@ -675,7 +681,7 @@ class ChannelResidual:
 
     @property
     def text(self) -> str:
-        """Description in words."""
+        """Describes the residual in words."""
         return (
             f"{self.channel}: residual is {self.times_noise:.3g} times the noise, most of it in legs of the "
             f"kind {self.kind}"
@@ -683,7 +689,9 @@ class ChannelResidual:
 
     @property
     def explained(self) -> bool:
-        """True if the residual is within the noise, or nearly so and a small share of the signal."""
+        """True if the residual is within the noise, or slightly above it and a small fraction of the
+        signal.
+        """
         return self.times_noise <= NOISE_LEVEL or (
             self.times_noise <= MOST_NOISE and self.share <= MOST_SHARE
         )

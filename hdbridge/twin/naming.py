@@ -1,7 +1,7 @@
 """Names the causes of a simulation's excess residuals, by forward selection.
 
-The question is the same after a fit (wrong initial values) and in a check (changes since the twin was made).
-Also finds parameters that a motion does not separate.
+The method is the same after a fit (causes: wrong initial values) and in a check (causes: changes since the
+twin was made). This module also finds parameters that a motion does not separate.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from hdbridge.twin.parameters import Parameter, at_coordinates, by_cause, coordi
 from hdbridge.units import figure
 
 # ----------------------------------------------------------------
-# Growth of a misfit, and significance of a rival's larger residuals against their scatter between legs.
+# Growth of a misfit, and the significance of a rival's larger residuals, given their scatter between legs.
 
 CLIP_RATIO = 4.0
-"""Limit to which residuals are clipped, in rms of their kind of leg, because a motor that breaks away at a
-different time is not a change of the axis."""
+"""Residuals are clipped to this multiple of the misfit on their kind of leg (or of the leg's typical residual
+if larger), because a motor that breaks away at a different time is not a change of the axis."""
 FALSE_ALARM = 0.02
 """Probability that one of two equally good simulations counts as worse."""
 
@@ -39,7 +39,7 @@ FALSE_ALARM = 0.02
 def scales_by_kind(data: Data, known: Misfit, noise: Mapping[str, float]) -> dict[str, Any]:
     """Returns, by channel and row, the known misfit on this kind of leg, or the noise if larger.
 
-    A kind without a known misfit is compared with the largest misfit of the others.
+    A kind of leg without a known misfit is compared with the largest misfit of the other kinds.
     """
     found = {}
     for name in CHANNELS:
@@ -53,8 +53,8 @@ def scales_by_kind(data: Data, known: Misfit, noise: Mapping[str, float]) -> dic
 def growth(data: Data, residuals: Mapping[str, FloatArray], was: Mapping[str, Any]) -> dict[str, float]:
     """Returns, by channel, the rms residual relative to ``was`` (`scales_by_kind`).
 
-    A row counts as at most `CLIP_RATIO` times the typical residual of its leg, because a single reading may
-    be wrong, but not a whole leg.
+    Residuals are clipped to `CLIP_RATIO` times ``was`` or, if larger, times the typical residual of their
+    leg, because a single reading may be wrong, but not a whole leg.
     """
     found = {}
     for name, inside in data.counts.items():
@@ -69,7 +69,7 @@ def growth(data: Data, residuals: Mapping[str, FloatArray], was: Mapping[str, An
 
 
 def worse_than_chance(left: FloatArray, change: FloatArray, legs: NDArray[np.intp]) -> bool:
-    """Returns True if a rival's residuals are larger than by chance.
+    """Returns True if a rival's residuals are significantly larger than the simulation's.
 
     ``left`` are the simulation's residuals by row, in units of the noise; ``change`` is the rival's residuals
     minus ``left``; ``legs`` is the leg number of each row.
@@ -87,15 +87,17 @@ def worse_than_chance(left: FloatArray, change: FloatArray, legs: NDArray[np.int
 GROWN = 1.5
 """Ratio above which two misfits count as different; smaller ratios result from noise and different legs."""
 EXPLAINED = 0.5
-"""Minimum share of the remaining growth, in squares, that a named cause explains: half."""
+"""Minimum fraction of the remaining growth, in squares, that a named cause explains."""
 OF_REPLAY = 0.25
-"""Minimum share of all growth, in squares, if the twin's values are not the axis's. Such a simulation shows
-each change with an error, and a remainder of that size is not another cause."""
+"""Minimum fraction of the whole growth, in squares, that a named cause explains if the twin's values are not
+the axis's. Such a twin reproduces each change with an error, and a remainder of that size is not an
+additional cause."""
 STEPS = 8
-"""Maximum steps of the fit of one cause."""
+"""Maximum number of steps of a fit."""
 SIZES = (2.5, 6.0)
-"""Changes of each parameter, in both directions, at which a fit may start, in units of its least change. The
-ringing of a load is out of phase after a small change, and a fit does not recover from that."""
+"""Changes of each parameter, in both directions, at which a fit may start, in units of its least change. Even
+a small change puts the ringing of a load out of phase, and a fit that starts from the unchanged value does
+not recover from that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +106,7 @@ class Explained:
 
     causes: tuple[str, ...]
     rivals: tuple[str, ...]
-    """Causes that explain the recording equally well in place of the last named cause."""
+    """Causes that would explain the recording equally well in place of the last named cause."""
     truth: Truth
     """The simulation with these causes fitted."""
     growth_before: Mapping[str, float]
@@ -122,8 +124,9 @@ def explain(
     """Names causes until the misfit of ``base`` is back at ``was`` (`scales_by_kind`).
 
     In each round every other cause is fitted together with the named causes. The best is named if it explains
-    most of the growth, and at least the share ``least`` of all growth. Causes made superfluous by a later one
-    are dropped. A rival of the last cause is worse by no more than the scatter of the legs.
+    at least the fraction `EXPLAINED` of the remaining growth, and the fraction ``least`` of the whole growth.
+    Causes made superfluous by a later one are dropped. A rival of the last cause is a cause that is not
+    significantly worse.
     """
     data, groups = replays.data, by_cause(parameters)
     legs = legs_of_rows(data, fitted_rows(data, everything=True))
@@ -194,7 +197,7 @@ def _excess(grown: Mapping[str, float]) -> float:
 # Findings.
 
 MIN_COMPONENT = 0.4
-"""Minimum component of a parameter in an unobservable direction for including it in the set."""
+"""Minimum component of a parameter in an unobservable direction for including the parameter in the set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,11 +210,11 @@ class Moved:
     after: float
     lower: float = math.nan
     upper: float = math.nan
-    """Upper end of the 95 % interval of the value after; NaN without an interval."""
+    """Upper end of the 95 % interval of ``after``; NaN without an interval."""
 
     @property
     def sentence(self) -> str:
-        """Change in words."""
+        """Describes the change: values before and after, and the interval if there is one."""
         unit = f" {self.unit}" if self.unit else ""
         moved = f"{self.name} {figure(self.before, 3)} -> {figure(self.after, 3)}{unit}"
         if math.isnan(self.lower):
@@ -228,11 +231,11 @@ class Finding:
     aliases: tuple[str, ...] = ()
     """Other causes that are not separable from this one in the motion."""
     move: str = ""
-    """Motion that would separate them."""
+    """Motion that would separate these causes."""
 
     @property
     def text(self) -> str:
-        """Change in words."""
+        """Describes the changes of the parameters, and the inseparable causes if there are any."""
         moved = "; ".join(each.sentence for each in self.parameters)
         rest = f", or {' or '.join(self.aliases)}: {self.move} would separate them" if self.aliases else ""
         return f"{moved}{rest}"
@@ -251,7 +254,7 @@ class InseparableSet:
 
     @property
     def text(self) -> str:
-        """Description in words."""
+        """Describes the set and the separating motions in words."""
         return f"{', '.join(self.names)}; {'; '.join(self.moves)} would separate them"
 
 
@@ -267,7 +270,7 @@ def finding(
     """Returns the finding of one cause: the parameters with a relevant change, or the one with the largest.
 
     The causes ``instead`` may have changed in their place. With ``ratio``, changes are given as ratios,
-    because neither value is the axis's; as differences if a parameter may be zero.
+    because neither value is the axis's, but as differences for a parameter that may be zero.
     """
     off = np.subtract(coordinates(after, parameters), coordinates(before, parameters))
     sizes = np.abs(off) / [each.least_change for each in parameters]

@@ -1,7 +1,7 @@
 """Parameters of the simulated drive that a fit may change, and their usual values.
 
-Each has a path in the truth file. Positive parameters are fitted by their logarithm, so half and double are
-equally distant; delays and parameters that may be zero are fitted directly.
+Each parameter has a path in the truth file. Positive parameters are fitted by their logarithm, so half and
+double the value are equally distant; delays and parameters that may be zero are fitted directly.
 """
 
 from __future__ import annotations
@@ -180,18 +180,18 @@ def free_value(truth: Truth, parameter: Parameter) -> float:
 
 
 def with_values(truth: Truth, values: Mapping[str, float]) -> Truth:
-    """Returns the truth with other values by parameter name, validated like a file."""
+    """Returns the truth with these values by parameter name, validated like a file."""
     return Truth.model_validate(_with(truth, values))
 
 
 def with_load_encoder(truth: Truth, **fields: Any) -> Truth:
-    """Returns the truth with other fields of the load encoder, including whole sections, unchecked."""
+    """Returns the truth with these fields of the load encoder, which may be whole sections; unchecked."""
     encoder = truth.load_.encoder.model_copy(update=fields)
     return truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": encoder})})
 
 
 def _with(truth: Truth, values: Mapping[str, float]) -> dict[str, Any]:
-    """Returns the content of the truth with other values."""
+    """Returns the content of the truth with these values."""
     data = truth.model_dump(by_alias=True, exclude_none=True)
     for name, value in values.items():
         *sections, key = BY_NAME[name].path.split(".")
@@ -241,9 +241,9 @@ RESONANCE_HZ: Final = 40.0
 DAMPING_RATIO: Final = 0.2
 """Damping ratio of the load on the gear's spring: material and grease; the article's bench has 0.2."""
 COULOMB_SHARE: Final = 0.1
-"""No-load running torque of strain wave gears at the motor, as a share of the rated torque: 5 to 15 %."""
+"""No-load running torque of strain wave gears at the motor, as a fraction of the rated torque: 5 to 15 %."""
 VISCOUS_SHARE: Final = 0.2
-"""Viscous friction of the grease in strain wave gears at 20 deg C and 3000 rpm, as a share of the rated
+"""Viscous friction of the grease in strain wave gears at 20 deg C and 3000 rpm, as a fraction of the rated
 torque."""
 RATED_SPEED_RAD_S: Final = 3000.0 * math.tau / 60.0
 """Rated speed of small servo motors."""
@@ -260,7 +260,7 @@ OBSERVER_HZ: Final = 50.0
 SHORTEST_FILTER_MS: Final = 0.02
 """Time constant of a negligible filter: a tenth of a short substep."""
 BRAKE_SHARE: Final = 3.0
-"""Torque of a holding brake, as a share of the rated torque: more than the torque of the motor."""
+"""Torque of a holding brake, as a multiple of the rated torque."""
 POSITION_GAIN_PER_S: Final = 200.0
 """Position gain of a stiff loop with direct sine/cosine feedback."""
 VELOCITY_BANDWIDTH_RAD_S: Final = 1000.0
@@ -268,11 +268,11 @@ VELOCITY_BANDWIDTH_RAD_S: Final = 1000.0
 INTEGRAL_TIME_MS: Final = 15.0
 """Integral time: two to three periods of the velocity loop's bandwidth."""
 COMMAND_FILTER_MS: Final = 1.0
-"""Short filter by which drives interpolate the demand between SYNCs."""
+"""Time constant of the short filter with which drives interpolate the demand between SYNCs."""
 FRICTION_FEEDFORWARD_SHARE: Final = 0.8
-"""Friction feed-forward as a share of the friction, without overshoot at reversals."""
+"""Friction feed-forward as a fraction of the friction; small enough to avoid overshoot at reversals."""
 TORQUE_LIMIT_PERCENT: Final = 300.0
-"""Peak over rated torque of small servo motors."""
+"""Peak torque of small servo motors, in per cent of the rated torque."""
 NOISE_COUNTS: Final = 0.3
 """Rms noise of an encoder in counts, usually below one."""
 SUBSTEP_MS: Final = 0.5

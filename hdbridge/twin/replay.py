@@ -1,10 +1,10 @@
 """Replays a recording's commands through a simulated drive, without bus and master.
 
 The state before a recording is unknown. The replay therefore switches the drive on at its angle zero and
-moves to the first command at the axis's limits. It repeats this before each part that does not continue the
-previous one. If the recording begins with the drive holding the axis, the recorded torque sets the loops'
-integrals. Between consecutive parts, the drive is switched off, as on the bench, and the load continues to
-ring.
+moves to the first command at the axis's limits. It repeats this approach before each part that does not
+continue the previous one. If the recording begins with the drive holding the axis, the recorded torque sets
+the loops' integrals. Between consecutive parts, the drive is switched off, as on the bench, and the load
+continues to ring.
 
 External influences are part of a recording, like its commands. A recorded torque on the load acts on the
 simulated load in place of its own weight, and the recorded temperature sets its initial temperature.
@@ -36,17 +36,18 @@ from hdbridge.sim.truth import Truth
 # Stretches: pieces of long recordings that a fit replays separately.
 
 STRETCH_S = 10.0
-"""Length of a stretch, long compared with its unknown beginning (60 motor degrees, ringing)."""
+"""Length of a stretch, long compared with the part at its start whose history is unknown (60 motor degrees,
+ringing)."""
 LONG_S = 30.0
 """Maximum length of an undivided part."""
 GAP_S = 0.5
-"""Maximum gap between two consecutive parts, such as two tasks of a master."""
+"""Maximum gap between two consecutive parts, such as two consecutive tasks of a master."""
 SAME_DEG = 1e-6
 """Maximum change of the command that counts as unchanged; motor degrees."""
 STOPPED_DEG = 5.0
 """Maximum motor travel from the last row of a procedure to standstill."""
 IDLE = 0.002
-"""Share of a record's largest torque below which a torque counts as zero."""
+"""Fraction of a record's largest torque below which a torque counts as zero."""
 RUN_IN_S = 2.0
 """Time after which earlier motion is irrelevant: the ringing of a weakly damped load (15 Hz, damping ratio
 0.03) has decayed to a three-hundredth."""
@@ -70,7 +71,8 @@ def stretches(part: Record, legs: Sequence[Segment]) -> list[Record]:
 
 
 def continuous(record: Record) -> list[slice]:
-    """Groups parts that follow each other within `GAP_S` with the axis in place; returns their rows.
+    """Groups parts that follow each other within `GAP_S`, between which the axis stays in place; returns the
+    rows of each group.
 
     In between, the drive is switched off, as on the bench between two procedures, or holds the command.
     """
@@ -78,7 +80,8 @@ def continuous(record: Record) -> list[slice]:
     firsts = [0]
     for first in record.starts[1:]:
         gap_s = float(time_s[first] - time_s[first - 1])
-        # Records that were joined afterwards are one row apart.
+        # Records whose times were shifted when they were joined are one sample apart, whatever the real
+        # pause, so they do not count as consecutive.
         follows = 1.5 * float(np.median(np.diff(time_s))) < gap_s <= GAP_S
         held = target is not None and abs(float(target[first] - target[first - 1])) <= SAME_DEG
         stood = abs(float(motor[first] - motor[first - 1])) <= STOPPED_DEG
@@ -88,9 +91,9 @@ def continuous(record: Record) -> list[slice]:
 
 
 def just_on(record: Record, row: int) -> bool:
-    """Returns True if the drive has just been switched on at a row, because it has no torque yet.
+    """Returns True if the drive has just been switched on at a row, as the absence of torque shows.
 
-    Also True for a record without torque, on the assumption that power is on only during a procedure.
+    Also returns True for a record without torque, on the assumption that power is on only during a procedure.
     """
     torque_nm = record.columns.get("motor_torque_nm")
     if torque_nm is None:
@@ -110,7 +113,7 @@ constant, or creeps up against friction by an amount that depends on a thousandt
 HELD_S = 0.1
 """Standstill after which only the integral holds the motor; the loops respond within a few milliseconds."""
 LARGEST_UNKNOWN = 0.25
-"""Maximum share of a recording that is excluded for its unknown history."""
+"""Maximum fraction of a recording that is excluded because of its unknown history."""
 
 
 class Standing(NamedTuple):
@@ -121,8 +124,8 @@ class Standing(NamedTuple):
     still: NDArray[np.bool_]
     """Mask of the rows from which command and motor stay at rest until the next command motion."""
     held: NDArray[np.intp]
-    """Rows that show the motor's holding torque: every `HELD_S`, and the last. The last row alone is
-    insufficient, because the integral may have moved until the motor broke away."""
+    """Rows that show the motor's holding torque: one every `HELD_S`, and the last row at rest. The last row
+    alone is insufficient, because the integral may have moved until the motor broke away."""
 
 
 def standing(part: Record, count_deg: float) -> Standing:
@@ -154,8 +157,8 @@ def begins_in_motion(part: Record) -> bool:
 def unknown_rows(record: Record, count_deg: float) -> NDArray[np.bool_]:
     """Returns the mask of rows in which the load may still ring from an unknown motion.
 
-    Such a motion precedes a recording that begins (or resumes) in motion, and the switch-off after a
-    procedure that ended in motion. ``count_deg`` is one motor count.
+    The motion is unknown before a group of consecutive parts that begins in motion, and before a part whose
+    command differs from that at the end of the previous part. ``count_deg`` is one motor count.
     """
     target, time_s = record.motor_target_deg, record.time_s
     unknown = np.zeros(len(record), dtype=np.bool_)
@@ -186,20 +189,22 @@ SETTLING_S = 0.75
 UNEVEN = 0.25
 """Maximum deviation of a sample's time from the grid, cycles."""
 MOSTLY = 0.95
-"""Minimum share of samples within `UNEVEN`, because a few late stamps do not imply late commands."""
+"""Minimum fraction of samples within `UNEVEN`; a few late time stamps do not imply late commands."""
 REST_S = 0.1
-"""Minimum rest of the command between two legs if the recording names no legs."""
+"""Minimum time for which the command stands still between two legs; used if the recording does not mark its
+legs."""
 RINGS_S = 1.0
 """Time from the end of a leg's motion to the end of the leg; a longer standstill is not part of any leg."""
 LEAST_LEG_S = 0.4
-"""Minimum length of a leg that the recording does not name: an acceleration and the ringing of a load at
-15 Hz."""
+"""Minimum length of a leg, if the recording does not mark its legs: an acceleration and the ringing of a load
+at 15 Hz."""
 SIGN_SHARE = 0.2
-"""Share of the mean torque that must oppose the motion for the sign to count as wrong."""
+"""Minimum torque against the motion, as a fraction of the mean absolute torque, for the sign to count as
+wrong."""
 TORQUE_MARGIN = 1.5
 """Ratio of a torque to the axis's limit above which its unit counts as wrong."""
 AHEAD_CYCLES = 0.5
-"""Lead of the motor over its command above which the command counts as logged late, cycles."""
+"""Lead of the motor over its command, in cycles, above which the command counts as logged late."""
 MOVING_DEG_S = 5.0
 """Motor speed above which the direction of friction is certain."""
 OFF_AFTER, ON_BEFORE = 2, 1
@@ -248,7 +253,8 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
     gaps = [first for first in part.starts[1:] if just_on(part, first)]
     nodes, values = cycles, target
     for first in gaps:
-        # After its last row a procedure continues to slow down, but not beyond the start of the next one.
+        # After its last row, a procedure continues to slow down, but not beyond the start of the next
+        # procedure.
         later = np.arange(1.0, OFF_AFTER + 1.0)
         earlier, before, last, rest = target[[max(first - 3, 0), first - 2, first - 1, first]]
         slowing = last - 2.0 * before + earlier
@@ -339,7 +345,7 @@ def _approach(
     moving = math.ceil(trajectory.duration / cycle_s)
     standing = math.ceil(standing_s / cycle_s)
     per_load_deg = axis.motor_encoder.counts(1.0) * ratio
-    # Backwards from its end, so that the last command before the recording has the recording's speed.
+    # Sampled backwards from its end, so that the last command before the recording has the recording's speed.
     times = [max(trajectory.duration - (moving - k) * cycle_s, 0.0) for k in range(moving)]
     way = [round(per_load_deg * float(trajectory.at_time(each)[0][0])) for each in times]
     here = round(per_load_deg * start_deg)
@@ -350,7 +356,7 @@ def _approach(
 def counted_cycles(time_s: FloatArray, cycle_s: float) -> FloatArray:
     """Returns the cycle number of each row, from zero; fractional if the rows do not follow the cycle.
 
-    Rows are counted, because a late stamp does not imply a late command. Gaps count as whole cycles.
+    Rows are counted, because a late time stamp does not imply a late command. Gaps count as whole cycles.
     """
     cycles: FloatArray = (time_s - time_s[0]) / cycle_s
     counted: FloatArray = np.concatenate([[0.0], np.cumsum(np.maximum(np.round(np.diff(cycles)), 1.0))])
@@ -361,14 +367,14 @@ def counted_cycles(time_s: FloatArray, cycle_s: float) -> FloatArray:
 
 
 def legs_of(recording: Recording) -> tuple[Segment, ...]:
-    """Returns the recording's legs; without named legs, its motions between rests and reversals."""
+    """Returns the legs that the recording marks; without them, its motions between rests and reversals."""
     if recording.segments:
         return recording.segments
     return tuple(leg for part in recording.record.parts() for leg in _legs_of_command(part))
 
 
 def _legs_of_command(part: Record) -> Iterator[Segment]:
-    """Yields the legs of a part by its command, or the whole part without one."""
+    """Yields the legs of a part, as derived from its command; the whole part if it has no command."""
     time_s, target = part.time_s, part.motor_target_deg
     cuts, moved_s = [float(time_s[0])], [float(time_s[-1])]
     if target is not None and len(part) > 2:
@@ -455,13 +461,13 @@ def run(
         truth = truth.model_copy(update={"temperature": heat})
     if commands.torque_on_load_nm is not None:
         outer_nm = truth.load_.torque_sense * commands.torque_on_load_nm
-        # The recorded torque is the weight; the hanging mass keeps its inertia.
+        # The recorded torque contains the weight, so the hanging mass contributes only its inertia.
         upright = mass and mass.model_copy(update={"tilt_deg": 90.0})
         truth = truth.model_copy(update={"load_": truth.load_.model_copy(update={"gravity": upright})})
     machine = Machine(truth, seed, may_compile=True, loaded=commands.torque_on_load_nm is not None)
     machine.torque_limit_permille = (
         10.0 * axis.limits.torque_percent
-    )  # the limit that the master sets in the drive
+    )  # the torque limit that the master sets in the drive
     permille_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
     sense = float(axis.motor_encoder.direction)
     substeps = _substeps(len(commands.counts), commands.cycle_s, machine.dt_s)

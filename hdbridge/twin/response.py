@@ -2,8 +2,8 @@
 
 The residuals of following error and torque with the best servo are fitted by finite impulse responses to the
 speed and the direction of the command (`hdbridge.sim.response`), by ridge regressions. The simulated motor
-follows a change of the demand like it follows the command, so the response of the demand is fitted to its
-speed.
+follows a change of the demand in the same way as the command, so the response of the demand is fitted to the
+simulated motor's speed.
 """
 
 from __future__ import annotations
@@ -31,17 +31,18 @@ tenth."""
 DIRECTION_S: Final = 0.12
 """Length of the responses to the direction: three periods of a velocity loop of 25 Hz."""
 RIDGES: Final = (1e-1, 1e-2, 1e-3, 1e-4)
-"""Weights of the taps' squares, as a share of each tap's information in the rows; chosen by held-out legs."""
+"""Ridge weights of the squared taps, as fractions of each tap's information in the rows; held-out legs decide
+between them."""
 ROUNDS: Final = 2
-"""Number of fits of the demand's response; the second corrects the changes due to friction."""
+"""Number of fits of the demand's response; the second corrects for friction."""
 MAX_MISFIT_RATIO: Final = 0.97
-"""Maximum ratio of the misfit with a response to that without for keeping the response."""
+"""A response is kept if it reduces the misfit to less than this fraction."""
 
 
 def with_response(replays: Replays, fitted: Fitted) -> Fitted:
     """Returns the fit with measured responses if they explain held-out legs better.
 
-    A response of the demand also changes the torque, so it must improve both together.
+    A response of the demand also changes the torque, so it is kept only if both channels together improve.
     """
     best = fitted
     for demanded, ridge in product((0, ROUNDS), RIDGES):

@@ -1,9 +1,9 @@
 """Thermal constants of the plant, fitted to the recorded temperature.
 
-The plant is one body between its losses and its surroundings (`hdbridge.sim.heat`). The losses are a copper
-loss by the torque squared, and the work of the motor's friction. All other parameters are already fitted, so
-two replays provide the losses. The fit itself needs no replays, because the temperature is linear in losses
-and ambient temperature.
+The plant is one body between its losses and its surroundings (`hdbridge.sim.heat`). The losses are the copper
+loss, proportional to the squared torque, and the work of the motor's friction. All other parameters have
+already been fitted, so two replays provide the losses. The fit itself needs no replays, because the
+temperature is linear in losses and ambient temperature.
 """
 
 from __future__ import annotations
@@ -49,30 +49,31 @@ COPPER_LOSS: Final = Parameter(
     "copper loss", "temperature.copper_loss_w", "W", 0.0, 1e5, RISE_K, MATTERS_K, AMBIENT.cause, _WARM_UP,
     linear=True,
 )  # fmt: skip
-"""Its spread and least change apply to a thermal resistance of 1 K/W; `_scaled` adapts them."""
+"""Copper loss at rated torque. Its spread and least change apply to a thermal resistance of 1 K/W; `_scaled`
+adapts them."""
 THERMAL: Final = (AMBIENT, RESISTANCE, TIME_CONSTANT, COPPER_LOSS)
 
 STEP_S: Final = 1.0
 """Time step with constant losses: a hundredth of the time constant of the smallest motor."""
 MINIMUM_STEPS: Final = 3
 LARGE_S: Final = 1e6
-"""Time constant of a body at one kelvin per watt that hardly warms: by 0.04 K in an hour at 10 W."""
+"""Time constant of a body of 1 K/W that hardly warms: by 0.04 K in an hour at 10 W."""
 LEAST_ERROR: Final = 1e-4
 """Minimum relative standard deviation of the friction's work."""
 START_K: Final = 1.0
-"""Standard deviation of the body's temperature about the first reading of a part, because a sensor lags
-behind."""
+"""Standard deviation of the body's temperature about the first reading of a part, because the sensor lags
+behind the body."""
 CORRELATION_SHARE: Final = 0.25
-"""Correlation time of the thermal model's error, as a share of the time constant."""
+"""Correlation time of the thermal model's error, as a fraction of the time constant."""
 PLACES: Final = (0.0, -1.4, 1.4)
 """Start values of the time constant: logarithms of the ratio to the truth's."""
 ROUNDS: Final = 3
-"""Maximum number of fits with a new estimate of the residuals' size."""
+"""Maximum number of fits, each with a new estimate of the residuals' size."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Rows of one continuous part, at even times."""
+    """One continuous part of a recording, resampled at equal time steps."""
 
     friction_w: FloatArray
     """Friction power, averaged over the step that ends at each time."""
@@ -82,7 +83,7 @@ class _Part:
     """Change of the truth's ambient temperature since the start of the part."""
     reading_c: FloatArray
     rows: NDArray[np.intp]
-    """Indices of the times whose readings count."""
+    """Indices of the times whose readings are fitted."""
     firsts: NDArray[np.intp]
     """Index into `rows` of the first of each run of equal readings."""
 
@@ -98,8 +99,8 @@ def with_warmth(
 ) -> tuple[Truth, Finding | None]:
     """Fits the thermal constants; returns the truth with them and their intervals, and a finding.
 
-    Returns the truth unchanged if the recording has no temperature. Constants that are not visible in the
-    recording keep their values.
+    Returns the truth unchanged if the recording has no temperature. Constants that the recording does not
+    show keep their values.
     """
     record = recording.record
     if Channel.TEMPERATURE.value not in record.columns:
@@ -136,8 +137,8 @@ def _fit(
 ) -> tuple[FloatArray, FloatArray]:
     """Fits the constants, a factor of the friction's work, and the initial temperature of each part.
 
-    Each run of equal readings counts as one, because their rounding error is common. Returns the coordinates
-    of `THERMAL` and their covariance.
+    Each run of equal readings counts as a single reading, because its readings share one rounding error.
+    Returns the coordinates of `THERMAL` and their covariance.
     """
     parameters = _scaled(truth)
     count = len(parameters)
@@ -189,7 +190,7 @@ def _scaled(truth: Truth) -> list[Parameter]:
 
 
 def _shown(parts: Sequence[_Part], place: FloatArray) -> FloatArray:
-    """Returns the body's mean temperature over each run."""
+    """Returns the simulated mean temperature of the body over each run of equal readings."""
     count = len(THERMAL)
     ambient_c, k_per_w, time_s, copper_w = _values(place[:count])
     friction, shown = math.exp(place[count]), []
@@ -210,10 +211,10 @@ def _body(goal_c: FloatArray, start_c: float, time_s: float) -> FloatArray:
 def _parts(
     recording: Recording, truth: Truth, friction_j: FloatArray, torque_squares: FloatArray
 ) -> list[_Part]:
-    """Prepares the continuous parts; skips those that are too short or without readings that count.
+    """Prepares the continuous parts; skips parts that are too short or have only held-out readings.
 
-    The losses are accumulated by row: the friction's work, and the integral of the squared torque over the
-    rated one in seconds.
+    The losses are accumulated by row: ``friction_j`` is the friction's work, ``torque_squares`` the time
+    integral of the squared ratio of torque to rated torque, s.
     """
     record, heat = recording.record, truth.temperature
     counts = np.ones(len(record), dtype=np.bool_)
@@ -270,7 +271,7 @@ def _losses(recording: Recording, axis: AxisConfig, truth: Truth) -> tuple[Float
 
 
 def _grown(truth: Truth, warm_c: FloatArray) -> FloatArray:
-    """Returns the friction at a temperature relative to the truth file's; at least a twentieth."""
+    """Returns the friction at a temperature, relative to that of the truth file; at least a twentieth."""
     heat = truth.temperature
     grown = 1.0 + heat.friction_growth_per_k * (warm_c - heat.unchanged_c)
     return np.asarray(np.maximum(grown, 0.05), dtype=np.float64)

@@ -1,10 +1,10 @@
-"""Translates an axis file and a model to a truth file: each effect to the simulated plant's own physics.
+"""Translates an axis file and a model to a truth file, each effect to the physics of the simulated plant.
 
-A model describes the error of the load; the plant has parts that cause it. `TABLE` assigns such a part to
-each effect of the catalogue, and a translation reports whether each effect of a model was translated in full,
-in part or not at all. The transmission error comes from the model alone. Everything else (motor, loops,
-friction, load, and the spring unless the model has one) comes from the given truth, else from usual values
-(`hdbridge.twin.parameters`).
+A model describes the error of the load; the plant has components that cause this error. `TABLE` assigns such
+a component to each effect of the catalogue, and a translation reports whether each effect of a model was
+translated in full, in part or not at all. The transmission error comes from the model alone. Everything else
+(motor, loops, friction, load, and the spring unless the model describes one) comes from the given truth, else
+from usual values (`hdbridge.twin.parameters`).
 """
 
 from __future__ import annotations
@@ -48,17 +48,20 @@ class Draft:
     sets_servo: bool
     """True if the drive's feed-forward is set to the written load, as after commissioning."""
     place: str | None = None
-    """Path of the present effect in the truth file; None if the plant has no counterpart."""
+    """Path, in the truth file, of the counterpart of the effect being translated; None if the plant has
+    none."""
     notes: list[str] = field(default_factory=list)
-    """Differences between the present effect and its counterpart in the truth file."""
+    """Differences between the effect being translated and its counterpart in the truth file."""
 
     def note(self, difference: str) -> None:
-        """Records a difference between the present effect and its counterpart; repeated ones are ignored."""
+        """Records a difference between the effect being translated and its counterpart; ignores
+        repetitions.
+        """
         if difference not in self.notes:
             self.notes.append(difference)
 
     def refuse(self, why: str) -> None:
-        """Notes that the plant has no counterpart of the present effect."""
+        """Records why the plant has no counterpart of the effect being translated."""
         self.place, self.notes = None, [why]
 
     @property
@@ -105,7 +108,9 @@ class Draft:
         return float(self.load["inertia_kg_m2"]) + self.hanging_kg_m2
 
     def set_inertia(self, kg_m2: float) -> None:
-        """Sets the load's total inertia, above that of the hanging mass, keeping the damping ratio."""
+        """Sets the total inertia of the load, which must exceed that of the hanging mass; keeps the damping
+        ratio.
+        """
         self.gear["damping_nm_s_per_rad"] *= math.sqrt(kg_m2 / self.inertia_kg_m2)
         self.load["inertia_kg_m2"] = kg_m2 - self.hanging_kg_m2
 
@@ -118,7 +123,7 @@ class Draft:
 
     @property
     def spare_stiffness_nm_per_rad(self) -> float:
-        """Maximum stiffness of sliders at the load whose resonance the present time step resolves."""
+        """Maximum stiffness of sliders at the load whose resonance the current time step resolves."""
         return Resonance.of(self.data).most_held_nm_per_rad(RESOLVED / (self.data["substep_ms"] / 1e3))
 
     def finish(self) -> None:
@@ -137,7 +142,7 @@ class Draft:
 
 
 SHORTEST_MS = 0.0625
-"""Shortest time step; a whole fraction of a millisecond."""
+"""Shortest time step; a sixteenth of a millisecond."""
 
 
 # ----------------------------------------------------------------
@@ -153,8 +158,8 @@ def branch(exponent: float, nodes: int) -> tuple[FloatArray, FloatArray]:
 def elements(travel: FloatArray, height: FloatArray) -> list[tuple[float, float]]:
     """Returns limit and travel to slipping of each element of a concave curve through the origin.
 
-    The curve is the sum of the elements from rest. Its points are in order, from (0, 0); beyond the last it
-    is flat.
+    The curve is the sum of the elements from rest. The points of the curve are in order and start at (0, 0);
+    beyond the last point the curve is flat.
     """
     slopes = [(h1 - h0) / (t1 - t0) for (t0, h0), (t1, h1) in pairwise(zip(travel, height, strict=True))]
     return [
@@ -171,7 +176,7 @@ HIGHEST_ORDER: Final = 512
 FLANK_TRAVEL_DEG: Final = 0.5
 """Motor travel from flank to flank: a fraction of a degree, like the play between teeth."""
 MOST_YIELD: Final = 0.9
-"""Maximum compliance of the teeth, as a share of the spring's; at one the plant is unstable."""
+"""Maximum compliance of the teeth, as a fraction of the spring's; at one the plant is unstable."""
 
 
 def ratio_error(effect: effects.RatioError, draft: Draft) -> None:
@@ -200,7 +205,9 @@ def orders(key: str, effect: Any, draft: Draft) -> None:
 
 
 def direction_phase(effect: effects.DirectionPhase, draft: Draft) -> None:
-    """Sets two flanks. The model's orders are the mean of both flanks; the plant's are those of one flank."""
+    """Sets the two flanks of the teeth. The model's orders are the mean of both flanks; the plant's orders
+    are those of one flank.
+    """
     held, flanks = list[str](), list[dict[str, Any]]()
     for each in draft.gear.get("motor_orders", ()):
         shift = math.radians(each["order"] * effect.shift_deg)
@@ -259,7 +266,7 @@ RADIUS_MM: Final = 20.0
 """Assumed radius of a disc's graduation. Only its ratio to the eccentricity has an effect."""
 LATEST_MS: Final = 100.0
 SMALL_ARCSEC: Final = 0.05
-"""Maximum deviation of a translation that is not noted: a tenth of a usual count."""
+"""Maximum deviation of a translation that is not noted: about a tenth of a typical encoder count."""
 _LIMITS: Final = {
     "sine_offset": 0.5, "cosine_offset": 0.5, "gain_mismatch": 0.5, "phase_mismatch_deg": 45.0,
     "third_harmonic": 0.3,
@@ -267,8 +274,7 @@ _LIMITS: Final = {
 
 
 def motor_eccentricity(effect: effects.MotorEncoderEccentricity, draft: Draft) -> None:
-    """Sets the disc of the motor encoder. The drive controls its reading, so the load has the opposite
-    error.
+    """Sets the disc of the motor encoder. The drive controls its reading, so the load has the opposite error.
 
     A disc reads too much by (e / r) sin(a - a0), so the load lags by this divided by the ratio.
     """
@@ -371,8 +377,8 @@ def count_loss(effect: effects.CountLoss, draft: Draft) -> None:
 # Effects of temperature, travel and time.
 
 LINEAR_BUILD_UP: Final = 0.5
-"""Build-up ratio below which, or above the inverse of which, the plant deviates: its element strains and
-releases with equal time constants."""
+"""The plant deviates if the build-up ratio is below this or above its inverse, because its element strains
+and releases with equal time constants."""
 
 
 def zero_drift(effect: effects.ZeroDrift, draft: Draft) -> None:
@@ -416,7 +422,9 @@ def wear(effect: effects.Wear, draft: Draft) -> None:
 
 
 def creep(effect: effects.Creep, draft: Draft) -> None:
-    """Sets Kelvin-Voigt elements. The model's strain leads in motion; the plant's yields to the drag."""
+    """Sets Kelvin-Voigt elements. The model's strain leads in the direction of motion, whereas the plant's
+    elements yield to the drag.
+    """
     parts = [
         {"time_constant_s": each.tau_s, "amplitude_arcsec": -each.amplitude_arcsec} for each in effect.parts
     ]
@@ -448,13 +456,14 @@ NODES: Final = 24
 SLIDERS: Final = 16
 """Maximum number of sliders at the load in a truth file."""
 DRY_TIME_S: Final = 0.01
-"""Time constant of a drag that depends only on direction: two or three control cycles."""
+"""Time constant of the creep element for a drag that depends only on direction: two or three control
+cycles."""
 HIGHEST_SHAKE_HZ: Final = 500.0
 HOLDS: Final = 1.5
 """Ratio of the friction that holds the load in a dead zone to its inertial torque at the highest
 acceleration."""
 MOST_HELD: Final = 0.3
-"""Maximum wind-up of the spring by the friction that holds the load in a dead zone, as a share of half the
+"""Maximum wind-up of the spring by the friction that holds the load in a dead zone, as a fraction of half the
 gap."""
 
 
@@ -494,7 +503,9 @@ def compliance(effect: effects.Compliance, draft: Draft) -> None:
 
 
 def inertial_windup(effect: effects.InertialWindup, draft: Draft) -> None:
-    """Sets J / K of the load on its spring, minus the wind-up of the load encoder's coupling."""
+    """Sets the load's inertia or the spring's stiffness according to the effect's J / K, after subtracting
+    that of the load encoder's coupling.
+    """
     seconds2 = effect.inertia_over_stiffness_s2
     coupling = draft.part("load", "encoder").get("coupling")
     if coupling:
@@ -538,7 +549,7 @@ def velocity_windup(effect: effects.VelocityWindup, draft: Draft) -> None:
 
 
 def hysteresis_parameters(effect: effects.HysteresisParameters, draft: Draft) -> None:
-    """Replaces the model's loop by the changed loop."""
+    """Replaces the loop of the model by the changed loop of the effect."""
     draft.gear.pop("hysteresis", None)
     draft.load.pop("presliding", None)
     hysteresis(effect.changed().law(), draft)
@@ -547,14 +558,14 @@ def hysteresis_parameters(effect: effects.HysteresisParameters, draft: Draft) ->
 def hysteresis(effect: effects.Hysteresis | effects.HysteresisMemory, draft: Draft) -> None:
     """Sets the effect's law as the gear's hysteresis if the load leads, or friction at the load if it lags.
 
-    A law with memory becomes parallel sliders.
+    A law with return-point memory becomes parallel sliders.
     """
     draft.place = "gear.hysteresis"
     if effect.offset_arcsec < 0.0:
         _lagging(effect, draft)
     elif isinstance(effect, effects.HysteresisMemory):
         xi, height = branch(effect.exponent, NODES)
-        # The virgin curve, half the size of a branch: offset g(2 x / width).
+        # The virgin curve has half the size of a branch: offset g(2 x / width).
         parts = elements(0.5 * effect.width_deg * xi, effect.offset_arcsec * height)
         slips = [{"limit_arcsec": limit, "yield_deg": travel} for limit, travel in parts]
         if slips:
@@ -689,7 +700,7 @@ class Translation:
 
     truth: Truth
     rows: tuple[Row, ...]
-    """One row per effect of the model, in catalogue order; effects outside it come last."""
+    """One row per effect of the model, in catalogue order; effects outside the catalogue come last."""
 
 
 class Entry(NamedTuple):
@@ -698,7 +709,8 @@ class Entry(NamedTuple):
     counterpart: str
     """Dotted paths in the truth file."""
     write: Callable[[Any, Draft], None]
-    """Writes an effect of this kind to a draft, with its path (if there are several) and differences."""
+    """Writes an effect of this kind to a draft; also sets the path if there are several, and notes
+    differences."""
 
 
 TABLE: Final[Mapping[str, Entry]] = MappingProxyType(
@@ -743,8 +755,8 @@ def translate(
     """Returns the simulated drive with the model's errors, on the axis of the axis file.
 
     ``base`` (default: usual values) provides everything that the model does not describe. Without a model,
-    ``base`` keeps its transmission error. InputError if the model has another gear ratio, or a value that the
-    plant cannot have.
+    ``base`` keeps its transmission error. InputError if the model has a different gear ratio, or a value that
+    the plant cannot have.
     """
     truth = _of_axis(axis, base) if base is not None else default_truth(axis)
     if model is None:

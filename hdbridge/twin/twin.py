@@ -2,7 +2,7 @@
 
 A fit assumes that the simulated drive can behave like the axis. The residuals on held-out legs test this
 assumption. Only the values of a twin that explains every channel are those of the axis. Any other twin merely
-replays the motion: its values belong to a different drive with similar motion.
+replays the motion; its values belong to a different drive with similar motion.
 
 profiles/NAME/twin.yaml           the active twin, which `hdbridge simulate` and `--simulate` use
               pending-twin.yaml   proposed by `hdbridge twin`, not yet committed
@@ -67,7 +67,7 @@ from hdbridge.units import figure
 # Result of `fit_twin`: the simulated drive's parameters, their intervals, and the residuals.
 
 HELD_OUT = "held out"
-"""Kind of leg for the held-out legs in a comparison."""
+"""Pseudo-kind of leg in a comparison: the held-out legs."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Twin:
     truth: Truth
     """Parameters, with intervals of the fitted ones; the provenance contains the data for `check`."""
     findings: tuple[Finding, ...]
-    """Causes of the errors of the initial simulation, if its values were the axis's."""
+    """Causes of the errors of the initial simulation, if its values were meant to be the axis's."""
     inseparable_sets: tuple[InseparableSet, ...]
     """Sets of parameters that are not separable in the recorded motion."""
     channel_residuals: tuple[ChannelResidual, ...]
@@ -105,15 +105,17 @@ class Twin:
 
 SIGNALS: Final = (LOAD_ERROR, FOLLOWING_ERROR, MOTOR_TORQUE, TEMPERATURE)
 LEAST_GAIN: Final = 0.01
-"""Minimum reduction of the mean ratio of the differences; smaller reductions are due to noise."""
+"""Minimum mean reduction of the differences for a twin to count as better; smaller reductions are due to
+noise."""
 EQUAL: Final = 0.01
-"""Share of the noise below which differences count as equal, because a few held-out readings may all
+"""Fraction of the noise below which differences count as equal, because a few held-out readings may all
 agree."""
 WORSE: Final = 1.1
-"""Ratio of the differences after and before above which a signal counts as worse, if it exceeds its noise."""
+"""A signal counts as worse if its difference has grown by more than this factor and exceeds its noise."""
 DECADE: Final = 10.0
 """Maximum ratio of a motor's inertia to the usual inertia for its rated torque, and of load to motor inertia
-seen by the motor. Servo motors of equal torque differ by a factor of three to five (catalogues)."""
+seen by the motor. The inertias of servo motors of equal torque differ by a factor of three to five
+(catalogues)."""
 
 
 def impossible(truth: Truth, axis: AxisConfig, cycle_s: float) -> tuple[str, ...]:
@@ -184,7 +186,8 @@ def replays_only(twin: Twin) -> str:
 
 
 def better(before: Comparison, after: Comparison) -> Verdict:
-    """Compares the rms differences of load error, following error, torque and (if recorded) temperature.
+    """Decides whether the rms differences of load error, following error, torque and (if recorded)
+    temperature have become smaller.
 
     Uses the held-out legs, or all legs if none are held out.
     """
@@ -271,11 +274,13 @@ class TwinFile:
         return type(self)(self.truth.model_copy(update={"provenance": known}), self.path)
 
     def bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> Self:
-        """Returns the twin bound to an axis and the drive that answered (else that of the axis file)."""
+        """Returns the twin, bound to an axis and to the drive that answered (or else the drive of the axis
+        file).
+        """
         return self.with_provenance(**binding(axis, identity))
 
     def check_ratio(self, axis: AxisConfig) -> None:
-        """Raises InputError if the twin has another gear ratio than the axis file.
+        """Raises InputError if the twin has a different gear ratio from the axis file.
 
         The compared ratio is that of the measurement; the gear's true ratio may differ by a `ratio_error`.
         """
@@ -288,7 +293,7 @@ class TwinFile:
             )
 
     def check_bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> None:
-        """Raises InputError if the twin belongs to another drive, axis or gear."""
+        """Raises InputError if the twin belongs to a different drive, axis or gear."""
         self.check_ratio(axis)
         check_binding(self.truth.provenance, axis, identity, self._name(), "twin", "make one")
 
@@ -321,7 +326,7 @@ TWINS: Final = Store(
 
 
 # ----------------------------------------------------------------
-# Makes a twin from recordings: fit, causes by which the start was wrong, inseparable sets, residuals.
+# Makes a twin from recordings: fit, causes of the errors of the start, inseparable sets, residuals.
 
 
 def fit_twin(
@@ -334,10 +339,11 @@ def fit_twin(
     """Fits the twin of an axis to recordings with the commanded motor angle.
 
     ``start`` is the initial simulation: the translated axis file and model, or an older twin. Replays run in
-    ``workers`` threads. InputError if a recording has no command or is of another gear.
+    ``workers`` threads. InputError if a recording has no command or comes from a different gear.
 
-    Causes are named only if the values before and after the fit are the axis's, and intervals given only if
-    those after the fit are. Otherwise a measured response is added if held-out legs confirm it.
+    Causes are named only if the values before and after the fit are the axis's; intervals are given only if
+    the values after the fit are the axis's. Otherwise a measured response is added if held-out legs confirm
+    it.
     """
     whole = Recording.joined(list(recordings))
     plain = start.model_copy(update={"servo": start.servo.model_copy(update={"response": None})})
@@ -385,7 +391,7 @@ def _wrong(replays: Replays, start: Truth, fitted: Fitted) -> tuple[Finding, ...
 
 
 def _compared(whole: Recording, axis: AxisConfig, truth: Truth) -> Comparison:
-    """Compares a recording with one simulation by kind of leg, and on the held-out legs."""
+    """Compares a recording with a simulation, by kind of leg and on the held-out legs."""
     held = [each.model_copy(update={"kind": HELD_OUT}) for each in held_out_legs(whole)]
     simulated = replay(whole, axis, truth)
     return compare(whole.record, simulated, [*legs_of(whole), *held], axis.gear.ratio)

@@ -1,4 +1,4 @@
-"""Encoders of the truth file: geometry of the disc, signals, delayed samples, lost counts."""
+"""Encoder sections of the truth file: geometry of the disc, signals, delayed samples, lost counts."""
 
 from typing import Literal, Self
 
@@ -75,7 +75,7 @@ class TrueEncoder(Strict):
 
 
 class TrueMotorEncoder(TrueEncoder):
-    """Encoder on the motor shaft. It reports whole counts; the drive's loops have finer steps."""
+    """Encoder on the motor shaft. It reports whole counts; the drive's loops use finer steps."""
 
     interpolation: int = Field(
         64, ge=1, le=65_536, description="steps per count that the drive's own loops see (sine/cosine tracks)"
@@ -93,7 +93,7 @@ class TrueCoupling(Strict):
 
 
 class TrueCable(Strict):
-    """Cable of the encoder: taut beyond an angle, where it turns the encoder's body."""
+    """Cable of the encoder, which is taut beyond an angle and then twists the encoder's body."""
 
     taut_from_deg: float = Field(
         ge=-36_000, le=36_000, description="load angle above which the cable is taut"
@@ -107,7 +107,9 @@ class TrueCable(Strict):
 
 
 class TrueSensorWarming(Strict):
-    """Warming of the encoder with the square of its speed, which no temperature channel measures."""
+    """Warming of the encoder, which grows with the square of its speed; no temperature channel measures
+    it.
+    """
 
     arcsec_at_10_deg_s: float = Field(
         ge=-3_600, le=3_600, description="final shift in long motion at 10 degrees per second"

@@ -12,7 +12,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 
 class TrueStiffening(Strict):
-    """Second and third stage of the spring, with another stiffness beyond each of two torques."""
+    """Second and third stage of the spring, with a different stiffness beyond each of two torques."""
 
     first_torque_nm: float = Field(gt=0, le=1e6, description="torque T1 at which the first stage ends")
     second_stiffness_nm_per_rad: float = Field(gt=0, le=1e9, description="stiffness K2 beyond T1")
@@ -78,7 +78,7 @@ class TrueCreep(Strict):
 
 
 class TrueJump(Strict):
-    """Jump of teeth that remains in the output."""
+    """Tooth jump, a shift that remains in the output."""
 
     time_s: float = Field(ge=0, le=1e8, description="time since the axis was switched on")
     teeth: int = Field(ge=-100, le=100, description="number of teeth by which the output jumps forward")
@@ -94,7 +94,7 @@ class TrueDamage(Strict):
 
 
 class TrueRoller(Strict):
-    """Roller on the motor's hub, pressed on at some load angles more than at others."""
+    """Roller on the motor's hub, which is pressed more strongly at some load angles than at others."""
 
     order: float = Field(gt=0, le=512, description="turns of the roller per motor turn, not a whole number")
     amplitude_arcsec: float = Field(ge=0, le=36_000, description="amplitude where it is pressed on most")
@@ -112,7 +112,7 @@ class TrueSeat(Strict):
 
 
 class TrueGear(Strict):
-    """Harmonic gear: ratio, elasticity, and the causes of transmission error."""
+    """Harmonic gear: ratio, elasticity, and causes of transmission error."""
 
     ratio: float = Field(ge=1, le=1_000, description="motor turns per load turn")
     stiffness_nm_per_rad: float = Field(gt=0, le=1e9, description="flexspline's spring to the load")

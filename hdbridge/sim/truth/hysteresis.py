@@ -17,7 +17,9 @@ class TrueOrder(Strict):
 
 
 class RollingFriction(Strict):
-    """Rolling-friction law of the article: after a reversal the error crosses over within a width."""
+    """Rolling-friction law of the article: after a reversal the error crosses to the other branch within a
+    width.
+    """
 
     law: Literal["rolling_friction"] = Field(description="the article's law; no return-point memory")
     offset_arcsec: float = Field(ge=0, le=36_000, description="error after long motion in one direction")

@@ -18,7 +18,7 @@ class TrueGravity(Strict):
 
 
 class TrueStribeck(Strict):
-    """Friction at the load that rises near rest."""
+    """Friction at the load that increases as the speed approaches zero."""
 
     breakaway_nm: float = Field(
         ge=0, le=1e6, description="friction at rest, in place of the Coulomb friction"
@@ -42,14 +42,14 @@ class TrueVibration(Strict):
 
 
 class TrueSlip(Strict):
-    """Spring between load and ground that slips at its limit."""
+    """Spring between load and ground that slips at its torque limit."""
 
     limit_nm: float = Field(gt=0, le=1e6, description="friction at which it slips")
     travel_deg: float = Field(gt=0, le=360, description="load travel from no friction to slipping")
 
 
 class TrueLoad(Strict):
-    """Load with its encoder."""
+    """Load and its encoder."""
 
     inertia_kg_m2: float = Field(gt=0, le=1e6, description="inertia of the load, at the load")
     coulomb_nm: float = Field(

@@ -9,7 +9,9 @@ from hdbridge.strictness import Strict
 
 
 class TrueMotorStribeck(Strict):
-    """Friction on the motor's shaft that rises near rest, before a lubricant film forms."""
+    """Friction on the motor's shaft that increases as the speed approaches zero, where no lubricant film
+    forms.
+    """
 
     rise: float = Field(
         ge=0, le=10, description="share of the Coulomb friction by which it is higher at rest"

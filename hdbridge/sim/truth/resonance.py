@@ -15,7 +15,7 @@ class Resonance:
     held_nm_per_rad: float
     """Stiffness of the sliders on the load before they slip."""
     inertia_kg_m2: float
-    """Inertia of the load without the mass on it, which may be removed."""
+    """Inertia of the load without the mass on it, because that mass may be removed."""
     reflected_kg_m2: float
     """Inertia of the motor, seen from the load."""
 
