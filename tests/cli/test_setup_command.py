@@ -137,7 +137,7 @@ def test_missing_requirements_are_reported(arguments, status, said, tmp_path):
 
 
 def test_nothing_moves_without_consent(tmp_path):
-    """On a terminal, answering no to the first question."""
+    """On a terminal, the user answers no to the first question."""
     parent, child = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, "-m", "hdbridge", "setup", "arm", "--simulate"],
