@@ -22,7 +22,7 @@ def tpdo1(statusword: int, position: int, torque: int = 0) -> bytes:
 
 
 def sent(frames: Frames) -> tuple[int, ...]:
-    """Controlword and target of the one RPDO."""
+    """Returns controlword and target of the only RPDO."""
     ((can_id, data),) = frames
     assert can_id == 0x201
     return struct.unpack("<Hi", data)

@@ -1,4 +1,4 @@
-"""Small recordings of a few joints, and a cluster that the tests share."""
+"""Small recordings of a few joints, and a cluster shared by the tests."""
 
 from pathlib import Path
 

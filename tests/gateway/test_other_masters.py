@@ -168,7 +168,7 @@ r 603F 00 0000
 
 
 class Master:
-    """Plays such lines on a bus."""
+    """Plays the lines of a start-up sequence on a bus."""
 
     def __init__(self, bus, clock):
         self.bus, self.clock = bus, clock

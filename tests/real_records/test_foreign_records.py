@@ -114,7 +114,7 @@ def test_files_of_other_programs_read_the_same(tmp_path: Path, content: bytes) -
 
 
 def shared(record: Record) -> np.ndarray:
-    """The columns of a record that `text` writes, shape (3, n); time from its first sample."""
+    """Returns the columns of a record that `text` writes, shape (3, n); time is from the first sample."""
     angles = (record.time_s - record.time_s[0], record.motor_position_deg, record.load_position_deg)
     return np.array(angles)
 
@@ -396,7 +396,9 @@ def test_errors_at_a_few_places_are_not_a_turn_in_radians(tmp_path: Path, seed: 
 
 @pytest.mark.parametrize("step_deg", [0.5, 3.0, 12.35, 18.8, 30.0])
 def test_angles_are_taken_for_radians_only_if_they_are(tmp_path: Path, step_deg: float) -> None:
-    """Some steps in degrees are an alias of a turn in radians; half of the record is a loop at a reversal."""
+    """Some of the steps in degrees are nearly whole multiples of 2 pi; half of the record is a loop at a
+    reversal.
+    """
     swept = step_deg * np.arange(1500.0)
     sine = 20.0 * np.sin(np.radians(swept))
     motor = np.concatenate([swept, swept[-1] + sine])
