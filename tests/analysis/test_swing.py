@@ -22,7 +22,7 @@ COUNT_DEG = 0.018
 
 @pytest.mark.parametrize(("frequency_hz", "damping"), [(25.0, 0.1), (60.0, 0.4)])
 def test_the_load_follows_its_base_according_to_the_equation(frequency_hz: float, damping: float) -> None:
-    """The samples are irregular, and two belong to another record."""
+    """The samples are irregular, and two belong to a different record."""
     rng = np.random.default_rng(1)
     time_s = np.cumsum(rng.uniform(0.5e-3, 1.5e-3, 800))
     natural = math.tau * frequency_hz

@@ -52,7 +52,7 @@ class Logged:
 
 
 class Master:
-    """A master of another make: its own PDO order and identifiers, SDO and CSP in raw frames."""
+    """A third-party master: its own PDO order and identifiers, SDO and CSP in raw frames."""
 
     def __init__(self, bus: LockstepBus, clock: VirtualClock) -> None:
         self.bus, self.clock, self.log = bus, clock, Logged()

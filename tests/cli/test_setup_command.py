@@ -57,7 +57,7 @@ def test_sets_up_a_compensated_axis_from_scratch(finished):
 
 
 def test_prints_ordinary_commands(finished, tmp_path):
-    """The first three printed commands, run in another folder, have the same effect."""
+    """The first three printed commands, run in a different folder, have the same effect."""
     _, done = finished
     for line in re.findall(r"^\$ hdbridge (.*)", done.stdout, re.M)[:3]:
         again = run_here(tmp_path, *line.split())

@@ -63,7 +63,7 @@ def test_inverse_is_exact(model, path, start):
         motor_deg = inverse.solve(load_deg)
         inverse.advance(motor_deg)
         reached = motor_deg / model.ratio + gear.advance(motor_deg, NOW) / 3600
-        # 1e-6 arcsec, or two bits of the motor angle where the law is so steep that this is coarser.
+        # 1e-6 arcsec, or two bits of the motor angle if the law is so steep that two bits are coarser.
         loop = model.effects[1]
         bits = 2 * loop.offset_arcsec * rise_at(2 * math.ulp(motor_deg) / loop.width_deg, loop.exponent)
         assert abs(reached - load_deg) * 3600 <= max(1e-6, 2 * bits)

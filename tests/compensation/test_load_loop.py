@@ -55,7 +55,7 @@ class Plant:
         return self.lag - self.its.value_arcsec
 
     def move(self, target: float, seconds: float = 1.0) -> float:
-        """Moves to another angle and rests there."""
+        """Moves to an angle and rests there."""
         self.target = target
         self.step(moving=True)
         return self.rest(seconds)

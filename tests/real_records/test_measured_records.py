@@ -136,7 +136,7 @@ def test_return_point_memory_predicts_the_dampers_other_motion() -> None:
 
 @pytest.mark.parametrize("name", ["sine", "earthquake"])
 def test_return_point_memory_of_the_damper_is_reported_if_visible(name: str) -> None:
-    """A sine reverses at ever different angles without nested loops, so both laws leave the same residual."""
+    """A sine reverses at varying angles without nested loops, so both laws leave the same residual."""
     (path,) = measured(f"damper/{name}.csv")
     record = real_records.damper_record(path.parents[1], name, 2.0)
     law = Hysteresis(offset_arcsec=95.0, width_deg=32.0, exponent=2.2)

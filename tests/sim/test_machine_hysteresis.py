@@ -88,7 +88,7 @@ def test_a_closed_loop_dissipates(make: Callable[[], Law], reach_deg: float) -> 
     law = make()
     low, high = 60.0 - reach_deg, 60.0 + reach_deg
     along_from(law, 0.0, high)
-    for _ in range(300):  # a law without memory needs many rounds until its small loops are closed
+    for _ in range(300):  # a law without memory needs many repetitions until its small loops are closed
         along_from(law, high, low, 20)
         along_from(law, low, high, 20)
     loop = [(high, law.advance(high))]

@@ -67,7 +67,7 @@ class DaemonBench:
         daemon.run(0.3)
         daemon.events.clear()
 
-    # ---------------------------------------------------------------- as `reliability.Bench` has it
+    # ---------------------------------------------------------------- interface of `reliability.Bench`
 
     def move(self) -> None:
         self.daemon.turn()
@@ -92,7 +92,7 @@ class DaemonBench:
         assert isinstance(wrong.__self__, WrongOnce)  # type: ignore[attr-defined]
         wrong.__self__.wrong_deg = counts * DEG_PER_TURN / self._counts_per_turn  # type: ignore[attr-defined]
 
-    # ---------------------------------------------------------------- what is true afterwards
+    # ---------------------------------------------------------------- checks after a fault
 
     @property
     def states(self) -> list[AxisState]:

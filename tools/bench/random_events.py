@@ -23,7 +23,7 @@ PER_STORY = {"slave": 200, "gateway": 100}
 
 
 def story(stack: str, seed: int) -> None:
-    """Plays one sequence of events; raises AssertionError if a law is broken."""
+    """Plays one sequence of events; raises AssertionError if an invariant is violated."""
     count, rng = PER_STORY[stack], Random(seed)
     seen: Any
     with tempfile.TemporaryDirectory(prefix="events-") as folder:
