@@ -1,4 +1,4 @@
-"""Tests that intervals include systematic errors: from a different law of the plant, or from a hidden similar effect."""
+"""Tests that intervals include systematic errors, due to a different law or to a hidden similar effect."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ def test_another_hysteresis_law_is_adopted_if_the_load_shows_it() -> None:
     assert dahl.gear.hysteresis.law == "dahl"
     assert TRUTH.gear.hysteresis is not None
     assert TRUTH.gear.hysteresis.law != "dahl"
-    # The loop that a calibration with a different law would report: too low, and with different zero crossings.
+    # The loop that a calibration with a different law would report: too low, with other zero crossings.
     wrong = with_values(TRUTH, {"loop offset": 0.93 * TRUTH.gear.hysteresis.offset_arcsec})
     with Replays(prepare(recorded(dahl), AXIS, wrong), 1) as replays:
         found = with_loop(replays, fitted(replays, wrong))
