@@ -152,7 +152,7 @@ def test_within_the_backlash_the_motor_never_reverses():
         inverse.advance(path[-1])
     steps = -np.diff(path)
     assert np.all(steps > 0.0)
-    # It takes up the lost motion on either side, then continues at the commanded rate.
+    # The motor takes up the lost motion on either side, then continues at the commanded rate.
     assert steps[0] > 3 * 50e-4
     assert steps[-1] == pytest.approx(50e-4, rel=1e-3)
 

@@ -78,7 +78,7 @@ class ForeignMachine:
         if not self._powered:
             settle(self.loops, start_counts * step)
             self._powered = True
-        elif knots[3] != start_counts * step:  # a new start of the demand
+        elif knots[3] != start_counts * step:  # the demand restarts elsewhere
             knots[:4] = start_counts * step
         knots[:3] = knots[1:4]
         knots[3] = end_counts * step
