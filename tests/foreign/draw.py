@@ -34,7 +34,7 @@ REST_DEG = 0.03
 
 @dataclass(frozen=True)
 class Truth:
-    """Sealed truth of a foreign axis, for the judge only."""
+    """Sealed truth of a foreign axis, for the evaluation only."""
 
     seed: int
     structure: str
@@ -56,7 +56,7 @@ class Truth:
         return ForeignMachine(self.mechanics, self.servo, self.encoders, self.seed)
 
     def by_place(self) -> dict[str, float]:
-        """True values by their place in a truth file, if there is one with the same meaning."""
+        """Returns true values by their path in a truth file, if a key there has the same meaning."""
         m, law, hysteresis = self.mechanics, self.servo.law, self.mechanics.hysteresis
         values = {
             "motor.inertia_kg_m2": m.motor_inertia_kg_m2,

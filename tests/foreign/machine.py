@@ -102,12 +102,12 @@ class ForeignMachine:
 
     @property
     def true_motor_deg(self) -> float:
-        """Motor angle, for judges."""
+        """True motor angle, for evaluations."""
         return math.degrees(self.plant.state[0]["motor"])
 
     @property
     def true_load_deg(self) -> float:
-        """Load angle, for judges."""
+        """True load angle, for evaluations."""
         return math.degrees(self.plant.state[0]["load"])
 
     @property

@@ -139,7 +139,7 @@ LOOPS = np.dtype([(name, "f8") for name in _STATE] + [(name, "i8") for name in (
 
 
 class Loops(NamedTuple):
-    """Parameters and state of a servo, as `torque` takes them."""
+    """Parameters and state of a servo, in the form that `torque` requires."""
 
     parameters: np.ndarray
     """Record `PARAMETERS`."""

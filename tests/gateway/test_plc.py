@@ -347,7 +347,7 @@ def client_by_force(bench):
 
 
 def client_for_a_moment(bench):
-    """A client takes the lease by force and releases it before the service has looked."""
+    """A client takes the lease by force and releases it before the service notices."""
     lease = bench.bridge.lease
     lease.release(lease.take("a person", force=True))
 

@@ -182,7 +182,7 @@ def signed(bits: int, counts: np.ndarray) -> np.ndarray:
 
 WAVE = 5.0 / 3600.0 * np.sin(np.radians(8.0 * MOTOR))
 TURNED = 1440.0 - np.abs(np.linspace(-1440.0, 1440.0, COUNT))
-"""There and back, with the reversal where the angle wraps."""
+"""Motor angle there and back, with the reversal at the wrap of the angle."""
 ADVISED: dict[str, tuple[str, str, str]] = {
     # content, message, advice
     "a load counter of 16 bits, in degrees": (
@@ -349,7 +349,7 @@ def test_a_multi_turn_counter_is_reported_with_its_size(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("jump_deg", [12.08, 47.3, 150.0, 505.0])
 def test_a_single_jump_is_not_a_counter_wrap(jump_deg: float) -> None:
-    """A reading that slips once, as in a measured record, is not advised to be unwrapped."""
+    """For a reading that slips once, as in a measured record, no unwrapping is suggested."""
     slow = np.round(MOTOR / 10.0, 8)
     slipped = np.where(np.arange(COUNT) > 100, slow + jump_deg, slow)
     assert find_wraps(slipped, slow / RATIO) is None

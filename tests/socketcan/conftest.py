@@ -1,6 +1,6 @@
 """A real SocketCAN interface and the simulated drive in a process of its own.
 
-Run by ``tools/socketcan.sh`` where the kernel has no vcan; without an interface these tests are skipped.
+Run by ``tools/socketcan.sh`` if the kernel has no vcan; without an interface these tests are skipped.
 """
 
 import atexit
@@ -87,7 +87,7 @@ def profile() -> Path:
 
 @pytest.fixture
 def may_configure(interface: str) -> Callable[..., None]:
-    """``ip`` for tests that take the interface away; skipped where that is not permitted."""
+    """``ip`` for tests that take the interface away; skipped if that is not permitted."""
     if (
         shutil.which("ip") is None
         or subprocess.run(["ip", "link", "set", "up", interface], check=False, capture_output=True).returncode

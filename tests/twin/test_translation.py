@@ -307,7 +307,7 @@ def test_effects_beyond_the_plant_are_reported() -> None:
 
 
 def test_unreachable_spring_stages_are_omitted() -> None:
-    """A diagnosis describes a linear spring this way, with the other stages beyond any torque."""
+    """A diagnosis gives a linear spring two further stages, which begin beyond any reachable torque."""
     linear = effects.Compliance(
         c1_arcsec_per_nm=31.0,
         c2_arcsec_per_nm=0.0,

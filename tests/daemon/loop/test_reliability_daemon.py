@@ -238,7 +238,7 @@ def test_a_stale_position_at_enable_moves_nothing(bench: DaemonBench) -> None:
     enabled = [target for word, target in targets if word & 0x0F == ENABLE_OPERATION]
     assert enabled
     assert abs(enabled[0] - before) <= 1
-    # Any further motion is that of the compensation as it is faded in.
+    # Any remaining motion is due to the compensation, which is faded in.
     assert abs(bench.motor_counts() - before) < 20
     further("the position in the enable command is stale").show(0)
 
