@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Print the path of a Chromium for the tests of the live page; Debian's is installed where there is none and we are root:
-# its shell without windows, which comes without a desktop's libraries and begins sooner.
+# Print the path of a Chromium for the tests of the live page. If there is none and the user is root, Debian's
+# headless shell is installed, which needs no desktop libraries and starts faster.
 #
-# Exit status: 0, or 69 and the reason on standard error when there is none to be had.
+# Exit status: 0, or 69 with the reason on standard error if no Chromium is available.
 set -u
 for name in chromium-headless-shell chromium chromium-browser google-chrome; do
     if command -v "$name"; then exit 0; fi

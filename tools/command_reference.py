@@ -171,7 +171,7 @@ def _section(command: Command, common: Container[Parameter], general: Container[
 
 
 def _common_item(parameter: Parameter, names: list[str], meanings: Mapping[str, int]) -> str:
-    """Returns the item of a shared option, with its commands if it has another meaning elsewhere."""
+    """Returns the item of a shared option, with its commands if others give it a different meaning."""
     groups = {name.split()[0] for name in names}
     if meanings[parameter.names[0]] == 1:
         owner = ""

@@ -1,10 +1,10 @@
 """Fits the probability formula: `python tools/fit_probabilities.py [--suite FOLDER]... [--keep TABLE.json]`.
 
-Diagnoses the records of blind suites (tools/blind/generate.py), whose causes are known. Each finding gives
-the terms of the formula (hdbridge/analysis/probability.py) and tells if the named cause was right. A logistic
-regression with a ridge penalty is fitted, every term with its required sign, and tested by cross-validation
-that leaves out whole records. An existing table of `--keep` is read instead. Prints the coefficients for
-`Scales`.
+Diagnoses the records of blind suites (tools/blind/generate.py), whose causes are known. Each finding provides
+the terms of the formula (hdbridge/analysis/probability.py) and shows whether the named cause was right. A
+logistic regression with a ridge penalty is fitted, every term with its required sign, and tested by
+cross-validation that leaves out whole records. If `--keep` names an existing table, it is read instead.
+Prints the coefficients for `Scales`.
 """
 
 from __future__ import annotations

@@ -127,7 +127,7 @@ def tests_of(mutant: Mutant) -> list[str]:
 
 
 def fails(path: str, source: str, tests: list[str], limit_s: float | None = None) -> tuple[bool, float]:
-    """Runs tests with another source of a module; returns True if one failed, and the CPU time, s."""
+    """Runs tests with a changed source of a module; returns True if one failed, and the CPU time, s."""
     assert "hdbridge" not in sys.modules, "the new process must load the package itself"
     before_s = _children_s()
     if not (child := os.fork()):

@@ -3,29 +3,30 @@
 #
 #   tools/socketcan.sh [--timeout SECONDS] [--uml] [--realtime] [--slowed N] [--check] COMMAND [ARGUMENT...]
 #
-# The command runs in the present folder with the present environment; its standard output, standard error and
+# The command runs in the current folder with the current environment; its standard output, standard error and
 # exit status are passed through; its standard input is empty. In this order:
-#   1. vcan0 exists and is up: the command simply runs.
-#   2. The kernel has vcan and we may add interfaces: vcan0 is made, and removed afterwards.
+#   1. If vcan0 exists and is up, the command simply runs.
+#   2. If the kernel has vcan and the user may add interfaces, vcan0 is created, and removed afterwards.
 #   3. Otherwise Debian's user-mode-linux (a Linux kernel that runs as a process, with the CAN modules that the
-#      host lacks) boots on this machine's own file system. It has one CPU: good for function and faults, not
-#      for judging timing below 4 ms. Missing Debian packages are installed when we are root. Where there is a C
-#      compiler, tools/uml/*.c are put under it: without them, it does not boot on processors with AMX. And
-#      tools/uml/guest/populate.c is put under the command: Python takes three quarters of the time to load with it.
+#      host lacks) boots on this machine's own file system. It has one CPU: suitable for tests of function and
+#      faults, but not of timing below 4 ms. Missing Debian packages are installed if the user is root. If there
+#      is a C compiler, tools/uml/*.c are compiled and preloaded; without them, user-mode-linux does not boot on
+#      processors with AMX. In addition, tools/uml/guest/populate.c is preloaded for the command: with it, Python
+#      takes three quarters of the time to load.
 #
-#   --timeout SECONDS   end everything after that long (default 3600); exit status 124
-#   --uml               use user-mode-linux even where the kernel has vcan
+#   --timeout SECONDS   end everything after this time (default 3600); exit status 124
+#   --uml               use user-mode-linux even if the kernel has vcan
 #   --realtime          give user-mode-linux real-time priority (SCHED_RR, as root): a system call then costs 16 us
-#                       instead of 25 to 70, but two at once leave a small machine nothing for anything else
-#   --slowed N          tests of function: in user-mode-linux (taken where it can be had, even where the kernel has
-#                       vcan) time passes N times as slowly while anything computes, and idle time is skipped, so
-#                       that what else this machine does is nothing to the command; see tools/uml/guest_clock.c
-#   --check             run nothing: exit 0 when one of the ways above is possible, 69 and the reason otherwise
+#                       instead of 25 to 70, but two at once leave a small machine no time for other processes
+#   --slowed N          for tests of function: in user-mode-linux (preferred if available, even if the kernel has vcan),
+#                       time passes N times as slowly while any process computes, and idle time is skipped, so that
+#                       other load on this machine does not affect the command; see tools/uml/guest_clock.c
+#   --check             run nothing: exit status 0 if one of the ways above is possible; otherwise 69, with the reason
 #
-# Exit status: the command's own; 124 timed out; 69 no SocketCAN to be had, user-mode-linux that does not boot on
-# this machine included; 70 user-mode-linux booted, and ended without running the command to its end.
-# SOCKETCAN_MEMORY (default 1G) is the memory of user-mode-linux; SOCKETCAN_LOCKS (default /tmp/socketcan-UID) is what
-# the names of the files begin with by which runs at the same time share the processors.
+# Exit status: the command's own; 124 after the time-out; 69 if no SocketCAN is available, also if user-mode-linux does
+# not boot on this machine; 70 if user-mode-linux booted but ended before the command did.
+# SOCKETCAN_MEMORY (default 1G) is the memory of user-mode-linux; SOCKETCAN_LOCKS (default /tmp/socketcan-UID) is the
+# prefix of the lock files by which concurrent runs share the processors.
 set -u
 
 readonly here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
@@ -92,7 +93,7 @@ install_packages() {
     uml_is_complete || { say "user-mode-linux is still incomplete after installation"; return 1; }
 }
 
-# Prints the library to load before user-mode-linux; nothing where it cannot be made.
+# Prints the path of the library to preload for user-mode-linux; nothing if it cannot be compiled.
 compile_preload() {
     local without="user-mode-linux is tried as it is: not on processors with AMX, and with the machine's own time"
     if ! command -v cc >/dev/null; then
@@ -105,7 +106,7 @@ compile_preload() {
     fi
 }
 
-# Sets `processor` to one of those given that no other user-mode-linux of this script has, while there is one.
+# Sets `processor` to a given one that no other user-mode-linux of this script uses; to any of them if all are in use.
 take_processor() {
     local each held
     for each in "$@"; do
@@ -117,21 +118,20 @@ take_processor() {
     processor=${all[$$ % $#]}
 }
 
-# For Python in user-mode-linux, which also works without.
+# Compiles the library that speeds up Python in user-mode-linux; Python works without it, too.
 compile_for_guest() {
     cc -O2 -shared -fPIC -o "$work/populate.so" "$here/uml/guest/populate.c" 2>/dev/null
 }
 
-# In its own session, so that one signal to the group ends user-mode-linux and every process in it.
+# Runs in a session of its own, so that one signal to the group ends user-mode-linux and every process in it.
 run_uml() {
     export -p | grep -vE '^declare -[a-zA-Z]*r' >"$work/environment"
     printf '%q ' "$@" >"$work/command"
     pwd >"$work/folder"
     : >"$work/stdout" >"$work/stderr"
-    # A kernel's command line cannot hold a path with spaces.
+    # The command line of a kernel cannot contain a path with spaces.
     cp "$here/uml/init.sh" "$work/init.sh"
-    # user-mode-linux and its processes hand over to each other at each system call, which is cheapest on one
-    # processor.
+    # user-mode-linux and its processes switch at each system call, which is cheapest on a single processor.
     local first=() processors
     mapfile -t processors < <(taskset -pc $$ | sed 's/.*: *//' | tr ',' '\n' |
         while IFS=- read -r from to; do seq "$from" "${to:-$from}"; done)
@@ -226,7 +226,7 @@ fi
 uml "$@"
 status=$?
 if [ $status -eq $unavailable ] && [ ! -e "$work/ready" ]; then
-    # Concurrent functional tests are separated by their kernels; here they take turns on the interface.
+    # In user-mode-linux, concurrent tests have separate kernels; on this kernel they take turns on the interface.
     if [ $force_uml = no ] && [ -n "$slowed" ] && exec {turn}>"$locks-native.lock" && flock "$turn" && native; then
         say "with this kernel's vcan instead, and with this machine's time"
         here "$@"

@@ -43,7 +43,7 @@ def shown(*arguments: Any, **channels: Any) -> Capability:
 
 
 def spoken(found: Capability) -> set[str]:
-    """Subjects that are identified or at least visible."""
+    """Returns the subjects that are identified or at least visible."""
     return {*found.identified, *(name for group in found.confused for name in group)} - {*found.unseen}
 
 

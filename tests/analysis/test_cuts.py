@@ -135,7 +135,7 @@ def test_motor_and_flexspline_orders_are_aliases_on_short_travel() -> None:
         "{order: 6, amplitude_arcsec: 3, phase_deg: 57.3}]\n"
         "  - effect: hysteresis\n    parameters: {offset_arcsec: 20, width_deg: 18, exponent: 1.6}\n"
     )
-    for turns, apart in ((1.5, False), (9.0, True)):  # order 2: by 0.15 of a period, or 0.9
+    for turns, apart in ((1.5, False), (9.0, True)):  # order 2 shifts by 0.15 of a period, or by 0.9
         found = diagnose(sweeps(turns=turns), model).findings
         (order,) = (each for each in found if each.cause in ("motor_order", "flexspline_order"))
         assert ("flexspline_order" in (order.cause, *order.aliases)) != apart

@@ -8,7 +8,9 @@ from hdbridge.analysis.linear import solve_symmetric
 
 
 def test_zero_columns_next_to_collinear_columns_stay_at_zero() -> None:
-    """An unused second spring constant, and two orders that coincide on a short arc."""
+    """The columns are those of an unused second spring constant, and of two orders that coincide on a short
+    arc.
+    """
     for seed in range(20):
         rng = np.random.default_rng(seed)
         columns = rng.standard_normal((200, 9)) @ rng.standard_normal((9, 9))

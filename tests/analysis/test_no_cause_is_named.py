@@ -1,4 +1,4 @@
-"""Fit and diagnosis contain nothing specific to one cause; that is in the cause's own file."""
+"""Fit and diagnosis contain nothing specific to one cause, because each cause has a file of its own."""
 
 from __future__ import annotations
 

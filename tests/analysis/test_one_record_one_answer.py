@@ -88,7 +88,7 @@ def test_both_find_the_same_orders_and_loop_with_the_same_uncertainty(seen: Seen
 
 
 def _white(blocks: Blocks) -> Blocks:
-    """Blocks with white noise only."""
+    """Returns the blocks with white noise only."""
     return replace(blocks, locked_arcsec=np.zeros(len(blocks)))
 
 

@@ -22,7 +22,7 @@ COUNT_DEG = 0.018
 
 @pytest.mark.parametrize(("frequency_hz", "damping"), [(25.0, 0.1), (60.0, 0.4)])
 def test_the_load_follows_its_base_according_to_the_equation(frequency_hz: float, damping: float) -> None:
-    """The samples are irregular, and two belong to another record."""
+    """The samples are irregular, and two belong to a different record."""
     rng = np.random.default_rng(1)
     time_s = np.cumsum(rng.uniform(0.5e-3, 1.5e-3, 800))
     natural = math.tau * frequency_hz
@@ -75,7 +75,7 @@ def test_a_quickly_changing_lag_is_not_encoder_noise() -> None:
 def test_fast_moves_of_a_healthy_axis_yield_a_remark_only(
     order: MotorOrder, move_s: float, way_deg: float, every_s: float
 ) -> None:
-    """The record begins in the middle of a move, with the elastic state of the motion before."""
+    """The record begins in the middle of a move, with the elastic state of the preceding motion."""
     step_s, number = 0.0005, 48
     clock_s = np.arange(round(number * 2.0 * move_s / step_s)) * step_s
     move, since_s = np.divmod(clock_s, 2.0 * move_s)
@@ -107,4 +107,4 @@ def test_fast_moves_of_a_healthy_axis_yield_a_remark_only(
     assert np.max(np.abs(lags)) > 5.0
     assert not found.findings
     assert any("swings on its spring at 5" in each for each in found.remarks)
-    assert len(found.traces.rows) == len(rows)  # none is left out
+    assert len(found.traces.rows) == len(rows)  # no sample is left out

@@ -38,7 +38,7 @@ READ = {0x6062, 0x6077, 0x6502, 0x603F}
 
 
 def stepped(axis: AxisConfig) -> tuple[BootReport, Record]:
-    """Boot a simulated drive with the axis's EDS and step the axis."""
+    """Boots a simulated drive with the axis's EDS and steps the axis; returns boot report and record."""
     plan(axis)
     with simulated(axis) as drive:
         report = drive.boot()
@@ -198,7 +198,9 @@ def test_limits_of_the_eds_are_compared_beforehand(tmp_path: Path) -> None:
 
 
 def test_limits_of_a_part_of_a_value_are_not_those_of_the_value(tmp_path: Path) -> None:
-    """Elmo's Gold drives permit 0 to 65535 for 1016h:01, which limits the time; the node id is above it."""
+    """The limits apply to the time in the lower 16 bits of 1016h:01; the node id is in the bits above. Elmo's
+    Gold drives state 0 to 65535.
+    """
     axis = profile_with(tmp_path, stating(OWN, "1016sub1", LowLimit=0, HighLimit=65535))
     assert left_to_drive(axis) == []
     assert [row.value for row in plan(axis) if row.index == 0x1016] == [127 << 16 | 50]
@@ -264,7 +266,9 @@ def test_check_reports_a_missing_mode(tmp_path: Path, modes: str, mode: str, ref
 
 
 def test_interpolated_position_mode_as_the_only_mode(tmp_path: Path, usual: Record) -> None:
-    """As on several harmonic arms: no 607Ah in an RPDO, no option codes, 6502h with PP, VL and IP."""
+    """The dictionary is like that of several drives in robot arms: no 607Ah in an RPDO, no option codes, and
+    6502h lists PP, VL and IP.
+    """
     eds = without(
         OWN, 0x6007, 0x605A, 0x605B, 0x605C, 0x605D, 0x605E, 0x6066, 0x6072, 0x6080, 0x6085, 0x1029, 0x6099
     )
@@ -281,7 +285,8 @@ def test_the_load_encoder_in_an_object_of_the_vendors(tmp_path: Path, usual: Rec
               "source: {index: 0x2030, subindex: 0, type: uint16}")  # fmt: skip
     _, record = stepped(profile_with(tmp_path, without(OWN, 0x60E4) + own, source))
     offset_deg = record.columns["load_position_deg"] - usual.columns["load_position_deg"]
-    assert offset_deg == pytest.approx(0x10000 * 360 / 2_880_000, abs=1e-9)  # negative at the start
+    # The position is negative at the start.
+    assert offset_deg == pytest.approx(0x10000 * 360 / 2_880_000, abs=1e-9)
 
 
 def test_identity_from_the_device_info_section(tmp_path: Path) -> None:

@@ -145,7 +145,7 @@ def test_one_lost_tpdo_freezes_the_correction_and_two_stop_the_axis(axis, model,
     node.faults.drop_tpdos = 1
     (fault_count,) = bench.run(Moves(Dwell(0.1))).fault_counts
     assert (fault_count.what, fault_count.cycles) == (Fault.LOST_TPDO.value, 1)
-    assert bench.run(Moves(Dwell(0.1))).fault_counts == ()  # of this run only
+    assert bench.run(Moves(Dwell(0.1))).fault_counts == ()  # counts of this run only
     assert bench.supervision.counts[Fault.LOST_TPDO] == 1
     node.faults.drop_tpdos = 4
     with pytest.raises(SafetyStop, match="a TPDO is missing"):

@@ -105,14 +105,14 @@ def test_load_dependent_ripple_is_compensated_with_load_torque():
     growth = TorqueModulation.candidate(50.0, model_with().effects).model_copy(
         update={"growth_percent_per_nm": 5.0, "limit_nm": 12.0}
     )
-    stepping = Stepping(count=33, start_deg=60.0)  # where the mass hangs out: 6 to 7 Nm
+    stepping = Stepping(count=33, start_deg=60.0)  # the arm of the mass is nearly horizontal: 6 to 7 Nm
     three_sigma = []
     for model in (model_with(compliance()), model_with(compliance(), growth)):
         with loaded(axis, gear="  torque_growth_per_nm: 0.05\n") as (drive, _):
             run = Bench(drive, compensation_for(axis, model)).run(stepping)
         three_sigma.append(Stepped.of("", run.outcome).pooled.three_sigma_arcsec)
     floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
-    assert three_sigma[0] > 3 * floor  # a third more ripple
+    assert three_sigma[0] > 3 * floor  # the ripple is a third larger
     assert three_sigma[1] < 1.3 * floor
 
 
@@ -127,7 +127,7 @@ def test_a_warm_gear_is_compensated_with_temperature():
             run = Bench(drive, compensation_for(axis, model)).run(Stepping(count=33))
         three_sigma.append(Stepped.of("", run.outcome).pooled.three_sigma_arcsec)
     floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
-    assert three_sigma[0] > 2 * floor  # a fifth more ripple, at 20 K above the reference
+    assert three_sigma[0] > 2 * floor  # the ripple is a fifth larger, at 20 K above the reference
     assert three_sigma[1] < 1.3 * floor
 
 
@@ -155,7 +155,7 @@ def test_an_axis_without_channels_records_none():
 def test_a_missing_torque_is_held_then_faded_out_and_returns_without_a_jump():
     axis = axis_with()
     with loaded(axis) as (drive, node):
-        # 60 degrees take 3.2 s; then the axis stands.
+        # 60 degrees take 3.2 s; then the axis is at rest
         script = Script(cycle_1000=lambda: stops(node), cycle_1250=lambda: resumes(node))
         bench = Bench(drive, compensation_for(axis, model_with(compliance())), interrupted=script)
         record = bench.run(Moves(MoveTo(60.0), Dwell(3.0))).record

@@ -1,4 +1,4 @@
-"""Shared by the tests of the bring-up: the article's axis with one fault, and the findings."""
+"""Fixtures of the bring-up tests: the article's axis with one fault, and the findings of the checks."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -32,7 +32,7 @@ def edited(text: str, changes: dict[str, str]) -> str:
 
 @dataclass
 class Case:
-    """One examination, with the parts that a test may change."""
+    """One run of the doctor's checks, with the inputs that a test may change."""
 
     folder: Path
     axis: dict[str, str] = field(default_factory=dict)

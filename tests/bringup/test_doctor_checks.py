@@ -34,7 +34,8 @@ def test_a_sound_axis_passes_every_check(case: Callable[..., Any]) -> None:
     assert 0.025 < verdicts["heartbeat"].figures["time_s"] < 0.1
     assert 0.016 <= verdicts["set_points"].figures["time_s"] < 0.05
     assert decode(examined.node.firmware.statusword()) is State.SWITCH_ON_DISABLED
-    assert abs(examined.node.firmware.motion.motor_counts) < 4000  # returned, except for the last stop
+    # The motor has returned, except for the last stop.
+    assert abs(examined.node.firmware.motion.motor_counts) < 4000
 
 
 def test_test_motion_turns_toward_the_side_with_room(case: Callable[..., Any]) -> None:
@@ -49,7 +50,7 @@ def test_test_motion_turns_toward_the_side_with_room(case: Callable[..., Any]) -
     ids=["high ratio", "coarse load encoder"],
 )
 def test_other_gears_and_encoders_pass(case: Callable[..., Any], ratio: int, counts: int, turns: int) -> None:
-    """The motor encoder also counts the other way."""
+    """In addition, the motor encoder counts in the opposite direction."""
     verdicts = case(
         axis={
             "  direction: 1\n\nload": "  direction: -1\n\nload",

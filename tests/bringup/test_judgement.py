@@ -131,7 +131,7 @@ def test_most_likely_key_is_reported_first(
         f"{key}: found {said[(RATIO, MOTOR_COUNTS, LOAD_COUNTS).index(key)]}, expected {expected} "
         in (verdict.remedies[0])
     )
-    assert len(verdict.remedies) == 3  # the others are reported as well
+    assert len(verdict.remedies) == 3  # the remedies for the other keys are reported as well
 
 
 @given(factor=st.floats(0.05, 20.0))

@@ -43,7 +43,7 @@ class Logged:
     """Time of SYNC in s, motor, load and demand of the drive in counts."""
 
     def write(self, path: Path, *, skip: Callable[[can.Message], bool] = lambda _: False) -> Path:
-        """Writes the frames by python-can's writer for the file's name."""
+        """Writes the frames with the python-can writer that matches the file's extension."""
         with can.Logger(path) as logger:
             for message in self.messages:
                 if not skip(message):
@@ -52,7 +52,7 @@ class Logged:
 
 
 class Master:
-    """A master of another make: its own PDO order and identifiers, SDO and CSP in raw frames."""
+    """A third-party master: its own PDO order and identifiers, SDO and CSP in raw frames."""
 
     def __init__(self, bus: LockstepBus, clock: VirtualClock) -> None:
         self.bus, self.clock, self.log = bus, clock, Logged()
@@ -83,7 +83,7 @@ class Master:
         assert self.take()[0x581][0] & 0xE3 == 0x43
 
     def map(self, kind: int, number: int, can_id: int, *words: int, sync: int = 1) -> None:
-        """``kind`` is 1800h or 1400h."""
+        """Maps and enables a PDO by SDO; ``kind`` is 1800h for a TPDO and 1400h for an RPDO."""
         communication, mapping = kind + number - 1, kind + 0x200 + number - 1
         self.put(communication, 1, can_id | 0x8000_0000, 4)
         self.put(mapping, 0, 0, 1)
@@ -95,7 +95,9 @@ class Master:
             self.put(communication, 1, can_id, 4)
 
     def boot(self, *, with_demand: bool = True) -> None:
-        """TPDO1 carries load encoder and statusword, TPDO2 torque and position; the target comes first."""
+        """Configures and starts the node. TPDO1 carries load encoder and statusword, TPDO2 torque and
+        position; in the RPDO, the target comes first.
+        """
         self.send(0x000, b"\x80\x01")
         self.read(0x1018, 1)
         self.read(0x1018, 2)
@@ -154,7 +156,7 @@ def logged() -> Logged:
 
 @pytest.fixture(scope="module")
 def without_demand() -> Logged:
-    """The same session without a position demand from the drive."""
+    """The same session without the drive's position demand (6062h)."""
     return driven(with_demand=False)
 
 
@@ -166,7 +168,9 @@ def run(*arguments: object) -> str:
 
 
 def check_angles(recording: Recording, logged: Logged, *, time_s: float = 1e-6) -> slice:
-    """Checks the angles exactly, the time to the format's resolution, and the rows that the master has."""
+    """Compares a recording with the master's own values: angles exactly, times to the format's resolution.
+    Returns the rows of the recording that the master has, too.
+    """
     record, rows = recording.record, np.array(logged.rows)
     motor = np.round(record.motor_position_deg * 8000 / 360.0)
     load = np.round(record.load_position_deg * 2_880_000 / 360.0)
@@ -218,7 +222,7 @@ def test_an_mf4_log_without_its_reader_names_the_extra(tmp_path: Path) -> None:
 def test_without_6062h_the_target_is_the_command(
     tmp_path: Path, without_demand: Logged, logged: Logged
 ) -> None:
-    """Same axis and seed: the drive reaches the target sent two cycles before."""
+    """Axis and seed are the same as with 6062h; the drive reaches the target sent two cycles before."""
     recording = import_log(without_demand.write(tmp_path / "bus.log"), AXIS)
     target = recording.record.motor_target_deg
     assert target is not None

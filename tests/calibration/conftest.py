@@ -1,4 +1,4 @@
-"""A calibrated axis to look at, and the command line as a process."""
+"""Fixtures: a calibrated axis, and the command line as a process."""
 
 import json
 import os
@@ -49,7 +49,7 @@ class Cell:
             env={
                 **os.environ,
                 "OPENBLAS_NUM_THREADS": "1",
-            },  # two small threads only get into each other's way
+            },  # two threads slow down operations on such small matrices
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -20,7 +20,7 @@ validation: {count: 4, cycles: 0}
 
 
 def begun(cell, *arguments):
-    """A calibration in its third task, which is long."""
+    """Starts a calibration; returns its process once the third task, which is long, is running."""
     (cell.folder / "long.yaml").write_text(LONG)
     process = cell.start("calibrate", "axis", "--simulate", "--plan", "long.yaml", "--out", "rec", *arguments)
     about = cell.folder / "rec" / "recording.yaml"

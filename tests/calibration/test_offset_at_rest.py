@@ -63,7 +63,7 @@ validation: {count: 20, step_deg: 43.56}
 
 
 def validated(folder: Path, load_kg_m2: float, stiffness: float, servo: dict, *more: Effect) -> Validation:
-    """Validates the exact model, and more effects, on the article's gear with another load and servo."""
+    """Validates the exact model, and more effects, on the article's gear with a different load and servo."""
     truth = yaml.safe_load((ARTICLE / "truth.yaml").read_text(encoding="utf-8"))
     truth["gear"] |= {"stiffness_nm_per_rad": stiffness, "damping_nm_s_per_rad": 15.0}
     truth["load"]["inertia_kg_m2"] = load_kg_m2

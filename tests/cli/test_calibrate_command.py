@@ -31,7 +31,7 @@ def motor_path(*turning_deg: float, speed_deg_s: float = 90.0, period_s: float =
 
 
 def write(path, motor_deg, columns=("time_s", "motor_position_deg", "load_position_deg"), ratio=RATIO):
-    """Returns a recording of `GEAR` as another program might have made it."""
+    """Writes a recording of `GEAR` as another program might have made it; returns its path."""
     noise = np.random.default_rng(5).normal(0.0, 0.8, len(motor_deg))
     error = GEAR.predict(Motion(motor_deg=motor_deg), Start.FORWARD) + noise
     data = {

@@ -36,7 +36,7 @@ def test_doctor_without_motion(hdbridge):
 
 
 def test_a_real_axis_moves_only_with_consent(hdbridge, monkeypatch):
-    """The bus is simulated, but the command does not know it."""
+    """The bus is simulated, but the command cannot detect that."""
     real = Session.connected
     monkeypatch.setattr(Session, "connected", lambda session: real(replace(session, simulate=True)))
     done = hdbridge("doctor", "article")

@@ -122,7 +122,7 @@ def test_a_pipe_is_written_directly(hdbridge, tmp_path):
 
 
 def test_a_device_is_never_replaced(hdbridge, tmp_path):
-    """Root makes a device node; other users take the terminal's, which they cannot replace anyway."""
+    """Root creates a device node; other users use the terminal's, which they may not replace."""
     device = tmp_path / "null"
     try:
         os.mknod(device, 0o666 | stat.S_IFCHR, os.makedev(1, 3))
@@ -223,7 +223,7 @@ def test_every_output_option_is_guarded():
                     (each for each in getattr(hint, "__metadata__", ()) if hasattr(each, "help")), None
                 )
                 says = (info.help or "") if info else ""
-                names_a_place = bool not in typing.get_args(hint)  # a flag does not
+                names_a_place = bool not in typing.get_args(hint)  # a flag is no output
                 writes = names_a_place and says.startswith("Write")
                 guarded = any(isinstance(each, Kind) for each in getattr(hint, "__metadata__", ()))
                 assert writes == guarded, (name, parameter, says)

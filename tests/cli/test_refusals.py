@@ -38,22 +38,26 @@ RIGHT = {
     "--method": "35", "--model": "axis/model.yaml", "--on": "", "--out": "out", "--manifest": "fleet.csv",
     "OUT": "axis", "FOLDER": "out",
 }  # fmt: skip
-"""Arguments in addition to the wrong value; nothing is ever done with them."""
+"""Valid values for the other arguments of a command that is given one invalid value. The command is refused
+before it uses them.
+"""
 NEEDED = {
     ("diagnose", "--model"), ("record", "export", "--out"), ("record", "import", "--out"),
     ("fleet", "run", "--out"), ("fleet", "run", "--manifest"),
     ("fleet", "watch", "--out"), ("fleet", "watch", "--manifest"),
 }  # fmt: skip
-"""Options that a command needs, except in another use of it."""
+"""Options that are required only in some uses of a command, among them the use tested here."""
 PARENTS_MADE = {
     ("new", "NAME"), ("record", "export", "--out"), ("record", "import", "--out"),
     ("fleet", "run", "--out"), ("fleet", "watch", "--out"), ("fleet", "simulate", "FOLDER"),
 }  # fmt: skip
-"""A missing folder is valid, also with missing parents."""
+"""Arguments for which a missing folder is valid, even if its parents are missing, too."""
 BY_ANOTHER = {("setup", "NAME"), ("setup", "--eds")}
-"""Refused by the command that `setup` prints and runs."""
+"""Arguments that are refused not by `setup` itself but by the command that it prints and runs."""
 PRINTS = {("doctor",)}
-"""Its checks are a list that includes those of the file."""
+"""Commands that print to standard output even if an argument is invalid: `doctor` lists the checks of the
+axis file, which include it.
+"""
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ def test_sets_up_a_compensated_axis_from_scratch(finished):
 
 
 def test_prints_ordinary_commands(finished, tmp_path):
-    """The first three printed commands, run in another folder, have the same effect."""
+    """The first three printed commands, run in a different folder, have the same effect."""
     _, done = finished
     for line in re.findall(r"^\$ hdbridge (.*)", done.stdout, re.M)[:3]:
         again = run_here(tmp_path, *line.split())
@@ -137,7 +137,7 @@ def test_missing_requirements_are_reported(arguments, status, said, tmp_path):
 
 
 def test_nothing_moves_without_consent(tmp_path):
-    """On a terminal, answering no to the first question."""
+    """On a terminal, the user answers no to the first question."""
     parent, child = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, "-m", "hdbridge", "setup", "arm", "--simulate"],

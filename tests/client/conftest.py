@@ -9,7 +9,7 @@ from hdbridge.client import messages
 
 @pytest.fixture
 def api(place):
-    """A machine after start-up, its first axis enabled."""
+    """The API of a machine after start-up, with the first axis enabled."""
     place.bridge.__init__()
     place.bridge.axes["joint-1"].at = messages.ControlState.ENABLED
     return place

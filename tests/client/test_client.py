@@ -181,7 +181,7 @@ def test_a_refused_point_or_an_error_ends_the_stream(client, api):
 def test_samples_are_received_live(client):
     cycles: list[int] = []
     for samples in client.live(every=5, axes=["joint-2"]):
-        if set(samples.axes) == {"joint-2"}:  # as requested, once the request has arrived
+        if set(samples.axes) == {"joint-2"}:  # not yet in samples from before the request arrived
             cycles += samples.cycle
         if len(cycles) > 10:
             break

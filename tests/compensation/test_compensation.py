@@ -63,7 +63,7 @@ def test_inverse_is_exact(model, path, start):
         motor_deg = inverse.solve(load_deg)
         inverse.advance(motor_deg)
         reached = motor_deg / model.ratio + gear.advance(motor_deg, NOW) / 3600
-        # 1e-6 arcsec, or two bits of the motor angle where the law is so steep that this is coarser.
+        # 1e-6 arcsec, or two bits of the motor angle if the law is so steep that two bits are coarser.
         loop = model.effects[1]
         bits = 2 * loop.offset_arcsec * rise_at(2 * math.ulp(motor_deg) / loop.width_deg, loop.exponent)
         assert abs(reached - load_deg) * 3600 <= max(1e-6, 2 * bits)
@@ -152,7 +152,7 @@ def test_within_the_backlash_the_motor_never_reverses():
         inverse.advance(path[-1])
     steps = -np.diff(path)
     assert np.all(steps > 0.0)
-    # It takes up the lost motion on either side, then continues at the commanded rate.
+    # The motor takes up the lost motion on either side, then continues at the commanded rate.
     assert steps[0] > 3 * 50e-4
     assert steps[-1] == pytest.approx(50e-4, rel=1e-3)
 

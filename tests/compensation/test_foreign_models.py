@@ -1,4 +1,4 @@
-"""Models of another gear, axis or drive cause no motion; limits that cut a model are reported."""
+"""Models of a different gear, axis or drive cause no motion; limits that cut a model are reported."""
 
 from dataclasses import replace
 from pathlib import Path

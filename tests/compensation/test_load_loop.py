@@ -55,7 +55,7 @@ class Plant:
         return self.lag - self.its.value_arcsec
 
     def move(self, target: float, seconds: float = 1.0) -> float:
-        """Moves to another angle and rests there."""
+        """Moves to an angle and rests there."""
         self.target = target
         self.step(moving=True)
         return self.rest(seconds)
@@ -64,7 +64,7 @@ class Plant:
         self.frozen = self.target + self.its.value_arcsec - self.lag
 
 
-# ---------------------------------------------------------------- the value
+# ---------------------------------------------------------------- the correction
 
 
 @given(
@@ -126,7 +126,7 @@ def test_a_reset_continues_from_its_value(value):
     assert its.step(3.0, 0.0, 0.0, moving=False) == value
 
 
-# ---------------------------------------------------------------- the doubt
+# ---------------------------------------------------------------- doubt about the load encoder
 
 
 @given(
@@ -257,7 +257,7 @@ def test_switching_on_again_ends_a_doubt():
     assert plant.its.doubt == ""
 
 
-# ---------------------------------------------------------------- what it is made from
+# ---------------------------------------------------------------- parameters from the model
 
 
 @pytest.mark.parametrize("law", [Hysteresis, HysteresisMemory])

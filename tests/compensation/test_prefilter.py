@@ -72,7 +72,7 @@ def test_correction_at_rest_equals_the_static_one_bit_for_bit(measured, moves):
             filtered.command(place + step)
             static.command(place + step)
         place += far
-    for _ in range(60):  # the filter's reach, and the ramp
+    for _ in range(60):  # length of the filter and of the ramp
         one, other = filtered.command(place), static.command(place)
     assert one == other
     assert filtered.correction_arcsec == static.correction_arcsec
@@ -106,7 +106,7 @@ def test_at_constant_speed_each_order_has_the_gain_of_the_filter(speed_deg_s):
     missed=st.sets(st.integers(0, 60)),
 )
 def test_size_and_slew_limits_hold_for_the_filtered_correction(measured, targets, missed):
-    """Also with targets that jump, as after a re-targeted move, a stop or a missed cycle."""
+    """The limits also hold if the targets jump, as after a re-targeted move, a stop or a missed cycle."""
     limits = CompensationLimits(maximum_arcsec=15.0, slew_arcsec_s=1000.0, ramp_s=0.0)
     compensation = begun(model(measured), limits)
     before, place = 0.0, 0.0
@@ -163,9 +163,9 @@ def test_model_file_keeps_the_response(tmp_path):
 @settings(deadline=None, max_examples=20)
 @given(measured=filters, far_deg=st.floats(0.3, 10.0))
 def test_no_filter_reverses_the_motor_at_the_end_of_a_move(measured, far_deg):
-    """The load would stay on the wrong side of its hysteresis."""
+    """After a reversal, the load would stay on the wrong branch of its hysteresis loop."""
     filtered = begun(model(measured))
     targets = [*smooth_move(far_deg, math.sqrt(far_deg / 8.0)), *[far_deg] * 60]
     motor = np.array([filtered.command(target) for target in targets])
-    late = motor[-75:]  # the slowest part, and the filter's reach
+    late = motor[-75:]  # the slowest part of the move, and the length of the filter
     assert late.max() - motor[-1] < 0.01

@@ -38,7 +38,7 @@ def flat(hertz: float) -> complex:
 
 
 def resonance(hz: float, damping: float):
-    """A servo behind a notch: its inverse has a narrow peak."""
+    """Returns the response of a servo with a notch filter; its inverse has a narrow peak."""
 
     def answer(hertz: float) -> complex:
         s = 1j * hertz / hz
@@ -60,7 +60,7 @@ def runs(answer, filters=None, noise_arcsec: float = 0.0, seed: int = 0) -> tupl
             applied = 0.0 if filters is None else 1.0
             if filters:
                 applied = complex(gain(filters, np.array([hertz]), CYCLE_S)[0])
-            # The angle runs with the target, so a late error is late by the lag.
+            # The error is a function of the target angle, so it reaches the load with the lag of the axis.
             value = size * (late - answer(hertz) * applied)
             value = value.conjugate() if speed < 0.0 else value
             values.append(value + noise_arcsec * complex(*rng.standard_normal(2)))
@@ -78,7 +78,7 @@ def measured(answer, explore: bool = False, trials=(), noise_arcsec: float = 0.0
 
 
 def left(answer, filters, hertz: np.ndarray) -> np.ndarray:
-    """Share of an order that remains at some frequencies."""
+    """Returns the fraction of an order that remains after the correction, at each frequency."""
     late = np.exp(-2j * math.pi * hertz * LAG_S)
     effect = np.array([answer(each) for each in hertz]) * gain(filters, hertz, CYCLE_S)
     return abs(1.0 - effect / late)
@@ -105,7 +105,7 @@ def test_the_filter_has_no_peak_where_nothing_was_measured():
 
 
 def test_a_run_that_explores_extends_the_known_range():
-    """The static correction has no effect at high frequencies that could be seen in the noise."""
+    """Without exploration, the static correction has no effect at high frequencies that exceeds the noise."""
 
     def answer(hertz: float) -> complex:
         return 1.0 / (1.0 + 1j * hertz / 15.0) ** 2

@@ -87,7 +87,7 @@ def wraps_pdos(check: str, text: str, kind: str, name: str, make: Callable[[Meth
 
 
 def entry(check: str, text: str, index: int, sub: int, **changes: Any) -> Fault:
-    """Gives a dictionary entry another value or guard."""
+    """Changes the value or the guard of a dictionary entry."""
 
     def seed(patch: Any, node: DriveNode, bus: Spoiled) -> None:
         for name, value in changes.items():

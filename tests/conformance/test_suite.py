@@ -60,7 +60,7 @@ def test_the_slave_of_a_gateway_conforms(tmp_path):
 
 
 def test_a_node_of_durand(tmp_path):
-    """The deviations of another stack are found, and its correct behaviour passes."""
+    """The deviations of a different CANopen stack are found, and its correct behaviour passes."""
     with durand_drive() as (bus, drive):
         path = tmp_path / "durand.eds"
         path.write_text(drive.node.eds.content, encoding="utf-8")

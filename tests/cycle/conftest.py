@@ -82,7 +82,7 @@ class Rig:
         return self.cycle.period_s
 
     def bad_target(self, counts: float) -> None:
-        """Returns the command of the next cycle."""
+        """Makes the next cycle command this target, motor counts."""
         self.bad = counts
 
     def move(self, cycles: int = 1) -> Feedback:
@@ -175,7 +175,7 @@ def rig(profile: Path = PROFILE, character: Character = FRIENDLY) -> Iterator[Ri
 
 @pytest.fixture
 def idle() -> Iterator[Rig]:
-    """Booted, not enabled."""
+    """Booted, but not enabled."""
     with rig() as made:
         yield made
 

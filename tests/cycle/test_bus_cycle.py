@@ -1,4 +1,4 @@
-"""One control cycle for several axes: order, silent axes, joining and leaving, figures of a turn."""
+"""One control cycle for several axes: order, silent axes, joining and leaving, figures of a cycle."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_one_load_encoder_node_cannot_be_two_axes() -> None:
             pair.cycle.join(with_encoder(2))
 
 
-# ------------------------------------------------------------------ figures of a turn
+# ------------------------------------------------------------------ figures of a cycle
 
 
 def test_reports_lateness_and_load_of_a_turn(pair: TwoAxes) -> None:
@@ -193,7 +193,7 @@ def test_bus_load_of_a_turn_matches_its_frames(pair: TwoAxes) -> None:
         seen = 0
         while (message := pair.intruder.recv(0)) is not None:
             seen += frame_bits(len(message.data))
-        # A heartbeat that arrives after the end of a turn counts in the next one.
+        # A heartbeat that arrives after the end of a cycle counts in the next one.
         assert cycle.bus_load * 4000 == pytest.approx(seen, abs=2 * frame_bits(1))
     configs = [axis.image.axis for axis in pair.axes]
     most = bus_load(configs, 1_000_000)

@@ -74,7 +74,9 @@ def test_a_drive_fault_stops_the_axis_and_is_named(moving) -> None:
 
 @pytest.mark.parametrize("stays", [False, True], ids=["leaves operational", "stays operational"])
 def test_a_stall_of_the_control_process_is_reported_as_such(moving, stays: bool) -> None:
-    """The drive timed out its master meanwhile; neither an NMT master nor an enable input is the cause."""
+    """Meanwhile the drive's time-out for its master has expired; neither an NMT master nor an enable input is
+    the cause of its stop.
+    """
     moving.node.faults.stay_operational = stays
     moving.move()
     moving.clock.sleep_until(moving.clock.now() + 0.4)

@@ -74,7 +74,7 @@ def test_a_missing_processor_is_reported() -> None:
 
 def test_a_fit_runs_without_priority_and_motion_within_it_with():
     with suspended_realtime(), resumed_realtime():
-        assert gc.isenabled()  # without preparation there is nothing to change
+        assert gc.isenabled()  # without real-time settings there is nothing to suspend
     with prepare_realtime(priority=0):
         assert not gc.isenabled()
         with suspended_realtime():

@@ -1,4 +1,4 @@
-"""The fault table: each row, and laws over any sequence of cycles."""
+"""The fault table: each row, and invariants that hold for any sequence of cycles."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hdbridge.errors import SafetyStop
 
 GO, FREEZE, STOP, LATCH = Reaction.GO, Reaction.FREEZE, Reaction.QUICK_STOP, Reaction.LATCH
 EXPECTED = {
-    # fault: reactions to the first, second and third consecutive cycle with it
+    # Fault, and its reactions in the first, second and third consecutive cycle.
     Fault.LOST_TPDO: (FREEZE, STOP, STOP),
     Fault.OVERRUN: (GO, STOP, STOP),
     Fault.DUPLICATE_TPDO: (GO, GO, GO),

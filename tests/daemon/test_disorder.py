@@ -1,9 +1,9 @@
 """Random commands, faults and failing services in any order.
 
-The laws (`support.daemonlaws`) are checked on every frame that leaves the loop: no target outside the limits,
-stale at enable, or farther from the last than the limits of velocity and slew allow; no power without an
-ENABLE command since it was last taken away; nothing to an axis that is not verified; each command answered
-once.
+The invariants (`support.daemonlaws`) are checked on every frame that leaves the loop: no target outside the
+limits, stale at enable, or farther from the previous target than the limits of velocity and slew allow; no
+power without an ENABLE command since power was last removed; no RPDO to an axis that is not verified; each
+command answered once.
 """
 
 import errno
@@ -85,7 +85,7 @@ class Disorder(RuleBasedStateMachine):
 
     def post(self, kind: CommandKind | int, axis: int = 0, **fields: float) -> None:
         with suppress(MailboxFullError):
-            # The laws must see the command before a turn takes it.
+            # The invariants must see the command before a cycle takes it.
             self.laws.post(kind, axis, self.daemon.post(kind, axis, **fields))  # type: ignore[arg-type]
 
     def go(self, number: int = 1) -> None:
@@ -145,7 +145,7 @@ class Disorder(RuleBasedStateMachine):
     @precondition(stopped)
     @rule()
     def start_again(self) -> None:
-        """The same rule again, so that a restart is frequent."""
+        """Duplicates the rule `start`, so that a restart is drawn more often."""
         self.start()
 
     @rule(axis=axes, number=turns)
@@ -208,7 +208,9 @@ class Disorder(RuleBasedStateMachine):
         number=turns,
     )
     def stream_smoothly(self, mask: int, travel: float, knots: int, before: bool, number: int) -> None:
-        """A path from the present positions, complete or cut short, with knots queued before or after."""
+        """Streams a path from the current positions, complete or cut short, with knots queued before or after
+        the stream begins.
+        """
         self.stream += 1
         if not before:
             self.post(K.STREAM_BEGIN, 0, a=0.1, i=mask, j=self.stream)
@@ -271,7 +273,7 @@ class Disorder(RuleBasedStateMachine):
         number=turns,
     )
     def outgoing(self, can_id: int, data: bytes, number: int) -> None:
-        # The laws do not cover a node that the service has reconfigured; they cover restarts and reads.
+        # The invariants do not cover a node that the service has reconfigured; they cover restarts and reads.
         if 0x600 <= can_id < 0x680 and data and data[0] >> 5 not in (2, 3, 4):
             data = b"\x40" + data[1:]
         self.daemon.memory.outgoing.add(RelayedFrame(0, can_id, data))
@@ -314,7 +316,7 @@ class Disorder(RuleBasedStateMachine):
         if can_id == 0x701 or can_id == 0x702:
             data = data[:1]
         if 0x181 <= can_id <= 0x182 or 0x281 <= can_id <= 0x282:
-            return  # reports a false position: see `lying_tpdo`
+            return  # the drive reports a false position: see `lying_tpdo`
         self.daemon.interfere(can_id, data)
         self.go(number)
 

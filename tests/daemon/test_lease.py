@@ -91,7 +91,7 @@ def test_a_wrong_token_changes_nothing(lease: Lease, time: Time, token: str) -> 
 
 
 class Disorder(RuleBasedStateMachine):
-    """Against a model that is nothing but the rules in words."""
+    """Compares the lease with a model that implements only the documented rules."""
 
     def __init__(self) -> None:
         super().__init__()

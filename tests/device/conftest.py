@@ -1,4 +1,4 @@
-"""Shared by the tests of the simulated drive: a motor without physics, a master of raw frames."""
+"""Fixtures for the simulated drive: a motor without physics, and a master of raw frames."""
 
 import struct
 from collections.abc import Iterator
@@ -40,7 +40,7 @@ class RawMaster:
         return self.take()
 
     def emergencies(self) -> list[int]:
-        """Codes of all EMCY frames so far."""
+        """Returns the codes of all EMCY frames so far."""
         self.take()
         return [data[0] | data[1] << 8 for can_id, data in self.seen if can_id == 0x081]
 
@@ -50,12 +50,12 @@ class RawMaster:
     # SDO
 
     def request(self, data: bytes) -> bytes:
-        """One SDO request of eight bytes and its answer."""
+        """Sends an SDO request of eight bytes and returns its answer."""
         (answer,) = self.requests(data)
         return answer
 
     def requests(self, data: bytes) -> list[bytes]:
-        """One SDO request of eight bytes and all its answers."""
+        """Sends an SDO request of eight bytes and returns all its answers."""
         self.take()
         self.send(0x601, data)
         return [data for can_id, data in self.take() if can_id == 0x581]
@@ -90,7 +90,7 @@ class RawMaster:
 
     @property
     def state(self) -> str:
-        """The power state, decoded as CiA 402 tabulates the statusword."""
+        """Returns the power state, decoded as CiA 402 tabulates the statusword."""
         word = self.statusword
         if word & 0x4F in (0x00, 0x40, 0x0F, 0x08):
             return {0x00: "not ready", 0x40: "disabled", 0x0F: "reaction", 0x08: "fault"}[word & 0x4F]
@@ -112,7 +112,9 @@ class RawMaster:
     def cycle(
         self, word: int = 0x0F, target: int | None = None, period_s: float = PERIOD_S
     ) -> tuple[int, ...]:
-        """SYNC, both TPDOs, RPDO, one period of time: (status, actual, torque, load, demand)."""
+        """Runs SYNC, both TPDOs, RPDO and one period of time; returns (status, actual, torque, load,
+        demand).
+        """
         self.take()
         self.send(0x080)
         frames = [frame for frame in self.take() if frame[0] in (0x181, 0x281)]

@@ -11,7 +11,7 @@ REACHED, LIMIT, BIT_12, BIT_13, REFERENCED = 0x0400, 0x0800, 0x1000, 0x2000, 0x4
 
 
 def set_point(master, target: int, bits: int = 0) -> None:
-    """The handshake of profile position mode, up to the withdrawn request."""
+    """Performs the handshake of profile position mode, up to the withdrawn request."""
     master.put(0x607A, 0, target, 4)
     master.control(0x1F | bits)
     assert master.statusword & BIT_12
@@ -109,7 +109,7 @@ def test_targets_stay_within_the_software_limits(master, start, target):
         master.cycle(0x0F, start)
     for _ in range(4):
         row = master.cycle(0x0F, target)
-    assert row[1] == (100 if target > 0 else -100)  # however far away, it is on that side
+    assert row[1] == (100 if target > 0 else -100)  # on that side, however far away the target is
     assert row[0] & LIMIT
     for _ in range(3):
         row = master.cycle(0x0F, 0)
@@ -207,7 +207,7 @@ def test_pp_target_reached_needs_the_window_for_its_time(master, motor):
 
 @pytest.mark.parametrize("behaviour", [Behaviour(), Behaviour(controlword=Controlword.LEVEL)])
 def test_a_halt_in_the_word_that_enables_holds_the_axis(motor, behaviour):
-    """ros2_canopen enables this way."""
+    """ros2_canopen enables with halt set, and clears it afterwards."""
     with lockstep_bench(motor, EDS, behaviour=behaviour) as (bus, clock, node):
         master = RawMaster(bus, clock, node, motor)
         master.put(0x6060, 0, 8, 1)

@@ -1,4 +1,4 @@
-"""Laws of the drive's own velocity profiles."""
+"""Invariants of the drive's own velocity profiles."""
 
 import pytest
 from hypothesis import given

@@ -26,7 +26,9 @@ def test_a_repeated_controlword_does_not_enable_again(master):
     [(0, None, "disabled"), *[(k, (20e3, 50e3, 80e3, 80e3)[(k - 1) % 4], None) for k in range(1, 9)]],
 )
 def test_quick_stop_by_605a(master, motor, option, decel, state):
-    """Distance v^2 / 2a on the ramp that the option names; 1 to 4 switch off after it, 5 to 8 stay."""
+    """The stop takes the distance v^2 / 2a on the ramp that the option names. After it, options 1 to 4 switch
+    power off; 5 to 8 do not.
+    """
     for index, value in ((0x6084, 20_000), (0x6085, 50_000), (0x60C6, 80_000)):
         master.put(index, 0, value, 4)
     master.put(0x605A, 0, option, 2)
@@ -130,10 +132,10 @@ def test_following_error_is_a_fault(master, motor):
         master.cycle(0x0F, target)
     for _ in range(3):
         master.cycle(0x0F, target)
-    assert master.emergencies() == []  # not beyond the window
+    assert master.emergencies() == []  # the following error stays within the window
     for _ in range(5):
         master.cycle(0x0F, 200)
-    assert master.emergencies() == []  # not for longer than the time
+    assert master.emergencies() == []  # the following error does not last longer than its time-out
     for _ in range(4):
         status = master.cycle(0x0F, 200)[0]
     assert master.emergencies() == [0x8611]

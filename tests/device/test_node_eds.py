@@ -108,7 +108,7 @@ def test_objects_missing_in_the_eds_are_absent_and_the_drive_still_works(bench, 
 
 
 def test_a_period_of_zero_is_that_of_sync(bench, motor):
-    """As Elmo's SimplIQ drives describe 60C2h."""
+    """The EDS of Elmo's SimplIQ drives describes 60C2h in this way."""
     with bench(
         (r"(\[60C2sub1\][^[]*?)DefaultValue=.*\n(?:LowLimit=.*\n)?", r"\g<1>DefaultValue=0\n")
     ) as master:

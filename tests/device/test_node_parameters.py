@@ -39,7 +39,7 @@ def test_stored_parameters_survive_a_reset_and_the_process(tmp_path):
         assert master.read(0x607A) == 0
         default = master.node.dictionary[0x6065, 0].default
         assert master.write(0x1011, 1, LOAD, 4) == 0
-        assert master.read(0x6065) == 1234  # until the next reset
+        assert master.read(0x6065) == 1234  # the value holds until the next reset
         master.nmt(129)
         assert master.read(0x6065) == default
     for content in (

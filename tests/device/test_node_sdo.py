@@ -32,5 +32,6 @@ def test_any_requests_are_answered_by_whole_frames(master, requests):
         answers = [answer for can_id, answer in master.take() if can_id == 0x581]
         assert all(len(answer) == 8 for answer in answers)
         assert len(answers) <= (127 if len(data) == 8 else 0)
-    master.send(0x601, struct.pack("<BHBI", 0x80, 0, 0, 0x05040000))  # a block may have begun
+    # Aborts a block transfer that may have begun.
+    master.send(0x601, struct.pack("<BHBI", 0x80, 0, 0, 0x05040000))
     assert master.read(0x1018, 2) == 0x402

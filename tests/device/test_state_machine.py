@@ -62,7 +62,7 @@ ALSO = {
     "7 by quick stop": (READY, "quick stop", DISABLED),
     "10 by quick stop": (ON, "quick stop", DISABLED),
 }
-"""Further transitions that CiA 402 names in the text of the same numbers."""
+"""Further transitions, which CiA 402 describes in its text under the same numbers."""
 
 
 def matches(pattern: str, word: int) -> bool:
@@ -99,7 +99,7 @@ class Slow(PowerStage):
         self.wanted, self.left = on, self.takes
 
     @property
-    def is_on(self) -> bool:  # asked once a period, and at once
+    def is_on(self) -> bool:  # read at the command, then once per period
         self.left -= 1
         return self.wanted and self.left < 0
 
@@ -171,7 +171,7 @@ class Slave:
             if word == 0x0F and self.stage.takes:
                 self.wait(0.004 * (self.stage.takes + 2))
         if state in (FAULT, REACTION):
-            if state == REACTION:  # in a move, which then ends on a ramp
+            if state == REACTION:  # in the middle of a move, which then ends on a ramp
                 self.put(0x607A, 0, round(self.motor.position) + 1_000_000, 4)
                 self.control(0x1F)
                 self.wait(0.06)
@@ -248,7 +248,7 @@ def test_every_controlword_while_power_is_being_switched_on(behaviour):
             wanted = expected(ON, word, 0x0F)
             assert node.state == (ON if wanted == ENABLED else wanted), f"{word:02X}h"
             node.wait(0.004 * 8)
-            pending = word & 0x80  # not a command, so the earlier request stands
+            pending = word & 0x80  # no command, so the earlier request remains valid
             assert node.state in ({ON, ENABLED} if pending else {wanted}), f"{word:02X}h"
 
 
@@ -291,7 +291,9 @@ def lose(node: Slave, option: int) -> None:
 
 
 def after(event: str, state: str) -> tuple[str, ...]:
-    """State that CiA 402 and the option codes give after an event, once the axis is at rest."""
+    """Returns the state that CiA 402 and the option codes require after an event, once the axis is at
+    rest.
+    """
     powered = state in POWERED
     if event == "reset node":
         return (DISABLED,)

@@ -60,12 +60,14 @@ def test_a_known_spring_is_not_replaced_by_load_encoder_eccentricity(
 
 @pytest.mark.slow
 def test_eccentricity_next_to_known_springs(run_out: Callable[[int], tuple[float, Diagnosis]]) -> None:
-    """Without a prior, 8 of 8 compliances were wrong; 5 of 6 right is then less likely than 1e-6."""
+    """Without a prior, 8 of 8 compliances were wrong; with an error rate that high, 5 right ones of 6 have a
+    probability below 1e-6.
+    """
     assert sum(holds(*run_out(seed)) for seed in SEEDS) >= 5
 
 
 def test_parts_are_as_wide_as_the_model_file_says(model: TransmissionModel) -> None:
-    """The loop gets the 95 % half widths of the file; orders without any get 4 %, at least 0.1 arcsec."""
+    """The loop gets the file's 95 % half widths; orders without an interval get 4 %, at least 0.1 arcsec."""
     loop = next(place for place, each in enumerate(model.effects) if each.name == "hysteresis")
     parts = calibrated(
         model.effects,

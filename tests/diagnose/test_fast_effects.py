@@ -90,7 +90,7 @@ def test_a_damaged_tooth_is_named_next_to_a_load_order(plant: ModuleType) -> Non
 
 
 def test_an_unattributed_arcsec_is_unexplained(plant: ModuleType) -> None:
-    """The error varies slowly in motion, by 1.7 arcsec rms; the motor encoder's count adds 0.9 arcsec rms."""
+    """The error varies slowly in motion, by 1.7 arcsec rms; the motor encoder's counts add 0.9 arcsec rms."""
     record = plant.record(plant.Truth(), plant.Plan(rate_hz=16.0, scale=0.1, load_turns=1.05, steps=8), 71)
     time_s = record["time_s"]
     decay = float(np.exp(time_s[0] - time_s[1]))

@@ -115,7 +115,7 @@ def test_two_speeds_separate_place_from_time(legs: list[tuple[float, float]], al
 def test_equal_steps_over_many_lines_do_not_show_line_errors(
     legs: list[tuple[float, float]], resolved: bool
 ) -> None:
-    """At 4 motor turns per second, the load passes 7.2 of 1800 lines between two samples."""
+    """At 4 motor turns per second, the load passes 7.2 of its encoder's 1800 lines between two samples."""
     lines = SubdivisionalError(
         lines_per_turn=1800, orders=(MotorOrder(order=1, amplitude_arcsec=3.0, phase_deg=0.0),)
     )

@@ -99,4 +99,4 @@ def test_a_stretch_does_not_predict_itself():
     values = np.where((TIME_S > 400.0) & (TIME_S < 405.0), 5.0, 0.0)  # within one stretch
     prediction = predicted(Coordinate("time", "s", TIME_S, bins=25), values, DIRECTION, folds(TIME_S))
     assert np.all(prediction[values > 0.0] == 0.0)
-    assert np.max(prediction) > 0.0  # but it predicts its neighbours
+    assert np.max(prediction) > 0.0  # but the stretch predicts its neighbours

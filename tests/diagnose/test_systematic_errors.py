@@ -1,4 +1,4 @@
-"""Tests that intervals include systematic errors: those of another law, or of a hidden similar effect."""
+"""Tests that intervals include systematic errors, due to a different law or to a hidden similar effect."""
 
 from __future__ import annotations
 
@@ -147,7 +147,8 @@ def test_wind_up_of_a_swinging_load_is_within_its_interval(
         turn = 2.0 * np.pi * rng.uniform(18.0, 30.0)
         time_s, motor, _ = plant.path(plan, np.random.default_rng(seed))
         acceleration = np.gradient(np.gradient(motor, time_s), time_s)
-        fast = 2.0 / (time_s[1] - time_s[0])  # 1 / (s^2 + 0.3 turn s + turn^2) by s = fast (z - 1) / (z + 1)
+        # Bilinear transform of 1 / (s^2 + 0.3 turn s + turn^2) by s = fast (z - 1) / (z + 1).
+        fast = 2.0 / (time_s[1] - time_s[0])
         first, last = (fast**2 + sign * 0.3 * turn * fast + turn**2 for sign in (1.0, -1.0))
         back = [1.0, 2.0 * (turn**2 - fast**2) / first, last / first]
         swung = filtered([1.0, 2.0, 1.0], back, acceleration) / first

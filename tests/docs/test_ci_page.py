@@ -23,7 +23,7 @@ def run(pytester: pytest.Pytester, *arguments: str) -> pytest.RunResult:
 
 
 def test_the_example_in_lockstep(pytester):
-    """Also the example with canopen, which states by its marker that it needs real time."""
+    """The example with canopen is skipped, because its marker states that it needs real time."""
     run(pytester).assert_outcomes(passed=13, skipped=1)
 
 
@@ -37,7 +37,7 @@ def main(interface, channel):
 
 
 def test_the_example_in_real_time(pytester):
-    """Includes the first lines of the page."""
+    """The run includes the first lines of the page."""
     pytester.makepyfile(my_program=MY_PROGRAM)
     (lines,) = re.findall(
         r"\n\n((?: {4}.*\n)*? {4}def test_my_program.*\n(?: {4}.*\n)*)", ci_page.PAGE.read_text("utf-8")
@@ -54,7 +54,7 @@ def test_the_example_in_two_processes(pytester):
 
 
 def steps() -> list[str]:
-    """The commands of the workflow."""
+    """Returns the commands of the workflow."""
     workflow = yaml.safe_load(ci_page.WORKFLOW.read_text("utf-8"))
     return [step["run"] for job in workflow["jobs"].values() for step in job["steps"] if "run" in step]
 

@@ -104,7 +104,7 @@ def test_every_page_is_in_the_index():
 
 @pytest.mark.parametrize("number", range(len(API_EXAMPLES)))
 def test_examples_of_the_library_run(number, tmp_path, monkeypatch, capsys):
-    """Each example is a program of its own; its expected output, if stated, follows `# ->`."""
+    """Each example is a separate program; its expected output, if stated, follows `# ->`."""
     monkeypatch.chdir(tmp_path)
     program = API_EXAMPLES[number]
     exec(compile(program, f"docs/api.md, example {number + 1}", "exec"), {"__name__": "__main__"})

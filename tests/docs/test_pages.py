@@ -33,7 +33,7 @@ def test_documented_commands_give_the_documented_output(path, tmp_path):
 
 @pytest.mark.parametrize("path", RUN, ids=_name)
 def test_each_command_of_a_page_is_run_or_left_out_for_a_reason(path):
-    """Commands in blocks of another kind would never be run."""
+    """Commands in blocks of other kinds would never be run."""
     text = path.read_text(encoding="utf-8")
     blocks = [block for block in pages.FENCE.finditer(text) if block["kind"] in ("", "text")]
     loose = [

@@ -1,4 +1,4 @@
-"""Shared by the tests of the master: an axis description, and a bus whose peers answer in lockstep."""
+"""Fixtures for the tests of the master: an axis description, and a bus whose peers answer in lockstep."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -41,7 +41,7 @@ AXIS: dict[str, Any] = {
 
 
 def make_axis(**changes: Any) -> AxisConfig:
-    """The axis above; ``changes`` are dotted names, with two underscores for the dot."""
+    """Returns the axis above with changes: keys are dotted names with two underscores for each dot."""
     return AxisConfig.model_validate(with_keys(AXIS, changes))
 
 

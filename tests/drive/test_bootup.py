@@ -211,7 +211,7 @@ STATED = {
 
 @pytest.fixture
 def stated(bus: Any, clock: Any, tiny: Any, build_axis: Callable[..., AxisConfig]) -> Drive:
-    """A drive whose axis file states all of these."""
+    """Provides a drive whose axis file states all options of `STATED`."""
     axis = build_axis(**{f"drive__{key}": value for key, value in STATED.items()})
     return Drive(bus, axis, clock, tiny.od, sdo_timeout_s=0.1)
 
@@ -273,7 +273,7 @@ def test_a_write_only_object_is_written(drive: Drive, tiny: Any) -> None:
     tiny.od[0x605A].access_type = "wo"
     tiny.scripts[0x605A, 0] = lambda request: [b"\x60" + request[1:4] + bytes(4)]
     assert 0x605A in {row.index for row in drive.boot().written}
-    tiny.od[0x605A].access_type = "rw"  # unlike the drive itself
+    tiny.od[0x605A].access_type = "rw"  # the EDS permits reading, the drive does not
     tiny.scripts[0x605A, 0] = lambda request: [
         b"\x80" + request[1:4] + (0x06010001).to_bytes(4, "little")
         if request[0] >> 5 == 2

@@ -98,7 +98,7 @@ def test_missing_readings_are_held_then_lost_and_may_return() -> None:
     assert each.step() == (Fault.CHANNEL_LOST, "load_torque: none arrived")
     assert each.value is None
     assert each.lost
-    assert each.step() is None  # said once
+    assert each.step() is None  # the fault is reported only once
     each.accept(2000)
     assert (each.step(), each.value, each.lost) == (None, 2.0, False)
 

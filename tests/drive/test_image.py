@@ -22,7 +22,7 @@ def tpdo1(statusword: int, position: int, torque: int = 0) -> bytes:
 
 
 def sent(frames: Frames) -> tuple[int, ...]:
-    """Controlword and target of the one RPDO."""
+    """Returns controlword and target of the only RPDO."""
     ((can_id, data),) = frames
     assert can_id == 0x201
     return struct.unpack("<Hi", data)
@@ -176,7 +176,7 @@ def test_in_ip_no_other_word_than_enable_operation_has_the_bit(
 
 @pytest.fixture
 def other(tmp_path: Path, build_axis: Callable[..., AxisConfig]) -> Callable[[str], ProcessImage]:
-    """The image of a drive with another EDS."""
+    """Returns the image of a drive with a different EDS."""
 
     def make(eds: str) -> ProcessImage:
         path = tmp_path / "drive.eds"

@@ -37,7 +37,7 @@ def drive(
 
 
 def cycle(drive: Drive, clock: Any, target_counts: int | None) -> None:
-    """One SYNC, its TPDOs, and the next set-point; None is the actual position."""
+    """Runs SYNC and its TPDOs, and sends the next set-point; None stands for the actual position."""
     image, link = drive.image, drive.link
     clock.sleep_until(clock.now() + drive.axis.drive.cycle_s)
     link.send(image.sync_id, b"")

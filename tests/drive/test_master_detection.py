@@ -31,7 +31,9 @@ SDO_REQUEST = (0x601, b"\x40\x00\x10\0\0\0\0\0")
 def bench(
     *frames: tuple[int, bytes], period_s: float = 0.1
 ) -> Iterator[tuple[can.BusABC, VirtualClock, can.BusABC]]:
-    """Master's end of a bus on which another node sends ``frames``, and a witness of the sent frames."""
+    """Provides the master's end of a bus on which another node sends ``frames``, and a witness of the sent
+    frames.
+    """
     channel = f"detection-{uuid4()}"
     truth = Truth.load(bundled_profile("article"))
     with ExitStack() as stack:
@@ -133,7 +135,7 @@ def test_one_master_per_interface_on_a_machine(tmp_path: Path) -> None:
 def test_holders_of_all_interfaces_are_listed(tmp_path):
     assert holders(tmp_path) == {}
     with InterfaceLock("socketcan", "can0", tmp_path), InterfaceLock("slcan", "/dev/ttyUSB0", tmp_path):
-        (tmp_path / "hdbridge-socketcan-can7.lock").touch()  # of one that has ended
+        (tmp_path / "hdbridge-socketcan-can7.lock").touch()  # the lock of a process that has ended
         (tmp_path / "another.lock").touch()
         found = holders(tmp_path)
     assert list(found) == [os.getpid()]
@@ -156,7 +158,7 @@ def test_an_unusable_lock_is_reported(tmp_path: Path) -> None:
 
 
 def test_opening_a_bus_takes_the_lock(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The kind of interface does not matter: it is not opened before the lock is held."""
+    """The lock is required for every kind of interface: no interface is opened before the lock is held."""
     monkeypatch.setattr("hdbridge.drive.interfacelock._folder", lambda: tmp_path)
     settings = AXIS.on_bus(interface="socketcan", channel="absent0").bus
     with InterfaceLock("socketcan", "absent0"):

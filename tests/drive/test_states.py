@@ -170,7 +170,7 @@ def test_a_drive_that_drops_out_is_not_enabled_again(word: int, controlword: int
     walk.observe(word)
     assert walk.aim is not State.OPERATION_ENABLED
     assert walk.controlword() == controlword
-    # Even if the drive recovers on its own.
+    # This holds even if the drive recovers on its own.
     walk.observe(0x0027)
     assert walk.controlword() != 0x0F
 

@@ -93,7 +93,9 @@ def test_law_follows_the_formula_between_reversals():
 
 
 def test_saturation_is_not_a_relay():
-    """A saturated reversal leaves the offset gradually; taken literally the law would jump by 80 arcsec."""
+    """After a reversal from saturation, the error leaves the offset gradually; taken literally, the law would
+    jump by 80 arcsec.
+    """
     tracker = ARTICLE.tracker()
     for angle in (0.0, 100.0):
         tracker.advance(angle, Moment())
@@ -137,4 +139,4 @@ def test_a_lagging_load_mirrors_a_leading_one(law, size, width, n, reach, start)
     np.testing.assert_array_equal(error, -leads.predict(motion, start))
     np.testing.assert_allclose(error[400:800], error[800:], atol=1e-9)
     forward = np.diff(motion.motor_deg[400:]) > 0
-    assert np.all(np.diff(error[400:])[forward] <= 1e-9)  # it falls along the path
+    assert np.all(np.diff(error[400:])[forward] <= 1e-9)  # the error decreases along the path

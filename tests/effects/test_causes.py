@@ -103,7 +103,7 @@ def test_new_motor_orders_are_sought_outside_the_model():
 def test_a_direction_phase_and_the_mean_of_both_flanks_are_the_shifted_tooth_error():
     angle = np.concatenate([np.linspace(0, 360, 500), np.linspace(360, 0, 500)])
     sign = np.where(np.arange(1000) < 500, 1, -1)
-    sign[500] = 1  # at rest at the turn: the direction holds
+    sign[500] = 1  # at rest at the turning point, so the direction is kept
     mean = ORDER_4.model_copy(
         update={"amplitude_arcsec": ORDER_4.amplitude_arcsec * math.cos(math.radians(4 * 5.0))}
     )
@@ -154,7 +154,9 @@ def test_the_lower_torque_comes_first():
 
 
 def test_skew_is_what_a_late_sample_shows_also_while_it_accelerates():
-    """Compared with positions sampled late, at the true speed; the remainder is of third order."""
+    """The skew is compared with positions sampled late, at the true speed; the remainder is of third
+    order.
+    """
     time_s = np.linspace(0, 1, 400)
     angle = 3000 * np.sin(3 * time_s)
     late = 3000 * np.sin(3 * (time_s + 0.002))
@@ -241,7 +243,7 @@ def test_lost_motion_grows_with_the_turns_run():
     effect = Wear(growth_arcsec_per_kiloturn=4, width_deg=1, turns_before=500, turns_limit=2000)
     thousand = 360_000.0
     error = effect.predict(Motion(np.array([0.0, thousand, 0.0, thousand])))
-    np.testing.assert_allclose(error, [0, 3, -4, 4])  # half of 1.5, then of 2 (the limit) times 4
+    np.testing.assert_allclose(error, [0, 3, -4, 4])  # half of the growth 1.5 * 4, then of 2 * 4 (limit)
 
 
 def test_a_gear_that_runs_in_wears_less_and_less():
@@ -333,7 +335,7 @@ def test_ripple_and_loop_change_with_warmth():
 
 
 def test_a_lag_over_a_long_record_keeps_its_precision():
-    """A million samples, half of them at steps a thousand times the time constant."""
+    """The record has a million samples, half of them at steps a thousand times the time constant."""
     count = 200_000
     time_s = np.cumsum(np.where(np.arange(count) % 2, 1e-3, 1e3))
     temperature = 20.0 + np.sin(np.arange(count))

@@ -80,7 +80,7 @@ def fitted_takes_back_its_own_coefficients(effect, motion, start):
 
 def error_scales_with_its_coefficients(effect, motion, start, factor):
     scaled = effect.fitted(factor * effect.coefficients())
-    if effect.name == "direction_phase":  # linear at the present shift only
+    if effect.name == "direction_phase":  # linear at the current shift only
         columns = effect.columns(motion, start)
         np.testing.assert_allclose(
             columns @ scaled.coefficients(), factor * effect.predict(motion, start), **CLOSE
@@ -107,7 +107,7 @@ def batch_equals_on_line_and_peeking_changes_nothing(effect, motion, start, prob
 
 
 def error_falls_no_steeper_than_its_slope_bound(effect, motion, start, away):
-    """From one state, as in the inverse, between any two angles that it may try."""
+    """The law holds from one state, as in the inverse, between any two angles that the inverse may try."""
     bound = effect.slope_bound_arcsec_per_deg()
     tracker = effect.tracker(start)
     for angle, now in zip(motion.motor_deg, moments(motion), strict=True):
@@ -140,7 +140,7 @@ def nothing_moved_and_nothing_recorded_is_no_trouble(effect):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_memory_of_a_tracker_does_not_grow(name):
-    """Neither time nor ever smaller nested loops, each of them significant, make it grow."""
+    """Memory use grows neither with time nor with ever smaller nested loops, each of them significant."""
     tracker = CATALOGUE[name].candidate(50.0, BASE).tracker()
     if isinstance(tracker, Memoryless):
         return
@@ -162,7 +162,7 @@ def test_memory_of_a_tracker_does_not_grow(name):
     gentle=st.booleans(),
 )
 def test_beyond_its_memory_a_tracker_is_independent_of_its_start(name, data, excursions, steps, sign, gentle):
-    """Two trackers with different pasts agree after this much travel in one direction."""
+    """Two trackers with different pasts agree after travelling `memory_deg` in one direction."""
     effect = data.draw(EXAMPLES[name])
     trackers = [
         (effect.gentle_tracker(start, 30.0) if gentle else None) or effect.tracker(start) for start in Start
@@ -170,7 +170,7 @@ def test_beyond_its_memory_a_tracker_is_independent_of_its_start(name, data, exc
     now = Moment(0.0, direction=1)
     for number, tracker in enumerate(trackers):
         tracker.advance(0.0, now)
-        if number and name != "wear":  # that one counts the distance
+        if number and name != "wear":  # wear counts the distance
             for angle in excursions:
                 tracker.advance(number * angle, now)
             tracker.advance(0.0, now)

@@ -15,7 +15,7 @@ PLAIN, MEMORY = Hysteresis(**GEAR), HysteresisMemory(**GEAR)
 
 
 def finely(*turns):
-    """A path through these angles in steps of 1/500 of each leg."""
+    """Returns a path through these angles in steps of 1/500 of each leg."""
     legs = [np.linspace(a, b, 500, endpoint=False) for a, b in pairwise(turns)]
     return Motion(np.concatenate([*legs, turns[-1:]]))
 
@@ -66,7 +66,7 @@ def test_the_law_is_a_sum_of_stop_operators(path, start):
 
 
 def test_hundreds_of_nested_loops_are_followed_without_a_jump():
-    """Beyond its capacity the innermost loops are merged, with an error below their own height."""
+    """Beyond the capacity for loops, the innermost ones are merged, with an error below their own height."""
     tracker = MEMORY.tracker(Start.FORWARD)
     turns = [(-1) ** i * 9.0 * (1 - i / 700) for i in range(600)]
     for angle in turns:

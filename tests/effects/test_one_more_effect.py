@@ -108,7 +108,7 @@ def test_effect_names_are_unique(taut_cable: type[Effect]) -> None:
     assert register(taut_cable) is taut_cable
 
     class Other(taut_cable):  # type: ignore[misc, valid-type]
-        """The effect of the same name."""
+        """A different effect with the same name."""
 
     with pytest.raises(InputError, match="give yours another name"):
         register(Other)

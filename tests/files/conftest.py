@@ -1,4 +1,4 @@
-"""A right axis file, for tests to change."""
+"""A valid axis file, for tests to change."""
 
 AXIS = """\
 schema: hdbridge.axis/1

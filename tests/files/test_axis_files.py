@@ -188,7 +188,7 @@ def test_an_unknown_profile_lists_the_known_ones():
 def test_bundled_files_are_found_in_a_wheel_and_in_a_working_copy(tmp_path):
     package = tmp_path / "site-packages" / "hdbridge"
     (package / "_bundled" / "eds").mkdir(parents=True)
-    (package.parent / "eds").mkdir()  # somebody else's package of that name
+    (package.parent / "eds").mkdir()  # an unrelated package of that name
     assert bundled_folder("eds", package) == package / "_bundled" / "eds"
     copy = tmp_path / "copy"
     (copy / "eds").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""The file reference matches the code."""
+"""The file reference in the docs matches the code."""
 
 import re
 

@@ -172,7 +172,7 @@ STEPS = st.lists(st.sampled_from(["commit", "activate", "rollback"]), max_size=1
 
 @given(STEPS, st.randoms(use_true_random=False))
 def test_rolling_back_undoes_activations_one_by_one(steps, random):
-    """Compared with the obvious model: a stack of active versions."""
+    """Compares the history with a simple model: a stack of active versions."""
     log: list[Activation] = []
     stack: list[int] = []
     newest = 0

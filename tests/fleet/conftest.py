@@ -1,4 +1,4 @@
-"""Small recordings of a few joints, and a cluster that the tests share."""
+"""Small recordings of a few joints, and a cluster shared by the tests."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from support.fleet import MODEL, record
 
 @pytest.fixture(scope="session")
 def fleet(tmp_path_factory) -> Path:
-    """Three joints with three recordings each (one with another encoder), a copy, bad files, a manifest."""
+    """Three joints, three recordings each (one with a different encoder), a copy, bad files, a manifest."""
     folder = tmp_path_factory.mktemp("fleet")
     (folder / "model.yaml").write_text(MODEL)
     rows = ["path,joint,hours,batch"]

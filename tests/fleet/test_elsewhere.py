@@ -25,7 +25,7 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # of the servers and clients
 
 
 def check_fleet_at(url):
-    """One folder with a recording, and one CSV file."""
+    """Checks a fleet at a URL: a folder with a recording, and a CSV file."""
     found = find_sources([url])
     assert [each.path.removeprefix(f"{url}/") for each in found] == ["a.csv.gz", "rec"]
     assert [each.joint for each in found] == [None, "J7"]

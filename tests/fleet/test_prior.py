@@ -76,7 +76,7 @@ def test_intervals_with_the_fleet_range_have_nominal_coverage():
 
 
 def row(joint, number, cause=None, batch="A", peak=5.0):
-    """A row of a data set, as far as the prior reads it."""
+    """Returns a row of a data set, with the columns that the prior reads."""
     parameters = [{"name": "amplitude", "value": peak, "low": peak - 1, "high": peak + 1, "unit": "arcsec"}]
     found = {"cause": cause, "rank": 1, "peak_arcsec": peak, "parameters": parameters, "aliases": []}
     same = dict.fromkeys(("figures", "temperature_c", "remarks"))

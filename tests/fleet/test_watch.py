@@ -78,7 +78,7 @@ def test_an_unchanged_recording_is_not_read_again(place, here, monkeypatch):
     go(place, here)
     assert names(here.read) == ["a.csv.gz", "b.csv.gz", "broken.csv", "c"]
     before = rows_by_name(place)
-    monkeypatch.setattr(here, "client", None)  # not even a cluster is started
+    monkeypatch.setattr(here, "client", None)  # no cluster is started, either
     end = go(place, here)
     assert (end.done, end.known, here.read) == (4, 4, [])
     assert rows_by_name(place) == before
@@ -120,7 +120,7 @@ def test_a_changed_model_is_noticed_without_a_changed_recording(place, here):
     go(place, here)
     (place.parent / "model.yaml").write_text(MODEL.replace("30.0", "31.0"))
     end = go(place, here)
-    assert end.known == 1  # the damaged one
+    assert end.known == 1  # the damaged recording
     assert len(here.read) == 4
     hashes = [row["model_sha256"] for row in rows_by_name(place).values() if not row["reason"]]
     assert (len(hashes), len(set(hashes))) == (3, 1)

@@ -64,7 +64,7 @@ def bench_of(truth: Truth, folder: Path) -> Iterator[ForeignBench]:
 
 
 class Commissioned(Nameplate):
-    """Nameplate, and limits for this motor; those of the EDS suit 8000 counts per turn."""
+    """Nameplate and limits of this motor; the limits of the EDS suit 8000 counts per turn."""
 
     def engrave(self, dictionary: Dictionary) -> None:
         super().engrave(dictionary)

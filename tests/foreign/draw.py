@@ -29,12 +29,12 @@ WAIT_S, WATCH_S = 0.15, 0.2
 JERKS_DEG_S3 = tuple(12_000.0 / 2**step for step in range(6))
 """Jerk limits tried in turn, at the load. The acceleration is at most a quarter of the jerk, per s2."""
 REST_DEG = 0.03
-"""Largest error of the settled motor; one count if that is more."""
+"""Maximum error of the settled motor; one count if a count is larger."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Sealed truth of a foreign axis, for the judge only."""
+    """Sealed truth of a foreign axis, for the evaluation only."""
 
     seed: int
     structure: str
@@ -56,7 +56,7 @@ class Truth:
         return ForeignMachine(self.mechanics, self.servo, self.encoders, self.seed)
 
     def by_place(self) -> dict[str, float]:
-        """True values by their place in a truth file, if there is one with the same meaning."""
+        """Returns true values by their path in a truth file, if a key there has the same meaning."""
         m, law, hysteresis = self.mechanics, self.servo.law, self.mechanics.hysteresis
         values = {
             "motor.inertia_kg_m2": m.motor_inertia_kg_m2,
@@ -308,7 +308,7 @@ def _acceleration_deg_s2(mechanics: Mechanics, servo: Servo) -> float:
 
 
 def _within_following_error(truth: Truth) -> Truth:
-    """The axis with a following error window that its fastest move keeps, at a lower speed if need be."""
+    """Returns the axis with a following error window for its fastest move, which may reduce its speed."""
     while (worst_deg := _following_error_deg(truth)) > 260.0:
         truth = replace(truth, velocity_deg_s=float(math.floor(0.8 * truth.velocity_deg_s)))
     return replace(truth, following_error_deg=float(math.ceil(1.3 * worst_deg + 10.0)))

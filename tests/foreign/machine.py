@@ -16,18 +16,18 @@ from numba import njit
 
 @dataclass(frozen=True)
 class Encoders:
-    """Motor and load encoder. A count's middle is its angle."""
+    """Motor and load encoder. The angle of a count is that of its middle."""
 
     motor_counts_per_turn: int
     motor_interpolation: int
-    """Steps per count in the loops. The bus has whole counts."""
+    """Interpolation steps per count in the control loops. The bus carries whole counts."""
     motor_flicker_counts: float
     """Rms noise of each motor reading, in the loops and on the bus."""
     load_counts_per_turn: int
     load_noise_arcsec: float
     """Rms noise of each load reading."""
     torque_noise_permille: float = 0.0
-    """Rms noise of the reported torque, of the rated one."""
+    """Rms noise of the reported torque, thousandths of the rated torque."""
 
 
 class ForeignMachine:
@@ -78,7 +78,7 @@ class ForeignMachine:
         if not self._powered:
             settle(self.loops, start_counts * step)
             self._powered = True
-        elif knots[3] != start_counts * step:  # a new start of the demand
+        elif knots[3] != start_counts * step:  # the demand restarts elsewhere
             knots[:4] = start_counts * step
         knots[:3] = knots[1:4]
         knots[3] = end_counts * step
@@ -102,12 +102,12 @@ class ForeignMachine:
 
     @property
     def true_motor_deg(self) -> float:
-        """Motor angle, for judges."""
+        """True motor angle, for evaluations."""
         return math.degrees(self.plant.state[0]["motor"])
 
     @property
     def true_load_deg(self) -> float:
-        """Load angle, for judges."""
+        """True load angle, for evaluations."""
         return math.degrees(self.plant.state[0]["load"])
 
     @property

@@ -69,7 +69,7 @@ class Mechanics:
     hysteresis: BoucWen | MaxwellSlip
     brake_nm: float = 1.0
     gravity_nm: float = 0.0
-    """Torque of a mass on the load that is held level. It hangs straight down at the load angle zero."""
+    """Torque of a mass on the load if its arm is horizontal. The arm hangs down at load angle zero."""
 
     @property
     def inertia_kg_m2(self) -> float:
@@ -98,7 +98,7 @@ STATE = np.dtype(
 
 
 class Plant(NamedTuple):
-    """Parameters and state of the mechanics, as `substep` takes them."""
+    """Parameters and state of the mechanics, in the form that `substep` requires."""
 
     parameters: np.ndarray
     """Record `PLANT`; SI."""

@@ -139,7 +139,7 @@ LOOPS = np.dtype([(name, "f8") for name in _STATE] + [(name, "i8") for name in (
 
 
 class Loops(NamedTuple):
-    """Parameters and state of a servo, as `torque` takes them."""
+    """Parameters and state of a servo, in the form that `torque` requires."""
 
     parameters: np.ndarray
     """Record `PARAMETERS`."""
@@ -171,7 +171,7 @@ def loops_of(servo: Servo) -> Loops:
     if servo.current_lag_ms > 0.0:
         ratio = 1000.0 * DT_S / servo.current_lag_ms
         p["current_share"] = -math.expm1(-ratio)
-        p["current_mean"] = -math.expm1(-ratio) / ratio  # mean of what is missing over a substep
+        p["current_mean"] = -math.expm1(-ratio) / ratio  # mean of the lag's remaining error over a substep
     average = 1
     if isinstance(law, StateFeedback):
         inertia, feedback = law.nominal_inertia_kg_m2, math.tau * law.feedback_hz

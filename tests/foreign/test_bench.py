@@ -15,7 +15,7 @@ every_structure = pytest.mark.parametrize("structure", STRUCTURES)
 
 
 def there_and_back(axis: AxisConfig, start_deg: float, way_deg: float) -> Trajectory:
-    """A smooth path within the limits: two cycloids."""
+    """Returns a smooth path within the limits: two cycloids."""
     limits = axis.limits
     half_s = max(
         2.2 * way_deg / limits.velocity_deg_s,

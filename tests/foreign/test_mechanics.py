@@ -44,7 +44,7 @@ def lossless(mechanics):
 def advance(
     plant: Plant, seconds: float, torque_nm: float = 0.0, brake_nm: float = 0.0, every: int = 1
 ) -> np.ndarray:
-    """Rows of motor angle, motor speed, load angle, load speed, energy."""
+    """Advances a plant; returns rows of motor angle, motor speed, load angle, load speed and energy."""
     rows = []
     for at in range(round(seconds / DT_S)):
         substep(plant.parameters, plant.orders, plant.elements, plant.state, torque_nm, brake_nm)
@@ -55,7 +55,9 @@ def advance(
 
 
 def frequency_and_damping(signal: np.ndarray, step_s: float) -> tuple[float, float]:
-    """Hz and damping ratio of a ring-down about zero, by its zero crossings and peaks."""
+    """Returns frequency (Hz) and damping ratio of a ring-down about zero, from its zero crossings and
+    peaks.
+    """
     at = np.flatnonzero(np.diff(np.sign(signal)))
     crossings = at + signal[at] / (signal[at] - signal[at + 1])
     peaks = [np.abs(signal[a : b + 1]).max() for a, b in pairwise(at)]

@@ -34,7 +34,7 @@ def test_the_measured_response_removes_the_ripple_at_speed(structure, tmp_path):
         ratio, cycle_s = bench.axis.gear.ratio, bench.axis.drive.cycle_s
     assert result.response is not None
     for each in result.ripples:
-        assert each.filtered_arcsec < 1.05 * each.none_arcsec  # never worse than none
+        assert each.filtered_arcsec < 1.05 * each.none_arcsec  # never worse than without correction
         if 4 * each.speed_deg_s * ratio / 360.0 < 0.8 * HIGHEST / cycle_s:
             assert each.removed_percent > 88.0, each
     paths = np.array(

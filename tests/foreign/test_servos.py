@@ -20,12 +20,14 @@ def axis(request) -> Truth:
 
 
 def linear(truth: Truth):
-    """Mechanics without friction and transmission error."""
+    """Returns the mechanics without friction and transmission error."""
     return replace(truth.mechanics, coulomb_nm=0.0, motor_orders=(), hysteresis=MaxwellSlip(()))
 
 
 def run(machine: ForeignMachine, targets: np.ndarray, cycle_s: float) -> np.ndarray:
-    """Motor and load angle (rad) and torque (Nm) after each substep; one set-point in counts per cycle."""
+    """Sends one set-point in counts per cycle; returns motor and load angle (rad) and torque (Nm) after each
+    substep.
+    """
     substeps = round(cycle_s / DT_S)
     trace = np.zeros((targets.size, substeps, 3))
     before = machine.motor_counts
@@ -40,7 +42,7 @@ def counts(truth: Truth, motor_deg):
 
 
 def step_deg(mechanics, servo, duration_s: float) -> np.ndarray:
-    """Motor angle over the substeps after a step of one degree."""
+    """Returns the motor angle over the substeps after a step of one degree."""
     target = FINE.motor_counts_per_turn / 360.0
     servo = replace(servo, interpolation="hold", dead_time_ms=0.0, rest_window_deg=0.0)
     machine = ForeignMachine(mechanics, servo, FINE, 0)
@@ -48,7 +50,7 @@ def step_deg(mechanics, servo, duration_s: float) -> np.ndarray:
 
 
 def stiff(truth: Truth):
-    """Linear mechanics whose load follows at once, without any friction."""
+    """Returns linear mechanics with a rigid spring and without any friction."""
     mechanics = replace(linear(truth), viscous_nm_s_per_rad=0.0, load_viscous_nm_s_per_rad=0.0)
     stiffness = mechanics.load_inertia_kg_m2 * (math.tau * 600.0) ** 2
     damping = 0.4 * math.sqrt(stiffness * mechanics.load_inertia_kg_m2)
@@ -99,7 +101,7 @@ def test_the_load_at_rest_follows_the_static_law(axis):
         assert machine.true_motor_deg == pytest.approx(
             target_deg, abs=max(REST_DEG, count_deg) + 0.5 * count_deg
         )
-        assert np.ptp(path[-round(0.2 / DT_S) :]) <= 0.05  # does not hunt
+        assert np.ptp(path[-round(0.2 / DT_S) :]) <= 0.05  # the axis does not hunt
 
 
 def test_limits_hold_and_integrators_recover(axis):

@@ -1,4 +1,4 @@
-"""A gateway with a master on the outer bus; a test of it is a coroutine."""
+"""Fixtures: a gateway with a master on the outer bus. The tests are coroutines."""
 
 import inspect
 
@@ -9,7 +9,9 @@ from support.service import play
 
 @pytest.fixture
 def bench(tmp_path, request):
-    """An axis that is verified, with its inner drive prepared; a parameter has options of `gateway_bench`."""
+    """Provides a verified axis with its inner drive prepared; an indirect parameter contains options of
+    `gateway_bench`.
+    """
     options = getattr(request, "param", {})
     with gateway_bench(tmp_path, **(options(tmp_path) if callable(options) else options)) as made:
         yield made

@@ -1,4 +1,4 @@
-"""Anything in any order on both buses: no set-point outside the limits, and no unrequested motion."""
+"""Random events in any order on both buses: no set-point outside the limits, and no unrequested motion."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -41,7 +41,7 @@ def test_drift_loses_no_set_point_and_delays_none(begin_s, duration_s, inner_s, 
     knots.append(OuterKnot(1, begin_s, 0.0, 0.0))
     judged = 0
     while turn_s < begin_s + duration_s:
-        while sync_s <= turn_s:  # SYNC comes with jitter, and with it a target
+        while sync_s <= turn_s:  # each SYNC is jittered and brings a new target
             sync.take(sync_s + rng.uniform(0.0, 0.02) * outer_s)
             target += rng.uniform(-1.0, 1.0)
             knots.append(OuterKnot(1, sync.time_s + sync.period_s, target, 0.0))

@@ -1,4 +1,4 @@
-"""Start-up sequences of other makers' masters, frame by frame, and the answers by CiA 301 and 402.
+"""Start-up sequences of third-party masters, frame by frame, and the answers by CiA 301 and 402.
 
 - Lely and ros2_canopen: boot procedure of CiA 302-2 with a configuration in the manner of dcfgen; then as the
   drive class `Motor402`: it enables with halt set and in no mode, homes, and polls 6061h
@@ -168,7 +168,7 @@ r 603F 00 0000
 
 
 class Master:
-    """Plays such lines on a bus."""
+    """Plays the lines of a start-up sequence on a bus."""
 
     def __init__(self, bus, clock):
         self.bus, self.clock = bus, clock

@@ -32,7 +32,9 @@ async def stands(bench, duration_s=0.3, within_deg=0.003):
 
 
 async def faulted(bench, *codes, within_s=1.0):
-    """Checks FAULT with one of these codes on the outer side, and then a drive without power."""
+    """Checks that the outer side reports FAULT with one of these codes, and that the drive then has no
+    power.
+    """
     plc = bench.plc
     await bench.until(lambda: plc.statusword & 0x4F == FAULT, within_s)
     assert set(plc.emergencies) & set(codes), [hex(each) for each in plc.emergencies]
@@ -55,7 +57,7 @@ async def go(bench):
     """Leads the node to operation enabled, then requests motion."""
     bench.plc.plan = lambda cycle: None
     bench.plc.emergencies.clear()
-    await bench.wait(1.0)  # the inner drive is prepared again
+    await bench.wait(1.0)  # meanwhile the inner drive is prepared again
     await bench.enable()
     await swing(bench)
     await bench.wait(0.5)
@@ -121,7 +123,7 @@ async def test_the_state_of_the_axis_has_period_and_jitter_of_the_outer_sync(ben
     bench.plc.late_s = lambda cycle: 0.001 * (cycle % 2)
     await bench.wait(1.0)
     outer = bench.bridge.axes["axis1"].state().outer
-    assert outer.jitter_s == pytest.approx(0.0005, rel=0.2)  # of a mean time between the two
+    assert outer.jitter_s == pytest.approx(0.0005, rel=0.2)  # relative to the mean of early and late SYNCs
     bench.plc.cycling = False
     await bench.wait(0.5)
     outer = bench.bridge.axes["axis1"].state().outer
@@ -192,7 +194,7 @@ async def test_a_lost_sync_is_the_cause_even_if_the_set_points_end_before_it_is_
     await bench.wait(0.6)
     bench.plc.cycling = False
     nodes, process = bench.daemon.clock.nodes, bench._process
-    nodes.remove(process)  # it does not get the processor
+    nodes.remove(process)  # the gateway process gets no processor time
     await bench.until(lambda: bench.daemon.states[0].name == "STOPPING")
     nodes.append(process)
     assert await bench.read(0x603F) == 0x8700
@@ -284,7 +286,7 @@ async def test_target_reached_means_that_the_load_rests_there(bench):
     window = await bench.read(0x6067)
     axis = bench.service.machine.axes[0].config
     count = abs(axis.motor_encoder.degrees(1)) / axis.gear.ratio * COUNTS_PER_DEG
-    assert count < window < 2.0 * count  # an exact model: the motor's count and the rounding
+    assert count < window < 2.0 * count  # the model is exact, so only the motor's count and rounding remain
     for _ in range(50):
         assert abs(bench.load_deg * COUNTS_PER_DEG - goal) < window + 0.5 * count
         assert plc.statusword & 0x400
@@ -347,7 +349,7 @@ def client_by_force(bench):
 
 
 def client_for_a_moment(bench):
-    """A client takes the lease by force and releases it before the service has looked."""
+    """A client takes the lease by force and releases it before the service notices."""
     lease = bench.bridge.lease
     lease.release(lease.take("a person", force=True))
 
@@ -384,12 +386,12 @@ async def test_a_withdrawn_power_request_is_not_executed(bench, withdraw, seen):
     driven = axis["load_target_deg"][axis["state"] == AxisState.ENABLED]
     assert np.ptp(driven) < 0.01  # the target begins at the load encoder; 1 degree was requested
     await stands(bench)
-    if withdraw is not client_by_force:  # the present holder, at rest
+    if withdraw is not client_by_force:  # the current holder withdraws, at rest
         assert bench.daemon.states[0].name == "DISABLED"
 
 
 async def both_enabled(bench):
-    """Two axes, one node each, one SYNC: each is configured and enabled by its own master."""
+    """Configures and enables two axes with one SYNC, each by its own master, and moves both to and fro."""
     for plc in reversed(bench.plcs):
         bench.plc = plc
         await bench.configure()
@@ -409,7 +411,7 @@ def load_of(bench, axis):
 async def test_each_axis_is_a_node_of_its_own_and_follows_its_own_targets(bench):
     await both_enabled(bench)
     first, second = bench.plcs
-    second.plan = lambda cycle: second.target  # stands
+    second.plan = lambda cycle: second.target  # the second axis stands still
     place, swung = load_of(bench, 1), []
     for _ in range(40):
         await bench.wait(0.05)
@@ -434,7 +436,7 @@ async def test_a_fault_of_one_axis_leaves_the_other_in_motion(bench):
     assert max(swung) - min(swung) > 1.9
     assert first.statusword & STATE == ENABLED
     assert first.emergencies == []
-    second.send(0, bytes((2, second.node)))  # NMT stop of one node is not that of the other
+    second.send(0, bytes((2, second.node)))  # an NMT stop of one node does not affect the other
     await bench.wait(0.2)
     assert first.statusword & STATE == ENABLED
 

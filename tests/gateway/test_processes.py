@@ -27,7 +27,7 @@ COUNTS_PER_DEG = 36_000
 
 
 class Patient(BaseNode402):
-    """Only extends the time-outs, because a busy machine may be slow."""
+    """Only extends the time-outs, for busy machines."""
 
     TIMEOUT_SWITCH_STATE_FINAL = 60.0
     TIMEOUT_SWITCH_STATE_SINGLE = 30.0

@@ -19,7 +19,7 @@ async def test_a_recording_has_the_targets_and_the_words_of_the_other_master(ben
     await swing(bench)
     await bench.wait(1.0)
     outer = bench.bridge.axes["axis1"].state().outer
-    # By design one cycle of the inner bus, and up to another one until the next frame.
+    # By design one cycle of the inner bus, and up to one more cycle until the next frame.
     assert period_s <= outer.latency_s <= outer.latency_99_s <= 2.01 * period_s
     plc.plan = lambda cycle: round(1000 * COUNTS_PER_DEG)  # beyond the limits of the axis
     await bench.wait(0.2)

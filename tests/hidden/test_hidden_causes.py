@@ -1,8 +1,8 @@
 """Tests with hidden physical causes: the diagnosis names them, and the extended model compensates them.
 
-There is one bench for each cause of the catalogue, for pairs, for no cause, for another hysteresis law, and
-for causes outside the catalogue. Sizes are 5 arcsec at the load (2 for the subdivisional error) with readings
-that have 0.3 arcsec of noise. Each plan is one that an engineer who suspects the cause would choose.
+There is one bench for each cause of the catalogue, for pairs, for no cause, for a different hysteresis law,
+and for causes outside the catalogue. Sizes are 5 arcsec at the load (2 for the subdivisional error) with
+readings that have 0.3 arcsec of noise. Each plan is one that an engineer who suspects the cause would choose.
 """
 
 import json

@@ -106,7 +106,7 @@ def bench_plan(turns: float = 20.0, speed: float = 200.3) -> list[tuple[str, np.
 
 @dataclass(frozen=True)
 class Bench:
-    """Members of this module for the tests."""
+    """The helpers of this module, as one object for the tests."""
 
     axis = Axis
     ramp = staticmethod(ramp)

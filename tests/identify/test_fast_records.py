@@ -10,7 +10,7 @@ from hdbridge.errors import InputError
 
 
 def sweep(begin, end, speed, acceleration, rate_hz):
-    """Returns a move with trapezoidal speed, without its first point, motor degrees."""
+    """Returns a move with a trapezoidal speed profile, without its first point, motor degrees."""
     way = abs(end - begin)
     speed = min(speed, np.sqrt(way * acceleration))
     rise, total = speed / acceleration, way / speed + speed / acceleration

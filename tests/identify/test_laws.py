@@ -38,7 +38,7 @@ def bouc_wen(motor_deg: Any, state: float) -> Any:
 
 
 def lagging(bench: Any, law: Any) -> Any:
-    """Returns an axis whose load lags by 25 arcsec times the loop of a law."""
+    """Returns an axis whose load lags by 25 arcsec times the loop of a given law."""
 
     class Lagging(bench.axis):  # type: ignore[misc, name-defined]
         def error(self, motor_deg: Any, state: float = 1.0) -> Any:

@@ -45,7 +45,9 @@ NARROW = PLAN.replace("name: small", "name: narrow").replace(
     "  - {procedure: sweep, load_turns: 1.05, motor_turns_per_s: 0.85}\n", ""
 )
 COARSE = (("cycle_ms: 4", "cycle_ms: 20"), ("counts_per_turn: 8000", "counts_per_turn: 32768"))
-"""A command in whole counts is followed at a fixed part of one; many small ones leave no bias in a sweep."""
+"""Longer cycle and finer motor counts. The motor follows whole-count commands at a fixed fraction of a count;
+with small counts, this biases a sweep only insignificantly.
+"""
 
 
 class Cell:
@@ -80,11 +82,11 @@ class Cell:
         return hidden
 
     def run(self, *arguments, status=0):
-        """`hdbridge ARGS...` in this folder; its standard output and standard error."""
+        """Runs `hdbridge ARGS...` in this folder; returns its standard output and standard error."""
         return self._run(self.folder, arguments, status)
 
     def improve(self, *arguments, status=0):
-        """Returns the JSON result and the printed output."""
+        """Runs `hdbridge improve`; returns the JSON result and the printed output."""
         options = ("--simulate", "--plan", "small.yaml", "--out", "rec", "--json", "result.json")
         options = () if "--resume" in arguments else options
         out, err = self.run("improve", "axis", *options, *arguments, status=status)
@@ -94,7 +96,7 @@ class Cell:
         return json.loads((self.folder / name).read_text())
 
     def files(self):
-        """The profile, byte for byte."""
+        """Returns the files of the profile, byte for byte."""
         return {each.name: each.read_bytes() for each in self.axis.rglob("*") if each.is_file()}
 
     def copy(self, folder):

@@ -1,4 +1,4 @@
-"""One recording of the simulated axis for all tests of the library's front door."""
+"""A recording of the simulated axis, shared by all tests of the library's public names."""
 
 from pathlib import Path
 

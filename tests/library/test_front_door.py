@@ -43,7 +43,7 @@ def test_another_name_is_refused_as_python_does():
 
 @pytest.mark.parametrize("name", ["simulated"])
 def test_a_function_is_not_hidden_by_the_module_of_its_name(name):
-    """The import system would put the module in its place, whichever comes first."""
+    """By default, an import of the module would replace the function, before or after its first use."""
     assert python(f"import hdbridge.{name}\nprint(type(hdbridge.{name}).__name__)") == "function"
     assert (
         python(f"import hdbridge\nhdbridge.{name}\nfrom hdbridge import {name}\nprint({name}.__name__)")

@@ -1,4 +1,4 @@
-"""A measurement of a bench goes straight into a file, a fit and a diagnosis, which check it."""
+"""A measurement of a bench is passed directly to a file, a fit and a diagnosis, which check it."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Laws of the set-point for any order of requests."""
+"""Invariants of the set-point for any order of requests."""
 
 import math
 
@@ -59,7 +59,7 @@ def asked(set_point: SetPoint, command: tuple) -> None:
 
 
 def _knots(set_point: SetPoint, speed: float, count: int) -> None:
-    """Streams knots of constant acceleration, as far as the limits permit, and no more after them."""
+    """Streams knots of constant acceleration as long as the limits permit, then stops streaming."""
     try:
         set_point.stream(0.1)
         set_point.begin_stream()
@@ -79,7 +79,7 @@ def _seen(set_point: SetPoint) -> tuple:
 def follow(
     set_point: SetPoint, limits: MotionLimits, period_s: float, steps: int, check_jerk: bool = True
 ) -> None:
-    """Steps, and checks the laws of each step."""
+    """Runs steps of the set-point, and checks the invariants after each."""
     for _ in range(steps):
         last, last_acceleration, mode = set_point.position_deg, set_point.acceleration_deg_s2, set_point.mode
         position = set_point.step()

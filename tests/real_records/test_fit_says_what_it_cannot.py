@@ -98,7 +98,7 @@ def test_the_residual_is_that_of_the_written_model(tmp_path: Path) -> None:
 
 
 def test_a_model_worse_on_held_out_data_is_not_written(tmp_path: Path) -> None:
-    """Ripple with another phase in each recording; any two predict the third badly."""
+    """The ripple has a different phase in each recording, so any two predict the third badly."""
     paths = moves(tmp_path, 2.0, (0.0, 60.0, 120.0))
     out = tmp_path / "model.yaml"
     result, data, _ = fitted(tmp_path, paths, "--out", str(out))

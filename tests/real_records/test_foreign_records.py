@@ -114,7 +114,7 @@ def test_files_of_other_programs_read_the_same(tmp_path: Path, content: bytes) -
 
 
 def shared(record: Record) -> np.ndarray:
-    """The columns of a record that `text` writes, shape (3, n); time from its first sample."""
+    """Returns the columns of a record that `text` writes, shape (3, n); time is from the first sample."""
     angles = (record.time_s - record.time_s[0], record.motor_position_deg, record.load_position_deg)
     return np.array(angles)
 
@@ -182,7 +182,7 @@ def signed(bits: int, counts: np.ndarray) -> np.ndarray:
 
 WAVE = 5.0 / 3600.0 * np.sin(np.radians(8.0 * MOTOR))
 TURNED = 1440.0 - np.abs(np.linspace(-1440.0, 1440.0, COUNT))
-"""There and back, with the reversal where the angle wraps."""
+"""Motor angle there and back, with the reversal at the wrap of the angle."""
 ADVISED: dict[str, tuple[str, str, str]] = {
     # content, message, advice
     "a load counter of 16 bits, in degrees": (
@@ -349,7 +349,7 @@ def test_a_multi_turn_counter_is_reported_with_its_size(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("jump_deg", [12.08, 47.3, 150.0, 505.0])
 def test_a_single_jump_is_not_a_counter_wrap(jump_deg: float) -> None:
-    """A reading that slips once, as in a measured record, is not advised to be unwrapped."""
+    """For a reading that slips once, as in a measured record, no unwrapping is suggested."""
     slow = np.round(MOTOR / 10.0, 8)
     slipped = np.where(np.arange(COUNT) > 100, slow + jump_deg, slow)
     assert find_wraps(slipped, slow / RATIO) is None
@@ -396,7 +396,9 @@ def test_errors_at_a_few_places_are_not_a_turn_in_radians(tmp_path: Path, seed: 
 
 @pytest.mark.parametrize("step_deg", [0.5, 3.0, 12.35, 18.8, 30.0])
 def test_angles_are_taken_for_radians_only_if_they_are(tmp_path: Path, step_deg: float) -> None:
-    """Some steps in degrees are an alias of a turn in radians; half of the record is a loop at a reversal."""
+    """Some of the steps in degrees are nearly whole multiples of 2 pi; half of the record is a loop at a
+    reversal.
+    """
     swept = step_deg * np.arange(1500.0)
     sine = 20.0 * np.sin(np.radians(swept))
     motor = np.concatenate([swept, swept[-1] + sine])

@@ -64,7 +64,7 @@ def test_a_robot_joint_is_named_and_the_names_predict_the_recording_left_out(
     orders = next(each for each in found.model.effects if each.name == "motor_order").orders
     if joint == 4:
         assert max(orders, key=lambda each: each.amplitude_arcsec).order == 2
-        # A drag that is a straight line in speed is reported as a delay.
+        # A drag that is linear in speed is reported as a delay.
         assert "velocity_windup" in named["channel_skew"]
     else:
         assert "compliance" in named
@@ -81,7 +81,9 @@ def test_a_robot_joint_is_named_and_the_names_predict_the_recording_left_out(
 def test_findings_predict_a_held_out_recording_like_a_regression(
     joints: dict[int, list[Record]], joint: int, most: float
 ) -> None:
-    """Wanted is 1.1 for both; joint 5's speed term is not accepted in four recordings of a second."""
+    """The goal is a ratio of 1.1 for both joints; joint 5 exceeds it, because its speed term is not accepted
+    in four recordings of a second each.
+    """
     records = joints[joint]
     after, regression = real_records.left_out(records), real_records.regressed(records)
     assert np.sqrt(np.mean(np.square(after))) < most * np.sqrt(np.mean(np.square(regression)))
@@ -134,7 +136,7 @@ def test_return_point_memory_predicts_the_dampers_other_motion() -> None:
 
 @pytest.mark.parametrize("name", ["sine", "earthquake"])
 def test_return_point_memory_of_the_damper_is_reported_if_visible(name: str) -> None:
-    """A sine reverses at ever different angles without nested loops, so both laws leave the same residual."""
+    """A sine reverses at varying angles without nested loops, so both laws leave the same residual."""
     (path,) = measured(f"damper/{name}.csv")
     record = real_records.damper_record(path.parents[1], name, 2.0)
     law = Hysteresis(offset_arcsec=95.0, width_deg=32.0, exponent=2.2)
@@ -152,7 +154,7 @@ def test_return_point_memory_of_the_damper_is_reported_if_visible(name: str) -> 
 
 @pytest.mark.parametrize("joint", [4, 5])
 def test_command_worsens_no_record(joints: dict[int, list[Record]], joint: int) -> None:
-    """The recordings end in motion, the command ahead of the motor by some degrees."""
+    """The recordings end in motion, with the command some degrees ahead of the motor."""
     commanded = [Record.read_csv(each) for each in measured(f"cobot-command/joint{joint}-*.csv")]
     without, with_command = (
         diagnose(concatenate(each), NOTHING, independent_zeros=True) for each in (joints[joint], commanded)

@@ -41,7 +41,7 @@ def model(amplitude, phase, offset):
 
 
 def traces():
-    """A sweep there and back over one load turn, then two sines with a pause in between."""
+    """Returns traces of a sweep there and back over one load turn, then two sines with a pause in between."""
     there = np.linspace(0.0, 18_000.0, 4000)
     sine = 45.0 * np.sin(np.linspace(0.0, 4.0 * np.pi, 400))
     motor = np.concatenate([there, there[::-1], sine])

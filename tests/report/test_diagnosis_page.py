@@ -76,7 +76,7 @@ WITHIN = {
     "count_loss": CountLoss(steps=(Step(time_s=60.0, size_arcsec=4.0),)),
     "vibration": Vibration(frequency_hz=3.3, amplitude_arcsec=4.0, phase_deg=0.0),
 }
-"""Causes whose candidates do nothing within this record."""
+"""Effects for causes whose default candidates have no effect within this record."""
 
 
 def finding(cause="load_order", size=4.0, **more):
@@ -308,7 +308,9 @@ def test_external_text_is_escaped():
 
 
 def test_a_changed_loop_is_plotted_with_the_models_loop():
-    """A finding may come from a fit with more freedom than the model has; the picture must not repeat it."""
+    """The fit of a finding may have more freedom than the model, so the chart is independent of the fitted
+    offset.
+    """
     found = CATALOGUE["hysteresis_parameters"].candidate(RATIO, MODEL.effects)
     boasted = found.model_copy(update={"offset_arcsec": found.base.offset_arcsec + 100.0})
     honest = diagnosis(finding("hysteresis_parameters", effect=found))

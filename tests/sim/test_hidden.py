@@ -97,13 +97,13 @@ def moving(there: Errors, here: Errors) -> float:
 
 
 def change(there: Errors, here: Errors) -> float:
-    """Returns the change at rest at the end, relative to the start."""
+    """Returns the change at rest from the start to the end."""
     apart = there.part("end") - here.part("end")
     return float(abs(np.median(apart[-50:]) - np.median((there.even() - here.even())[:50])))
 
 
 def at_a_turn(there: Errors, here: Errors) -> float:
-    """Returns the change after a turn of the load, relative to the start."""
+    """Returns the change after one turn of the load, relative to the start."""
     apart = there.even() - here.even()
     return float(abs(np.median(apart[-200:]) - np.median(apart[:200])))
 

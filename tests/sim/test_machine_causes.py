@@ -66,7 +66,7 @@ def test_a_hanging_load_winds_the_spring_up_through_its_stages(torque_nm: float)
     wind_up = (
         min(size, 4.0) / 16_000 + max(0.0, min(size, 9.0) - 4.0) / 20_000 + max(0.0, size - 9.0) / 28_000
     )
-    down_deg = math.copysign(90.0, torque_nm)  # at load angle zero it pulls towards there with all its weight
+    down_deg = math.copysign(90.0, torque_nm)  # the full weight acts when the load angle is zero
     truth = axis(load__gravity=mass(size, down_deg), gear__stiffening=STAGES)
     machine, exercise = moved(truth, 30.0)
     exercise.move(-30.0, 300.0, 1000.0)
@@ -100,7 +100,7 @@ def test_load_friction_yields_before_it_slips(sense: float) -> None:
         errors.append(error_arcsec(machine))
         loads.append(machine.true_load_deg)
     rise = sense * np.diff(errors)
-    assert np.all(sense * np.diff(loads) < 0.0)  # it moves in the motor's direction, never the other
+    assert np.all(sense * np.diff(loads) < 0.0)  # the load moves in the motor's direction, never in the other
     assert rise[0] > 1.5 * rise[8] > 1.5 * abs(rise[-1])
     assert errors[-1] == pytest.approx(sense * held_arcsec, rel=0.01)
 
@@ -284,7 +284,8 @@ def test_hours_of_work_change_loop_and_tooth_error_up_to_a_limit() -> None:
         "hysteresis_growth": 0.5,
         "motor_orders": [{"order": 1, "amplitude_arcsec": 10.0, "phase_deg": 90.0}],
     }
-    machine, exercise = moved(axis(gear__hysteresis=loop, gear__ageing=ageing), 330.0, 120.0)  # 90 deg: -10
+    # At the final angle of 90 deg, the motor order is -10 arcsec.
+    machine, exercise = moved(axis(gear__hysteresis=loop, gear__ageing=ageing), 330.0, 120.0)
     begun_s = float(exercise.readings().time_s[-1])
     assert error_arcsec(machine) == pytest.approx(40.0 + (20.0 - 10.0) * begun_s / 20.0, abs=0.2)
     exercise.hold(30.0)

@@ -88,7 +88,7 @@ def test_a_closed_loop_dissipates(make: Callable[[], Law], reach_deg: float) -> 
     law = make()
     low, high = 60.0 - reach_deg, 60.0 + reach_deg
     along_from(law, 0.0, high)
-    for _ in range(300):  # a law without memory needs many rounds until its small loops are closed
+    for _ in range(300):  # a law without memory needs many repetitions until its small loops are closed
         along_from(law, high, low, 20)
         along_from(law, low, high, 20)
     loop = [(high, law.advance(high))]
@@ -122,7 +122,7 @@ def test_the_error_depends_on_the_path_not_on_its_steps(make: Callable[[], Law])
 
 
 def along_from(law: Law, start: float, end: float, pieces: int = 200) -> float:
-    """Leads a law straight on from its present state; returns the error at the end."""
+    """Leads a law on a straight path from its current state; returns the error at the end."""
     error = 0.0
     for piece in range(1, pieces + 1):
         error = law.advance(start + (end - start) * piece / pieces)
@@ -130,7 +130,7 @@ def along_from(law: Law, start: float, end: float, pieces: int = 200) -> float:
 
 
 def after_an_excursion(law: Law, back_deg: float) -> float:
-    """The error after 60 degrees forth and 13 back, with an excursion on the way back."""
+    """Returns the error after 60 degrees forth and 13 back, with an excursion on the way back."""
     along_from(law, 0.0, 60.0)
     along_from(law, 60.0, 52.0)
     if back_deg:

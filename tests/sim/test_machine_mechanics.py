@@ -56,8 +56,8 @@ def test_without_losses_energy_and_momentum_stay(substep_ms: float) -> None:
     for _ in range(round(500.0 / substep_ms)):
         plant.step(0.0, 0.0)
         energies.append(energy_j(plant, truth))
-    # Motor and load are stepped in turn, which feeds the resonance a little: in half a second a few
-    # percent at most, where the gear's real damping takes nearly all of it in a twentieth of a second.
+    # Stepping motor and load alternately adds a little energy to the resonance, at most a few per cent in
+    # half a second. The gear's real damping would remove nearly all energy in a twentieth of a second.
     assert max(energies) < energy * (1.0 + 0.3 * substep_ms**2)
     momentum = (
         truth.motor.inertia_kg_m2 * plant.motor_deg_s + truth.load_.inertia_kg_m2 / 50 * plant.load_deg_s

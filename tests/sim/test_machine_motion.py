@@ -22,7 +22,7 @@ def test_a_settled_step_stands_at_the_static_law(profile: str) -> None:
             axis.move(direction * STEP_COUNTS)
             assert axis.overshoot_deg < 0.002
             if step == 0:
-                continue  # this one takes the hysteresis to its side
+                continue  # this move brings the hysteresis to its own branch
             expected = static_arcsec(known, axis.target * DEG_PER_COUNT, direction)
             assert axis.error_arcsec == pytest.approx(expected, abs=0.25)
             assert axis.machine.motor_counts == axis.target

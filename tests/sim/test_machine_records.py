@@ -44,8 +44,9 @@ def fingerprint(truth: Truth) -> str:
     return digest.hexdigest()[:16]
 
 
-# The first is of a gear without tooth error, whose ratio is constant: taken from a plant that had no causes
-# and no momentary ratio. They hold where the C library's sine is the same to within what a count hides.
+# The first digest of each row is of a gear without tooth error, whose ratio is constant; it was recorded
+# before the plant had causes and a momentary ratio. The digests are the same on any C library whose sine
+# differs by too little to change a count.
 @pytest.mark.parametrize(
     ("profile", "substep_ms", "without_teeth", "expected"),
     [

@@ -1,4 +1,4 @@
-"""Virtual time at the pace of real time: never ahead of it, and late without a rush."""
+"""Virtual time at the pace of real time: never ahead of it; a short delay is caught up, a long one is not."""
 
 import pytest
 from hypothesis import given

@@ -91,7 +91,7 @@ def test_an_absent_truth_file_is_refused(tmp_path: Path) -> None:
 
 
 def parts(model: type[BaseModel]) -> set[type[BaseModel]]:
-    """A model and all models that its fields name."""
+    """Returns a model and, recursively, all models in its fields."""
     found = {model}
     waiting: list[Any] = [field.annotation for field in model.model_fields.values()]
     while waiting:

@@ -1,6 +1,6 @@
 """A real SocketCAN interface and the simulated drive in a process of its own.
 
-Run by ``tools/socketcan.sh`` where the kernel has no vcan; without an interface these tests are skipped.
+Run by ``tools/socketcan.sh`` if the kernel has no vcan; without an interface these tests are skipped.
 """
 
 import atexit
@@ -87,7 +87,7 @@ def profile() -> Path:
 
 @pytest.fixture
 def may_configure(interface: str) -> Callable[..., None]:
-    """``ip`` for tests that take the interface away; skipped where that is not permitted."""
+    """``ip`` for tests that take the interface away; skipped if that is not permitted."""
     if (
         shutil.which("ip") is None
         or subprocess.run(["ip", "link", "set", "up", interface], check=False, capture_output=True).returncode
@@ -184,7 +184,7 @@ def master_on(channel: str, profile: Path | None = None) -> Iterator[Master]:
 
 
 class Drives:
-    """The simulated drive in a process that is reused while it lives, because it takes 3 s to start."""
+    """The simulated drive in a process, which is reused while it lives because its start takes 3 s."""
 
     def __init__(self) -> None:
         self._stack = ExitStack()
@@ -219,7 +219,7 @@ def simulated(
 
 @pytest.fixture
 def master(interface: str, simulated: subprocess.Popen[bytes]) -> Iterator[Master]:
-    """Booted, on the other side of the interface from the simulated drive."""
+    """Provides a booted master on the interface; the simulated drive is at the other end."""
     with master_on(interface) as made:
         made.boot()
         yield made
@@ -227,6 +227,6 @@ def master(interface: str, simulated: subprocess.Popen[bytes]) -> Iterator[Maste
 
 @pytest.fixture
 def intruder(interface: str) -> Iterator[can.BusABC]:
-    """Another node's end of the bus."""
+    """Provides the bus end of another node."""
     with can.Bus(interface="socketcan", channel=interface, ignore_config=True) as bus:
         yield bus

@@ -33,5 +33,5 @@ def test_conform_checks_a_drive_in_another_process(interface, tmp_path):
     wrong = {name: each["found"] for name, each in found.items() if each["result"] == "fail"}
     assert wrong == {}, done.stderr
     assert done.returncode == 0
-    # Remote frames and 29-bit identifiers, as the kernel carries them.
+    # Remote frames and 29-bit identifiers, in the representation of the kernel.
     assert found["guarding.toggle"]["result"] == found["nmt.ignores.extended"]["result"] == "pass"

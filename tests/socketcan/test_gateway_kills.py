@@ -160,7 +160,7 @@ def killed(witness: Witness, pid: int) -> int:
     )
 
 
-@pytest.mark.slow  # 34 s of a processor; tests/gateway kills the processes in every run, without vcan
+@pytest.mark.slow  # 34 s of CPU time; tests/gateway kills the processes in every run, without vcan
 @pytest.mark.usefixtures("interface")
 def test_a_killed_process_leads_to_no_motion_without_a_request(tmp_path: Path) -> None:
     with under_way(tmp_path) as (daemon, plc, witness):

@@ -142,13 +142,13 @@ def streamed(axis: Axis, path: MoveTo, limits: object) -> None:
 
 
 def path_run(samples: np.ndarray) -> PathRun:
-    """Returns the samples in motion, and those of the rest after it."""
+    """Returns the samples in motion, and the samples of the rest after it."""
     rows = [Sample(0.004 * at, row[0], math.nan, row[2], row[1], 0.0) for at, row in enumerate(samples)]
     moved = np.flatnonzero(np.diff(samples["load_target_deg"]))
     return PathRun("", tuple(rows[moved[0] : moved[-1] + 2]), tuple(rows[moved[-1] + 2 :]))
 
 
-@pytest.mark.slow  # 50 s of a processor
+@pytest.mark.slow  # 50 s of CPU time
 def test_the_filtered_correction_removes_the_ripple(tmp_path: Path) -> None:
     for name, found in figures(tmp_path, (76.0,)).items():
         ripple, path = found[0]

@@ -1,4 +1,6 @@
-"""Every fault of the reliability table on a real Linux CAN stack, and the manners of the commands there."""
+"""Every fault of the reliability table on a real Linux CAN stack, and the behaviour of commands on a shared
+bus.
+"""
 
 import re
 import shutil
@@ -31,7 +33,7 @@ from tests.socketcan.conftest import master_on
 
 @contextmanager
 def drive_in_a_thread(interface: str, profile: Path, character: Character = FRIENDLY) -> Iterator[DriveNode]:
-    """The simulated drive on a socket of its own, with its fault injector within reach."""
+    """Provides the simulated drive on its own socket, with access to its fault injector."""
     axis, truth = AxisConfig.load(profile), character.of_truth(Truth.load(profile))
     ended = threading.Event()
     with can.Bus(interface="socketcan", channel=interface, ignore_config=True) as bus:
@@ -146,13 +148,13 @@ def check(bench: VcanBench, row: Row, character: Character) -> None:
         time.sleep(1.0)
         place = bench.motor_counts
         if row.fault is not Fault.BUS_DOWN:
-            bench.interfere(0x080)  # the first SYNC of another program
+            bench.interfere(0x080)  # the first SYNC of the other program
         time.sleep(0.3)
         assert abs(bench.motor_counts - place) <= 2
         assert power.times <= row.resumptions_on(character), "power without a request"
 
 
-# ------------------------------------------------------------------ manners
+# ------------------------------------------------------------------ commands on a shared bus
 
 
 def test_a_bus_of_another_master_is_left_alone(interface: str, profile: Path, intruder: can.BusABC) -> None:
@@ -182,5 +184,7 @@ def test_a_bus_without_the_drive(interface: str, profile: Path) -> None:
 
 
 def step(profile: Path, interface: str) -> subprocess.CompletedProcess[str]:
-    """Runs ``hdbridge step`` in this process: in user-mode-linux one takes 3 s of a processor to begin."""
+    """Runs ``hdbridge step`` in this process, because in user-mode-linux a new process needs 3 s of CPU time
+    to start.
+    """
     return run_here(Path.cwd(), "step", profile, "--interface", "socketcan", "--channel", interface)

@@ -28,4 +28,4 @@ def test_candump_shows_one_cycle_in_order(master, interface: str, tmp_path: Path
     periods = sorted(cyclic[b][0] - cyclic[a][0] for a, b in pairwise(syncs[-150:]))
     expected = master.cycle.period_s
     assert periods[len(periods) // 2] == pytest.approx(expected, rel=0.1)
-    assert periods[0] > 0.4 * expected  # late ones are skipped, never made up for by a burst
+    assert periods[0] > 0.4 * expected  # late cycles are skipped, never made up for by a burst

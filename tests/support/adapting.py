@@ -151,7 +151,7 @@ class Sampler:
         self.use(model)
 
     def use(self, model: TransmissionModel) -> None:
-        """Predicts with another model from now on; its hysteresis state follows from the last path."""
+        """Predicts with a different model from now on; its hysteresis state follows from the last path."""
         self._tracker = model.tracker(Start.VIRGIN)
         for angle in self._demand.tolist():
             self._tracker.advance(angle, Moment())

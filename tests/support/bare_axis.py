@@ -17,13 +17,13 @@ STEP_COUNTS = 968
 
 
 def truth(profile: str = "article", **changes: Any) -> Truth:
-    """A profile's axis with values changed, keys like ``gear__ratio``."""
+    """Returns the truth of a profile's axis with changed values; keys are like ``gear__ratio``."""
     data = Truth.load(PROFILES / profile).model_dump(by_alias=True)
     return Truth.model_validate(with_keys(data, changes))
 
 
 def trajectory(distance_counts: int) -> list[int]:
-    """A jerk-limited move in whole counts per cycle, within the limits of the article's axis file."""
+    """Returns a jerk-limited move in whole counts per cycle, within the limits of the article's axis file."""
     otg = ruckig.Ruckig(1, CYCLE_S)
     way, out = ruckig.InputParameter(1), ruckig.OutputParameter(1)
     way.current_position = way.current_velocity = way.current_acceleration = [0.0]
@@ -65,7 +65,7 @@ class Axis:
             self.overshoot_deg = max(self.overshoot_deg, over_deg)
 
     def to(self, target: int) -> None:
-        """One cycle."""
+        """Runs one cycle."""
         self.machine.follow(self.target, target, self.substeps)
         self.target = target
 
@@ -75,12 +75,12 @@ class Axis:
 
     @property
     def error_arcsec(self) -> float:
-        """Load error at the target."""
+        """Returns the load error at the target."""
         return (self.machine.true_load_deg - self.target * DEG_PER_COUNT / 50.0) * 3600.0
 
 
 def static_arcsec(known: Truth, motor_deg: float, direction: int) -> float:
-    """Tables 1 and 2 after long motion in one direction."""
+    """Returns the error by the article's Tables 1 and 2 after long motion in one direction, arcsec."""
     law: Any = known.gear.hysteresis
     tooth = (
         each.amplitude_arcsec * math.cos(math.radians(each.order * motor_deg + each.phase_deg))

@@ -31,7 +31,7 @@ DROPPED = (
 
 
 class Navigated(AssertionError):
-    """Raised if the page changed to another document before an expression had its value."""
+    """Raised if the document of the page was replaced before an expression had its value."""
 
 
 class Page:
@@ -102,7 +102,7 @@ class Page:
     def until(self, condition: str) -> Any:
         """Waits until an expression is true in the page; returns its value.
 
-        If the page changes to another document meanwhile, Chromium drops the expression without a value, so
+        If the document is replaced meanwhile, Chromium drops the expression without a value, so
         it is evaluated again.
         """
         return until(

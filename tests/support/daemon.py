@@ -1,7 +1,7 @@
 """Control loop of the daemon with simulated drives, in one thread on virtual time: `SteppedDaemon`.
 
-Waiting on the service's side turns the loop: `SteppedClock.sleep_until` and `SteppedTiming.sleep` run as many
-turns as fit. So the service runs here unchanged, as fast as the processor allows.
+While the service waits, the loop runs: `SteppedClock.sleep_until` and `SteppedTiming.sleep` run as many
+cycles as fit. The service therefore runs unchanged, as fast as the processor allows.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class SteppedClock:
 
 
 class SteppedTiming:
-    """Timing in which waiting turns the loop, and blocking calls run in the same thread."""
+    """Timing in which waiting runs cycles of the loop, and blocking calls run in the same thread."""
 
     def __init__(self, daemon: SteppedDaemon) -> None:
         self._daemon = daemon
@@ -125,7 +125,7 @@ class SteppedDaemon:
             self.turn()
         raise AssertionError(f"not within {timeout_s} s; {self.states}, events {list(self.events)[-5:]}")
 
-    # ---------------------------------------------------------------- what is
+    # ---------------------------------------------------------------- state
 
     @property
     def states(self) -> list[AxisState]:
@@ -134,7 +134,7 @@ class SteppedDaemon:
     def reported(self, kind: EventKind, axis: int | None = None) -> list[Event]:
         return [each for each in self.events if each.kind is kind and axis in (None, each.axis)]
 
-    # ---------------------------------------------------------------- what a service does
+    # ---------------------------------------------------------------- actions of a service
 
     def post(self, kind: CommandKind, axis: int = 0, **fields: float) -> int:
         return self.memory.commands.post(kind, axis, **fields)  # type: ignore[arg-type]
@@ -210,7 +210,7 @@ class SteppedDaemon:
         mask = sum(1 << axis for axis in knots)
         return self.order(CommandKind.STREAM_BEGIN, min(knots), a=timeout_s, i=mask, j=self._streams)
 
-    # ---------------------------------------------------------------- what goes wrong
+    # ---------------------------------------------------------------- disturbances
 
     def interfere(self, can_id: int, data: bytes = b"", **kind: bool) -> None:
         """Sends a frame from another node, before the next cycle."""
@@ -255,8 +255,7 @@ def stepped_daemon(
     bitrate_bps: int | None = 1_000_000,
 ) -> Iterator[SteppedDaemon]:
     """Provides a control loop with simulated axes, none verified yet; with the article's model by default.
-
-    ``setup`` changes an axis of each control process before its first turn.
+    ``setup`` changes an axis of each control process before its first cycle.
     """
     configs = [character.of_axis(each) for each in (article_axes(axes) if isinstance(axes, int) else axes)]
     plant = character.of_truth(truth if isinstance(truth, Truth) else Truth.load(truth))

@@ -1,4 +1,4 @@
-"""Laws of the daemon's control loop, checked by a spy on the bus for each frame."""
+"""Invariants of the daemon's control loop, checked for each frame by a spy on the bus."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STANDING_COUNTS = 4
 
 
 class AxisLaws:
-    """Laws of the RPDOs of one axis."""
+    """Invariants that the RPDOs of one axis must satisfy."""
 
     def __init__(self, daemon: SteppedDaemon, index: int) -> None:
         self.axis = daemon.axes[index]
@@ -76,7 +76,7 @@ def most_counts(config: AxisConfig) -> int:
 
 
 class Laws:
-    """Laws of all frames, events and samples of one bus."""
+    """Invariants of all frames, events and samples of one bus."""
 
     def __init__(self, daemon: SteppedDaemon) -> None:
         self.daemon = daemon

@@ -1,6 +1,6 @@
-"""Random events on both buses of a gateway, and the laws that must always hold.
+"""Random events on both buses of a gateway, and the invariants that must always hold.
 
-The laws examine the control loop's samples and the frames of the outer master, not the gateway.
+The checks examine the control loop's samples and the frames of the outer master, not the gateway.
 """
 
 import errno
@@ -59,7 +59,7 @@ class Laws:
         self.mapped = self.operational = True
         """True while the master's PDO mapping is in force, so that RPDOs take effect at SYNC, not at once."""
         self.unasked = ""
-        """Reason why the present following is unrequested, if it moves; empty if it was requested."""
+        """Reason why a motion that follows the master would be unrequested; empty if it is requested."""
         self.lowest = self.highest = self.began_deg = 0.0
         self.periods = self.moved = self.enabled = 0
         """Number of cycles checked, of cycles with a moving set-point, and of enablings by the master."""
@@ -188,7 +188,7 @@ async def rest(bench: GatewayBench, laws: Laws, duration_s: float) -> None:
 
 
 def play_story(folder: Path, story: Sequence[tuple[str, Any]]) -> Laws:
-    """Plays events on a gateway with an enabled axis; AssertionError if a law is broken."""
+    """Plays events on a gateway with an enabled axis; AssertionError if an invariant is violated."""
 
     async def scenario(bench: GatewayBench) -> Laws:
         async with bench.service.ready() as bridge:

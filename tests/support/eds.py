@@ -55,7 +55,7 @@ def mapped(
 
 
 def profile_with(folder: Path, eds: str | bytes, *edits: tuple[str, str]) -> AxisConfig:
-    """Copies the article's profile to a folder, with another EDS and an edited axis file."""
+    """Copies the article's profile to a folder, with a different EDS and an edited axis file."""
     shutil.copytree(bundled_profile("article"), folder, dirs_exist_ok=True)
     (folder / "drive.eds").write_bytes(eds if isinstance(eds, bytes) else eds.encode())
     text = (folder / "axis.yaml").read_text()

@@ -94,7 +94,7 @@ class Plc:
         self.seen.append((now_s, self.statusword, self.position, self.target))
         self.cycle += 1
 
-    # ---------------------------------------------------------------- by hand
+    # ---------------------------------------------------------------- single frames
 
     def send(self, can_id: int, data: bytes = b"", **kind: Any) -> None:
         self.bus.send(can.Message(arbitration_id=can_id, data=data, **{"is_extended_id": False, **kind}))

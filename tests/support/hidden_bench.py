@@ -33,7 +33,7 @@ from support.hidden import Hidden, Run, hide_all
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 CYCLE_MS = 40
-"""Cycle time for most causes, which a quarter of the samples of `FAST_MS` shows equally well."""
+"""Cycle time for most causes, which are equally visible in a quarter of the samples of `FAST_MS`."""
 MORE_MS = 20
 """Cycle time for causes that are small in each sample or visible only in part of the record."""
 FAST_MS = 10

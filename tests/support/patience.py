@@ -1,4 +1,4 @@
-"""Waiting of tests for another thread or process, with a time-out that detects hangs, not slowness."""
+"""Waits of tests for other threads and processes, with a time-out that detects hangs, not slowness."""
 
 import time
 from collections.abc import Callable

@@ -67,7 +67,7 @@ class DaemonBench:
         daemon.run(0.3)
         daemon.events.clear()
 
-    # ---------------------------------------------------------------- as `reliability.Bench` has it
+    # ---------------------------------------------------------------- interface of `reliability.Bench`
 
     def move(self) -> None:
         self.daemon.turn()
@@ -92,7 +92,7 @@ class DaemonBench:
         assert isinstance(wrong.__self__, WrongOnce)  # type: ignore[attr-defined]
         wrong.__self__.wrong_deg = counts * DEG_PER_TURN / self._counts_per_turn  # type: ignore[attr-defined]
 
-    # ---------------------------------------------------------------- what is true afterwards
+    # ---------------------------------------------------------------- checks after a fault
 
     @property
     def states(self) -> list[AxisState]:
@@ -109,7 +109,7 @@ class DaemonBench:
         return self.states[axis] is AxisState.ENABLED and abs(self.motor_counts(axis) - before) > 500
 
     def stay_stopped(self, *axes: int) -> None:
-        """Checks that axes come to rest and stay at rest and without power, whatever the commands."""
+        """Checks that axes come to rest, then stay at rest without power, whatever the commands."""
         daemon, states = self.daemon, [*self.states]
         sent: dict[int, list[int]] = {RPDO + 1 + axis: [] for axis in range(2)}
         daemon.bus.spy = lambda can_id, data: sent[can_id].append(data[0]) if can_id in sent else None

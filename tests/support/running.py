@@ -62,7 +62,7 @@ class Daemon:
             except ValueError:
                 self.events.append({"event": line.strip()})
 
-    # ------------------------------------------------------------------ what it says
+    # ------------------------------------------------------------------ output
 
     def until_notified(self, line: str) -> None:
         """Waits until the service manager has received this message."""
@@ -90,7 +90,7 @@ class Daemon:
         """Returns the process ids of the ``control`` or ``service`` processes, oldest first."""
         return [event["pid"] for event in self.events if event["event"] == f"{which} process started"]
 
-    # ------------------------------------------------------------------ what it is asked
+    # ------------------------------------------------------------------ requests
 
     def state(self) -> dict[str, Any] | None:
         """Returns the state of the machine; None while the API does not answer."""
@@ -158,7 +158,7 @@ class Daemon:
         """Discards the lease, which a new service does not know, and which expires if it is not used."""
         self._lease = None
 
-    # ------------------------------------------------------------------ its end
+    # ------------------------------------------------------------------ end
 
     def ended(self) -> int:
         """Waits for the end of the keeper; returns its exit status."""

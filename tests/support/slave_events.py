@@ -1,6 +1,6 @@
-"""Random events on one slave, and the laws that must always hold.
+"""Random events on one slave, and the invariants that must always hold.
 
-The laws examine the motor's demand and the frames that the master has sent, not the firmware: no demand
+The checks examine the motor's demand and the frames that the master has sent, not the firmware: no demand
 outside the limits, and no motion without a request since the last loss of drive or master.
 """
 
@@ -46,7 +46,7 @@ class TimedStage(PowerStage):
 
 
 class WatchedMotor(IdealMotor):
-    """Motor that checks every demand against the laws."""
+    """Motor that checks every demand against the invariants."""
 
     def __init__(self, rng: Random) -> None:
         super().__init__(0)
@@ -257,7 +257,9 @@ class Story:
 
 
 def play_events(seed: int, count: int) -> Laws:
-    """Plays random events on a slave; AssertionError if a law is broken. Returns the laws' counts."""
+    """Plays random events on a slave; AssertionError if an invariant is violated. Returns the checks with
+    their counts.
+    """
     rng = Random(seed)
     laws, motor, stage = Laws(), WatchedMotor(rng), TimedStage()
     behaviour = Behaviour.model_validate(

@@ -26,7 +26,7 @@ STEP_COUNTS: Final = 40
 
 
 def axis_of(node_id: int, name: str = "", profile: Path = PROFILE, **drive: object) -> AxisConfig:
-    """Returns the article's axis with another node id."""
+    """Returns the article's axis with a different node id."""
     axis = AxisConfig.load(profile)
     changed = axis.drive.model_copy(update={"node_id": node_id, **drive})
     return axis.model_copy(update={"drive": changed, "name": name or f"axis {node_id}"})

@@ -1,4 +1,4 @@
-"""Program independent of hdbridge that exchanges frames: it moves the simulated drive in lockstep."""
+"""A program, independent of hdbridge, that moves the simulated drive in lockstep by raw frames."""
 
 import shutil
 import struct
@@ -36,14 +36,14 @@ class Program:
         return found
 
     def request(self, data: bytes) -> bytes | None:
-        """The answer to an SDO request."""
+        """Sends an SDO request and returns the answer."""
         self.others += self.take()
         self.send(0x601, data)
         answers = [bytes(each.data) for each in self.take() if each.arbitration_id == 0x581]
         return answers[0] if answers else None
 
     def read(self, index: int, subindex: int = 0) -> int | None:
-        """Returns None without an answer, or on an abort."""
+        """Reads an object; returns None if no answer arrives, or after an abort."""
         answer = self.request(struct.pack("<BHBI", 0x40, index, subindex, 0))
         return int.from_bytes(answer[4:], "little") if answer and answer[0] != 0x80 else None
 
@@ -66,7 +66,7 @@ class Program:
         assert self.drive.state == "operation enabled"
 
     def cycle(self, word: int = 0x0F, step: int = STEP_COUNTS) -> list[can.Message]:
-        """One period: SYNC, its TPDOs, which are returned, RPDO."""
+        """Runs one period: SYNC, its TPDOs, which are returned, and an RPDO."""
         self.others += self.take()
         self.send(0x080)
         answers = self.take()
@@ -81,7 +81,7 @@ class Program:
 
 @pytest.fixture
 def second_axis(tmp_path: Path) -> Path:
-    """A profile of node 2."""
+    """Provides a profile of node 2."""
     folder = tmp_path / "second"
     shutil.copytree(bundled_profile("article"), folder)
     axis = folder / "axis.yaml"
@@ -99,7 +99,7 @@ def drive() -> Iterator[SimulatedDrive]:
 
 @pytest.fixture
 def program(drive: SimulatedDrive) -> Program:
-    """Enabled and moving at constant speed."""
+    """Provides a program whose drive is enabled and moves at constant speed."""
     made = Program(drive)
     made.start()
     made.move(30)

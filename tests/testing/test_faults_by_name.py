@@ -42,7 +42,7 @@ def tpdos(drive, program, name: str, **arguments) -> list[list[int]]:
     return [ids(program.cycle()) for _ in range(3)]
 
 
-# Each: the symptom of the fault, on a drive in motion.
+# Each function below checks the symptom of its fault on a drive in motion.
 
 
 def lost_tpdo(drive, program):
@@ -238,7 +238,7 @@ def motor_encoder_jump(drive, program):
     assert motor_counts(program.cycle()) - before > 1000
     true_before = drive.truth.motor_deg
     program.move(4)
-    assert drive.truth.motor_deg < true_before - 10.0  # the loops follow their encoder
+    assert drive.truth.motor_deg < true_before - 10.0  # the control loops follow the faulty encoder
 
 
 def motor_weak(drive, program):
@@ -311,7 +311,7 @@ def no_watchdogs(drive, program):
 
 
 def slow_brakes(drive, program):
-    """The stop takes the time of this deceleration: 10,000 counts/s at 20,000 counts/s2."""
+    """The stop takes the time given by this deceleration: 10,000 counts/s at 20,000 counts/s2."""
     drive.fault("slow_brakes", counts_per_s2=20_000.0)
     drive.fault("drive_fault")
     drive.sleep(0.4)

@@ -31,7 +31,7 @@ def show(name: str) -> str:
 
 
 def test_pytest_loads_next_to_nothing_for_it():
-    """Modules that load in every run of an environment with hdbridge, used or not."""
+    """Pytest loads the plugin in every run of an environment that contains hdbridge, used or not."""
     program = (
         "import sys, pytest; before = {*sys.modules}; import hdbridge.pytest_plugin; "
         "print(sorted({*sys.modules} - before))"

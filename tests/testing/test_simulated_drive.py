@@ -129,7 +129,7 @@ def test_a_bus_exists_only_with_its_drive():
 
 
 def test_in_real_time_the_drive_runs_on_its_own():
-    """Faults, log and filters from any thread; the program blocks in `recv` meanwhile."""
+    """Faults take effect and filters apply while the program blocks in `recv`."""
     with simulated_drive("article", bus="virtual") as drive, drive.open_bus() as bus:
         bus.set_filters([{"can_id": 0x081, "can_mask": 0x7FF}])
         drive.fault("drive_fault", after_s=0.05, code=0x4310)
@@ -202,7 +202,7 @@ def test_a_real_interface_is_not_taken_down():
 
 
 def test_drives_take_turns_on_a_real_bus():
-    """As with workers of pytest-xdist on one vcan0: the second waits until the first has ended."""
+    """Workers of pytest-xdist share vcan0 in this way: the second drive waits for the first to end."""
     bus = "udp_multicast:239.74.163.9"
     order = []
 

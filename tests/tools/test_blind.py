@@ -106,7 +106,7 @@ def test_a_suite_has_the_requested_cases() -> None:
     assert len({each.causes for each in faults}) == 23
     assert len({each.axis for each in faults}) >= len(faults) / 5
     assert suite == list(cases(wanted, 1))
-    # A larger suite of the same seed holds the smaller one, so a suite can be continued.
+    # A larger suite of the same seed contains the smaller one, so a suite can be extended.
     assert set(cases({"fault": 10}, 1)) < set(cases({"fault": 20}, 1))
     with pytest.raises(ValueError, match="found 'singles'"):
         list(cases({"singles": 1}, 1))
@@ -154,7 +154,7 @@ def test_the_cause_is_in_the_record_as_stated(lost: Path) -> None:
     folder = lost / "a" / "fault-000"
     secret = unsealed(folder)
     (hidden,) = secret["hidden"]
-    # About its mean, a step is between half of it and all of it.
+    # Relative to its mean, the size of a step is between half and all of the stated size.
     assert 0.4 < secret["effect"]["peak_arcsec"] / hidden["size_arcsec"] < 1.1
     time_s = Recording.load(*record_of(folder)).record.time_s
     assert time_s[0] < hidden["parameters"]["time_s"] < time_s[-1]
@@ -269,7 +269,8 @@ def test_several_causes_are_matched_once_each() -> None:
         ({"wear": {"detectable": True, "detection_limit_arcsec": 1.0}}, 2.0, True),
         ({"wear": {"detectable": True, "detection_limit_arcsec": 3.0}}, 2.0, False),
         ({"wear": {"detectable": False, "detection_limit_arcsec": None}}, 2.0, False),
-        ({"ratio_error": {"detectable": True, "detection_limit_arcsec": 1.0}}, 2.0, True),  # its twin
+        # A ratio error is the structural twin of wear.
+        ({"ratio_error": {"detectable": True, "detection_limit_arcsec": 1.0}}, 2.0, True),
         ({"creep": {"detectable": True, "detection_limit_arcsec": 1.0}}, 2.0, False),
     ],
 )
@@ -342,7 +343,7 @@ def test_motor_order_changes_are_relative_to_the_given_model() -> None:
     model = {"effects": [{"effect": "synchronous", "parameters": given}]}
     found = finding("motor_order", order_1_amplitude_arcsec=value(4.05), order_1_phase_deg=value(420.05))
     compared = verdict({**hidden, "truth": truth}, found, model=model).compared
-    # The disc's -2 sin(a - 30) is 2 cos(a + 60), in phase with the 3 - 1 that the model is short of.
+    # The disc's -2 sin(a - 30) is 2 cos(a + 60), in phase with the 3 - 1 that is missing in the model.
     assert [each.true for each in compared] == pytest.approx([4.0, 420.0], abs=1e-3)
     assert all(each.covered for each in compared)
 

@@ -1,4 +1,4 @@
-"""No test fails because the computer is busy: waits for threads and processes have no limits of their own."""
+"""No test fails because the computer is busy: waits for threads and processes use the common time-out."""
 
 import ast
 import re
@@ -8,7 +8,7 @@ from pathlib import Path
 TESTS = Path(__file__).parents[1]
 CLOCK = re.compile(r"\btime\.(monotonic|perf_counter|time)\(")
 EXCEPTIONS = {"support/patience.py", "support/daemon_faults.py"}
-"""The limit itself; a client that is hostile in vcan's own time."""
+"""Exempt files: the definition of the time-out, and a hostile client whose time-out is part of the test."""
 
 
 def limits(tree: ast.AST) -> Iterator[int]:

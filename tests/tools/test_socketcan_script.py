@@ -1,4 +1,4 @@
-"""``tools/socketcan.sh`` without a bootable user-mode-linux: it gives the reason and ends with 69."""
+"""``tools/socketcan.sh`` without a bootable user-mode-linux states the reason; its exit status is 69."""
 
 import os
 import re
@@ -27,7 +27,7 @@ def run_with(tmp_path: Path):
             path = tmp_path / name.replace("_", ".")
             path.write_text(f"#!/bin/sh\n{text}\n")
             path.chmod(0o755)
-        locks = {"SOCKETCAN_LOCKS": str(tmp_path / "locks")}  # others on this machine may run it
+        locks = {"SOCKETCAN_LOCKS": str(tmp_path / "locks")}  # the script may run elsewhere on this machine
         environment = dict(os.environ, PATH=f"{tmp_path}:{os.environ['PATH']}") | locks
         return subprocess.run(
             [SCRIPT, "--uml", *options, "true"], env=environment, capture_output=True, text=True, check=False
@@ -69,7 +69,7 @@ def test_real_time_priority_is_given_on_request_only(run_with, options, policy) 
 def test_two_runs_get_a_processor_each(run_with, tmp_path: Path) -> None:
     if len(os.sched_getaffinity(0)) < 2:
         pytest.skip("this machine has one processor")
-    # Each waits for the other, then prints its processor.
+    # Each process waits for the other, then prints its processor.
     kernel = tmp_path / "linux.uml"
     kernel.write_text(
         f"#!/bin/sh\ncd {tmp_path}; touch $$.here\n"
@@ -86,8 +86,8 @@ def test_two_runs_get_a_processor_each(run_with, tmp_path: Path) -> None:
 def test_computing_takes_little_time_and_idle_time_is_skipped() -> None:
     """Time is the guest's own, so a busy machine does not affect it.
 
-    This holds from the start of the command, before any idle time. Counting takes the machine a tenth of a
-    second at least. While the kernel boots, time passes eight times as fast.
+    This holds from the start of the command, before any idle time. The counting loop takes the machine at
+    least a tenth of a second. While the kernel boots, time passes eight times as fast.
     """
     counted = "i=0; while [ $i -lt 300000 ]; do i=$((i+1)); done"
     slept = f"cat /proc/uptime; {counted}; cat /proc/uptime; sleep 3600; cat /proc/uptime"

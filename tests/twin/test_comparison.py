@@ -201,7 +201,7 @@ def comparison(kind: str = HELD_OUT, **differences: float) -> Comparison:
         (HELD_OUT, {"load_error": 4.0, "motor_torque": 1.0}, {"load_error": 1.0, "motor_torque": 1.2}, False,
          "motor torque differs by 1.2 Nm, before by 1"),
         (HELD_OUT, {"load_error": 4.0}, {"load_error": 4.0}, False, "not smaller than before"),
-        # A loss below the noise does not count.
+        # An increase below the noise is ignored.
         (HELD_OUT, {"load_error": 4.0, "motor_torque": 0.02}, {"load_error": 1.0, "motor_torque": 0.04}, True,
          "29 % smaller"),
         # A replay of the true axis has rounding errors and residuals of reversals in third differences.
@@ -217,10 +217,10 @@ def test_a_twin_is_kept_if_better_on_average_and_worse_in_nothing(
 
 
 def test_a_temperature_counts_beyond_the_step_of_its_reading() -> None:
-    """Share for 0.1 K."""
+    """Temperature differences below the reading's step of 0.1 K count as 0.1 K."""
     cold, near = comparison(load_error=4.0, temperature=0.05), comparison(load_error=1.0, temperature=0.09)
     assert "75 % smaller" in better(cold, near).text
     far = comparison(load_error=1.0, temperature=0.4)
     assert "temperature differs by 0.4 K, before by 0.05" in better(cold, far).text
-    # Both fall to a quarter: the temperature from 0.4 to 0.1, as a difference within a step counts as a step.
+    # Both fall to a quarter: the temperature difference falls from 0.4 K to below the step of 0.1 K.
     assert "75 % smaller" in better(comparison(load_error=4.0, temperature=0.4), near).text

@@ -1,4 +1,4 @@
-"""A fit includes a part only if the recording shows it: friction near rest, another loop, a limit."""
+"""A fit includes a part only if the recording shows it: friction near rest, a different loop, a limit."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ from hdbridge.twin.misfit import Replays, prepare
 from hdbridge.twin.parameters import BY_NAME, named, value_in, with_load_encoder, with_values
 
 AXIS = DEMO.model_copy(update={"drive": DEMO.drive.model_copy(update={"following_error_deg": 60.0})})
-"""A limited drive falls behind."""
+"""At its current limit, the drive falls behind, so the axis file allows a large following error."""
 NAMES = ("Coulomb friction", "load inertia", "servo dead time")
 LIMIT = "current limit"
 LIMIT_PERCENT = 15.0
-"""The demo axis needs 19 % for the steps."""
+"""Current limit of the limited drive; the steps need 19 % on the demo axis."""
 PARAMETERS = named(*NAMES)
 
 
 def recorded(truth: Truth = TRUTH) -> Recording:
-    """Steps there and back on an axis."""
+    """Records steps there and back on an axis."""
     return _recorded(truth.model_dump_json(by_alias=True, exclude_none=True))
 
 
@@ -61,13 +61,13 @@ def fitted(replays: Replays, start: Truth, steps: int = 2) -> Fitted:
 
 
 def with_coupling(hz: float | None) -> Truth:
-    """The demo axis with another coupling between load and load encoder; None: a rigid one."""
+    """Returns the demo axis with a different coupling between load and load encoder; None: a rigid one."""
     coupling = None if hz is None else TrueCoupling(frequency_hz=hz, damping_ratio=0.1)
     return with_load_encoder(TRUTH, coupling=coupling)
 
 
 def with_growth(per_k: float) -> Truth:
-    """The demo axis with a friction that changes with the temperature."""
+    """Returns the demo axis with a friction that changes with the temperature."""
     heat = {"reference_c": 22.0, "friction_growth_per_k": per_k}
     return TRUTH.model_copy(update={"temperature": TRUTH.temperature.model_copy(update=heat)})
 
@@ -137,7 +137,7 @@ def test_another_hysteresis_law_is_adopted_if_the_load_shows_it() -> None:
     assert dahl.gear.hysteresis.law == "dahl"
     assert TRUTH.gear.hysteresis is not None
     assert TRUTH.gear.hysteresis.law != "dahl"
-    # As a calibration with another law reports it: too low, and with crossings elsewhere.
+    # The loop that a calibration with a different law would report: too low, with other zero crossings.
     wrong = with_values(TRUTH, {"loop offset": 0.93 * TRUTH.gear.hysteresis.offset_arcsec})
     with Replays(prepare(recorded(dahl), AXIS, wrong), 1) as replays:
         found = with_loop(replays, fitted(replays, wrong))
@@ -176,7 +176,7 @@ def test_a_gear_without_a_loop_has_none_by_another_law() -> None:
     bare = TRUTH.model_copy(update={"gear": gear})
     assert by_each_law(bare) == []
     assert by_law_of(bare, TRUTH) is bare
-    # A fit may make a loop lower than at its start.
+    # A fit may reduce the offset of a loop below the size of its initial state.
     assert TRUTH.gear.hysteresis.start_arcsec == -9.0  # type: ignore[union-attr]
     lower = with_values(by_each_law(TRUTH)[0], {"loop offset": 5.0})
     assert value_in(lower, BY_NAME["loop offset"]) == 5.0

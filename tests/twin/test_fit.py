@@ -53,7 +53,7 @@ def test_remaining_descent_is_not_scatter_of_the_legs() -> None:
 
 
 def test_intervals_cover_the_truth_with_a_dominant_leg() -> None:
-    """Each leg has a value of its own, and one of eight has as much information as four others."""
+    """Each leg has an independent error, and one of the eight legs has as much information as four others."""
     legs = np.repeat(np.arange(8), 50)
     slopes = np.where(legs == 0, 2.0, 1.0)[:, None]
     off = []
@@ -91,7 +91,7 @@ def test_wide_differences_average_out_replay_noise() -> None:
     where, rough = rng.uniform(size=400), 0.2
 
     def shape(place: Rows) -> Rows:
-        """Rows that break away earlier or later after any change of the parameters, however small."""
+        """Returns rows that break away earlier or later after any change of the parameters, however small."""
         return TRUE @ place + rough * np.sin(2e3 * where * (1.0 + place.sum()))
 
     moves = 0.05 * np.eye(2)
@@ -235,12 +235,12 @@ def test_a_fit_interrupted_before_its_first_result_leaves_nothing() -> None:
 
 
 TRUTH = with_values(DEMO, {"command filter": 1.06})
-"""At 90 motor degrees per second the motor lags by 4.24 counts; its encoder reads 4."""
+"""At 90 motor degrees per second, the motor lags by 4.24 counts, but its encoder reads 4."""
 PARAMETERS = (BY_NAME["command filter"],)
 
 
 def sweeps(bench: Exercise) -> None:
-    """Speeds in whole counts per cycle at which the motor's encoder has the same error in every row."""
+    """Moves at whole counts per cycle, so that the motor encoder's error is the same in every row."""
     bench.hold(0.4)
     for speed_deg_s in (90.0, -90.0):
         bench.lead(lambda seconds, speed=speed_deg_s: speed * seconds, 4.0)
@@ -264,7 +264,7 @@ def test_rounding_misleads_only_a_fit_that_treats_it_as_noise() -> None:
 @pytest.mark.parametrize("outlier_probability", [0.0, 1e-4])
 def test_half_the_squares_are_the_loss_of_log_likelihood(half: float, outlier_probability: float) -> None:
     if half == 0.0:
-        outlier_probability = 0.0  # without steps: least squares
+        outlier_probability = 0.0  # no rounding steps: ordinary least squares
     off = np.array([-7.0, -3.9, -0.2, 0.0, 0.05, 1.0, 4.1, 6.0])
     halves, outlier_probabilities = np.full(8, half), np.full(8, outlier_probability)
 

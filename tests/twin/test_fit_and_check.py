@@ -43,7 +43,9 @@ NAMES = ("Coulomb friction", "load inertia", "servo dead time")
 
 @cache
 def recorded(seed: int = 0, count: int = 3, **changes: float) -> Recording:
-    """Some long steps each way on the demo axis, with some of its values changed (by their names)."""
+    """Records long steps each way on the demo axis, with some of its values changed (keywords are their
+    names).
+    """
     values = {name.replace("_", " "): value for name, value in changes.items()}
     return benched(AXIS, with_values(TRUTH, values) if values else TRUTH, seed, count)
 
@@ -55,7 +57,7 @@ def benched(axis: AxisConfig, truth: Truth, seed: int, count: int) -> Recording:
 
 @cache
 def twin(filter_ms: float = TRUTH.servo.command_filter_ms) -> Truth:
-    """The twin of a fit that began at the truth of the demo axis, with another command filter."""
+    """Fits a twin to the demo axis; the fit starts at the truth, except for the command filter."""
     parameters, start = (
         named(*NAMES),
         with_values(TRUTH, {"command filter": filter_ms}),
@@ -118,7 +120,7 @@ def test_a_check_is_silent_without_a_change() -> None:
 
 
 def test_recorded_warmth_is_not_a_change() -> None:
-    """A warming by 20 K lowers the friction by a fifth, which matters."""
+    """Warming by 20 K lowers the friction by a fifth, so the check must take it into account."""
     grows = TRUTH.temperature.model_copy(update={"friction_growth_per_k": -0.01, "reference_c": 22.0})
     warm = TRUTH.model_copy(update={"temperature": grows.model_copy(update={"start_c": 42.0})})
     intervals = {**twin().intervals, "temperature.ambient_c": (21.0, 23.0)}
@@ -129,7 +131,7 @@ def test_recorded_warmth_is_not_a_change() -> None:
 
 
 def disturbed(recording: Recording) -> Recording:
-    """Shifts some torques by a thousand scales, as if a stuck motor broke away at another time."""
+    """Shifts some torques by a thousand scales, as if a stuck motor broke away at a different time."""
     torque = recording.record.columns["motor_torque_nm"].copy()
     torque[np.argmax(np.abs(torque)) :][:6] = 0.0
     return with_torque(recording, torque)
@@ -144,7 +146,8 @@ def with_torque(recording: Recording, torque: np.ndarray) -> Recording:
 def test_a_check_names_changes_not_misfit(
     seen: Callable[[Recording], Recording],
 ) -> None:
-    # The filter is shorter by an irrelevant amount, but with more inertia other rows show it.
+    # The twin's command filter is insignificantly shorter on its own recording; with more inertia, other rows
+    # show the difference.
     near = twin(0.9 * TRUTH.servo.command_filter_ms)
     changed = recorded(seed=2, count=1, load_inertia=1.5 * TRUTH.load_.inertia_kg_m2)
     checked = check(seen(changed), AXIS, near, workers=1)
@@ -169,7 +172,7 @@ def test_a_load_that_rings_out_of_step_has_changed() -> None:
 
 @cache
 def replay_only() -> Truth:
-    """A twin with wrong loops, whose residual is several times the noise."""
+    """Returns a twin with wrong control loops, whose residual is several times the noise."""
     wrong = with_values(TRUTH, {"position gain": 80.0, "integral time": 40.0, "motor inertia": 6e-5})
     parameters = named(*NAMES)
     with Replays(prepare(recorded(), AXIS, wrong), 1) as replays:
@@ -187,7 +190,7 @@ def test_a_replay_only_twin_is_checked_against_its_original_misfit() -> None:
 
 
 def test_a_change_that_the_twin_s_own_error_hides_is_not_ruled_out() -> None:
-    """The demand is later by a millisecond, which brings a twin with a wrong delay nearer to the axis."""
+    """The dead time of the axis falls from 1.2 to 0 ms; the twin's wrong 0.6 ms differs equally from both."""
     early = with_values(TRUTH, {"servo dead time": 0.6})
     with Replays(prepare(recorded(servo_dead_time=1.2), AXIS, early), 1) as replays:
         known = with_knowledge(
@@ -211,7 +214,7 @@ def test_a_replay_only_twin_names_a_change_by_its_ratio() -> None:
 
 @pytest.mark.parametrize("twin_of", [twin, replay_only])
 def test_increased_misfit_is_never_silent(twin_of: Callable[[], Truth]) -> None:
-    """A hunting torque, which no parameter of the simulated drive can cause."""
+    """The changed axis has a hunting torque, which no parameter of the simulated drive can cause."""
     recording = recorded(seed=1, count=1)
     torque = recording.record.columns["motor_torque_nm"]
     hunts = torque + 0.05 * np.sin(np.arange(len(torque)) / 2.0) * (torque != 0.0)

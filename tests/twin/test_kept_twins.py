@@ -49,12 +49,12 @@ def test_a_twin_is_pending_until_it_is_committed_and_activations_are_undone(prof
     assert TWINS.commit(profile, DATE, SERIAL) == 2
     assert TWINS.rollback(profile, "no better", DATE, SERIAL) == 1
     assert TwinFile.load(profile / "twin.yaml").truth.motor.coulomb_nm == 0.05
-    # The models of the same profile are kept apart.
+    # The history of the models in the same profile is unaffected.
     assert store.log(profile) == []
 
 
 def test_twins_read_back_exactly(profile: Path) -> None:
-    """With a line for each interval."""
+    """In the file, each confidence interval is on one line."""
     fit = {"parameters": ["Coulomb friction", "load inertia"], "noise": {"motor torque": 1e-05}}
     twin = twin_of(profile).with_provenance(fit=fit).bound_to(AxisConfig.load(profile), SERIAL)
     twin.save(profile / "pending-twin.yaml")

@@ -47,14 +47,14 @@ def recorded() -> Recording:
 
 
 def with_command_offset(counts: int = ZERO_COUNTS) -> Recording:
-    """Command of a controller whose zero differs from the drive's."""
+    """Returns the recording with a command from a controller whose zero differs from the drive's."""
     columns = recorded().record.columns
     offset = {"motor_target_deg": columns["motor_target_deg"] + counts * COUNT_DEG}
     return Recording(Record({**columns, **offset}), axis="demo", ratio=50.0)
 
 
 def left(truth: Truth, recording: Recording | None = None) -> dict[str, float]:
-    """Rms of the residuals by channel."""
+    """Returns the rms of the residuals by channel."""
     found = residuals(prepare(recording or recorded(), AXIS, truth), truth)
     return {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in found.items()}
 
@@ -64,7 +64,9 @@ def test_a_command_offset_is_not_a_following_error() -> None:
 
 
 def test_a_count_is_not_a_zero_offset() -> None:
-    """A motor may rest a count from its command; in motion this is a following error like any other."""
+    """A motor may come to rest one count away from its command; in motion, the same deviation is an ordinary
+    following error.
+    """
     data = prepare(with_command_offset(1), AXIS, TRUTH)
     assert np.median(residuals(data, TRUTH)[FOLLOWING][data.counts[FOLLOWING]]) == pytest.approx(
         COUNT_DEG, rel=0.3
@@ -170,7 +172,7 @@ def test_without_memory_the_load_counts_at_once() -> None:
 
 
 NOISE = {FOLLOWING: 0.5, TORQUE: 0.02, LOAD: 7.0}
-"""Some ten times the rounding."""
+"""About ten times the rounding error of each channel."""
 
 
 @cache
@@ -179,7 +181,7 @@ def as_measured() -> Data:
 
 
 def noisy(where: str) -> Data:
-    """The recording with white noise on each channel, in motion or at rest only."""
+    """Returns the recording with white noise on each channel, in motion or at rest only."""
     rng = np.random.default_rng(1)
     pieces = []
     for piece in as_measured().pieces:

@@ -22,9 +22,11 @@ ROWS, LEGS = 1200, 24
 
 
 class Known:
-    """Replaces replays by a lag at some speeds, friction by the speed's sign, and noise.
+    """Replaces replays: the following error is a lag in proportion to the speed, the torque is a friction
+    with the sign of the speed, and the measured values have noise.
 
-    Dead time and filter are one lag except for the share of acceleration in a ``quick`` motion.
+    Dead time and filter cause the same lag, except that the filter also has a term with the acceleration of a
+    ``quick`` motion.
     """
 
     def __init__(self, axis: Truth, quick: float) -> None:
@@ -55,7 +57,7 @@ class Known:
 
 
 def diagnosed(axis: Truth, quick: float) -> tuple[Explained, tuple[InseparableSet, ...]]:
-    """Returns the causes by which the axis differs from `TRUTH`, and sets that slopes do not separate."""
+    """Returns the causes by which the axis differs from `TRUTH`, and the sets of inseparable parameters."""
     replays: Any = Known(axis, quick)
     parameters = named(*NAMES)
     noise = dict.fromkeys((FOLLOWING, TORQUE, LOAD), 1.0)
@@ -97,7 +99,9 @@ def test_changes_below_the_noise_keep_the_false_alarm_rate(size: float, least: f
 
 
 def test_correlated_residuals_hide_changes_that_white_noise_would_show() -> None:
-    """In each leg they are as large as the change, with a random sign; white ones are so only in total."""
+    """Correlated residuals resemble the change in each leg, with a random sign per leg; white residuals of
+    the same total power average out within a leg.
+    """
     change = 0.5 * CHANGE
     signs = np.random.default_rng(3).choice([-1.0, 1.0], 12)
     together = (2.0 * change * signs[LEG_OF_ROW]) - change * (2.0 * np.mean(signs))

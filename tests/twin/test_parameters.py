@@ -20,7 +20,7 @@ from hdbridge.twin.parameters import (
 
 DEMO = with_sections(TRUTH, PARAMETERS)
 DAHL = by_each_law(DEMO)[-1]
-"""With a loop that has a yield in place of a width."""
+"""The demo's truth with a hysteresis law that has a yield in place of a width."""
 
 
 @pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda each: each.name)

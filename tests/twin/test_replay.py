@@ -46,7 +46,7 @@ CHANNELS = ("time_s", "motor_target_deg", "motor_position_deg", "load_position_d
 
 
 def demo(noise_arcsec: float = 0.0, **servo: float) -> tuple[AxisConfig, Truth]:
-    """The demo axis with encoders that count backwards, and its truth."""
+    """Returns the demo axis, with encoders that count backwards, and its truth."""
     axis, truth = (yaml.safe_load((DEMO / name).read_text()) for name in ("axis.yaml", "truth.yaml"))
     for name in ("motor_encoder", "load_encoder"):
         axis[name]["direction"] = -1
@@ -100,7 +100,7 @@ def test_rows_off_the_cycle_are_interpolated() -> None:
     given = replay(Recording(fewer), axis, truth)
     assert np.array_equal(given.time_s, fewer.time_s)
     apart = np.abs(given.motor_position_deg - whole.motor_position_deg[some])
-    assert np.max(apart) < 0.2  # the command between two rows is a guess, to some counts of 0.045 deg
+    assert np.max(apart) < 0.2  # between two rows, the command is known only to some counts of 0.045 deg
 
 
 def test_parts_are_replayed_one_by_one() -> None:
@@ -113,7 +113,7 @@ def test_parts_are_replayed_one_by_one() -> None:
 
 
 def test_a_part_begins_as_warm_as_it_was_recorded() -> None:
-    """An axis whose friction falls by a hundredth per kelvin, and which is 20 K warmer at the second part."""
+    """The axis is 20 K warmer at the second part, and its friction falls by a hundredth per kelvin."""
     axis, truth = demo()
     axis = axis.model_copy(update={"temperature": Temperature(source=SENSOR, celsius_per_count=0.1)})
     heat = truth.temperature.model_copy(update={"friction_growth_per_k": -0.01, "reference_c": 22.0})
@@ -166,7 +166,7 @@ def test_a_dead_time_delays_torque_and_motion_alike() -> None:
 
 
 def test_commands_at_uneven_times_are_met_to_the_last_row() -> None:
-    """A recording that ends in motion, between two cycles."""
+    """The recording ends in motion, between two cycles."""
     time_s = 0.01 * np.arange(60) + 0.00037 * np.arange(60)
     target_deg = 300.0 * np.maximum(time_s - 0.1, 0.0)
     used = replay(Recording(record_at(time_s, target_deg), ratio=50.0), *demo()).columns["motor_target_deg"]
@@ -231,7 +231,7 @@ def test_rows_off_any_cycle_are_kept() -> None:
 
 
 def record_at(time_s: np.ndarray, target: np.ndarray, motor: np.ndarray | None = None) -> Record:
-    """A record of a command and of a motor and a load that follow it."""
+    """Returns a record of a command, and of a motor and a load that follow it."""
     motor = target if motor is None else motor
     return Record({"time_s": time_s, "motor_target_deg": target, "motor_position_deg": motor,
                    "load_position_deg": motor / 50.0})  # fmt: skip
@@ -260,7 +260,7 @@ SINE_S = np.arange(0.0, 6.0, 0.004)
             np.interp(LONG_REST_S, [0.0, 1.0, 15.0, 16.0], [0.0, 90.0, 90.0, 0.0]),
             [(0.0, 2.0), (15.0, 17.0)],
         ),
-        # An oscillation without rest is cut at its turns.
+        # An oscillation without rest is cut at its turning points.
         (
             SINE_S,
             20.0 * np.sin(np.pi * SINE_S),
@@ -300,7 +300,7 @@ COUNT_DEG = 0.045
 
 
 def moved_twice(creeps_deg: float) -> tuple[Record, np.ndarray]:
-    """Half a second of motion, half a second of rest in which the motor creeps, and motion again."""
+    """Returns half a second of motion, half a second of rest in which the motor creeps, and motion again."""
     target = np.concatenate([np.linspace(0.0, 20.0, 50), np.full(50, 20.0), np.linspace(20.4, 40.0, 49)])
     motor = target.copy()
     motor[60:100] += creeps_deg * np.linspace(0.0, 1.0, 40)
@@ -321,7 +321,7 @@ def test_a_resting_motor_reports_torque_repeatedly(creeps_deg: float, count: int
 
 
 def test_a_standing_motor_is_held_by_its_recorded_torque_in_the_replay_that_judges_a_twin() -> None:
-    """Soft loops that have not settled would wind up, and begin the next motion with another torque."""
+    """Soft loops that have not settled would wind up, and begin the next motion with a different torque."""
     rests = record_of(TRUTH, moved((40.0, 300.0, 3000.0, 1.0), (9.0, 90.0, 900.0, 0.0)))
     servo = TRUTH.servo.model_copy(
         update={"position_gain_per_s": 8.0, "integral_of": "position", "integral_time_ms": 45.0}
@@ -335,7 +335,7 @@ def test_a_standing_motor_is_held_by_its_recorded_torque_in_the_replay_that_judg
 
 
 def ended_in_motion(first_s: float, then_s: float) -> Record:
-    """A procedure that ends far from where the next one begins."""
+    """Returns a record whose first procedure ends far from where the second one begins."""
     parts = []
     for length_s, place in ((first_s, 0.0), (then_s, 7.0)):
         time_s = CYCLE_S * np.arange(round(length_s / CYCLE_S))
@@ -390,7 +390,7 @@ def test_a_fit_takes_some_of_each_kind_of_motion() -> None:
     assert taken_s <= 40.0
     assert {"sweep", "step"} <= set(taken.kinds)
     assert whole_s > 130.0
-    # This axis never stands, and a stretch that begins in motion does not rest in its first row.
+    # This axis is never at rest, and a stretch that begins in motion has no rest in its first row.
     assert len(data.pieces) > 5
     assert not any(each.rest.any() for each in data.pieces)
 
@@ -415,7 +415,7 @@ def two_tasks() -> Recording:
 
 
 def delayed(recording: Recording, later_s: float) -> Recording:
-    """Delays the second part, as in another recording."""
+    """Delays the second part, as if it were from a different recording."""
     record = recording.record
     time_s = record.time_s + later_s * (np.arange(len(record)) >= record.starts[1])
     return Recording(
@@ -430,7 +430,7 @@ def test_parts_soon_after_each_other_follow_and_later_ones_do_not() -> None:
 
 
 def test_a_replay_switches_the_drive_off_between_parts_as_the_bench_does() -> None:
-    """Otherwise a load that rings or a spring that is wound up would start again from rest."""
+    """Otherwise a ringing load or a wound-up spring would restart from rest."""
     recording = two_tasks()
     again = replay(recording, AXIS, with_load_encoder(TRUTH, noise_arcsec=0.0))
     for name in ("motor_target_deg", "motor_position_deg", "motor_torque_nm"):
@@ -442,7 +442,7 @@ def test_a_part_that_ends_in_motion_slows_down_as_before_and_is_switched_off() -
     target, second = record.motor_target_deg, record.starts[1]
     assert target is not None
     moves = np.flatnonzero(np.diff(target[:second]) != 0.0)
-    cut = int(moves[-1]) - 3  # the command of the first rows that are left out still moves
+    cut = int(moves[-1]) - 3  # the command still moves in the first of the rows that are left out
     kept = np.r_[0:cut, second : len(record)]
     columns = {name: column[kept] for name, column in record.columns.items()}
     commands = commands_of(Record(columns, starts=(0, cut)), AXIS, TRUTH)
@@ -467,7 +467,9 @@ def test_the_second_part_counts_from_its_first_row_where_it_is_known_what_came_b
 
 
 def test_the_elastic_state_is_that_of_the_part_before() -> None:
-    """Alone, the second part would begin with the elastic state of a drive that has just been switched on."""
+    """Replayed alone, the second part would begin with the elastic state of a drive that has just been
+    switched on.
+    """
     data = prepare(two_tasks(), AXIS, TRUTH)
     left = residuals(data, TRUTH)[LOAD]
     assert np.std(left[left != 0.0]) < 1.0, "arcsec: the noise and the rounding"

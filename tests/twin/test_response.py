@@ -1,4 +1,4 @@
-"""A drive of another make has a measured response in addition to its loops."""
+"""A third-party drive has a measured response in addition to its loops."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_steady_speed_has_the_same_response_in_any_cycle(
 def test_a_command_at_rest_is_followed_without_any_response() -> None:
     response = Response(FOREIGN, 100.0)
     response.advance(0.0, 50.0, 0.004)
-    assert response.demand_counts == response.torque_nm == 0.0  # the latest cycle has no share
+    assert response.demand_counts == response.torque_nm == 0.0  # the latest cycle contributes nothing
     response.advance(50.0, 50.0, 0.004)
     assert response.demand_counts
     assert response.torque_nm

@@ -51,7 +51,9 @@ PLAIN = (
 
 
 def plain_fit(data: Data, start: Truth, steps: int = 25) -> Truth:
-    """Least squares over the replay, from soft loops without torque feed-forward: the reference."""
+    """Returns the reference fit: least squares over the replay, started from soft loops without torque
+    feed-forward.
+    """
     whole = start.motor.inertia_kg_m2 + start.load_.whole_inertia_kg_m2 / start.gear.ratio**2
     soft = {
         "position_gain_per_s": 40.0,
@@ -78,13 +80,13 @@ def plain_fit(data: Data, start: Truth, steps: int = 25) -> Truth:
     def at(moved: np.ndarray) -> np.ndarray:
         return np.clip(place + (moved - 1.0) * spread, low, high)
 
-    # From one, because the steps of the differences are shares of the coordinates.
+    # The variables start at one, because least_squares takes steps in proportion to them.
     end = least_squares(lambda moved: left(at(moved)), np.ones(len(place)), diff_step=0.02, max_nfev=steps)
     return at_coordinates(truth, parameters, at(end.x).tolist())
 
 
 def shares(other: Recording, axis: AxisConfig, truth: Truth) -> dict[str, float]:
-    """Following error and torque on the other motion, share of the signal."""
+    """Returns the errors of following error and torque on the other motion, as shares of the signal."""
     comparison = compare(other.record, replay(other, axis, truth), other.segments, axis.gear.ratio)
     rows = {name: comparison.row(name) for name in ("following_error", "motor_torque")}
     return {name: row.share for name, row in rows.items() if row is not None}

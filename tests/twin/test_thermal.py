@@ -52,7 +52,7 @@ def warmed(heat: TrueTemperature, seed: int, minutes: float, rests: float = 0.25
 
 
 def fitted(recording: Recording) -> Fitted:
-    """Fits the friction, without a step, for its uncertainty."""
+    """Solves for the friction with zero steps, only to obtain its uncertainty."""
     few = recording.record.rows(0, 500)
     with Replays(prepare(Recording(few), AXIS, TRUTH), 1) as replays:
         return solve(replays, TRUTH, FRICTION, 0)
@@ -97,7 +97,9 @@ def test_seconds_of_motion_leave_thermal_constants_unchanged() -> None:
 
 
 def test_the_time_between_parts_is_not_guessed() -> None:
-    """Two parts of a warm-up that follow by one row when put together: the second has its own reading."""
+    """Joined parts are one row apart, whatever time has passed between them, so the second part of this
+    warm-up starts from its own temperature reading.
+    """
     whole = warmed(HEATS[0], 2, 12.0).record
     parts = [Recording(whole.rows(0, len(whole) // 3)), Recording(whole.rows(len(whole) // 2, len(whole)))]
     recording = Recording.joined(parts)
@@ -113,7 +115,7 @@ def test_without_temperature_the_truth_is_unchanged() -> None:
 
 
 def test_warmth_dependent_terms_keep_their_reference() -> None:
-    """The reference was the former ambient temperature."""
+    """The reference remains the former ambient temperature if a new one is fitted."""
     grows = TRUTH.temperature.model_copy(update={"friction_growth_per_k": -0.01})
     start = TRUTH.model_copy(update={"temperature": grows})
     heat = HEATS[0].model_copy(update={"friction_growth_per_k": -0.01, "reference_c": 22.0})

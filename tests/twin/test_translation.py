@@ -30,7 +30,7 @@ N = 50.0
 
 
 def fine_axis() -> AxisConfig:
-    """The demo's axis with encoders whose counts do not show, one of them counting down."""
+    """Returns the demo's axis with encoders whose counts are negligible, one of them counting down."""
     motor = DEMO.motor_encoder.model_copy(update={"counts_per_turn": 800_000, "direction": -1})
     load = DEMO.load_encoder.model_copy(update={"counts_per_turn": 28_800_000})
     return DEMO.model_copy(update={"motor_encoder": motor, "load_encoder": load})
@@ -71,19 +71,21 @@ def stand(bench: Exercise) -> None:
 
 
 def brisk(bench: Exercise) -> None:
-    """Sines with high acceleration, but without steps of it that would make the load ring."""
+    """Moves in sines with high acceleration, but without steps of it that would make the load ring."""
     bench.sine(200.0, 0.5, 3.0)
     bench.sine(100.0, 1.0, 3.0)
 
 
 def warming(truth: Truth) -> Truth:
-    """An ambient temperature that rises by a kelvin a second, and an axis that starts warmer."""
+    """Returns a truth with an ambient temperature that rises by a kelvin per second, and an axis that starts
+    warmer.
+    """
     heat = {"ambient_k_per_hour": 3600.0, "time_constant_s": 0.5, "start_c": 25.0}
     return truth.model_copy(update={"temperature": truth.temperature.model_copy(update=heat)})
 
 
 def hanging(truth: Truth) -> Truth:
-    """A mass of 5.9 Nm on the axis."""
+    """Returns a truth with a mass that causes up to 5.9 Nm on the axis."""
     data = truth.model_dump(by_alias=True)
     data["load"]["gravity"] = {"mass_kg": 3.0, "arm_m": 0.2, "down_deg": -60.0}
     return Truth.model_validate(data)
@@ -96,12 +98,16 @@ class Case:
     parts: tuple[effects.Effect, ...]
     lead: Callable[[Exercise], None] = to_and_fro
     left: float = 0.03
-    """Share of the effect's own part, rms, that a translation of another shape may leave."""
+    """Permitted rms residual, as a share of the effect's own signal, if the plant's law has a different
+    shape.
+    """
     floor_arcsec: float = 0.5
-    """Contribution of the plant's dynamics at these speeds."""
+    """Permitted residual due to the plant's dynamics at these speeds."""
     plant: Callable[[Truth], Truth] = lambda truth: truth
     in_python: bool = False
-    """Its law has more elements than others: to compile an axis with room for them takes far longer."""
+    """True if the plant runs uncompiled, because compiling an axis with room for so many elements takes far
+    longer.
+    """
 
 
 SPRING = effects.Compliance(
@@ -225,7 +231,7 @@ def exercised(truth: Truth, lead: Callable[[Exercise], None]) -> Record:
 
 def predicted(parts: tuple[effects.Effect, ...], record: Record) -> np.ndarray:
     target, time_s = record.columns["motor_target_deg"], record.time_s
-    speed = np.round(np.gradient(target, time_s), 6)  # a target that rests is not quite the same float
+    speed = np.round(np.gradient(target, time_s), 6)  # the target at rest varies by a rounding error
     motion = dataclasses.replace(
         record.motion(),
         motor_deg=record.motor_position_deg,
@@ -301,7 +307,7 @@ def test_effects_beyond_the_plant_are_reported() -> None:
 
 
 def test_unreachable_spring_stages_are_omitted() -> None:
-    """A diagnosis describes a linear spring this way, with the other stages beyond any torque."""
+    """A diagnosis gives a linear spring two further stages, which begin beyond any reachable torque."""
     linear = effects.Compliance(
         c1_arcsec_per_nm=31.0,
         c2_arcsec_per_nm=0.0,
@@ -318,7 +324,7 @@ def test_unreachable_spring_stages_are_omitted() -> None:
 
 def test_custom_effects_without_counterpart_are_reported() -> None:
     class Draught(effects.Synchronous):
-        """Not of the catalogue."""
+        """Effect outside the catalogue."""
 
         name: ClassVar[str] = "draught"
 

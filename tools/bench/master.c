@@ -1,9 +1,10 @@
-/* The exchange of one control cycle in C, for comparison with what it costs in Python.
+/* The exchange of one control cycle in C, for comparison with its cost in Python.
  *
  *     cc -O2 -o master master.c && ./master vcan0 1000 20000
  *
- * SYNC, two TPDOs, RPDO, and the master's heartbeat every 25 ms, each period (in us) for so many cycles, with SCHED_FIFO 50
- * and locked memory. Prints how late each cycle began and how long it was busy, in ns, one line per cycle.
+ * Arguments: interface, period in us, number of cycles. Each cycle is SYNC, two TPDOs and RPDO, and every 25 ms the
+ * master's heartbeat, with SCHED_FIFO 50 and locked memory. Prints the lateness and the busy time of each cycle in ns, one
+ * line per cycle.
  */
 #define _GNU_SOURCE
 #include <linux/can.h>

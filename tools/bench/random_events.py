@@ -2,8 +2,9 @@
 
     python tools/bench/random_events.py [--stack slave|gateway] [--events 100000] [--seed 1]
 
-After each event the laws of the tests must hold: no set-point outside the limits, no unrequested motion.
-Prints the progress. A sequence of events that breaks a law is printed with its seed; exit status 1.
+After each event the invariants of the tests must hold: no set-point outside the limits, no unrequested
+motion. Prints the progress. If a sequence of events violates an invariant, prints it with its seed and ends
+with exit status 1.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ PER_STORY = {"slave": 200, "gateway": 100}
 
 
 def story(stack: str, seed: int) -> None:
-    """Plays one sequence of events; raises AssertionError if a law is broken."""
+    """Plays one sequence of events; raises AssertionError if an invariant is violated."""
     count, rng = PER_STORY[stack], Random(seed)
     seen: Any
     with tempfile.TemporaryDirectory(prefix="events-") as folder:

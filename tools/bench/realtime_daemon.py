@@ -9,11 +9,11 @@ loop (`Controller.turn`) is in this process, with SCHED_FIFO and locked memory. 
 service, on the same processor: it empties the rings of samples and events, and posts requests of clients
 in a loop:
 
-    moves, re-targeted in motion - jogs - stops - streams of knots - compensation off and on - another model
-    in motion - SDO requests
+    moves, re-targeted in motion - jogs - stops - streams of knots - compensation off and on - a different
+    model in motion - SDO requests
 
-  busy    from the wake-up to the next time that the loop sleeps: all of a turn, sample and commands included
-  missed  turns that began more than half a period late or were busy beyond the next deadline
+  busy    from the wake-up to the next time that the loop sleeps: a whole cycle, sample and commands included
+  missed  cycles that began more than half a period late or were busy beyond the next deadline
 
 It fails if a period was skipped, an axis stopped without a request, or a sample was lost.
 """

@@ -38,7 +38,7 @@ COARSE_COUNTS = (8_000, 8_192, 10_000, 16_384, 20_000)
 FINE_COUNTS = (2**16, 2**17, 2**18, 2**20)
 SUBSTEPS_MS = (1.0, 0.5, 0.25, 0.2, 0.1, 0.05)
 MOST_SAMPLES = 600_000
-"""Maximum number of samples of a calibration; a smaller travel is drawn if it takes more."""
+"""Maximum number of samples of a calibration; if it would take more, a smaller travel is drawn."""
 
 
 @dataclass(frozen=True)

@@ -299,7 +299,7 @@ class Course:
     """Pause between two parts of the record, s."""
 
     def run(self, ratio: float) -> Run:
-        """Returns the scale of a cause's size for the course."""
+        """Returns the properties of the course that determine the sizes of causes."""
         period_s = self.rig.axis.drive.cycle_s
         ways = [np.array(self.rig.target_deg[first:end]) for first, end in self.parts]
         speeds = [np.diff(each) / period_s for each in ways]

@@ -138,7 +138,7 @@ class Bench:
 
 
 def run_of(plan: Plan, truth: Truth) -> Run:
-    """Returns the scale of a cause's size for a plan."""
+    """Returns the properties of a plan that determine the sizes of causes."""
     ratio = truth.gear.ratio
     sweep_s = 2.0 * 360.0 * plan.sweep_turns / plan.fast_deg_s
     slow_s = 2.0 * 360.0 * plan.slow_turns / plan.slow_deg_s

@@ -95,7 +95,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def claim(folder: Path, seed: int) -> None:
-    """Records the seed of the folder; raises ValueError if it belongs to another seed."""
+    """Records the seed of the folder; raises ValueError if it belongs to a different seed."""
     about = folder / "suite.json"
     if about.exists():
         found = json.loads(about.read_text(encoding="utf-8"))["seed"]

@@ -1,7 +1,7 @@
 """True parameters of a finding: the hidden cause in the finding's units and conventions.
 
-The secret has the hidden cause and the plant, model.yaml the diagnosis's reference. A
-parameter is missing if the two do not mean the same, for the reasons given next to each cause.
+The secret has the hidden cause and the plant; model.yaml is the reference of the diagnosis. If a parameter
+does not have the same meaning in both, it is left out; the reason is stated next to each cause.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def _phasor(amplitude: float, phase_deg: float) -> complex:
 
 
 def _polar(order: float, value: complex) -> Values:
-    """Returns the values by the names of a finding; no phase of a zero amplitude."""
+    """Returns amplitude and phase by their names in a finding; empty if the amplitude is zero."""
     if abs(value) < 1e-9:
         return {}
     name = f"order_{order:.0f}"
@@ -83,11 +83,11 @@ def _disc(disc: Data, arcsec_per_rad: float) -> dict[float, complex]:
 
 
 def _read_by(disc: Data, teeth: dict[float, complex], ratio: float) -> dict[float, complex]:
-    """Orders of the whole error by the *reading* of a motor disc, arcsec at the load.
+    """Returns the orders of the total error over the *reading* of a motor disc, arcsec at the load.
 
-    The drive keeps the reading where it is commanded, so the motor stands off by the disc's error: the load
-    by that over the ratio, and the tooth error is that of another motor angle, which gives orders 2 and 4 a
-    share in order 1.
+    The drive keeps the reading at its command, so the motor is off by the disc's error. The load is off by
+    that error divided by the ratio, and by the tooth error at the actual motor angle, so orders 2 and 4 of
+    the teeth contribute to order 1.
     """
     reading = math.tau * np.arange(FINE) / FINE
     off = np.zeros(FINE)
@@ -142,8 +142,10 @@ def _load_orders(secret: Secret) -> Values:
 
 
 def _compliance(secret: Secret) -> Values:
-    """The softness and the ends of each stage; of a finding without stages, the wind-up under the highest
-    torque by that torque, which is the softer the more a cause hidden later has softened the spring.
+    """Returns compliance and torque limit of each stage.
+
+    For a finding without stages, returns the wind-up under the highest torque divided by that torque. If
+    another cause, hidden later, has softened the spring, this value is increased in proportion.
     """
     stiffness = secret.stiffness
     first = ARCSEC_PER_RAD / stiffness
@@ -170,15 +172,16 @@ def _inertial(secret: Secret) -> Values:
 
 
 def _velocity(secret: Secret) -> Values:
-    """Returns the dry part. The viscous slope at rest would extrapolate another law of thinning."""
+    """Returns the Coulomb part only: the viscous slope at rest would depend on the law of shear thinning."""
     dry = secret.parameters.get("coulomb_nm")
     return {"coulomb_arcsec": float(dry) / secret.stiffness * ARCSEC_PER_RAD} if dry else {}
 
 
 def _loop_height(secret: Secret) -> Values:
-    """Returns half the height of both laws together.
+    """Returns half the height of the loops of both hysteresis laws together.
 
-    Width and exponent have no true values, because the plant obeys another law."""
+    Width and exponent have no true values, because the plant obeys a different law.
+    """
     height = 0.0
     for name in ("hysteresis", "second_hysteresis"):
         law = secret.gear.get(name) or {}
@@ -188,8 +191,10 @@ def _loop_height(secret: Secret) -> Values:
 
 
 def _interpolation(secret: Secret) -> Values:
-    """The line count, and the harmonics of the angle that signals within a line give: the imperfections
-    multiply each other, so an offset of a tenth beside an unequal gain is 4 % off its own harmonic.
+    """Returns the line count, and the amplitudes of the harmonics of the error within a line.
+
+    They are computed from the signals, because the imperfections multiply each other: with an unequal gain,
+    the harmonic of an offset of a tenth changes by 4 %.
     """
     result = {"lines_per_turn": float(secret.parameters["lines_per_turn"])}
     signals = secret.load.get("encoder", {}).get("signals")
@@ -214,7 +219,7 @@ def _zero_drift(secret: Secret) -> Values:
 
 
 def _amplitude_drift(secret: Secret) -> Values:
-    """Returns the growth in per cent of the part at the plant's reference temperature."""
+    """Returns the growth of ripple and friction, per cent/K at the plant's reference temperature."""
     warmth = secret.truth.get("temperature", {})
     growths = {
         "ripple_percent_per_k": warmth.get("tooth_growth_per_k", secret.parameters.get("growth_per_k")),
@@ -224,11 +229,12 @@ def _amplitude_drift(secret: Secret) -> Values:
 
 
 def _wear(secret: Secret) -> Values:
-    """Growth of the lost motion from side to side, lagging: minus twice that of either way.
+    """Returns the growth of the lost motion between the two directions, with the sign of a lag: -2 times the
+    growth in one direction.
 
-    A finding that has no exponent grows in proportion to the travel, the plant with a power p of it: compared
-    is the straight line nearest to r^p over a travel r run evenly, whose slope is 6 p / ((p + 1) (p + 2)) of
-    the mean growth.
+    A finding without an exponent grows linearly with the travel r, but the plant grows as r^p. The true value
+    is therefore the slope of the best straight-line fit to r^p over uniformly distributed travel, which is 6
+    p / ((p + 1) (p + 2)) times the mean growth.
     """
     known = secret.parameters
     if "exponent" in secret.found:
@@ -277,13 +283,13 @@ TRUE: Mapping[str, Callable[[Secret], Values]] = {
     "motor_encoder_eccentricity": _motor_orders,
     "flexspline_order": _flexspline,
     "load_order": _load_orders,
-    # Both: half of the angle between the two flanks, forward ahead.
+    # Both values are half of the angle between the two flanks; the forward flank leads.
     "direction_phase": _named(shift_deg="shift_deg"),
     "torque_modulation": _scaled(100.0, growth_percent_per_nm="growth_per_nm"),
     "compliance": _compliance,
     "inertial_windup": _inertial,
     "velocity_windup": _velocity,
-    # The secret counts the age of the load's sample, the finding how much later it is taken.
+    # The secret states the age of the load's sample, the finding the delay at which it is taken.
     "channel_skew": _scaled(-1.0, delay_ms="delay_ms"),
     "backlash": _named(gap_arcsec="gap_arcsec"),
     "hysteresis_parameters": _named(
@@ -300,8 +306,8 @@ TRUE: Mapping[str, Callable[[Secret], Values]] = {
     "wear": _wear,
     "ratio_error": _named(ramp_arcsec_per_turn="arcsec_per_motor_turn"),
     "count_loss": _count_loss,
-    # Not the amplitude: the secret has that of the load on its spring, and where the motor rests the
-    # vibration shakes the loop as well, by more than that.
+    # The amplitude is left out: the secret has the amplitude of the load on its spring, but while the motor
+    # rests, the vibration also drives the hysteresis loop, by more than that amplitude.
     "vibration": _named(frequency_hz="frequency_hz"),
     "local_defect": _local_defect,
 }

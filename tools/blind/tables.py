@@ -12,7 +12,7 @@ from proportions import proportion
 
 BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.99, 1.0001)
 NEAR = 0.05
-"""Relative tolerance within which a claimed gain holds."""
+"""Relative tolerance within which a claimed gain counts as correct."""
 EFFECTS = ((0.0, 0.3), (0.3, 1.0), (1.0, 3.0), (3.0, math.inf))
 """Bin edges: rms of a cause over the noise of a reading."""
 LONG = 30_000

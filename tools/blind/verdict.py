@@ -88,7 +88,7 @@ class Verdict:
     """Rms of the cause's effect in the record over the noise of a reading."""
     hidden: tuple[str, ...]
     first: str
-    """Returns the kind of the leading finding: ``right``, ``wrong``, ``unexplained`` or ``nothing``."""
+    """Kind of the leading finding: ``right``, ``wrong``, ``unexplained`` or ``nothing``."""
     first_names_it: bool
     """True if the leading name is right without an alias."""
     named: tuple[str, ...]
@@ -99,7 +99,7 @@ class Verdict:
     ordinary: bool
     """True if a cause is named that every axis has, such as wind-up."""
     detectable: bool | None
-    """The diagnosis reports that it would name a cause of this size in this record."""
+    """True if the diagnosis reports that it would name a cause of this size in this record."""
     probabilities: tuple[tuple[float, bool], ...]
     compared: tuple[Compared, ...]
     fresh_gain: float | None
@@ -190,7 +190,7 @@ def _detectable(diagnosis: Data | None, known: tuple[str, ...], secret: Data) ->
     """
     if diagnosis is None or len(known) != 1 or not secret.get("effect"):
         return None
-    # A side effect here does not count as more of the cause: a mass also winds up the spring, for example.
+    # Side effects do not count as more of the cause here: a mass, for example, also winds up the spring.
     peak_arcsec = min(secret["effect"]["peak_arcsec"], secret["hidden"][0]["size_arcsec"])
     names = {known[0], *(each for twins in TWINS if known[0] in twins for each in twins)}
     reports = [diagnosis.get("identifiability", {}).get(each) for each in names]
@@ -202,7 +202,7 @@ def _detectable(diagnosis: Data | None, known: tuple[str, ...], secret: Data) ->
 
 
 def _fresh(answer: Answer, named: list[Data]) -> tuple[float | None, float | None]:
-    """Returns the gain and the rest of the written model on a fresh record, over those claimed."""
+    """Returns gain and residual of the written model on a fresh record, relative to the claimed values."""
     before, after = ((each or {}).get("baseline", {}).get("rms_arcsec") for each in (
         answer.fresh_given, answer.fresh_extended
     ))  # fmt: skip

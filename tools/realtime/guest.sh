@@ -1,5 +1,5 @@
 #!/bin/bash
-# In the guest, on the host's file system: bring vcan0 up, run the command, leave its exit status.
+# In the guest, on the host's file system: bring vcan0 up, run the command, write its exit status to a file.
 work=/run/job
 export PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
 ip link set up lo

@@ -4,15 +4,16 @@
 #   tools/realtime/run.sh [--timeout SECONDS] COMMAND [ARGUMENT...]
 #
 # Debian's own PREEMPT_RT kernel boots in QEMU, on this machine's file system, with one processor that is emulated: each
-# instruction takes one nanosecond of the guest's time (-icount shift=0), and idle time is skipped. So nothing that this
-# machine does shows in the guest's timing. What is late there is late by the guest's own doing, and a microsecond is a thousand
-# instructions, which can be compared from one commit to the next. It is slow: a minute until the command starts, and then
-# ten times slower than the machine.
+# instruction takes one nanosecond of the guest's time (-icount shift=0), and idle time is skipped. Load on this machine
+# therefore does not affect the guest's timing: any delay in the guest has its cause in the guest, and a microsecond is a
+# thousand instructions, so commits can be compared. It is slow: the command starts after a minute, and then runs ten
+# times slower than on this machine.
 #
-# Output and exit status are the command's; it runs in the present folder with the present environment.
-# Needs root and apt for what is missing: QEMU, busybox, cpio, kmod, can-utils, iproute2 and the kernel (70 MB, kept in
+# Output and exit status are the command's; it runs in the current folder with the current environment.
+# Needs root and apt to install missing packages: QEMU, busybox, cpio, kmod, can-utils, iproute2 and the kernel (70 MB, kept in
 # build/realtime).
-# Exit status: the command's own; 69 kernel or programs cannot be had; 70 the guest did not run the command; 124 timed out.
+# Exit status: the command's own; 69 if kernel or programs are not available; 70 if the guest did not run the command;
+# 124 after the time-out.
 set -u
 
 readonly here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
@@ -45,7 +46,7 @@ fetch_kernel() {
     (cd "$kept" && apt-get -o APT::Sandbox::User=root download "$package") >>"$kept/apt.log" 2>&1
 }
 
-# The kernel, and a file system for its start: busybox, the modules in the order of their needs, and init.
+# The kernel, and a file system for its start: busybox, the modules in the order of their dependencies, and init.
 unpack_kernel() {
     [ "$kept/initramfs" -nt "$here/init" ] && return 0
     local tree=$kept/unpacked name version

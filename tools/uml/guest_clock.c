@@ -1,14 +1,15 @@
-/* A clock of its own for user-mode-linux, on which the machine that it runs on hardly counts.
+/* A clock for user-mode-linux that is nearly independent of the load on the machine that it runs on.
  *
  *     cc -O2 -shared -fPIC -o guest_clock.so guest_clock.c
  *     UML_CLOCK_SLOWED=50 UML_CLOCK_SLOWED_FROM=FILE LD_PRELOAD=./guest_clock.so linux.uml ...
  *
- * When all in the guest are idle its time jumps to the next timer at once, and as soon as FILE exists (when it has booted)
- * it passes UML_CLOCK_SLOWED times as slowly as the machine's while the guest computes. Until then it passes eight times as
- * fast: the kernel measures its RAID routines for a second and a half by the clock. So a processor that is taken away for 100 ms is 2 ms to the guest, and no second is waited for. To the
- * guest's kernel and to every process in it that is simply a fast machine. Without the variables time is the machine's.
+ * When all processes in the guest are idle, its time jumps to the next timer at once. As soon as FILE exists (after booting),
+ * time passes UML_CLOCK_SLOWED times as slowly as the machine's while the guest computes. Until then it passes eight times
+ * as fast, because the kernel measures its RAID routines for a second and a half of the clock. If a processor is taken away
+ * for 100 ms, it is only 2 ms for the guest, and no time is spent on waiting. To the guest's kernel and to every process in
+ * it, the computer seems to be a fast one. Without the variables, time is the machine's.
  *
- * The kernel has one timer (timer_settime), one clock (CLOCK_MONOTONIC) and one place where it is idle (sigsuspend).
+ * The kernel has one timer (timer_settime), one clock (CLOCK_MONOTONIC) and one place at which it is idle (sigsuspend).
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -68,7 +69,7 @@ int clock_gettime(clockid_t clock, struct timespec *time)
     return 0;
 }
 
-/* The machine's timer for what is left on the guest's clock; none when nothing is armed. */
+/* Sets the machine's timer to the time left on the guest's clock; disarms it if the guest has none. */
 static int arm(void)
 {
     int64_t left_ns = 0;
@@ -81,7 +82,7 @@ static int arm(void)
     return real_timer_settime(timer, 0, &each, NULL);
 }
 
-/* Not only when all are idle: a command that computes from its first moment would do so while time still flies. */
+/* Called not only when all are idle; otherwise a command that computes from its start would run in accelerated time. */
 static void slow_down_when_booted(void)
 {
     if (!slowed_from || access(slowed_from, F_OK) != 0)
@@ -107,7 +108,7 @@ int timer_settime(timer_t which, int flags, const struct itimerspec *set, struct
     return arm();
 }
 
-/* The next expiry that is still to come: of one that came only once, none. */
+/* Advances to the next future expiry; a one-shot timer that has expired has none. */
 static void count_expired(void)
 {
     int64_t now_ns = guest_ns();

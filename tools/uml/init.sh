@@ -1,5 +1,5 @@
 #!/bin/bash
-# The first process inside user-mode-linux: bring vcan0 up, run the command, leave its exit status, halt.
+# The first process inside user-mode-linux: bring vcan0 up, run the command, write its exit status to a file, halt.
 # Started by tools/socketcan.sh, which passes SOCKETCAN_WORK (a folder on the host) on the kernel's command line.
 
 work=$SOCKETCAN_WORK
@@ -49,7 +49,7 @@ done
     exec "$@"
 ) >/run/stdout 2>/run/stderr
 status=$?
-# What the command left running may hold the pipes open: do not wait for ever.
+# Background processes of the command may keep the pipes open, so the wait is limited.
 for _ in $(seq 50); do
     [ -n "$(jobs -r)" ] || break
     sleep 0.1

@@ -1,12 +1,12 @@
-/* Lets user-mode-linux boot on processors whose register area is larger than it knows of (AMX, for one).
+/* Lets user-mode-linux boot on processors whose register area is larger than it supports (for example, with AMX).
  *
  *     cc -O2 -shared -fPIC -o whole_xstate.so whole_xstate.c && LD_PRELOAD=./whole_xstate.so linux.uml ...
  *
  * user-mode-linux keeps 2,696 bytes of its processes' extended registers (x87 to AVX-512 and the protection keys) and
- * puts them back by PTRACE_SETREGSET. Linux takes them back only whole: since 5.16 it answers EFAULT to an area that is
- * smaller than the processor's (11,008 bytes with AMX), and user-mode-linux aborts at its first process. So what is
- * missing is added here: zeros, and in XSTATE_BV, which says of each component whether the area holds it or it is in
- * its initial state, the bits of what does not fit into the short area are cleared.
+ * restores them by PTRACE_SETREGSET. Linux accepts only a complete area: since 5.16 it answers EFAULT to an area that is
+ * smaller than the processor's (11,008 bytes with AMX), and user-mode-linux aborts at its first process. This library
+ * therefore appends zeros up to the full size. XSTATE_BV states of each component whether the area contains it or it is in
+ * its initial state; the bits of components that do not fit into the short area are cleared.
  */
 #define _GNU_SOURCE
 #include <cpuid.h>

@@ -171,7 +171,7 @@ def call_everything(machine: Machine, folder: Path) -> list[str]:
 
 
 def test_every_call_works_without_optional_keys(tmp_path: Path) -> None:
-    """Of any two keys, each is left out at least once while the other is present."""
+    """For each pair of optional keys, either is left out at least once while the other is present."""
     whole = files(tmp_path)
     tried = {content(machine_of(tmp_path, *whole))}
     optional = []
@@ -179,9 +179,9 @@ def test_every_call_works_without_optional_keys(tmp_path: Path) -> None:
         for place in keys(file):
             left = [*whole]
             left[number] = without(file, [place])
-            with suppress(InputError):  # a required key
+            with suppress(InputError):  # the key is required
                 one = content(machine_of(tmp_path, *left))
-                if one not in tried:  # else the key was at its default
+                if one not in tried:  # otherwise the file states the default
                     tried.add(one)
                     optional.append((number, place))
     assert len(optional) > 12

@@ -20,7 +20,7 @@ def hasty(tmp_path_factory):
 
 
 def said(place, sent: bytes) -> bytes:
-    """Returns the bytes until the server closes the connection; the client itself never does."""
+    """Returns the bytes received until the server closes the connection; the client never closes it first."""
     with socket.socket(socket.AF_UNIX) as raw:
         raw.connect(str(place.socket))
         raw.sendall(sent)

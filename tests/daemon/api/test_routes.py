@@ -26,7 +26,7 @@ from hdbridge.client import messages
     ],
 )
 def test_motion_requests_need_the_lease(api, leased, method, path, body, asked):
-    """The same request is executed once with the lease, and never without it or with another token."""
+    """The same request is executed once with the lease, and never without it or with a wrong token."""
     url = f"/axes/joint-1/{path}"
     with api.over_socket() as stranger:
         refused = [

@@ -97,7 +97,7 @@ def client_schema(api):
 )  # fmt: skip
 @pytest.mark.parametrize("over", ["over_tcp", "over_socket"])
 def test_a_foreign_host_name_is_refused(api, host, over):
-    """A page whose name was rebound to this machine sends that name as its host."""
+    """A page whose host name was rebound to this machine's address sends that name as its host."""
     with getattr(api, over)(Host=host) as client:
         assert client.post("/stop").status_code == 421
     assert api.bridge.stopped == []

@@ -65,7 +65,7 @@ while True:
 
 
 def test_a_stop_gets_through_a_flood_of_new_connections(api):
-    """Over TCP, where every process of the machine may connect."""
+    """The flood is over TCP, to which every process of the machine may connect."""
     with subprocess.Popen(
         [sys.executable, "-c", FLOOD, str(api.port)], stdout=subprocess.PIPE, text=True
     ) as flood:

@@ -79,7 +79,9 @@ def test_an_invalid_request_ends_the_connection_with_a_reason(api, wrong):
 
 
 def test_a_slow_client_loses_only_its_own_samples(api):
-    """A client that reads nothing for thousands of cycles gets the newest ones and the number of others."""
+    """A client that reads nothing for thousands of cycles then receives the newest samples, and the number of
+    those that were dropped.
+    """
     api.bridge.rows = 40
     with socket.socket(socket.AF_UNIX) as raw:
         raw.connect(str(api.socket))

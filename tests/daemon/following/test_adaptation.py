@@ -133,7 +133,7 @@ def test_at_rest_nothing_moves():
     axis.takes(axis.time_s + PERIOD_S * np.arange(30_000), warm)
     assert axis.adaptation.windows <= windows + 1
     assert state_of(axis) == before
-    standing["load_position_deg"] += np.linspace(0.0005, 0.02, 30_000)  # as no gear's
+    standing["load_position_deg"] += np.linspace(0.0005, 0.02, 30_000)  # faster than any gear drifts
     axis.takes(axis.time_s + PERIOD_S * np.arange(30_000), standing)
     assert axis.adaptation.windows <= windows + 1
     assert used_arcsec(axis.adaptation).tolist() == before[2]
@@ -147,7 +147,8 @@ def test_without_reversals_the_hysteresis_estimate_is_unchanged():
     axis.takes(*axis.measures(MODEL, one_way[:40].tolist()))
     before = axis.adaptation.estimate_arcsec, np.array(axis.adaptation.learned().covariance)
     windows = axis.adaptation.windows
-    axis.takes(*axis.measures(worn(3.0), one_way[40:].tolist()))  # the loop and the zero look alike
+    # One-way motion does not separate the loop from a zero offset.
+    axis.takes(*axis.measures(worn(3.0), one_way[40:].tolist()))
     assert axis.adaptation.windows > windows
     assert axis.adaptation.estimate_arcsec[OFFSET] == before[0][OFFSET]
     assert np.array(axis.adaptation.learned().covariance)[OFFSET, OFFSET] == pytest.approx(
@@ -161,7 +162,7 @@ def test_a_zero_shift_is_reported_and_changes_nothing_else():
         axis.works(seed=seed)
     quiet = used_arcsec(axis.adaptation)
     times, samples = axis.measures(MODEL, wandering(400, 7))
-    drift = 0.01 * (times - times[0])  # 36 arcsec an hour: as a gear warms up
+    drift = 0.01 * (times - times[0])  # 36 arcsec an hour, as of a gear that warms up
     samples["load_position_deg"] += drift / 3600.0
     axis.takes(times, samples)
     assert axis.waiting is None
@@ -189,7 +190,7 @@ def test_a_sudden_load_offset_freezes_until_the_zero_is_reset():
     assert "slipped" in axis.frozen
     assert used_arcsec(axis.adaptation).tolist() == before[2]
     times, samples = axis.measures(MODEL, axis.path[-1:])
-    samples["state"] = AxisState.LENT  # it is homed
+    samples["state"] = AxisState.LENT  # the axis is homed
     axis.takes(times, samples)
     axis.works(stands=100, zero_arcsec=40.0)
     assert axis.waiting is None

@@ -18,7 +18,7 @@ OFFSET, SECOND = 12, slice(2, 4)
 
 @pytest.fixture(scope="module")
 def left_alone() -> list[float]:
-    """Three sigma over neighbouring tests without adaptation; independent of the load encoder."""
+    """Three sigma over neighbouring tests without adaptation, which is independent of the load encoder."""
     with at_work(CHANGING, None) as work:
         work.until(WORKED_S)
         return work.three_sigma_arcsec()
@@ -43,7 +43,7 @@ def test_a_changing_gear_is_followed_within_the_floor(left_alone: list[float]) -
 def test_a_load_encoder_that_fails_freezes_the_adaptation(
     fault: str, at_s: float, left_alone: list[float]
 ) -> None:
-    """Noise is judged once its usual size is known."""
+    """Excessive noise counts as a failure only after the normal noise level is known."""
     with at_work(CHANGING, QUICK) as work:
         work.until(at_s)
         work.faults.load_reading = FAULTS[fault](work)

@@ -137,7 +137,7 @@ def test_a_jump_persists_until_the_drive_is_verified_again():
     assert follower.health.status.fault is EncoderFault.JUMPED
     again = working(duration_s=60.0, seed=9)
     again["cycle"] += samples["cycle"][-1]
-    again["axes"]["state"][:10] = 0  # unverified
+    again["axes"]["state"][:10] = 0  # the axis is unverified
     assert judged(again, follower)[-1][1].fault is None
 
 
@@ -170,7 +170,8 @@ def test_an_uncalibrated_gear_is_not_an_encoder_fault():
     nothing = TransmissionModel(AXIS.gear.ratio)
     maker = SampleMaker(AXIS, nothing, model_of(offset=160.0, second=30.0), 3, compensated=False)
     samples = maker.make(moves_and_rests(120.0, PERIOD_S, 3, 60.0))
-    assert EncoderHealth(AXIS, MODEL).take(samples).fault is EncoderFault.JUMPED  # with a model
+    # If the axis had a model, this would be a fault.
+    assert EncoderHealth(AXIS, MODEL).take(samples).fault is EncoderFault.JUMPED
     assert [each.fault for _, each in judged(samples, Follower(AXIS, nothing))] == [None]
     samples["axes"]["load_position_deg"][len(samples) // 2 :] = samples["axes"]["load_position_deg"][0]
     assert EncoderHealth(AXIS, nothing).take(samples).fault is EncoderFault.FROZEN

@@ -72,7 +72,7 @@ def test_hours_of_normal_work_raise_nothing(seed):
 
 
 def quiet(seed, duration_s):
-    """The truth lies within the model's intervals, even at their edge."""
+    """Checks that a truth at the edge of the model's intervals raises no remark."""
     sign = (-1) ** seed
     truth = model_of(31.6 + sign * HALF_WIDTH_OFFSET_ARCSEC, second(sign * HALF_WIDTH_ARCSEC))
     watch, raised = watched(truth, duration_s=duration_s, seed=seed)

@@ -11,7 +11,7 @@ from hdbridge.daemon.loop.states import AxisState
 
 @pytest.fixture
 def daemon() -> Iterator[SteppedDaemon]:
-    """One axis, unverified."""
+    """Provides one axis, unverified."""
     with stepped_daemon() as made:
         yield made
 

@@ -1,4 +1,4 @@
-"""Shutdown: every axis comes to rest without power from any state, within a bounded time."""
+"""Shutdown: from any state, every axis comes to rest without power, within a bounded time."""
 
 import math
 

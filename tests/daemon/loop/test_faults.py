@@ -44,7 +44,7 @@ def test_a_bus_that_goes_down_while_nothing_moves(daemon: SteppedDaemon, lent: b
 
 
 def each_cycle(can_id: int, data: bytes = b"", **kind: bool) -> Callable[[SteppedDaemon], None]:
-    """A frame of another node in each of 500 cycles."""
+    """Returns an action that sends a frame of another node in each of 500 cycles."""
 
     def do(daemon: SteppedDaemon) -> None:
         for _ in range(500):
@@ -55,7 +55,7 @@ def each_cycle(can_id: int, data: bytes = b"", **kind: bool) -> Callable[[Steppe
 
 
 def wish(**faults: int) -> Callable[[SteppedDaemon], None]:
-    """A fault of the simulated drive's TPDOs, for two seconds."""
+    """Returns an action that makes the simulated drive's TPDOs faulty and runs two seconds."""
 
     def do(daemon: SteppedDaemon) -> None:
         for name, value in faults.items():

@@ -1,4 +1,4 @@
-"""A turn of the loop leaks no memory, so it can run for months."""
+"""A cycle of the loop leaks no memory, so the loop can run for months."""
 
 import gc
 import math
@@ -30,7 +30,8 @@ def work(daemon: SteppedDaemon) -> None:
 
 
 def test_nothing_grows(enabled: SteppedDaemon) -> None:
-    gc.freeze()  # else each of the five collections walks through all that the other tests have loaded
+    # Otherwise each of the five collections traverses everything that the other tests have loaded.
+    gc.freeze()
     try:
         for _ in range(2):
             work(enabled)
@@ -43,5 +44,5 @@ def test_nothing_grows(enabled: SteppedDaemon) -> None:
     finally:
         tracemalloc.stop()
         gc.unfreeze()
-    # A hundred bytes a turn would be some 20 MB a day.
+    # A leak of a hundred bytes per cycle would be some 20 MB a day.
     assert after - before < 16 * 2 * TURNS

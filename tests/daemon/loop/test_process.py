@@ -12,7 +12,7 @@ CONTROL = [sys.executable, "-m", "hdbridge.daemon.loop.process"]
 
 
 def ended(machine: Machine, simulation: Simulation | None, **changes: object) -> tuple[int, str, int]:
-    """Runs a control process to its end; returns its exit status, its output, and the number of turns."""
+    """Runs a control process to its end; returns its exit status, its output, and its number of cycles."""
     with Memory.create(len(machine.axes), machine.cycle_s) as memory:
         start = Start(machine, memory.fd, os.getpid(), simulation=simulation)
         fd = start.hand_over(**changes)

@@ -42,7 +42,7 @@ def powered(node: DriveNode) -> bool:
 
 
 def turns_until(bench: DaemonBench, state: AxisState, most: int = 1000) -> int:
-    """Turns until the first axis is in a state."""
+    """Runs cycles until the first axis is in a state; returns their number."""
     for turns in range(1, most + 1):
         bench.daemon.turn()
         if bench.states[0] is state:
@@ -61,7 +61,7 @@ def test_tpdo_order_has_no_effect(moving: DaemonBench) -> None:
 
 
 def test_a_wrapping_position_has_no_effect(bench: DaemonBench) -> None:
-    end = bench.node.firmware.motion.machine.load_counts + 150_000  # 19 degrees on
+    end = bench.node.firmware.motion.machine.load_counts + 150_000  # in 19 degrees
 
     def wrapped(counts: int) -> int:
         return (counts - end) % (2 * INT32) - INT32
@@ -218,7 +218,7 @@ def test_the_service_cannot_write_restart_or_command_a_moving_drive(moving: Daem
     daemon.run(0.1)
     passed = set(frames[:3]) & set(sent)
     assert not passed
-    assert sum(1 for can_id, _ in sent if can_id == 0x080) == 25  # one SYNC a cycle and no more
+    assert sum(1 for can_id, _ in sent if can_id == 0x080) == 25  # exactly one SYNC per cycle
     assert daemon.reported(E.REFUSED)
     assert moving.moves_on(0)
     further("an SDO write, an NMT reset, a set-point from the service in motion").show(len(passed))
@@ -238,7 +238,7 @@ def test_a_stale_position_at_enable_moves_nothing(bench: DaemonBench) -> None:
     enabled = [target for word, target in targets if word & 0x0F == ENABLE_OPERATION]
     assert enabled
     assert abs(enabled[0] - before) <= 1
-    # Any further motion is that of the compensation as it is faded in.
+    # Any remaining motion is due to the compensation, which is faded in.
     assert abs(bench.motor_counts() - before) < 20
     further("the position in the enable command is stale").show(0)
 

@@ -60,7 +60,7 @@ def _bring_back(daemon: SteppedDaemon) -> None:
         if daemon.states[0] is AxisState.DISABLED:
             daemon.enable(0)
     except (AssertionError, HdbridgeError):
-        daemon.run(0.2)  # a refusal is an answer, too
+        daemon.run(0.2)  # a refusal counts as an answer
 
 
 def _moves(daemon: SteppedDaemon, target_deg: float) -> None:

@@ -48,7 +48,7 @@ def test_unread_events_are_counted(memory: Memory) -> None:
     for cycle in range(EVENTS_KEPT + 10):
         memory.events.append(Event(0, cycle, 0, -1, EventKind.DONE))
     events, lost = reader.read()
-    assert lost == 11  # one more: the slot that may be being written
+    assert lost == 11  # plus the slot that may be in the middle of a write
     assert [each.cycle for each in events] == list(range(11, EVENTS_KEPT + 10))
 
 

@@ -76,7 +76,7 @@ def test_a_slot_being_written_is_not_read(memory: Memory, field: str) -> None:
     reader = memory.reader()
     for cycle in range(3):
         write(memory, cycle)
-    # As a writer leaves it in the middle of a store.
+    # The state that a writer leaves if it is killed in the middle of a store.
     reader._rows[2].view(sample_dtype(memory.axes))[field] = 77
     samples, lost = reader.read()
     assert samples["cycle"].tolist() == [0, 2]

@@ -30,7 +30,7 @@ def bridge(place):
 
 @pytest.fixture
 def page(place, bridge, chromium):
-    """The page, live."""
+    """Provides the live page in a browser."""
     chromium.complaints.clear()
     chromium.requested.clear()
     show(chromium, place)

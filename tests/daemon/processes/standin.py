@@ -1,7 +1,7 @@
-"""Stand-in for a child of the keeper: ``control`` counts turns, the others report that they are alive.
+"""Stand-in for a child of the keeper: ``control`` counts cycles, the others report that they are alive.
 
-HDBRIDGE_TEST_CONTROL, HDBRIDGE_TEST_SERVICE in the environment are an exit status with which it ends at once.
-SIGUSR1 makes the service ask for the bus.
+If HDBRIDGE_TEST_CONTROL or HDBRIDGE_TEST_SERVICE is set in the environment, that process ends at once with
+this exit status. SIGUSR1 makes the service ask for the bus.
 """
 
 import os

@@ -146,7 +146,7 @@ with InterfaceLock("socketcan", "can0", Path(sys.argv[1])):
 
 
 def test_a_lent_bus_returns_however_its_borrower_ends(keeper: Callable[..., Kept], tmp_path: Path) -> None:
-    """The borrower is killed, and meanwhile the service as well. Nothing else runs on the bus."""
+    """The borrower is killed, and meanwhile the service as well; no other program uses the bus."""
     kept = keeper()
     kept.until_notified("READY=1")
     os.kill(kept.until_begun("service"), signal.SIGUSR1)

@@ -55,7 +55,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
     options = {
         "port": random.randrange(20_000, 32_000),
         "hop_limit": 0,
-    }  # a port has the frames of all groups
+    }  # a multicast port receives the frames of all groups
     axis["bus"] = {"interface": "udp_multicast", "channel": channel, "options": options}
     path.write_text(yaml.safe_dump(axis))
     with started(tmp_path, "simulate", tmp_path), running(tmp_path, tmp_path, name="article") as daemon:
@@ -65,7 +65,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 
 
 def until_off(daemon: Daemon) -> None:
-    """Waits until the loop turns without power. A busy machine may have stopped the axis for lost frames."""
+    """Waits until the loop runs without power. A busy machine may have stopped the axis for lost frames."""
     off = {"unverified", "disabled", "quick-stopped", "latched"}
     daemon.until(
         lambda: (found := daemon.state())
@@ -80,7 +80,7 @@ def until_taken_back(daemon: Daemon, loops: int) -> None:
 
 
 def model_in_use(daemon: Daemon) -> dict[str, Any]:
-    """Returns the model in use; a control process that has just begun has none yet."""
+    """Returns the model in use; None while a newly started control process has no model."""
     return dict(daemon.until(lambda: (daemon.state() or {"axes": [{}]})["axes"][0].get("model"), "a model"))
 
 

@@ -1,4 +1,4 @@
-"""Samples reach the disk within the limits; those near a fault stay."""
+"""Samples reach the disk within the limits; those near a fault are kept."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""kill -9: everything up to the last second is on the disk, and the next start mends the file."""
+"""kill -9: everything up to the last second is on the disk, and the next start repairs the file."""
 
 import signal
 import subprocess

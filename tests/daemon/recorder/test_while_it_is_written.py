@@ -31,14 +31,16 @@ def folder(tmp_path: Path) -> Path:
 
 
 def stages(path: Path) -> list[Path]:
-    """The names that a recording may still get."""
+    """Returns the names that the recorder may still give to a recording."""
     finished = path.with_name(path.name.removesuffix(".part"))
     kept = path.parent / "kept" / finished.name
     return [each for each in (finished, kept) if each != path]
 
 
 def renames(folder: Path, names: list[str]) -> Callable[[str, Path], None]:
-    """Renames each of these recordings when it is about to be opened, as far as the recorder ever does."""
+    """Returns a hook that renames each of these recordings when it is about to be opened, to its next
+    possible name.
+    """
 
     def hook(event: str, path: Path) -> None:
         if event == "open" and path.is_relative_to(folder) and path.name in names and path.exists():

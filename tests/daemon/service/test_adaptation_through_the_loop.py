@@ -1,4 +1,4 @@
-"""The adaptation through the whole daemon: samples from the loop, another model into it."""
+"""The adaptation through the whole daemon: samples come from the loop, and a changed model goes to it."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -74,7 +74,7 @@ async def work(bridge: ServiceBridge, token: str, stands: int, seed: int = 0) ->
 
 
 def offset_arcsec(bridge: ServiceBridge) -> float:
-    """Identifier of the compensating model."""
+    """Returns the hysteresis offset of the model in use, arcsec."""
     effects = bridge.axes["axis1"].models.in_use.compensating.effects
     return next(each.offset_arcsec for each in effects if isinstance(each, Hysteresis))
 
@@ -87,7 +87,7 @@ async def test_the_model_in_the_loop_is_adapted_and_reverted(service: Service) -
         samples = samples["axes"][:, 0]
         stands = (samples["velocity_deg_s"] == 0.0) & (samples["weight"] == 1.0)
         changed = np.abs(np.diff(samples["correction_arcsec"]))[stands[1:] & stands[:-1]]
-        assert 0.0 < float(np.max(changed)) < 0.5  # a cycle: four arcsec are faded in, never at once
+        assert 0.0 < float(np.max(changed)) < 0.5  # per cycle, because the four arcsec are faded in
         assert offset_arcsec(bridge) == pytest.approx(44.0, abs=1.0)
         assert service.daemon.reported(EventKind.CHANGED)
         state = bridge.axes["axis1"].state().adaptation

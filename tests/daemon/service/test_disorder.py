@@ -202,7 +202,7 @@ class Disorder(RuleBasedStateMachine):
 
 
 class Longer(Disorder):
-    """The same for longer."""
+    """The same test with more steps and examples."""
 
 
 TestDisorder = Disorder.TestCase

@@ -35,7 +35,7 @@ def test_routine_events_do_not_displace_stops() -> None:
     assert log.newest_public == 2
     assert log.public(1)[0].event == event(EventKind.MOTION_ENDED, MotionMode.GOTO)
     assert log.public(2) == log.public(99) == []
-    assert log.newest == 2 * KEPT + 2  # the service itself sees all
+    assert log.newest == 2 * KEPT + 2  # the service's own reader receives all events
     assert log.answer(7) is not None
 
 

@@ -26,7 +26,7 @@ NOW = datetime(2026, 3, 1, tzinfo=UTC)
 
 
 def wider(model: TransmissionModel) -> TransmissionModel:
-    """The model with half as much hysteresis again."""
+    """Returns the model with 1.5 times the hysteresis offset."""
     effects = tuple(
         each.model_copy(update={"offset_arcsec": 1.5 * each.offset_arcsec})
         if isinstance(each, Hysteresis)
@@ -158,7 +158,7 @@ def pair(tmp_path: Path):
 
 
 def begin_uncompensated(service: Service) -> None:
-    """The control process starts again, as the keeper does it: with no model, and a new process number."""
+    """Restarts the control process as the keeper does: with no model, and a new process number."""
     service.daemon.begin_again()
     for axis in service.daemon.axes:
         axis.follower.correction = Correction(
@@ -217,7 +217,7 @@ async def test_a_new_service_reads_the_settings_in_use(pair: Service) -> None:
         await bridge.axes["axis2"].switch_load_loop(token, on=False)
         chosen = [axis.models.chosen for axis in bridge.axes.values()]
     for axis in pair.machine.axes:
-        axis.profile.model.unlink()  # the next one needs no file for it
+        axis.profile.model.unlink()  # the next process needs no file for it
     before = pair.daemon.memory.settings[0].number
     async with pair.bridge() as bridge:
         assert [axis.models.in_use for axis in bridge.axes.values()] == chosen

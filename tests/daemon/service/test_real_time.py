@@ -19,7 +19,9 @@ from hdbridge.errors import RefusedError
 
 @contextmanager
 def turning(service: Service) -> Iterator[None]:
-    """The loop turns in a thread, faster than its period; its clock is virtual, the service's is real."""
+    """Runs the loop in a thread, faster than its nominal period: the loop's clock is virtual, the service's
+    is real.
+    """
     ended = threading.Event()
 
     def turn() -> None:
@@ -42,7 +44,7 @@ async def verified(bridge: ServiceBridge) -> None:
 
 @pytest.mark.parametrize("slower", [1, 5000], ids=["idle", "busy"])
 def test_many_concurrent_requests(tmp_path: Path, slower: int) -> None:
-    """Must also pass on a computer that is this many times slower."""
+    """Requests must also succeed on a computer that is this many times slower."""
 
     async def story(service: Service) -> None:
         memory = service.daemon.memory
@@ -59,7 +61,7 @@ def test_many_concurrent_requests(tmp_path: Path, slower: int) -> None:
             assert first.state().load_target_deg == pytest.approx(3.0)
             assert second.state().load_target_deg == pytest.approx(-2.0)
 
-            # One client waits for a move, others look, read, and take its place.
+            # One client waits for a move, others read states and objects, and finally replace the move.
             waiting = asyncio.create_task(first.motion.move(token, 60.0))
             await asyncio.sleep(0.05)
             read = await asyncio.gather(

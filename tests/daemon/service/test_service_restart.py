@@ -45,10 +45,10 @@ async def test_no_request_is_made_before_the_axis_state_is_known(service: Servic
     async with service.bridge() as bridge:
         axis = bridge.axes["axis1"]
         token = bridge.lease.take("at once")
-        await axis.reset(token)  # waits until it is
+        await axis.reset(token)  # waits until the state is known
         assert axis.commissioning.report is not None
         assert daemon.states == [AxisState.DISABLED]
-        assert 0x000 not in sent  # no NMT command
+        assert 0x000 not in sent  # no NMT command has been sent
 
 
 async def test_without_a_control_process_nothing_is_sent(service: Service) -> None:

@@ -10,7 +10,7 @@ PERIOD_S = 0.004
 
 
 class Computer:
-    """Real time, and a loop that turns as often as it gets the processor."""
+    """Real time, and a loop that runs a cycle whenever it is given processor time."""
 
     def __init__(self):
         self.real_s, self.turns = 1000.0, 7

@@ -58,7 +58,7 @@ def compliance(site: Site) -> Hidden:
 
 
 def inertial_windup(site: Site) -> Hidden:
-    """Injects a heavier load and a softer gear; the wind-up is at least that of the axis before."""
+    """Injects a heavier load and a softer gear; the wind-up is at least that of the unchanged axis."""
     acceleration = math.radians(site.run.load_acceleration_deg_s2)
     inertia = site.truth.load_.whole_inertia_kg_m2
     present = inertia * acceleration / site.truth.gear.stiffness_nm_per_rad * ARCSEC_PER_RAD

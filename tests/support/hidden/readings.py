@@ -9,8 +9,8 @@ from support.hidden.site import ARCSEC_PER_RAD, ARCSEC_PER_TURN, Hidden, Site
 
 
 def _disc(site: Site, arcsec: float, second: float) -> dict[str, Any]:
-    """Returns a disc with this error of the first order at its shaft, and a fraction ``second`` of it of the
-    second order.
+    """Returns a disc with a first-order error of ``arcsec`` at its shaft, and a second-order error that is
+    ``second`` times as large.
     """
     radius_mm = site.stretched(12.0, 60.0)
     off_um = arcsec / ARCSEC_PER_RAD * radius_mm * 1000.0

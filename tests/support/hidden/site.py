@@ -43,7 +43,7 @@ class Hidden:
     parameters: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     """Parameters to compare a finding with; names include their units."""
     brings: tuple[str, ...] = ()
-    """Causes that this cause necessarily implies; they are right findings, too."""
+    """Causes that this cause necessarily implies; these are right findings, too."""
 
 
 @dataclass

@@ -1,14 +1,14 @@
-/* Memory of Python processes in user-mode-linux, entered many pages at a time.
+/* Populates the memory of Python processes in user-mode-linux many pages at a time.
  *
  *     cc -O2 -shared -fPIC -o populate.so populate.c
  *     LD_PRELOAD=./populate.so python ...
  *
- * There, a page that is touched for the first time takes 64 us: three exchanges with the process of the host that stands
- * for this one, nine tenths of them for memory that Python has just asked for. Where the kernel has the pages already and
- * their protection changes, it enters the whole range at once, at 7 us a page. So pages are asked for with the memory,
- * and their protection is changed and changed back: Python's arenas, which come by mmap, and the heap, which gets its
- * first pages here before anything runs. The pieces of Python's stack that it asks for and gives back at the same depth
- * again and again, a thousand times while the daemon's service loads, are kept.
+ * In user-mode-linux, the first access to a page takes 64 us: three exchanges with the process of the host that represents
+ * this one. Nine tenths of these accesses are to memory that Python has just requested. If the kernel already has the pages
+ * and their protection changes, it enters the whole range at once, at 7 us per page. This library therefore requests the
+ * pages together with the memory, and changes their protection and back. It does so for Python's arenas, which come by
+ * mmap, and for the heap, whose first pages are populated before anything runs. Chunks of Python's stack, which Python
+ * requests and frees repeatedly at the same depth (a thousand times while the daemon's service loads), are kept.
  */
 #define _GNU_SOURCE
 #include <errno.h>
@@ -23,8 +23,8 @@
 enum {
     PAGE = 4096,
     ARENA = 1 << 20, /* of CPython's obmalloc */
-    CHUNK = 1 << 14, /* of its stack */
-    HEAP = 16 << 20, /* what the daemon's service takes */
+    CHUNK = 1 << 14, /* of CPython's stack */
+    HEAP = 16 << 20, /* enough for the daemon's service */
     KEPT = 8
 };
 
@@ -70,10 +70,10 @@ void *mmap(void *at, size_t length, int prot, int flags, int fd, off_t offset)
         if (length == CHUNK)
             return chunk();
     }
-    return (void *)syscall(SYS_mmap, at, length, prot, flags, fd, offset); /* -1 is MAP_FAILED */
+    return (void *)syscall(SYS_mmap, at, length, prot, flags, fd, offset); /* returns MAP_FAILED (-1) on failure */
 }
 
-void *mmap64(void *, size_t, int, int, int, off_t) __attribute__((alias("mmap"))); /* what Python calls */
+void *mmap64(void *, size_t, int, int, int, off_t) __attribute__((alias("mmap"))); /* the name that Python calls */
 
 int munmap(void *at, size_t length)
 {
@@ -91,8 +91,8 @@ __attribute__((constructor)) static void begin(void)
     python = strncmp(program_invocation_short_name, "python", 6) == 0;
     if (!python)
         return;
-    mallopt(M_MMAP_THRESHOLD, HEAP + ARENA); /* on the heap */
-    mallopt(M_TRIM_THRESHOLD, HEAP + ARENA); /* and it stays there */
+    mallopt(M_MMAP_THRESHOLD, HEAP + ARENA); /* allocates large blocks on the heap, too */
+    mallopt(M_TRIM_THRESHOLD, HEAP + ARENA); /* and never returns them to the kernel */
     char *block = malloc(HEAP);
     if (block) {
         char *first = (char *)(((size_t)block + PAGE - 1) & -(size_t)PAGE);
