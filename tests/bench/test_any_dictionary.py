@@ -216,7 +216,7 @@ def test_equal_limits_count_as_no_limits(tmp_path: Path) -> None:
     [
         ((-128, 10), "csp", None),
         ((0, 0), "csp", None),
-        ((-1, 7), "csp", r"drive\.mode: csp is not among .*6060h permits -1 to 7\); 'mode: ip' would be"),
+        ((-1, 7), "csp", r"drive\.mode: csp is not among .*6060h permits -1 to 7\); 'mode: ip' is supported"),
         ((-9, 6), "ip", r"drive\.mode: ip is not among .*6060h permits -9 to 6\); this drive cannot be used"),
     ],
 )
@@ -251,8 +251,8 @@ def test_a_missing_mode_is_reported_before_its_objects(tmp_path: Path) -> None:
         ("0x00000043", "ip", None),
         ("0", "csp", None),
         ("", "csp", None),
-        ("0x00000043", "csp", r"drive\.mode: csp is not among .*6502h is 00000043h.*'mode: ip' would be"),
-        ("0x000000A1", "ip", r"drive\.mode: ip is not among .*'mode: csp' would be"),
+        ("0x00000043", "csp", r"drive\.mode: csp is not among .*6502h is 00000043h.*'mode: ip' is supported"),
+        ("0x000000A1", "ip", r"drive\.mode: ip is not among .*'mode: csp' is supported"),
         ("0x00000003", "csp", r"this drive cannot be used: choose one with cyclic synchronous"),
     ],
 )

@@ -165,7 +165,7 @@ def test_a_model_follows_the_commanded_angle_if_recorded():
     [
         (record(ratio=40.0), 50.0, "the motor makes 40 turns per turn of the load (measured over 320 deg of the load); expected a ratio of 50: correct the ratio, or the counts per turn of an encoder"),
         (record(ratio=160.0), 161.0, "the motor makes 160 turns per turn of the load (measured over 398 deg of the load); expected a ratio of 161: correct the ratio, or the counts per turn of an encoder"),
-        (record(ratio=-50.0), 50.0, "the motor makes 50 turns per turn of the load, against it (measured over 400 deg of the load); expected a ratio of 50: reverse the direction of one encoder"),
+        (record(ratio=-50.0), 50.0, "the motor makes 50 turns per turn of the load, in the opposite direction (measured over 400 deg of the load); expected a ratio of 50: reverse the direction of one encoder"),
         (Record({**record().columns, "load_position_deg": np.zeros(101)}), 50.0, "the load stands still while the motor turns (measured over 400 deg of the load); expected a ratio of 50: look at the load encoder's column"),
     ],
 )  # fmt: skip

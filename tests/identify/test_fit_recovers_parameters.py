@@ -123,7 +123,7 @@ def test_a_load_order_biases_nothing_and_is_reported(bench):
     assert off(result, "hysteresis", "offset_arcsec", axis.offset) < 2.0
     load = next(each for each in result.nuisances if each.name == "load order 1")
     assert load.value == pytest.approx(15.0, abs=0.3)
-    assert any("load order 1 shows" in each for each in result.warnings)
+    assert any("load order 1 is visible" in each for each in result.warnings)
 
 
 def test_recordings_with_zeros_of_their_own(bench):

@@ -131,8 +131,8 @@ def test_a_later_first_knot_delays_the_start():
     ("knot", "message"),
     [
         ((0.1, math.nan, 0.0), "finite"),
-        ((0.0, 0.0, 0.0), "must rise"),
-        ((-1.0, 0.0, 0.0), "must rise"),
+        ((0.0, 0.0, 0.0), "expected increasing times"),
+        ((-1.0, 0.0, 0.0), "expected increasing times"),
         ((0.1, 20.0, 0.0), r"deg/s; the axis file allows 60 \(limits.velocity_deg_s\)"),
         ((0.1, 1.0, 0.0), r"600 deg/s2; the axis file allows 200 \(limits.acceleration_deg_s2\)"),
         ((100.0, 121.0, 0.0), "position limits are -90 and 120 deg"),
@@ -160,7 +160,7 @@ def test_a_stream_starts_at_rest_at_the_present_position():
     set_point.jog(10.0, 1.0)
     for _ in range(10):
         set_point.step()
-    with pytest.raises(InputError, match="begins at rest"):
+    with pytest.raises(InputError, match="must begin at rest"):
         set_point.stream(1.0)
 
 
@@ -169,7 +169,7 @@ def test_the_buffer_is_bounded():
     for number in range(MOST_KNOTS + 1):
         set_point.knot(number * PERIOD_S, 0.0, 0.0)
     assert set_point.room == 0
-    with pytest.raises(InputError, match="waiting"):
+    with pytest.raises(InputError, match="are in the buffer"):
         set_point.knot(1e3, 0.0, 0.0)
 
 

@@ -51,7 +51,6 @@ class Compliance(Angleless, Linear):
         Shape("torque1_nm", 0.1, 1e5, logarithmic=True),
         Shape("torque2_nm", 0.2, 1e5, logarithmic=True),
     )
-    nonnegative = True
     linear = ("c1_arcsec_per_nm", "c2_arcsec_per_nm", "c3_arcsec_per_nm")
     typical = {
         "c1_arcsec_per_nm": 15.9,
