@@ -21,7 +21,8 @@ def test_scan_names_the_line_that_differs(hdbridge, profile):
     done = hdbridge("scan", folder, "--simulate")
     assert done.returncode == 4
     assert (
-        f"{folder}/axis.yaml:16:5: drive.identity.product_code: found 0x403; node 1 reports 0x402" in done.stdout
+        f"{folder}/axis.yaml:16:5: drive.identity.product_code: found 0x403; node 1 reports 0x402"
+        in done.stdout
     )
 
 
