@@ -177,7 +177,7 @@ class Adaptation:
         changes = changes_between(self.committed, self.model, self.committed)
         self._estimator = calibrated_estimator(self._drift, self.settings)
         self._free_zero()
-        self._unfreeze("begun anew")
+        self._unfreeze("restarted")
         self._proposed = self._used = np.zeros(self._drift.zero)
         self.model = self.committed
         self.mode = "observe"
@@ -203,7 +203,7 @@ class Adaptation:
         """Restores the committed response after a refinement that increased the ripple, and freezes."""
         self.model = replace(self.model, response=self.committed.response)
         self.freeze(
-            Freeze("the refined response in motion leaves more ripple: it was withdrawn", lasting=True)
+            Freeze("the refined response in motion increased the ripple and was withdrawn", lasting=True)
         )
         return Proposal(self.model, (), True, self._now_s)
 
@@ -216,7 +216,7 @@ class Adaptation:
         if self._zero_arcsec is not None or self.freeze_reason is not None:
             self._free_zero()
             if self.freeze_reason is not None and self.freeze_reason.lasting:
-                self._unfreeze("the zero was taken again")
+                self._unfreeze("the zero was learned again")
 
     def freeze(self, found: Freeze) -> None:
         """Stops learning until the cause ends, and reverts the last windows."""
@@ -249,7 +249,7 @@ class Adaptation:
         if self.freeze_reason is not None:
             return self.freeze_reason.reason
         if not path_known:
-            return "the axis has not yet turned past its loop"
+            return "the axis has not yet moved beyond the hysteresis width"
         return None if self.windows else "not enough motion yet"
 
     def estimated_changes(self) -> dict[str, float]:
@@ -301,7 +301,7 @@ class Adaptation:
         rows = np.array([each.row for each in window])
         observed = np.array([each.error_arcsec for each in window])
         if self._zero_arcsec is None:
-            self._take_zero(rows, observed)
+            self._learn_zero(rows, observed)
         residual = observed - rows @ self._estimator.estimate
         variance = np.einsum("ij,jk,ik->i", rows, self._estimator.covariance, rows)
         sigma = np.sqrt(variance + self._sigma_arcsec**2) + self._rate_allowance_arcsec(window, rows)
@@ -359,7 +359,7 @@ class Adaptation:
     def _zero(self) -> float:
         return float(self._estimator.estimate[self._drift.zero])
 
-    def _take_zero(self, rows: FloatArray, observed: FloatArray) -> None:
+    def _learn_zero(self, rows: FloatArray, observed: FloatArray) -> None:
         """Learns the zero as the median of a window, so that only the scatter about it is tested."""
         at = self._drift.zero
         estimate = self._estimator.estimate.copy()
@@ -399,7 +399,8 @@ class Adaptation:
         if moved is None or abs(moved) <= most:
             return None
         return Freeze(
-            f"the zero has moved by {moved:+.1f} arcsec since it was taken (at most {most:g}): take it again",
+            f"the zero has moved by {moved:+.1f} arcsec since it was learned (at most {most:g}): "
+            "learn it again",
             lasting=True,
         )
 
@@ -470,12 +471,12 @@ def _shift(residual_arcsec: FloatArray, gate_arcsec: FloatArray) -> Freeze | Non
     common = np.all(np.abs(residual_arcsec - shift) <= gate_arcsec)
     if common and abs(shift) > float(np.median(gate_arcsec)):
         return Freeze(
-            f"the load encoder reads {shift:+.1f} arcsec off all at once, alike in both directions: "
+            f"the load encoder has shifted by {shift:+.1f} arcsec at once, equally in both directions: "
             "a scale or coupling that slipped, or a lost zero",
             lasting=True,
         )
     worst = float(np.max(np.abs(residual_arcsec)))
     return Freeze(
-        f"the load is read up to {worst:.1f} arcsec off what the model and its rates allow, not alike at all "
-        "places"
+        f"the load encoder deviates by up to {worst:.1f} arcsec from the model, more than the rate limits "
+        "allow, and not equally at all places"
     )

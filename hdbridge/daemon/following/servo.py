@@ -15,7 +15,7 @@ from hdbridge.analysis.response import DIFFERENT, Answers, Limits, lags_agree, m
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import Response
-from hdbridge.daemon.following.judging import CLEARLY
+from hdbridge.daemon.following.judging import CLEAR_SHARE
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleFlag
 from hdbridge.units import DEG_PER_TURN
@@ -139,7 +139,7 @@ class ServoWatch:
         if len(answers.lags_ms) < MIN_RUNS:
             return None
         apart, lag_ms = answers.difference, median(answers.lags_ms)
-        limit = CLEARLY * DIFFERENT if self.retuned else DIFFERENT
+        limit = CLEAR_SHARE * DIFFERENT if self.retuned else DIFFERENT
         retuned = apart > limit or not lags_agree(stored.following_lag_ms, lag_ms)
         if retuned == self.retuned:
             return None
