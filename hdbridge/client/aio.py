@@ -398,7 +398,7 @@ class AsyncAxis:
         """Sets the adaptation mode: ``off``, ``observe`` or ``on``."""
         return await self._post("adaptation", messages.Adapt.given(mode=mode))
 
-    async def adaptation_back(self) -> AxisState:
+    async def revert_adaptation(self) -> AxisState:
         """Discards the changes by the adaptation, which only observes from then on."""
         return await self._delete("adaptation")
 
