@@ -15,7 +15,7 @@ from hdbridge.control.axiscycle import STILL_CYCLES, AxisCycle
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Report
 from hdbridge.daemon.loop.feeds import KnotFeed, OuterFeed
 from hdbridge.daemon.loop.follower import Follower
-from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, AxisState, Cause, Happening, refusal, target_of
+from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, AxisState, Cause, Trigger, refusal, target_of
 from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import NO_FAULT, Command, CommandKind, EventKind, Memory, SampleFlag
 from hdbridge.daemon.setting import CompensationSetting
@@ -28,7 +28,7 @@ from hdbridge.motion import MotionMode
 
 _OFF: Final = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
 _FOLLOW: Final = MotionMode.FOLLOW
-_LASTING: Final = {
+_MULTI_TURN_COMMANDS: Final = {
     CommandKind.ENABLE: (AxisState.ENABLING, AxisState.ENABLED),
     CommandKind.DISABLE: (AxisState.STOPPING, AxisState.DISABLED),
 }
@@ -63,7 +63,7 @@ class AxisLoop:
         self.set_point = self.follower.set_point
         self.group: frozenset[int] = frozenset()
         """Indices of the axes that began the same stream, which stop together with this axis."""
-        self.broken: frozenset[int] = frozenset()
+        self.left_group: frozenset[int] = frozenset()
         """Group whose stream this axis left before its end; the controller stops the others."""
 
         self._slot, self._report = memory.settings[index], report
@@ -83,7 +83,7 @@ class AxisLoop:
         self._doubt = ""
         """Last reported states of the compensation change, the stream underrun and the load loop."""
         self._pending: dict[CommandKind, int] = {}
-        """Ids of the pending commands of `_LASTING`."""
+        """Ids of the pending commands of `_MULTI_TURN_COMMANDS`."""
         self._motion_id = 0
         self._mode = MotionMode.HOLD
         self._powering_off = False
@@ -91,7 +91,7 @@ class AxisLoop:
         """Number of turns left before the drive's time-out."""
         self._why = ""
         """Reason for stopping, if the supervision did not report one."""
-        self.stands = True
+        self.stop_reported = True
         """True if the axis is at rest and its stop was reported; False only in QUICK_STOPPED and LATCHED."""
         self._place = self._still = 0
         """Motor counts in the last turn of a stop, and the number of consecutive turns at standstill."""
@@ -154,13 +154,13 @@ class AxisLoop:
     def verification_lost(self) -> None:
         """Handles a bus failure, after which the drive must be verified again, even if lent."""
         self._why = "the bus went down while the axis was lent"
-        self._happened(Happening.VERIFICATION_LOST)
+        self._transition(Trigger.VERIFICATION_LOST)
 
     def _done(self, id_: int) -> None:
         if id_:
             self._report(EventKind.DONE, id_, 0)
 
-    def _happened(self, cause: Cause) -> None:
+    def _transition(self, cause: Cause) -> None:
         """Makes the transition for ``cause``, if there is one in this state."""
         if (target := target_of(self.state, cause)) is not None:
             self._enter(target)
@@ -177,11 +177,11 @@ class AxisLoop:
             self._stand()
         if state in STOPPED:
             self.image.power.quick_stop()  # overrides any power target: only ENABLE leads back to power
-            self.stands = False
+            self.stop_reported = False
             self._still = 0
             self._left = self._turns(STOP_TIMEOUT_S)
         self._report(EventKind.STATE, 0, state)
-        for kind, (during, done) in _LASTING.items():
+        for kind, (during, done) in _MULTI_TURN_COMMANDS.items():
             if state is done:
                 self._done(self._pending.pop(kind, 0))
             elif state is not during:
@@ -204,7 +204,7 @@ class AxisLoop:
     def _break_group(self) -> None:
         """Leaves the group of a coordinated move, which the controller then stops."""
         if self.group:
-            self.broken, self.group = self.group, frozenset()
+            self.left_group, self.group = self.group, frozenset()
 
     def _turns(self, time_s: float) -> int:
         return math.ceil(time_s / self._period_s)
@@ -258,7 +258,7 @@ class AxisLoop:
 
     def _reset(self, command: Command) -> None:
         quick_stopped = self.state is AxisState.QUICK_STOPPED
-        if quick_stopped and not self.stands:
+        if quick_stopped and not self.stop_reported:
             raise TransitionError(f"{self.config.name}: the axis is still stopping; wait until it stands")
         if self.state is AxisState.LATCHED and not command.i:
             raise TransitionError(
@@ -353,18 +353,18 @@ class AxisLoop:
         supervision = self.supervision
         if supervision.stop is not None:
             latched = supervision.reaction is Reaction.LATCH
-            self._happened(Happening.VERIFICATION_LOST if latched else Happening.STOP_LATCHED)
+            self._transition(Trigger.VERIFICATION_LOST if latched else Trigger.STOP_LATCHED)
         state = self.state
         if state is AxisState.ENABLED:
             self._after_motion()
         elif state is AxisState.ENABLING:
             if self.cycle.command is self._follow:
-                self._happened(Happening.POWERED)
+                self._transition(Trigger.POWERED)
             else:
                 self._overdue(f"it did not reach 'operation enabled' within {2 * ENABLE_TIMEOUT_S:g} s")
         elif state is AxisState.STOPPING:
             self._after_stopping()
-        elif not self.stands:
+        elif not self.stop_reported:
             self._after_stop()
 
     def _after_motion(self) -> None:
@@ -386,7 +386,7 @@ class AxisLoop:
             if not set_point.at_rest:
                 words = "the set-points of the gateway ended in motion; it loses its power"
                 self._report(EventKind.UNDERRUN, self._motion_id, 0, words)
-            self._happened(Happening.UNFED)
+            self._transition(Trigger.UNFED)
         if set_point.underrun is not self._underrun:
             self._underrun = set_point.underrun
             if self._underrun:
@@ -406,7 +406,7 @@ class AxisLoop:
             if self.set_point.at_rest:
                 self._power_off()
         elif self.image.power.state in _OFF:
-            self._happened(Happening.POWER_OFF)
+            self._transition(Trigger.POWER_OFF)
         else:
             self._overdue(f"it did not switch power off within {STOP_TIMEOUT_S:g} s")
 
@@ -420,7 +420,7 @@ class AxisLoop:
                 f"{self.config.name}: the drive takes too long: {what}, it is in '{state}'; look at its "
                 "enable input, its supply and its fault history"
             )
-        self._happened(Happening.OVERDUE)
+        self._transition(Trigger.OVERDUE)
 
     def _after_stop(self) -> None:
         """Reports a stop once the axis is at rest or the time-out has passed."""
@@ -429,7 +429,7 @@ class AxisLoop:
                 return
         elif self.cycle.stopping:
             return
-        self.stands = True
+        self.stop_reported = True
         stop = self.supervision.stop
         code = FAULT_INDEX[stop.fault] if stop is not None else NO_FAULT
         error = self.cycle.stopped

@@ -98,10 +98,10 @@ class Controller:
             self._bus_down()
         for axis in axes:
             axis.after()
-            if axis.broken:
+            if axis.left_group:
                 self._stop_group(axis)
         if self._ending:
-            self._go_on_ending()
+            self._continue_ending()
         self._sample()
 
     def _sample(self) -> None:
@@ -174,12 +174,12 @@ class Controller:
 
     def _stop_group(self, stopped: AxisLoop) -> None:
         """Brakes the other axes of a group when one axis leaves it."""
-        for index in stopped.broken:
+        for index in stopped.left_group:
             axis = self.axes[index]
-            if axis.group == stopped.broken:
+            if axis.group == stopped.left_group:
                 axis.group = frozenset()
                 axis.stop()
-        stopped.broken = frozenset()
+        stopped.left_group = frozenset()
 
     # ---------------------------------------------------------------- the service's frames
 
@@ -252,14 +252,14 @@ class Controller:
         if axis.state not in _AT_REST:
             axis.command(Command(0, kind, axis.index))
 
-    def _go_on_ending(self) -> None:
+    def _continue_ending(self) -> None:
         self._ending_left -= 1
         moving = False
         for axis in self.axes:
             if axis.state in _AT_REST:
                 continue
             power = axis.image.power
-            if axis.state is AxisState.QUICK_STOPPED and axis.stands:
+            if axis.state is AxisState.QUICK_STOPPED and axis.stop_reported:
                 if power.state in _OFF:
                     continue
                 if axis.index not in self._released:
