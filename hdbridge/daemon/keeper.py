@@ -108,7 +108,7 @@ class Child:
         return self._process.poll()
 
     @property
-    def how(self) -> str:
+    def end_description(self) -> str:
         """Exit status or signal in words."""
         status = self.ended
         if status is None:
@@ -262,7 +262,7 @@ class Loan:
 
     def __init__(self, lock: InterfaceLock) -> None:
         self._lock = lock
-        self.asked_s: float | None = None
+        self.requested_s: float | None = None
         self._begun_s = 0.0
         self._collected = False
 
@@ -282,7 +282,7 @@ class Loan:
             self._lock.acquire()
         except BusInUseError:
             return False
-        self.asked_s = None
+        self.requested_s = None
         return True
 
 
@@ -316,9 +316,9 @@ class Keeper:
         self._ready = False
         self._status = 0
         """Exit status of the daemon."""
-        self._signals = self._heeded = 0
+        self._signals = self._handled = 0
         self._stopping_since_s: float | None = None
-        self._helpers_told_s: float | None = None
+        self._helpers_terminated_s: float | None = None
         self._fed_s = 0.0
         self._selector = selectors.DefaultSelector()
 
@@ -342,21 +342,21 @@ class Keeper:
         return self._status
 
     def _turn(self, now_s: float) -> None:
-        self._heed_signals(now_s)
+        self._handle_signals(now_s)
         if self._control is not None and self._control.ended is not None:
             self._control_ended(self._control, now_s)
         for helper in self._helpers:
             if helper.child is not None and helper.child.ended is not None:
                 self._helper_ended(helper, helper.child, now_s)
         if self._stopping_since_s is not None:
-            self._go_on_stopping(now_s)
+            self._continue_stopping(now_s)
             return
         if self._loan is not None:
             self._lend(self._loan, now_s)
         for helper in self._helpers:
             if helper.due_s is not None and now_s >= helper.due_s:
                 self._start_helper(helper, now_s)
-        self._look_after(now_s)
+        self._supervise(now_s)
 
     # ------------------------------------------------------------------ children
 
@@ -385,7 +385,7 @@ class Keeper:
         child.close()
 
     def _control_ended(self, child: Child, now_s: float) -> None:
-        status, how = child.ended, child.how
+        status, end = child.ended, child.end_description
         assert status is not None
         self._forget(child)
         self._control = None
@@ -393,15 +393,15 @@ class Keeper:
         if self._stopping_since_s is not None:
             self._status = self._status or max(status, 0)
             return
-        if self._loan is not None and self._loan.asked_s is not None:
+        if self._loan is not None and self._loan.requested_s is not None:
             self._loan.begin(now_s)
             self._memory.status[Cell.BUS_LENT] = time.monotonic_ns()
-            _log.info("the bus is lent", {"how": how})
+            _log.info("the bus is lent", {"how": end})
             return
-        _log.error("control process died", {"how": how, "lived_s": round(now_s - child.started_s, 1)})
+        _log.error("control process died", {"how": end, "lived_s": round(now_s - child.started_s, 1)})
         known = status if status in _ERRORS else HdbridgeError.exit_status
         if status in _ERRORS and not self._memory.status.loop_count:
-            self._stop(now_s, known, f"the control process cannot begin ({how})")
+            self._stop(now_s, known, f"the control process cannot begin ({end})")
         elif not self._budget.spend(now_s):
             self._stop(now_s, known, "the control process dies again and again")
         else:
@@ -409,18 +409,18 @@ class Keeper:
             self._start_control(now_s)
 
     def _helper_ended(self, helper: _Helper, child: Child, now_s: float) -> None:
-        name, status, how = helper.name, child.ended, child.how
+        name, status, end = helper.name, child.ended, child.end_description
         assert status is not None
         self._forget(child)
         helper.child = None
         if self._stopping_since_s is not None:
             return
         lived_s = now_s - child.started_s
-        _log.error(f"{name} process died", {"how": how, "lived_s": round(lived_s, 1)})
+        _log.error(f"{name} process died", {"how": end, "lived_s": round(lived_s, 1)})
         self._restarts[name] += 1
         if not self._ready and (status in _ERRORS or self._restarts[name] >= _FIRST_ATTEMPTS):
             known = status if status in _ERRORS else HdbridgeError.exit_status
-            self._stop(now_s, known, f"the {name} cannot begin ({how})")
+            self._stop(now_s, known, f"the {name} cannot begin ({end})")
         else:
             helper.due_s = now_s + helper.back_off.delay_s(lived_s)
         if helper.alive is Cell.GATEWAY_TIME_NS:
@@ -429,12 +429,12 @@ class Keeper:
     def _lend(self, loan: Loan, now_s: float) -> None:
         """Ends the control process if a loan is requested; starts a new one when the bus is free again."""
         status = self._memory.status
-        if loan.asked_s is None:
+        if loan.requested_s is None:
             if status[Cell.BUS_WANTED] and self._control is not None:
-                loan.asked_s = now_s
+                loan.requested_s = now_s
                 status[Cell.STOP_ASKED] = 1
         elif self._control is not None:
-            if now_s - loan.asked_s > self._times.stop_s:
+            if now_s - loan.requested_s > self._times.stop_s:
                 _log.error("the axes do not come to rest", {"after_s": self._times.stop_s})
                 self._control.send(signal.SIGKILL)
         elif loan.is_over(now_s):
@@ -443,7 +443,7 @@ class Keeper:
                 status[cell] = 0
             self._start_control(now_s)
 
-    def _look_after(self, now_s: float) -> None:
+    def _supervise(self, now_s: float) -> None:
         """Kills hung children; reports readiness, sign of life and status to the service manager."""
         status = self._memory.status
         axes = ", ".join(axis.name for axis in self._start.machine.axes)
@@ -478,13 +478,13 @@ class Keeper:
 
     # ------------------------------------------------------------------ the end
 
-    def _heed_signals(self, now_s: float) -> None:
+    def _handle_signals(self, now_s: float) -> None:
         """Handles signals: the first brakes to rest, the second quick-stops, the third kills all children."""
-        while self._heeded < self._signals:
-            self._heeded += 1
-            if self._heeded == 1:
+        while self._handled < self._signals:
+            self._handled += 1
+            if self._handled == 1:
                 self._stop(now_s, 0, "asked to")
-            elif self._heeded == 2:
+            elif self._handled == 2:
                 self._memory.status[Cell.STOP_ASKED] = 2
             else:
                 self._end_all()
@@ -500,7 +500,7 @@ class Keeper:
         self._notifier.stopping()
         self._memory.status[Cell.STOP_ASKED] = 1
 
-    def _go_on_stopping(self, now_s: float) -> None:
+    def _continue_stopping(self, now_s: float) -> None:
         assert self._stopping_since_s is not None
         if self._control is not None:
             if now_s - self._stopping_since_s > self._times.stop_s:
@@ -508,10 +508,10 @@ class Keeper:
                 self._status = self._status or HdbridgeError.exit_status
                 self._control.send(signal.SIGKILL)
             return
-        number, told_s = signal.SIGTERM, self._helpers_told_s
-        if told_s is None:
-            self._helpers_told_s = now_s
-        elif now_s - told_s > self._times.service_stop_s:
+        number, terminated_s = signal.SIGTERM, self._helpers_terminated_s
+        if terminated_s is None:
+            self._helpers_terminated_s = now_s
+        elif now_s - terminated_s > self._times.service_stop_s:
             number = signal.SIGKILL
         else:
             return

@@ -225,7 +225,7 @@ class Guard:
                 "of api.tcp.names in the machine file",
             )  # fmt: skip
         if not policy.knows_origin(headers.get("origin"), host, scheme):
-            return refusal(403, "asked by a page from elsewhere; expected none, or the daemon's own page")
+            return refusal(403, "request from a foreign web page; expected none, or the daemon's own page")
         shown = headers.get("authorization"), headers.get("sec-websocket-protocol")
         if policy.needs_token(scope["path"]) and not policy.admits(*shown):
             return refusal(
@@ -238,7 +238,7 @@ class Guard:
             "websocket", WEBSOCKETS_MAXIMUM
         )  # fmt: skip
         if self._traffic.open[kind] >= most:
-            return refusal(503, f"{most} of them are under way; close some, or try again later")
+            return refusal(503, f"too many requests ({most}) in progress; close some, or try again later")
         return None
 
 

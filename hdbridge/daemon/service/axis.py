@@ -77,7 +77,7 @@ class ServiceAxis:
         """Returns the state of the axis in the newest cycle."""
         return self._report(self)
 
-    def hear(self, event: Event) -> None:
+    def on_event(self, event: Event) -> None:
         """Takes an event of the axis."""
         if event.kind is EventKind.STOPPED:
             self.stopped = event, datetime.now(UTC)
@@ -273,7 +273,7 @@ class ServiceAxis:
     async def follow(self, model: TransmissionModel) -> None:
         """Compensates with the adapted parameters of the chosen model, whose version does not change."""
         async with self._changing:
-            await self._use(await self._work(self.models.moved, model))
+            await self._use(await self._work(self.models.with_adapted, model))
 
     def followed(self, holder: str) -> Following:
         """Returns the adaptation, for a change by ``holder``; raises InputError for an axis without one."""

@@ -158,7 +158,7 @@ class ServiceBridge:
         """Takes the loop's events from the observer: those of an axis, and failures of the bus."""
         for event in events:
             if event.axis >= 0:
-                self.axes[self._names[event.axis]].hear(event)
+                self.axes[self._names[event.axis]].on_event(event)
             elif event.kind in (EventKind.BUS_DOWN, EventKind.BUS_UP):
                 self._bus_up = event.kind is EventKind.BUS_UP
 

@@ -114,7 +114,7 @@ class OuterMaster:
                     await self._enable(axis, cells, series)
                 elif axis.link.value("mode") == MotionMode.FOLLOW and not self._core.lease.holds(granted_by):
                     await axis.link.do(CommandKind.STOP)
-                elif holds and self._is_left(axis, cells):
+                elif holds and self._has_stale_power(axis, cells):
                     await axis.disable(self._token)
                 elif (
                     holds
@@ -131,7 +131,7 @@ class OuterMaster:
                     noted = str(error)
                     self._core.log.note(f"for {self._name}: {error}", axis.link.index)
 
-    def _is_left(self, axis: ServiceAxis, cells: OuterCells) -> bool:
+    def _has_stale_power(self, axis: ServiceAxis, cells: OuterCells) -> bool:
         """Returns True if the axis has power from a request that is over, of this or an earlier process."""
         granted = cells[OuterCell.GRANTED]
         return axis.link.state in _OWN and granted != 0 and cells[OuterCell.WANTED] != granted

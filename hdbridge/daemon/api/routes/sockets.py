@@ -49,7 +49,7 @@ _GONE: Final = 1006
 
 routes = APIRouter()
 _STATES: Final = [each.value for each in ControlState]
-_AS_THEY_ARE: Final = (
+_COPIED_FIELDS: Final = (
     "load_target_deg", "load_position_deg", "motor_position_deg", "motor_torque_nm", "velocity_deg_s",
     "correction_arcsec", "predicted_arcsec", "loop_arcsec", "weight", "reading0", "reading1",
 )  # fmt: skip
@@ -190,7 +190,7 @@ def columns(
 
 
 def _axis(rows: NDArray[Any]) -> AxisColumns:
-    found: dict[str, Any] = {name: rows[name].tolist() for name in _AS_THEY_ARE}
+    found: dict[str, Any] = {name: rows[name].tolist() for name in _COPIED_FIELDS}
     error_arcsec = ARCSEC_PER_DEG * (rows["load_position_deg"] - rows["load_target_deg"])
     return AxisColumns.model_construct(
         state=[_STATES[each] for each in rows["state"].tolist()], error_arcsec=error_arcsec.tolist(), **found
