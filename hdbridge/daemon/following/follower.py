@@ -142,8 +142,8 @@ class Follower:
         axis: Any = samples["axes"][:, self._index]
         cycle, times_s = samples["cycle"], 1e-9 * samples["time_ns"].astype(np.float64)
         self._now_s = float(times_s[-1])
-        joined = self._next_cycle in {None, int(cycle[0])} and int(cycle[-1] - cycle[0]) == len(cycle) - 1
-        servo = self._servo.take(axis, joined=joined, believed=status.fault is None)
+        contiguous = self._next_cycle in {None, int(cycle[0])} and int(cycle[-1] - cycle[0]) == len(cycle) - 1
+        servo = self._servo.take(axis, contiguous=contiguous, encoder_trusted=status.fault is None)
         first = self._begin_of_path(axis, cycle)
         raised: list[RaisedVerdict] = []
         if servo is not None:

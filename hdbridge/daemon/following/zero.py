@@ -104,7 +104,7 @@ class Zero:
         self.rates: list[Rate] = []
         """Rates at the last judgement, one per span with enough observations."""
         self._recent: deque[Observation] = deque()
-        self._suspicions = 0
+        self._suspicious_fits = 0
 
     def take(self, observations: Sequence[Observation]) -> tuple[EncoderFault, str] | None:
         """Takes observations in order; returns a fault and its evidence once it is certain."""
@@ -191,16 +191,16 @@ class Zero:
         change, *_ = self._fit(rows, error_arcsec, self._information)
         change[0] = 0.0
         total = np.cumsum(error_arcsec - rows @ change)
-        likely = np.abs(total[before - 1] - total[-1] * before / count)
-        row = int(before[np.argmax(likely / np.sqrt(before * (count - before)))])
+        statistic = np.abs(total[before - 1] - total[-1] * before / count)
+        row = int(before[np.argmax(statistic / np.sqrt(before * (count - before)))])
         information = np.append(0.0, self._information)
         stepped = np.column_stack([np.arange(count) >= row, rows])
         change, errors, step_residual = self._fit(stepped, error_arcsec, information)
         step, error = float(change[0]), float(errors[0])
         if abs(step) < max(STEP_ARCSEC, SIGMAS * error):
             return None
-        bent = np.column_stack([np.maximum(rows[:, 0] - rows[row, 0], 0.0), rows])
-        *_, drift_residual = self._fit(bent, error_arcsec, information)
+        drifted = np.column_stack([np.maximum(rows[:, 0] - rows[row, 0], 0.0), rows])
+        *_, drift_residual = self._fit(drifted, error_arcsec, information)
         if step_residual > MAX_STEP_TO_DRIFT_RATIO * drift_residual:
             return None
         return EncoderFault.JUMPED, (
@@ -212,8 +212,8 @@ class Zero:
         """Returns a fault once a drift too fast or too large for a gear has lasted."""
         away = 0.0 if self.displacement is None else self.displacement.arcsec
         drifts = any(each.exceeds(RATE_ARCSEC_MIN) for each in self.rates)
-        self._suspicions = self._suspicions + 1 if drifts or abs(away) > MAX_ARCSEC else 0
-        if self._suspicions < CONSECUTIVE_FITS:
+        self._suspicious_fits = self._suspicious_fits + 1 if drifts or abs(away) > MAX_ARCSEC else 0
+        if self._suspicious_fits < CONSECUTIVE_FITS:
             return None
         rate = max(self.rates, key=lambda each: abs(each.arcsec_min) - SIGMAS * each.error)
         return EncoderFault.DRIFTING, (
