@@ -2,8 +2,8 @@
 
 `AxisLoop.command` takes the service's commands between two turns. `AxisCycle` requests a target in each turn
 in which the drive is enabled. The state determines which function provides the target (`_enabling`,
-`Follower.follow` or `_pursue`), so the turn itself makes no decision. `AxisLoop.after` evaluates the result
-of the turn.
+`Follower.follow` or `_follow_gateway`), so the turn itself makes no decision. `AxisLoop.after` evaluates
+the result of the turn.
 """
 
 import math
@@ -87,13 +87,13 @@ class AxisLoop:
         self._motion_id = 0
         self._mode = MotionMode.HOLD
         self._powering_off = False
-        self._left = 0
+        self._turns_left = 0
         """Number of turns left before the drive's time-out."""
         self._why = ""
         """Reason for stopping, if the supervision did not report one."""
         self.stop_reported = True
         """True if the axis is at rest and its stop was reported; False only in QUICK_STOPPED and LATCHED."""
-        self._place = self._still = 0
+        self._last_counts = self._still_turns = 0
         """Motor counts in the last turn of a stop, and the number of consecutive turns at standstill."""
         self._handlers: dict[CommandKind, Callable[[Command], None]] = {
             CommandKind.VERIFIED: self._verified,
@@ -127,7 +127,7 @@ class AxisLoop:
         target = target_of(self.state, kind)
         assert target is not None
         if kind is CommandKind.DISABLE and target is AxisState.STOPPING:
-            self._refuse_pending(kind, "another one came")
+            self._refuse_pending(kind, "another disable command has replaced it")
             self._pending[kind] = command.id
         elif kind is not CommandKind.ENABLE:
             self._done(command.id)
@@ -174,12 +174,12 @@ class AxisLoop:
         if state is AxisState.STOPPING and before is not AxisState.ENABLED:
             self._power_off()
         if state not in MAY_MOVE:
-            self._stand()
+            self._end_motion()
         if state in STOPPED:
             self.image.power.quick_stop()  # overrides any power target: only ENABLE leads back to power
             self.stop_reported = False
-            self._still = 0
-            self._left = self._turns(STOP_TIMEOUT_S)
+            self._still_turns = 0
+            self._turns_left = self._turns(STOP_TIMEOUT_S)
         self._report(EventKind.STATE, 0, state)
         for kind, (during, done) in _MULTI_TURN_COMMANDS.items():
             if state is done:
@@ -192,7 +192,7 @@ class AxisLoop:
         if id_ := self._pending.pop(kind, 0):
             self._report(EventKind.REFUSED, id_, kind, why)
 
-    def _stand(self) -> None:
+    def _end_motion(self) -> None:
         """Ends the motion: stops following set-points, and leaves the stream and its group."""
         self.cycle.command = None
         self._powering_off = False
@@ -213,7 +213,7 @@ class AxisLoop:
 
     def _verified(self, command: Command) -> None:
         self._seed(command)
-        self._aim_off()
+        self._request_power_off()
         self.cycle.begin()
 
     def _seed(self, command: Command) -> None:
@@ -238,7 +238,7 @@ class AxisLoop:
         self._why = ""
         self._pending[CommandKind.ENABLE] = command.id
         rarest = max((each.every_cycles for each in self.config.channels.values()), default=0)
-        self._left = self._turns(2 * ENABLE_TIMEOUT_S) + 2 * rarest
+        self._turns_left = self._turns(2 * ENABLE_TIMEOUT_S) + 2 * rarest
         self.cycle.command = self._enabling
         self.cycle.begin()
 
@@ -259,7 +259,7 @@ class AxisLoop:
     def _reset(self, command: Command) -> None:
         quick_stopped = self.state is AxisState.QUICK_STOPPED
         if quick_stopped and not self.stop_reported:
-            raise TransitionError(f"{self.config.name}: the axis is still stopping; wait until it stands")
+            raise TransitionError(f"{self.config.name}: the axis is still stopping; wait until it is at rest")
         if self.state is AxisState.LATCHED and not command.i:
             raise TransitionError(
                 f"{self.config.name}: boot and verify the drive again before this latch is released"
@@ -283,9 +283,9 @@ class AxisLoop:
         self.set_point.follow()
         self._outer.begin(command.j, command.a, self._due_s(), self.set_point.position_deg)
         self._motion_id, self._mode = command.id, MotionMode.FOLLOW
-        self.cycle.command = self._pursue
+        self.cycle.command = self._follow_gateway
 
-    def _pursue(self, feedback: Feedback) -> int | None:
+    def _follow_gateway(self, feedback: Feedback) -> int | None:
         """Follows the gateway's set-points one period late, because the newest may not have arrived yet."""
         if self.set_point.mode is MotionMode.FOLLOW:
             aim = self._outer.at(self._due_s() - self._period_s)
@@ -310,7 +310,7 @@ class AxisLoop:
 
     # ---------------------------------------------------------------- power
 
-    def _aim_off(self) -> None:
+    def _request_power_off(self) -> None:
         power = self.image.power
         try:
             power.go(State.SWITCH_ON_DISABLED)
@@ -320,8 +320,8 @@ class AxisLoop:
     def _power_off(self) -> None:
         self.cycle.command = None
         self._powering_off = True
-        self._left = self._turns(STOP_TIMEOUT_S)
-        self._aim_off()
+        self._turns_left = self._turns(STOP_TIMEOUT_S)
+        self._request_power_off()
 
     def _enabling(self, feedback: Feedback) -> int | None:
         """Holds position until every channel has a value, then follows from the actual position."""
@@ -331,7 +331,7 @@ class AxisLoop:
                 f"{self.config.where(waiting[0].key)}: no plausible reading arrived "
                 f"({waiting[0].why}); check the sensor, or leave the key out"
             )
-            self._left = 0
+            self._turns_left = 0
         if not waiting and feedback.fresh:
             self.follower.begin(feedback)
             self._underrun = False
@@ -411,8 +411,8 @@ class AxisLoop:
             self._overdue(f"it did not switch power off within {STOP_TIMEOUT_S:g} s")
 
     def _overdue(self, what: str) -> None:
-        self._left -= 1
-        if self._left > 0:
+        self._turns_left -= 1
+        if self._turns_left > 0:
             return
         if not self._why:
             state = self.image.power.state.value
@@ -425,7 +425,7 @@ class AxisLoop:
     def _after_stop(self) -> None:
         """Reports a stop once the axis is at rest or the time-out has passed."""
         if self.supervision.stop is None and self.state is AxisState.QUICK_STOPPED:
-            if not self._obeyed():
+            if not self._quick_stop_over():
                 return
         elif self.cycle.stopping:
             return
@@ -437,18 +437,18 @@ class AxisLoop:
         text = error.text if error is not None else self._why
         self._report(EventKind.STOPPED, int(explained), code, text)
 
-    def _obeyed(self) -> bool:
+    def _quick_stop_over(self) -> bool:
         """Returns True if a commanded quick stop is over: the motor is at rest or the time-out has passed."""
-        counts, before = self.cycle.feedback.motor_counts, self._place
-        self._place = counts
+        counts, before = self.cycle.feedback.motor_counts, self._last_counts
+        self._last_counts = counts
         driven = self.image.power.state is State.OPERATION_ENABLED
-        self._still = self._still + 1 if not driven and abs(counts - before) <= 1 else 0
-        self._left -= 1
-        if self._left > 0:
-            return self._still >= STILL_CYCLES
+        self._still_turns = self._still_turns + 1 if not driven and abs(counts - before) <= 1 else 0
+        self._turns_left -= 1
+        if self._turns_left > 0:
+            return self._still_turns >= STILL_CYCLES
         if driven:
             self._why += "; the drive did not obey it, so its voltage is disabled"
-            self._aim_off()
+            self._request_power_off()
         return True
 
     # ---------------------------------------------------------------- the sample of a turn
