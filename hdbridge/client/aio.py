@@ -53,7 +53,7 @@ RENEWALS: Final = 3
 MESSAGE_MAXIMUM: Final = 32 << 20
 """Maximum size of a WebSocket message in bytes, enough for the largest batch of samples of many axes."""
 CLOSE_S: Final = 1.0
-POINTS_AT_A_TIME: Final = 200
+POINTS_PER_MESSAGE: Final = 200
 Point = messages.StreamPoint | tuple[float, float] | tuple[float, float, float]
 """Time in seconds, load angle in degrees, and optionally speed in deg/s."""
 
@@ -437,8 +437,8 @@ class AsyncStream:
             else messages.StreamPoint.given(**dict(zip(names, each, strict=False)))
             for each in points
         ]
-        for first in range(0, len(items), POINTS_AT_A_TIME):
-            await self.exchange(messages.StreamPoints(points=items[first : first + POINTS_AT_A_TIME]))
+        for first in range(0, len(items), POINTS_PER_MESSAGE):
+            await self.exchange(messages.StreamPoints(points=items[first : first + POINTS_PER_MESSAGE]))
 
     async def end(self) -> None:
         """Ends the stream; returns when the axis is at rest at the last point."""

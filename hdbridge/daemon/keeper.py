@@ -46,7 +46,7 @@ _SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 _ERRORS: Final = range(2, 16)
 """Exit statuses of an `HdbridgeError`. The child has reported the error, and a restart would only repeat
 it."""
-_FIRST_ATTEMPTS: Final = 3
+_MAX_START_ATTEMPTS: Final = 3
 PATIENCE_S: Final = 1.0
 """Maximum wait if the service manager's queue is full, for messages that must not be lost."""
 
@@ -319,7 +319,7 @@ class Keeper:
         self._signals = self._handled = 0
         self._stopping_since_s: float | None = None
         self._helpers_terminated_s: float | None = None
-        self._fed_s = 0.0
+        self._alive_sent_s = 0.0
         self._selector = selectors.DefaultSelector()
 
     def run(self) -> int:
@@ -401,9 +401,9 @@ class Keeper:
         _log.error("control process died", {"how": end, "lived_s": round(now_s - child.started_s, 1)})
         known = status if status in _ERRORS else HdbridgeError.exit_status
         if status in _ERRORS and not self._memory.status.loop_count:
-            self._stop(now_s, known, f"the control process cannot begin ({end})")
+            self._stop(now_s, known, f"the control process cannot start ({end})")
         elif not self._budget.spend(now_s):
-            self._stop(now_s, known, "the control process dies again and again")
+            self._stop(now_s, known, "the control process keeps dying")
         else:
             self._restarts["control"] += 1
             self._start_control(now_s)
@@ -418,9 +418,9 @@ class Keeper:
         lived_s = now_s - child.started_s
         _log.error(f"{name} process died", {"how": end, "lived_s": round(lived_s, 1)})
         self._restarts[name] += 1
-        if not self._ready and (status in _ERRORS or self._restarts[name] >= _FIRST_ATTEMPTS):
+        if not self._ready and (status in _ERRORS or self._restarts[name] >= _MAX_START_ATTEMPTS):
             known = status if status in _ERRORS else HdbridgeError.exit_status
-            self._stop(now_s, known, f"the {name} cannot begin ({end})")
+            self._stop(now_s, known, f"the {name} cannot start ({end})")
         else:
             helper.due_s = now_s + helper.back_off.delay_s(lived_s)
         if helper.alive is Cell.GATEWAY_TIME_NS:
@@ -462,8 +462,8 @@ class Keeper:
             about = {"machine": machine.name, "axes": axes, "api": ", ".join(addresses)}
             _log.info("ready", about)
         running |= bool(status[Cell.BUS_LENT])
-        if running and now_s - self._fed_s >= (self._notifier.watchdog_s or 0.0) / 4.0:
-            self._fed_s = now_s
+        if running and now_s - self._alive_sent_s >= (self._notifier.watchdog_s or 0.0) / 4.0:
+            self._alive_sent_s = now_s
             self._notifier.alive()
         restarts = ", ".join(f"{name} restarted {n} times" for name, n in self._restarts.items() if n)
         words = f"holds {axes}" if self._ready else "begins"
@@ -483,7 +483,7 @@ class Keeper:
         while self._handled < self._signals:
             self._handled += 1
             if self._handled == 1:
-                self._stop(now_s, 0, "asked to")
+                self._stop(now_s, 0, "a signal requested it")
             elif self._handled == 2:
                 self._memory.status[Cell.STOP_ASKED] = 2
             else:

@@ -137,7 +137,7 @@ class Traffic:
     """Number of requests in progress (``http``) and of WebSockets (``websocket``)."""
 
     @contextmanager
-    def under_way(self, kind: str) -> Iterator[None]:
+    def in_progress(self, kind: str) -> Iterator[None]:
         """Counts a request or WebSocket as open within the block."""
         self.open[kind] += 1
         try:
@@ -192,7 +192,7 @@ class Guard:
             if problem is not None:
                 await _answer(problem, scope, receive, sending)
             else:
-                with self._traffic.under_way("http"):
+                with self._traffic.in_progress("http"):
                     await self._app(scope, receive if stops else _replayed(body, receive), sending)
         finally:
             self._traffic.count(scope["method"], status)
@@ -205,7 +205,7 @@ class Guard:
         if problem is None:
             _log.info("websocket", _about(scope))
             # A client may disconnect at any moment, even while it receives the reason for a close.
-            with self._traffic.under_way("websocket"), suppress(WebSocketDisconnect):
+            with self._traffic.in_progress("websocket"), suppress(WebSocketDisconnect):
                 await self._app(scope, receive, send)
             _log.info("websocket ended", _about(scope))
             return

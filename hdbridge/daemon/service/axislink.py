@@ -134,8 +134,8 @@ class AxisLink:
                 raise RefusedError(f"{self.name}: {why}")
             if not self.core.observer.alive:
                 raise DaemonError(
-                    f"{self.name}: the control process has not turned lately: it hangs or is gone; the drive "
-                    "stops by itself, and the axis comes back disabled"
+                    f"{self.name}: the control process has completed no cycle lately: it hangs or has died; "
+                    "the drive stops automatically, and the axis will be disabled"
                 )
             await self.core.timing.sleep(POLL_S)
 
@@ -176,7 +176,7 @@ class AxisLink:
             why = activity.over or "it was braked before its end"
             activity.end(why)
             raise RefusedError(f"{self.name}: {why}")
-        activity.end("it came to its end")
+        activity.end("it is complete")
         return True
 
 

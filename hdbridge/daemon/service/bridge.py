@@ -296,7 +296,7 @@ class ServiceBridge:
     async def quick_stop(self) -> None:
         """Quick-stops all axes. Requires no lease."""
         for axis in self.axes.values():
-            axis.give_up("it was stopped by a quick stop")
+            axis.cancel_activity("it was stopped by a quick stop")
         await self.core.do(CommandKind.QUICK_STOP)
 
     async def lend_bus(self, holder: str) -> None:

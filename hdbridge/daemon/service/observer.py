@@ -34,7 +34,7 @@ class Observer:
         self._log = log
         self._seen = log.newest
         self._sinks: list[Sink] = []
-        self._broken: set[int] = set()
+        self._failed_sinks: set[int] = set()
         self.newest: SampleArray | None = None
         """Newest sample, shape (1,); None before the first."""
         self.lost = 0
@@ -72,6 +72,6 @@ class Observer:
             try:
                 sink.take(samples, events, lost)
             except Exception:
-                if id(sink) not in self._broken:
-                    self._broken.add(id(sink))
+                if id(sink) not in self._failed_sinks:
+                    self._failed_sinks.add(id(sink))
                     _log.exception("a sink failed", extra={"sink": type(sink).__name__})

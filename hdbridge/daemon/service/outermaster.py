@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from hdbridge.daemon.service.core import Core
 
 _log: Final = logging.getLogger(__name__)
-_OWN: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED})
+_POWERED: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED})
 _STOPPED: Final = frozenset({AxisState.UNVERIFIED, AxisState.QUICK_STOPPED, AxisState.LATCHED})
 SETTLES_S: Final = 2.0
 """Maximum time for an axis to brake and lose its power before a reset or the next enable."""
@@ -73,7 +73,7 @@ class OuterMaster:
     def __init__(self, core: Core, settings: GatewaySettings, mark: Callable[[str, int], None]) -> None:
         """``mark`` reports a fault and makes the recorder keep the time around it."""
         self._core, self._mark = core, mark
-        self._patience_s = 1e-3 * settings.timeout_ms
+        self._timeout_s = 1e-3 * settings.timeout_ms
         self._name = f"the master on {settings.bus.interface}:{settings.bus.channel}"
         self._token = ""
 
@@ -134,7 +134,7 @@ class OuterMaster:
     def _has_stale_power(self, axis: ServiceAxis, cells: OuterCells) -> bool:
         """Returns True if the axis has power from a request that is over, of this or an earlier process."""
         granted = cells[OuterCell.GRANTED]
-        return axis.link.state in _OWN and granted != 0 and cells[OuterCell.WANTED] != granted
+        return axis.link.state in _POWERED and granted != 0 and cells[OuterCell.WANTED] != granted
 
     async def _enable(self, axis: ServiceAxis, cells: OuterCells, series: int) -> None:
         link, token = axis.link, self._token
@@ -153,7 +153,7 @@ class OuterMaster:
             )
             await axis.enable(token)
             if not is_withdrawn():
-                await link.do(CommandKind.FOLLOW, a=self._patience_s, j=series)
+                await link.do(CommandKind.FOLLOW, a=self._timeout_s, j=series)
             if is_withdrawn():
                 cells[OuterCell.REFUSED] = series
                 await axis.disable(self._token)
