@@ -511,7 +511,7 @@ def _unreachable(address: Address, problem: Exception) -> DaemonError:
     """Returns the error for a daemon that cannot be reached or has disconnected."""
     if isinstance(problem, httpx.ConnectError):
         return DaemonError(f"{address}: no daemon answers ({problem}); start it with 'hdbridge run'")
-    what = "did not answer in time" if isinstance(problem, httpx.TimeoutException) else "went away"
+    what = "did not answer in time" if isinstance(problem, httpx.TimeoutException) else "disconnected"
     return DaemonError(
         f"{address}: the daemon {what} ({problem or type(problem).__name__}); the outcome is unknown: "
         f"check the state first"
@@ -526,4 +526,4 @@ def _disconnected(address: Address, problem: Exception) -> HdbridgeError:
         return _refused(response.status_code, kind, bytes(response.body or b""))
     if isinstance(problem, ConnectionClosed) and problem.rcvd is not None and problem.rcvd.reason:
         return DaemonError(problem.rcvd.reason)
-    return DaemonError(f"{address}: the connection is gone ({problem or type(problem).__name__})")
+    return DaemonError(f"{address}: the connection was lost ({problem or type(problem).__name__})")

@@ -176,7 +176,7 @@ class Heartbeat:
         self.begun = False
         """True if the counter has advanced since the restart."""
 
-    def look(self, value: int) -> bool:
+    def check(self, value: int) -> bool:
         """Returns True if the counter has advanced since the last check."""
         advanced = value != self._last
         self._last = value
@@ -430,16 +430,16 @@ class Keeper:
         """Ends the control process if a loan is requested; starts a new one when the bus is free again."""
         status = self._memory.status
         if loan.requested_s is None:
-            if status[Cell.BUS_WANTED] and self._control is not None:
+            if status[Cell.BUS_REQUESTED] and self._control is not None:
                 loan.requested_s = now_s
-                status[Cell.STOP_ASKED] = 1
+                status[Cell.STOP_REQUESTED] = 1
         elif self._control is not None:
             if now_s - loan.requested_s > self._times.stop_s:
                 _log.error("the axes do not come to rest", {"after_s": self._times.stop_s})
                 self._control.send(signal.SIGKILL)
         elif loan.is_over(now_s):
             _log.info("the bus is taken back")
-            for cell in (Cell.BUS_LENT, Cell.STOP_ASKED):
+            for cell in (Cell.BUS_LENT, Cell.STOP_REQUESTED):
                 status[cell] = 0
             self._start_control(now_s)
 
@@ -447,11 +447,11 @@ class Keeper:
         """Kills hung children; reports readiness, sign of life and status to the service manager."""
         status = self._memory.status
         axes = ", ".join(axis.name for axis in self._start.machine.axes)
-        running = self._turns.look(status.loop_count)
+        running = self._turns.check(status.loop_count)
         self._kill_hung(self._control, self._turns, self._times.hung_s)
         serving = True
         for helper in self._helpers:
-            helper.heartbeat.look(status[helper.alive])
+            helper.heartbeat.check(status[helper.alive])
             self._kill_hung(helper.child, helper.heartbeat, helper.hung_s)
             serving &= helper.child is not None and status[helper.begun] == helper.child.pid
         if not self._ready and self._turns.begun and serving:
@@ -485,7 +485,7 @@ class Keeper:
             if self._handled == 1:
                 self._stop(now_s, 0, "a signal requested it")
             elif self._handled == 2:
-                self._memory.status[Cell.STOP_ASKED] = 2
+                self._memory.status[Cell.STOP_REQUESTED] = 2
             else:
                 self._end_all()
 
@@ -498,7 +498,7 @@ class Keeper:
             helper.due_s = None
         _log.info("stopping", {"why": why})
         self._notifier.stopping()
-        self._memory.status[Cell.STOP_ASKED] = 1
+        self._memory.status[Cell.STOP_REQUESTED] = 1
 
     def _continue_stopping(self, now_s: float) -> None:
         assert self._stopping_since_s is not None

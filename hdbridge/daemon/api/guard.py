@@ -196,9 +196,9 @@ class Guard:
                     await self._app(scope, receive if stops else _replayed(body, receive), sending)
         finally:
             self._traffic.count(scope["method"], status)
-            looks = scope["method"] in {"GET", "HEAD"} and status < 400
+            is_read = scope["method"] in {"GET", "HEAD"} and status < 400
             about = {**_about(scope), "status": status, "ms": round(1e3 * (time.monotonic() - began), 1)}
-            _log.log(logging.DEBUG if looks else logging.INFO, "request", about)
+            _log.log(logging.DEBUG if is_read else logging.INFO, "request", about)
 
     async def _websocket(self, scope: Scope, receive: Receive, send: Send) -> None:
         problem = self._refused(scope)
@@ -254,7 +254,7 @@ async def _read(scope: Scope, receive: Receive) -> tuple[bytes, Problem | None]:
             while True:
                 message = await receive()
                 if message["type"] == "http.disconnect":
-                    return b"", refusal(400, "the client went away before its request was complete")
+                    return b"", refusal(400, "the client disconnected before its request was complete")
                 parts.append(message.get("body", b""))
                 size += len(parts[-1])
                 if size > BODY_MAXIMUM:

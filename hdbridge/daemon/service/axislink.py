@@ -126,7 +126,7 @@ class AxisLink:
         """
         stopping = False
         while True:
-            done, stopping = self._look(activity, stopping)
+            done, stopping = self._poll_motion(activity, stopping)
             if done:
                 return
             why = activity.over or (waiting.over if waiting is not None else "")
@@ -139,13 +139,13 @@ class AxisLink:
                 )
             await self.core.timing.sleep(POLL_S)
 
-    def look(self, activity: Activity) -> None:
+    def check(self, activity: Activity) -> None:
         """Checks a motion without waiting. Raises like `arrival`, and RefusedError if it has ended."""
-        done, _ = self._look(activity, stopping=False)
+        done, _ = self._poll_motion(activity, stopping=False)
         if done or activity.over:
             raise RefusedError(f"{self.name}: {activity.over}")
 
-    def _look(self, activity: Activity, stopping: bool) -> tuple[bool, bool]:
+    def _poll_motion(self, activity: Activity, stopping: bool) -> tuple[bool, bool]:
         """Returns (motion has ended, axis is stopping for a reason not yet reported)."""
         self.core.observer.poll()
         log = self.core.log

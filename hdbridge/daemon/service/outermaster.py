@@ -107,7 +107,7 @@ class OuterMaster:
             try:
                 if cells[OuterCell.RESETS] != cells[OuterCell.RESETS_DONE]:
                     await self._reset(axis, cells, holds)
-                elif (series := cells[OuterCell.WANTED]) > max(
+                elif (series := cells[OuterCell.REQUESTED]) > max(
                     cells[OuterCell.GRANTED], cells[OuterCell.REFUSED]
                 ):
                     granted_by = self._token
@@ -134,14 +134,14 @@ class OuterMaster:
     def _has_stale_power(self, axis: ServiceAxis, cells: OuterCells) -> bool:
         """Returns True if the axis has power from a request that is over, of this or an earlier process."""
         granted = cells[OuterCell.GRANTED]
-        return axis.link.state in _POWERED and granted != 0 and cells[OuterCell.WANTED] != granted
+        return axis.link.state in _POWERED and granted != 0 and cells[OuterCell.REQUESTED] != granted
 
     async def _enable(self, axis: ServiceAxis, cells: OuterCells, series: int) -> None:
         link, token = axis.link, self._token
 
         def is_withdrawn() -> bool:
             """Returns True if the request is withdrawn, or the lease was taken even if it is free again."""
-            return not self._core.lease.holds(token) or cells[OuterCell.WANTED] != series
+            return not self._core.lease.holds(token) or cells[OuterCell.REQUESTED] != series
 
         try:
             # A master may enable again while the axis still brakes from the last time.

@@ -146,7 +146,7 @@ class ServiceStream:
         """Raises RefusedError with the reason if the stream has ended, LeaseError if the lease has."""
         self._link.core.lease.check(self._activity.holder)
         if self._has_begun and not self._ended:
-            self._link.look(self._activity)
+            self._link.check(self._activity)
         if self._activity.over or self._ended:
             why = self._activity.over or "it was ended"
             raise RefusedError(f"{self._link.name}: the stream has ended: {why}")
