@@ -551,7 +551,7 @@ def adapt(
     if back == (mode is not None):
         raise InputError("expected either a mode or --back")
     with daemon.moving(axis) as moved:
-        daemon.print_state(moved.adaptation_back() if mode is None else moved.adapt(mode.value))
+        daemon.print_state(moved.revert_adaptation() if mode is None else moved.adapt(mode.value))
 
 
 @on_daemon

@@ -53,7 +53,7 @@ RENEWALS: Final = 3
 MESSAGE_MAXIMUM: Final = 32 << 20
 """Maximum size of a WebSocket message in bytes, enough for the largest batch of samples of many axes."""
 CLOSE_S: Final = 1.0
-POINTS_AT_A_TIME: Final = 200
+POINTS_PER_MESSAGE: Final = 200
 Point = messages.StreamPoint | tuple[float, float] | tuple[float, float, float]
 """Time in seconds, load angle in degrees, and optionally speed in deg/s."""
 
@@ -402,8 +402,8 @@ class AsyncAxis:
         """Sets the adaptation mode: ``off``, ``observe`` or ``on``."""
         return await self._post("adaptation", messages.Adapt.given(mode=mode))
 
-    async def adaptation_back(self) -> AxisState:
-        """Discards the changes made by the adaptation, which only observes from then on."""
+    async def revert_adaptation(self) -> AxisState:
+        """Discards the changes by the adaptation, which only observes from then on."""
         return await self._delete("adaptation")
 
     async def read(self, object_: str) -> SdoValue:
@@ -441,8 +441,8 @@ class AsyncStream:
             else messages.StreamPoint.given(**dict(zip(names, each, strict=False)))
             for each in points
         ]
-        for first in range(0, len(items), POINTS_AT_A_TIME):
-            await self.exchange(messages.StreamPoints(points=items[first : first + POINTS_AT_A_TIME]))
+        for first in range(0, len(items), POINTS_PER_MESSAGE):
+            await self.exchange(messages.StreamPoints(points=items[first : first + POINTS_PER_MESSAGE]))
 
     async def end(self) -> None:
         """Ends the stream; returns when the axis is at rest at the last point."""
@@ -515,7 +515,7 @@ def _unreachable(address: Address, problem: Exception) -> DaemonError:
     """Returns the error for a daemon that cannot be reached or has disconnected."""
     if isinstance(problem, httpx.ConnectError):
         return DaemonError(f"{address}: no daemon answers ({problem}); start it with 'hdbridge run'")
-    what = "did not answer in time" if isinstance(problem, httpx.TimeoutException) else "went away"
+    what = "did not answer in time" if isinstance(problem, httpx.TimeoutException) else "disconnected"
     return DaemonError(
         f"{address}: the daemon {what} ({problem or type(problem).__name__}); the outcome is unknown: "
         f"check the state first"
@@ -530,4 +530,4 @@ def _disconnected(address: Address, problem: Exception) -> HdbridgeError:
         return _refused(response.status_code, kind, bytes(response.body or b""))
     if isinstance(problem, ConnectionClosed) and problem.rcvd is not None and problem.rcvd.reason:
         return DaemonError(problem.rcvd.reason)
-    return DaemonError(f"{address}: the connection is gone ({problem or type(problem).__name__})")
+    return DaemonError(f"{address}: the connection was lost ({problem or type(problem).__name__})")

@@ -126,7 +126,7 @@ class Axis:
     activate_model = _waits(AsyncAxis.activate_model)
     load_loop = _waits(AsyncAxis.load_loop)
     adapt = _waits(AsyncAxis.adapt)
-    adaptation_back = _waits(AsyncAxis.adaptation_back)
+    revert_adaptation = _waits(AsyncAxis.revert_adaptation)
     read = _waits(AsyncAxis.read)
     write = _waits(AsyncAxis.write)
 

@@ -71,15 +71,15 @@ def _check(name: str, text: str, *, stores: bool = False) -> Callable[[_Function
     return add
 
 
-def _numbered(t: NodeTester, identity: list[int], node_id: int) -> None:
-    """Sets a new node id, which becomes valid at the next reset of the communication."""
+def _set_node_id(t: NodeTester, identity: list[int], node_id: int) -> None:
+    """Sets the node id that becomes valid at the next reset of the communication."""
     _select(t, identity)
     _answered(t, _ask(t, 0x11, node_id), 0x11, 0)
 
 
-def _back(t: NodeTester, identity: list[int], now: int) -> None:
-    """Restores the node's own node id; sends all requests before it waits, so that the user cannot end the
-    run before they are sent.
+def _restore_node_id(t: NodeTester, identity: list[int], now: int) -> None:
+    """Restores the node's own node id; sends all requests before it waits, so that the user's stop cannot
+    prevent them.
     """
     requests = [struct.pack("<BI3x", 0x40 + part, number) for part, number in enumerate(identity)]
     since = len(t.log)
@@ -151,28 +151,28 @@ def _(t: NodeTester, _: list[int]) -> None:
 @_check("node-id.pending", "A new node id waits for a reset of the communication")
 def _(t: NodeTester, identity: list[int]) -> None:
     other = _free_node_id(t)
-    _numbered(t, identity, other)
+    _set_node_id(t, identity, other)
     try:
         t.true(t.ask(upload_request(0x1000)), "no SDO answer", "one at the node id in use")
     finally:
-        _back(t, identity, t.node_id)
+        _restore_node_id(t, identity, t.node_id)
 
 
 @_check("node-id.used", "After a reset of the communication the node boots with its new node id")
 def _(t: NodeTester, identity: list[int]) -> None:
     other = _free_node_id(t)
-    _numbered(t, identity, other)
+    _set_node_id(t, identity, other)
     since = t.mark()
     t.nmt(NMT_RESET_COMMUNICATION)
     try:
         t.true(t.hears(0x700 + other, t.timing.boot_s, since), "no boot-up message", f"one of node {other}")
     finally:
-        _back(t, identity, other)
+        _restore_node_id(t, identity, other)
 
 
 @_check("fast-scan", "Without a node id the node is silent until a fast scan finds it")
 def _(t: NodeTester, identity: list[int]) -> None:
-    _numbered(t, identity, _NO_NODE_ID)
+    _set_node_id(t, identity, _NO_NODE_ID)
     since = t.mark()
     t.nmt(NMT_RESET_COMMUNICATION)
     try:
@@ -185,7 +185,7 @@ def _(t: NodeTester, identity: list[int]) -> None:
             _answered(t, _ask(t, 0x51, 0, part, (part + 1) % 4, number=number), 0x4F)
         _answered(t, _ask(t, 0x5E), 0x5E, _NO_NODE_ID)
     finally:
-        _back(t, identity, _NO_NODE_ID)
+        _restore_node_id(t, identity, _NO_NODE_ID)
 
 
 @_check("fast-scan.configured", "A node with a node id does not answer a fast scan")

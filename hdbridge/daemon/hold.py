@@ -40,7 +40,7 @@ def hold(
         if simulation is None and not force:
             lock = stack.enter_context(InterfaceLock(machine.bus.interface, machine.bus.channel))
         given = machine.api.socket
-        path = machine.beside(given) if given is not None else folder / f"{machine.name}.sock"
+        path = machine.resolve_path(given) if given is not None else folder / f"{machine.name}.sock"
         listeners = [stack.enter_context(unix_socket(path, machine.api.group))]
         stack.callback(path.unlink, missing_ok=True)
         if (tcp := machine.api.tcp) is not None:

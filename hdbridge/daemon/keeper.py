@@ -46,7 +46,7 @@ _SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 _ERRORS: Final = range(2, 16)
 """Exit statuses of an `HdbridgeError`. The child has reported the error, and a restart would only repeat
 it."""
-_FIRST_ATTEMPTS: Final = 3
+_MAX_START_ATTEMPTS: Final = 3
 PATIENCE_S: Final = 1.0
 """Maximum wait if the service manager's queue is full, for messages that must not be lost."""
 
@@ -108,7 +108,7 @@ class Child:
         return self._process.poll()
 
     @property
-    def how(self) -> str:
+    def end_description(self) -> str:
         """Exit status or signal in words."""
         status = self.ended
         if status is None:
@@ -176,7 +176,7 @@ class Heartbeat:
         self.begun = False
         """True if the counter has advanced since the restart."""
 
-    def look(self, value: int) -> bool:
+    def check(self, value: int) -> bool:
         """Returns True if the counter has advanced since the last check."""
         advanced = value != self._last
         self._last = value
@@ -262,7 +262,7 @@ class Loan:
 
     def __init__(self, lock: InterfaceLock) -> None:
         self._lock = lock
-        self.asked_s: float | None = None
+        self.requested_s: float | None = None
         self._begun_s = 0.0
         self._collected = False
 
@@ -282,7 +282,7 @@ class Loan:
             self._lock.acquire()
         except BusInUseError:
             return False
-        self.asked_s = None
+        self.requested_s = None
         return True
 
 
@@ -316,10 +316,10 @@ class Keeper:
         self._ready = False
         self._status = 0
         """Exit status of the daemon."""
-        self._signals = self._heeded = 0
+        self._signals = self._handled = 0
         self._stopping_since_s: float | None = None
-        self._helpers_told_s: float | None = None
-        self._fed_s = 0.0
+        self._helpers_terminated_s: float | None = None
+        self._alive_sent_s = 0.0
         self._selector = selectors.DefaultSelector()
 
     def run(self) -> int:
@@ -342,21 +342,21 @@ class Keeper:
         return self._status
 
     def _turn(self, now_s: float) -> None:
-        self._heed_signals(now_s)
+        self._handle_signals(now_s)
         if self._control is not None and self._control.ended is not None:
             self._control_ended(self._control, now_s)
         for helper in self._helpers:
             if helper.child is not None and helper.child.ended is not None:
                 self._helper_ended(helper, helper.child, now_s)
         if self._stopping_since_s is not None:
-            self._go_on_stopping(now_s)
+            self._continue_stopping(now_s)
             return
         if self._loan is not None:
             self._lend(self._loan, now_s)
         for helper in self._helpers:
             if helper.due_s is not None and now_s >= helper.due_s:
                 self._start_helper(helper, now_s)
-        self._look_after(now_s)
+        self._supervise(now_s)
 
     # ------------------------------------------------------------------ children
 
@@ -385,7 +385,7 @@ class Keeper:
         child.close()
 
     def _control_ended(self, child: Child, now_s: float) -> None:
-        status, how = child.ended, child.how
+        status, end = child.ended, child.end_description
         assert status is not None
         self._forget(child)
         self._control = None
@@ -393,34 +393,34 @@ class Keeper:
         if self._stopping_since_s is not None:
             self._status = self._status or max(status, 0)
             return
-        if self._loan is not None and self._loan.asked_s is not None:
+        if self._loan is not None and self._loan.requested_s is not None:
             self._loan.begin(now_s)
             self._memory.status[Cell.BUS_LENT] = time.monotonic_ns()
-            _log.info("the bus is lent", {"how": how})
+            _log.info("the bus is lent", {"how": end})
             return
-        _log.error("control process died", {"how": how, "lived_s": round(now_s - child.started_s, 1)})
+        _log.error("control process died", {"how": end, "lived_s": round(now_s - child.started_s, 1)})
         known = status if status in _ERRORS else HdbridgeError.exit_status
         if status in _ERRORS and not self._memory.status.loop_count:
-            self._stop(now_s, known, f"the control process cannot begin ({how})")
+            self._stop(now_s, known, f"the control process cannot start ({end})")
         elif not self._budget.spend(now_s):
-            self._stop(now_s, known, "the control process dies again and again")
+            self._stop(now_s, known, "the control process keeps dying")
         else:
             self._restarts["control"] += 1
             self._start_control(now_s)
 
     def _helper_ended(self, helper: _Helper, child: Child, now_s: float) -> None:
-        name, status, how = helper.name, child.ended, child.how
+        name, status, end = helper.name, child.ended, child.end_description
         assert status is not None
         self._forget(child)
         helper.child = None
         if self._stopping_since_s is not None:
             return
         lived_s = now_s - child.started_s
-        _log.error(f"{name} process died", {"how": how, "lived_s": round(lived_s, 1)})
+        _log.error(f"{name} process died", {"how": end, "lived_s": round(lived_s, 1)})
         self._restarts[name] += 1
-        if not self._ready and (status in _ERRORS or self._restarts[name] >= _FIRST_ATTEMPTS):
+        if not self._ready and (status in _ERRORS or self._restarts[name] >= _MAX_START_ATTEMPTS):
             known = status if status in _ERRORS else HdbridgeError.exit_status
-            self._stop(now_s, known, f"the {name} cannot begin ({how})")
+            self._stop(now_s, known, f"the {name} cannot start ({end})")
         else:
             helper.due_s = now_s + helper.back_off.delay_s(lived_s)
         if helper.alive is Cell.GATEWAY_TIME_NS:
@@ -429,29 +429,29 @@ class Keeper:
     def _lend(self, loan: Loan, now_s: float) -> None:
         """Ends the control process if a loan is requested; starts a new one when the bus is free again."""
         status = self._memory.status
-        if loan.asked_s is None:
-            if status[Cell.BUS_WANTED] and self._control is not None:
-                loan.asked_s = now_s
-                status[Cell.STOP_ASKED] = 1
+        if loan.requested_s is None:
+            if status[Cell.BUS_REQUESTED] and self._control is not None:
+                loan.requested_s = now_s
+                status[Cell.STOP_REQUESTED] = 1
         elif self._control is not None:
-            if now_s - loan.asked_s > self._times.stop_s:
+            if now_s - loan.requested_s > self._times.stop_s:
                 _log.error("the axes do not come to rest", {"after_s": self._times.stop_s})
                 self._control.send(signal.SIGKILL)
         elif loan.is_over(now_s):
             _log.info("the bus is taken back")
-            for cell in (Cell.BUS_LENT, Cell.STOP_ASKED):
+            for cell in (Cell.BUS_LENT, Cell.STOP_REQUESTED):
                 status[cell] = 0
             self._start_control(now_s)
 
-    def _look_after(self, now_s: float) -> None:
+    def _supervise(self, now_s: float) -> None:
         """Kills hung children; reports readiness, sign of life and status to the service manager."""
         status = self._memory.status
         axes = ", ".join(axis.name for axis in self._start.machine.axes)
-        running = self._turns.look(status.loop_count)
+        running = self._turns.check(status.loop_count)
         self._kill_hung(self._control, self._turns, self._times.hung_s)
         serving = True
         for helper in self._helpers:
-            helper.heartbeat.look(status[helper.alive])
+            helper.heartbeat.check(status[helper.alive])
             self._kill_hung(helper.child, helper.heartbeat, helper.hung_s)
             serving &= helper.child is not None and status[helper.begun] == helper.child.pid
         if not self._ready and self._turns.begun and serving:
@@ -462,8 +462,8 @@ class Keeper:
             about = {"machine": machine.name, "axes": axes, "api": ", ".join(addresses)}
             _log.info("ready", about)
         running |= bool(status[Cell.BUS_LENT])
-        if running and now_s - self._fed_s >= (self._notifier.watchdog_s or 0.0) / 4.0:
-            self._fed_s = now_s
+        if running and now_s - self._alive_sent_s >= (self._notifier.watchdog_s or 0.0) / 4.0:
+            self._alive_sent_s = now_s
             self._notifier.alive()
         restarts = ", ".join(f"{name} restarted {n} times" for name, n in self._restarts.items() if n)
         words = f"holds {axes}" if self._ready else "begins"
@@ -478,14 +478,14 @@ class Keeper:
 
     # ------------------------------------------------------------------ the end
 
-    def _heed_signals(self, now_s: float) -> None:
+    def _handle_signals(self, now_s: float) -> None:
         """Handles signals: the first brakes to rest, the second quick-stops, the third kills all children."""
-        while self._heeded < self._signals:
-            self._heeded += 1
-            if self._heeded == 1:
-                self._stop(now_s, 0, "asked to")
-            elif self._heeded == 2:
-                self._memory.status[Cell.STOP_ASKED] = 2
+        while self._handled < self._signals:
+            self._handled += 1
+            if self._handled == 1:
+                self._stop(now_s, 0, "a signal requested it")
+            elif self._handled == 2:
+                self._memory.status[Cell.STOP_REQUESTED] = 2
             else:
                 self._end_all()
 
@@ -498,9 +498,9 @@ class Keeper:
             helper.due_s = None
         _log.info("stopping", {"why": why})
         self._notifier.stopping()
-        self._memory.status[Cell.STOP_ASKED] = 1
+        self._memory.status[Cell.STOP_REQUESTED] = 1
 
-    def _go_on_stopping(self, now_s: float) -> None:
+    def _continue_stopping(self, now_s: float) -> None:
         assert self._stopping_since_s is not None
         if self._control is not None:
             if now_s - self._stopping_since_s > self._times.stop_s:
@@ -508,10 +508,10 @@ class Keeper:
                 self._status = self._status or HdbridgeError.exit_status
                 self._control.send(signal.SIGKILL)
             return
-        number, told_s = signal.SIGTERM, self._helpers_told_s
-        if told_s is None:
-            self._helpers_told_s = now_s
-        elif now_s - told_s > self._times.service_stop_s:
+        number, terminated_s = signal.SIGTERM, self._helpers_terminated_s
+        if terminated_s is None:
+            self._helpers_terminated_s = now_s
+        elif now_s - terminated_s > self._times.service_stop_s:
             number = signal.SIGKILL
         else:
             return

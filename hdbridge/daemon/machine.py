@@ -117,7 +117,7 @@ class Machine:
         file, else, if that is not writable, in the user's state folder.
         """
         if self.recorder.folder is not None:
-            return self.beside(self.recorder.folder)
+            return self.resolve_path(self.recorder.folder)
         if _given(environment) is not None or not _writable(self.folder):
             return self.state_folder(environment) / "recordings"
         return (self.folder / "recordings" / "daemon").absolute()
@@ -136,7 +136,7 @@ class Machine:
         state = environment.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
         return Path(state) / "hdbridge" / self.name
 
-    def beside(self, text: str) -> Path:
+    def resolve_path(self, text: str) -> Path:
         """Returns the absolute path for a path in the machine file."""
         return (self.folder / text).absolute()
 
@@ -173,7 +173,7 @@ class Machine:
             replace(axis, config=axis.config.model_copy(update={"bus": bus, "realtime": realtime}))
             for axis in axes
         ]
-        _check_together(axes, bus, places)
+        _check_axes(axes, bus, places)
         _check_tcp(file, places)
         _check_interfaces(file, places)
         _check_gateway(file, axes, bus, places)
@@ -268,15 +268,15 @@ def _agreed(axes: Sequence[Axis], ask: Callable[[AxisConfig], T], places: _Place
     return first
 
 
-def _check_together(axes: Sequence[Axis], bus: BusConfig, places: _Places) -> None:
+def _check_axes(axes: Sequence[Axis], bus: BusConfig, places: _Places) -> None:
     """Checks that names are unique, that the axes can share a bus, and that the bus load fits the cycle."""
     names: dict[str, int] = {}
     for number, axis in enumerate(axes):
         if (other := names.setdefault(axis.name, number)) != number:
             raise places.error(
                 ("axes", number, "profile"),
-                f"an axis '{axis.name}' stands in {places.where(('axes', other))} already; expected another "
-                f"name in {axis.config.where('name')}",
+                f"axis name '{axis.name}' is already used in {places.where(('axes', other))}; expected "
+                f"another name in {axis.config.where('name')}",
             )
     configs = [axis.config for axis in axes]
     if (found := conflict(configs)) is not None:
@@ -306,7 +306,7 @@ def _check_gateway(file: MachineFile, axes: Sequence[Axis], bus: BusConfig, plac
         if name not in known:
             raise places.error(at, f"no axis '{name}'; expected one of: {', '.join(known)}")
         if (owner := nodes.setdefault(node, name)) != name:
-            raise places.error(at, f"node {node} is '{owner}' already; expected another node id")
+            raise places.error(at, f"node id {node} is already used by '{owner}'; expected another")
         limits = known[name].limits
         farthest = max(abs(limits.position_min_deg), abs(limits.position_max_deg)) / 360.0
         if farthest * gateway.counts_per_turn >= 1 << 31:

@@ -25,7 +25,7 @@ from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
 from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.eventlog import Journal
+from hdbridge.daemon.service.eventlog import EventLogger
 from hdbridge.daemon.service.following import Following
 from hdbridge.daemon.service.observer import Sink
 from hdbridge.daemon.service.timing import SimulatedClock, Timing
@@ -72,7 +72,7 @@ async def serve(start: Start, memory: Memory) -> None:
         bridge.recorder = recorder
         stack.callback(recorder.close)
         following = follow(machine, bridge, recorder, stack)
-        sinks: list[Sink] = [Journal([*bridge.axes]), metrics, recorder, *following]
+        sinks: list[Sink] = [EventLogger([*bridge.axes]), metrics, recorder, *following]
         for sink in sinks:
             bridge.core.observer.add(sink)
         await stack.enter_async_context(bridge)
@@ -80,13 +80,13 @@ async def serve(start: Start, memory: Memory) -> None:
         async with asyncio.TaskGroup() as group:
             group.create_task(server.run())
             group.create_task(_say_when_served(server, memory))
-            beside = [
+            background_tasks = [
                 group.create_task(_apply(following)),
                 group.create_task(_keep_socket(start, server, bridge.core.log.note)),
             ]
             await terminated.wait()
             await _last_words(bridge, memory)
-            for task in beside:
+            for task in background_tasks:
                 task.cancel()
             server.stop()
 
@@ -104,7 +104,7 @@ def follow(
     following: list[Following] = []
     for index, (axis, port) in enumerate(zip(machine.axes, bridge.axes.values(), strict=True)):
         given = axis.adaptation.folder
-        folder = machine.beside(given) if given is not None else machine.axis_folder(axis, "adaptation")
+        folder = machine.resolve_path(given) if given is not None else machine.axis_folder(axis, "adaptation")
         worker = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix=f"following-{axis.name}"))
         made = Following(index, port, axis.adaptation, folder, worker, recorder, diagnosis)
         port.following = made
@@ -129,7 +129,7 @@ def listeners(machine: Machine, descriptors: Sequence[int], page_token: str | No
     if page_token is not None:
         made.append(Listener(others[0], Policy(page_token)))
     elif tcp is not None:
-        token = machine.beside(tcp.token_file).read_text(encoding="ascii").strip()
+        token = machine.resolve_path(tcp.token_file).read_text(encoding="ascii").strip()
         made.append(Listener(others[0], Policy(token, frozenset(each.lower() for each in tcp.names))))
     return made
 

@@ -105,7 +105,7 @@ def test_machine_can_be_pickled(folder: Path) -> None:
         (
             "profile: two",
             "profile: one",
-            "machine.yaml:5:14: axes[1].profile: an axis 'one' stands in line 4 already; expected another name",
+            "machine.yaml:5:14: axes[1].profile: axis name 'one' is already used in line 4; expected another name",
         ),
         ("name: test", "name: test\nlease_s: 0", "machine.yaml:3:10: lease_s: found 0; expected a number from 0.5"),
         (

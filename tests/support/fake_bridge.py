@@ -75,7 +75,7 @@ class FakeAxis:
         if not -180 <= target_deg <= 180:
             raise InputError(f"found {target_deg:g} deg; expected from -180 to 180 deg")
 
-    def followed(self, holder: str) -> FakeAxis:
+    def following_for(self, holder: str) -> FakeAxis:
         self._bridge.lease.check(holder)
         return self
 

@@ -85,7 +85,7 @@ def _add_pages(app: FastAPI, bridge: ServiceBridge, metrics: Metrics, traffic: T
         """Returns 200 while the control loop runs, else 503."""
         alive = bridge.state().cycle.alive
         status = HTTPStatus.OK if alive else HTTPStatus.SERVICE_UNAVAILABLE
-        words = "ok\n" if alive else "the control loop does not turn\n"
+        words = "ok\n" if alive else "the control loop completes no cycles\n"
         return Response(words, status, media_type="text/plain")
 
 

@@ -137,7 +137,7 @@ class Traffic:
     """Number of requests in progress (``http``) and of WebSockets (``websocket``)."""
 
     @contextmanager
-    def under_way(self, kind: str) -> Iterator[None]:
+    def in_progress(self, kind: str) -> Iterator[None]:
         """Counts a request or WebSocket as open within the block."""
         self.open[kind] += 1
         try:
@@ -192,20 +192,20 @@ class Guard:
             if problem is not None:
                 await _answer(problem, scope, receive, sending)
             else:
-                with self._traffic.under_way("http"):
+                with self._traffic.in_progress("http"):
                     await self._app(scope, receive if stops else _replayed(body, receive), sending)
         finally:
             self._traffic.count(scope["method"], status)
-            looks = scope["method"] in {"GET", "HEAD"} and status < 400
+            is_read = scope["method"] in {"GET", "HEAD"} and status < 400
             about = {**_about(scope), "status": status, "ms": round(1e3 * (time.monotonic() - began), 1)}
-            _log.log(logging.DEBUG if looks else logging.INFO, "request", about)
+            _log.log(logging.DEBUG if is_read else logging.INFO, "request", about)
 
     async def _websocket(self, scope: Scope, receive: Receive, send: Send) -> None:
         problem = self._refused(scope)
         if problem is None:
             _log.info("websocket", _about(scope))
             # A client may disconnect at any moment, even while it receives the reason for a close.
-            with self._traffic.under_way("websocket"), suppress(WebSocketDisconnect):
+            with self._traffic.in_progress("websocket"), suppress(WebSocketDisconnect):
                 await self._app(scope, receive, send)
             _log.info("websocket ended", _about(scope))
             return
@@ -225,7 +225,7 @@ class Guard:
                 "of api.tcp.names in the machine file",
             )  # fmt: skip
         if not policy.knows_origin(headers.get("origin"), host, scheme):
-            return refusal(403, "asked by a page from elsewhere; expected none, or the daemon's own page")
+            return refusal(403, "request from a foreign web page; expected none, or the daemon's own page")
         shown = headers.get("authorization"), headers.get("sec-websocket-protocol")
         if policy.needs_token(scope["path"]) and not policy.admits(*shown):
             return refusal(
@@ -238,7 +238,7 @@ class Guard:
             "websocket", WEBSOCKETS_MAXIMUM
         )  # fmt: skip
         if self._traffic.open[kind] >= most:
-            return refusal(503, f"{most} of them are under way; close some, or try again later")
+            return refusal(503, f"too many requests ({most}) in progress; close some, or try again later")
         return None
 
 
@@ -254,7 +254,7 @@ async def _read(scope: Scope, receive: Receive) -> tuple[bytes, Problem | None]:
             while True:
                 message = await receive()
                 if message["type"] == "http.disconnect":
-                    return b"", refusal(400, "the client went away before its request was complete")
+                    return b"", refusal(400, "the client disconnected before its request was complete")
                 parts.append(message.get("body", b""))
                 size += len(parts[-1])
                 if size > BODY_MAXIMUM:

@@ -143,7 +143,7 @@ class _Scrape(Collector):
         answered = [((method, str(status)), n) for (method, status), n in sorted(traffic.answered.items())]
         yield _counter("api_requests", "Requests answered.", answered, ("method", "status"))
         open_now = [((kind,), traffic.open[kind]) for kind in ("http", "websocket")]
-        yield _gauge("api_clients", "Requests and WebSockets under way.", open_now, ("kind",))
+        yield _gauge("api_clients", "Requests and WebSockets in progress.", open_now, ("kind",))
 
 
 def _field(state: Any, path: str) -> Any:

@@ -33,13 +33,13 @@ def answer(problem: Problem) -> Response:
 
 def register(app: FastAPI) -> None:
     """Registers the error handlers of the application."""
-    app.add_exception_handler(HdbridgeError, _of_the_house)
-    app.add_exception_handler(RequestValidationError, _not_valid)
-    app.add_exception_handler(HTTPException, _of_http)
-    app.add_exception_handler(Exception, _unexpected)
+    app.add_exception_handler(HdbridgeError, _on_hdbridge_error)
+    app.add_exception_handler(RequestValidationError, _on_validation_error)
+    app.add_exception_handler(HTTPException, _on_http_exception)
+    app.add_exception_handler(Exception, _on_unexpected_error)
 
 
-async def _of_the_house(request: Request, error: Exception) -> Response:
+async def _on_hdbridge_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HdbridgeError)
     problem = Problem.of(error, request.path_params.get("axis"))
     if isinstance(error, UnknownError):
@@ -47,7 +47,7 @@ async def _of_the_house(request: Request, error: Exception) -> Response:
     return answer(problem)
 
 
-async def _not_valid(request: Request, error: Exception) -> Response:
+async def _on_validation_error(request: Request, error: Exception) -> Response:
     """Answers a request that violates the schema, with one complaint per key, without its value."""
     assert isinstance(error, RequestValidationError)
     complaints = []
@@ -61,7 +61,7 @@ async def _not_valid(request: Request, error: Exception) -> Response:
     return answer(problem)
 
 
-async def _of_http(_request: Request, error: Exception) -> Response:
+async def _on_http_exception(_request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     kind = "InputError" if error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR else "HdbridgeError"
     response = answer(refusal(error.status_code, _printable(str(error.detail)), kind))
@@ -69,7 +69,7 @@ async def _of_http(_request: Request, error: Exception) -> Response:
     return response
 
 
-async def _unexpected(request: Request, error: Exception) -> Response:
+async def _on_unexpected_error(request: Request, error: Exception) -> Response:
     """Answers an unexpected error; its details go to the log only."""
     _log.error("failed", {"method": request.method, "path": request.url.path, "error": repr(error)})
     return answer(

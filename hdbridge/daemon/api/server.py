@@ -110,7 +110,7 @@ class _Server(uvicorn.Server):
             each.transport.abort()
 
 
-class _Watched(asyncio.Protocol):
+class _CheckedConnection(asyncio.Protocol):
     """Connection that is checked every `HEAD_S`; the kernel identifies the peer of a Unix socket."""
 
     client: tuple[str, int] | None
@@ -132,7 +132,7 @@ class _Watched(asyncio.Protocol):
         self._watch = self.loop.call_later(HEAD_S, self._check)
 
 
-class _Connection(_Watched, H11Protocol):
+class _Connection(_CheckedConnection, H11Protocol):
     """HTTP connection, limited to `CONNECTIONS_MAXIMUM`."""
 
     _idle_since_s = 0.0
@@ -174,7 +174,7 @@ class _Connection(_Watched, H11Protocol):
         super()._check()
 
 
-class _WebSocket(_Watched, WebSocketsSansIOProtocol):
+class _WebSocket(_CheckedConnection, WebSocketsSansIOProtocol):
     """WebSocket connection; its pings detect dead peers."""
 
     def _check(self) -> None:

@@ -44,7 +44,7 @@ REVERTED_WINDOWS = 3
 """Number of windows before a fault whose updates are reverted."""
 RATE_INTERVALS = 2.0
 """Maximum number of update intervals that count for the rate limit after a pause."""
-LEAST_SHARE = 0.99
+MIN_RATE_LIMITED_SHARE = 0.99
 """Share of the permitted change per interval from which a change is applied, even below
 `AdaptationSettings.smallest_arcsec`."""
 GATE_SIGMAS = 6.0
@@ -120,10 +120,10 @@ class Adaptation:
         self._window: list[Observation] = []
         self._zero_arcsec: float | None = None
         """Zero when it was learned."""
-        self._cleared = 0
-        self._earlier: deque[tuple[FloatArray, FloatArray]] = deque(maxlen=REVERTED_WINDOWS)
+        self._plausible_windows = 0
+        self._previous_estimates: deque[tuple[FloatArray, FloatArray]] = deque(maxlen=REVERTED_WINDOWS)
         """Estimates and covariances before each of the last windows."""
-        self._begun_s: float | None = None
+        self._learning_since_s: float | None = None
         """Begin of the first window learned since the start or the last freeze; None before."""
         self._window_s: float | None = None
         """End of the last window, used or not."""
@@ -161,7 +161,7 @@ class Adaptation:
         if mode == "on" and self.freeze_reason is not None:
             estimator = self._estimator
             estimator.covariance = estimator.covariance + np.diag(estimator.scale**2)
-            self._free_zero()
+            self._reset_zero()
             self._unfreeze("by command")
         if mode != self.mode:
             # Changes that were only observed are not applied at once: start from the model in use.
@@ -176,8 +176,8 @@ class Adaptation:
         """Restores the committed model and only observes from now on, until `set_mode`."""
         changes = changes_between(self.committed, self.model, self.committed)
         self._estimator = calibrated_estimator(self._drift, self.settings)
-        self._free_zero()
-        self._unfreeze("begun anew")
+        self._reset_zero()
+        self._unfreeze("restarted")
         self._proposed = self._used = np.zeros(self._drift.zero)
         self.model = self.committed
         self.mode = "observe"
@@ -203,7 +203,7 @@ class Adaptation:
         """Restores the committed response after a refinement that increased the ripple, and freezes."""
         self.model = replace(self.model, response=self.committed.response)
         self.freeze(
-            Freeze("the refined response in motion leaves more ripple: it was withdrawn", lasting=True)
+            Freeze("the refined response in motion increased the ripple and was withdrawn", lasting=True)
         )
         return Proposal(self.model, (), True, self._now_s)
 
@@ -214,23 +214,23 @@ class Adaptation:
     def invalidate_zero(self) -> None:
         """Handles a possible change of the drive's zero (homed or off), which ends a lasting freeze."""
         if self._zero_arcsec is not None or self.freeze_reason is not None:
-            self._free_zero()
+            self._reset_zero()
             if self.freeze_reason is not None and self.freeze_reason.lasting:
-                self._unfreeze("the zero was taken again")
+                self._unfreeze("the zero was learned again")
 
     def freeze(self, found: Freeze) -> None:
         """Stops learning until the cause ends, and reverts the last windows."""
         self._window.clear()
-        self._cleared = 0
+        self._plausible_windows = 0
         before = self.freeze_reason
         if before is None:
-            if self._earlier:
-                self._estimator.estimate, self._estimator.covariance = self._earlier[0]
-                self._earlier.clear()
+            if self._previous_estimates:
+                self._estimator.estimate, self._estimator.covariance = self._previous_estimates[0]
+                self._previous_estimates.clear()
             self._log_event("frozen", reason=found.reason, lasting=found.lasting)
         if before is None or (found.lasting and not before.lasting):
             self.freeze_reason = found
-        self._begun_s = None
+        self._learning_since_s = None
 
     @property
     def estimate_arcsec(self) -> FloatArray:
@@ -249,7 +249,7 @@ class Adaptation:
         if self.freeze_reason is not None:
             return self.freeze_reason.reason
         if not path_known:
-            return "the axis has not yet turned past its loop"
+            return "the axis has not yet moved beyond the hysteresis width"
         return None if self.windows else "not enough motion yet"
 
     def estimated_changes(self) -> dict[str, float]:
@@ -281,7 +281,7 @@ class Adaptation:
             return
         estimator.estimate, estimator.covariance = estimate, covariance
         self.windows = learned.windows
-        self._free_zero()
+        self._reset_zero()
         if self.mode == "on":
             self._proposed = self._used = np.clip(applied, -self._bounds, self._bounds)
             self.model = replace(self.model, response=learned.response or self.model.response)
@@ -301,28 +301,28 @@ class Adaptation:
         rows = np.array([each.row for each in window])
         observed = np.array([each.error_arcsec for each in window])
         if self._zero_arcsec is None:
-            self._take_zero(rows, observed)
+            self._learn_zero(rows, observed)
         residual = observed - rows @ self._estimator.estimate
         variance = np.einsum("ij,jk,ik->i", rows, self._estimator.covariance, rows)
         sigma = np.sqrt(variance + self._sigma_arcsec**2) + self._rate_allowance_arcsec(window, rows)
-        found = _shift(residual, GATE_SIGMAS * sigma) or self._zero_drifts(rates)
+        found = _outlier_freeze(residual, GATE_SIGMAS * sigma) or self._zero_rate_freeze(rates)
         self._window_s = window[-1].time_s
         if found is not None:
             self.freeze(found)
             return
         if self.freeze_reason is not None:
-            self._cleared += not self.freeze_reason.lasting
-            if self._cleared < CLEAR_WINDOWS:
+            self._plausible_windows += not self.freeze_reason.lasting
+            if self._plausible_windows < CLEAR_WINDOWS:
                 return
             self._unfreeze("the load encoder agrees with the model again")
         self._learn(window, rows, observed)
-        found = self._zero_out_of_bound()
+        found = self._zero_bound_freeze()
         if found is not None:
             self.freeze(found)
 
     def _learn(self, window: list[Observation], rows: FloatArray, observed: FloatArray) -> None:
         estimator, zero = self._estimator, self._drift.zero
-        self._earlier.append((estimator.estimate, estimator.covariance))
+        self._previous_estimates.append((estimator.estimate, estimator.covariance))
         one_way = reversals(window) < self.settings.excitation.reversals
         estimator.update(
             rows,
@@ -333,8 +333,8 @@ class Adaptation:
         )
         estimator.estimate[:zero] = np.clip(estimator.estimate[:zero], -self._bounds, self._bounds)
         self.windows += 1
-        if self._begun_s is None:
-            self._begun_s = window[0].time_s
+        if self._learning_since_s is None:
+            self._learning_since_s = window[0].time_s
 
     def _rate_allowance_arcsec(self, window: list[Observation], rows: FloatArray) -> FloatArray:
         """Returns the change that the rate limits permit since the last window, (n,)."""
@@ -350,8 +350,8 @@ class Adaptation:
         if self.freeze_reason is not None:
             self._log_event("thawed", reason=reason)
         self.freeze_reason = None
-        self._cleared = 0
-        self._begun_s = self._window_s = None
+        self._plausible_windows = 0
+        self._learning_since_s = self._window_s = None
 
     # ------------------------------------------------------------------ the zero
 
@@ -359,7 +359,7 @@ class Adaptation:
     def _zero(self) -> float:
         return float(self._estimator.estimate[self._drift.zero])
 
-    def _take_zero(self, rows: FloatArray, observed: FloatArray) -> None:
+    def _learn_zero(self, rows: FloatArray, observed: FloatArray) -> None:
         """Learns the zero as the median of a window, so that only the scatter about it is tested."""
         at = self._drift.zero
         estimate = self._estimator.estimate.copy()
@@ -368,12 +368,12 @@ class Adaptation:
         self._estimator.estimate = estimate
         self._set_zero_sigma(self._sigma_arcsec)
 
-    def _free_zero(self) -> None:
+    def _reset_zero(self) -> None:
         """Resets the zero to unknown."""
         self._set_zero_sigma(ZERO_ARCSEC)
         self._zero_arcsec = None
         self._window.clear()
-        self._earlier.clear()
+        self._previous_estimates.clear()
 
     def _set_zero_sigma(self, sigma_arcsec: float) -> None:
         at = self._drift.zero
@@ -382,7 +382,7 @@ class Adaptation:
         covariance[at, at] = sigma_arcsec**2
         self._estimator.covariance = covariance
 
-    def _zero_drifts(self, rates: Sequence[Rate]) -> Freeze | None:
+    def _zero_rate_freeze(self, rates: Sequence[Rate]) -> Freeze | None:
         """Returns a lasting freeze if the zero moves faster than the settings permit."""
         most = self.settings.zero_rate_arcsec_per_hour
         for each in rates:
@@ -394,12 +394,13 @@ class Adaptation:
                 )
         return None
 
-    def _zero_out_of_bound(self) -> Freeze | None:
+    def _zero_bound_freeze(self) -> Freeze | None:
         moved, most = self.zero_moved_arcsec, self.settings.zero_bound_arcsec
         if moved is None or abs(moved) <= most:
             return None
         return Freeze(
-            f"the zero has moved by {moved:+.1f} arcsec since it was taken (at most {most:g}): take it again",
+            f"the zero has moved by {moved:+.1f} arcsec since it was learned (at most {most:g}): "
+            "learn it again",
             lasting=True,
         )
 
@@ -407,17 +408,17 @@ class Adaptation:
 
     def _proposal(self) -> Proposal | None:
         settings = self.settings
-        if self._begun_s is None or self._window_s is None:
+        if self._learning_since_s is None or self._window_s is None:
             return None
-        since_s = max(self._begun_s, self._changed_s)
+        since_s = max(self._learning_since_s, self._changed_s)
         passed_s = min(self._window_s - since_s, RATE_INTERVALS * settings.interval_s)
         if passed_s < settings.interval_s:
             return None
         self._changed_s = self._window_s
         most = settings.rate_arcsec_per_hour * passed_s / 3600.0
         step = np.clip(self.estimate_arcsec - self._proposed, -most, most)
-        worth = min(settings.smallest_arcsec, LEAST_SHARE * most)
-        if not len(step) or float(np.max(np.abs(step))) < worth:
+        threshold = min(settings.smallest_arcsec, MIN_RATE_LIMITED_SHARE * most)
+        if not len(step) or float(np.max(np.abs(step))) < threshold:
             return None
         change = self._proposed + step
         model = self._changed(change)
@@ -459,7 +460,7 @@ def _changes_json(changes: Sequence[Change]) -> dict[str, dict[str, float]]:
     }
 
 
-def _shift(residual_arcsec: FloatArray, gate_arcsec: FloatArray) -> Freeze | None:
+def _outlier_freeze(residual_arcsec: FloatArray, gate_arcsec: FloatArray) -> Freeze | None:
     """Returns a freeze if residuals exceed the gate for wear and temperature, both (n,).
 
     It is lasting if all residuals are shifted alike.
@@ -470,12 +471,12 @@ def _shift(residual_arcsec: FloatArray, gate_arcsec: FloatArray) -> Freeze | Non
     common = np.all(np.abs(residual_arcsec - shift) <= gate_arcsec)
     if common and abs(shift) > float(np.median(gate_arcsec)):
         return Freeze(
-            f"the load encoder reads {shift:+.1f} arcsec off all at once, alike in both directions: "
+            f"the load encoder has shifted by {shift:+.1f} arcsec at once, equally in both directions: "
             "a scale or coupling that slipped, or a lost zero",
             lasting=True,
         )
     worst = float(np.max(np.abs(residual_arcsec)))
     return Freeze(
-        f"the load is read up to {worst:.1f} arcsec off what the model and its rates allow, not alike at all "
-        "places"
+        f"the load encoder deviates by up to {worst:.1f} arcsec from the model, more than the rate limits "
+        "allow, and not equally at all places"
     )

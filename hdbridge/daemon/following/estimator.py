@@ -29,8 +29,8 @@ from hdbridge.daemon.machinefile import AdaptationSettings
 EXCITED = 1.0
 """Information of a batch along a direction, in units of 1 / scale^2, above which the direction counts as
 excited."""
-NOTHING = 1e-12
-"""Eigenvalue, as a share of the largest, below which a direction counts as uninformed."""
+RANK_TOLERANCE = 1e-12
+"""Eigenvalue, as a share of the largest, below which a direction counts as unobserved."""
 DISC_ARCSEC = 10.0
 """Expected size of the load encoder's own errors per turn."""
 ZERO_ARCSEC = 1000.0
@@ -76,7 +76,7 @@ class Estimator:
         cross = scale[:, np.newaxis] * (rows[:, free].T @ rows) / sigma**2
         right = scale * (rows[:, free].T @ (observed - rows @ self.estimate)) / sigma**2
         values, vectors = np.linalg.eigh(cross[:, free] * scale)
-        seen = values > max(NOTHING * values[-1], 1e-300) if len(values) else np.zeros(0, dtype=bool)
+        seen = values > max(RANK_TOLERANCE * values[-1], 1e-300) if len(values) else np.zeros(0, dtype=bool)
         if not np.any(seen):
             return
         values, vectors = values[seen], vectors[:, seen]
@@ -93,8 +93,8 @@ class Estimator:
         gain = np.linalg.solve(directions @ spread + np.diag(1.0 / values), spread.T).T
         gain[~free] = 0.0
         self.estimate = self.estimate + gain @ ((vectors.T @ right) / values)
-        left = np.eye(len(self.estimate)) - gain @ directions
-        after = left @ self.covariance @ left.T + (gain / values) @ gain.T
+        reduction = np.eye(len(self.estimate)) - gain @ directions
+        after = reduction @ self.covariance @ reduction.T + (gain / values) @ gain.T
         self.covariance = 0.5 * (after + after.T)
 
 
@@ -193,8 +193,8 @@ def ranged_fit(
     return fit.directions @ fit.slack, fit.directions @ fit.directions.T
 
 
-def correlated(left: FloatArray) -> float:
+def variance_factor(residual: FloatArray) -> float:
     """Returns the factor by which correlation of neighbouring residuals (n,) increases a variance."""
-    correlation = float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-300)
+    correlation = float(residual[1:] @ residual[:-1]) / max(float(residual @ residual), 1e-300)
     correlation = min(max(correlation, 0.0), MAX_CORRELATION)
     return (1.0 + correlation) / (1.0 - correlation)

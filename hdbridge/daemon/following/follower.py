@@ -27,7 +27,7 @@ from hdbridge.daemon.following.health import (
     held_out_arcsec,
     in_states,
 )
-from hdbridge.daemon.following.judging import Raised, Verdict, Watch
+from hdbridge.daemon.following.judging import RaisedVerdict, Verdict, Watch
 from hdbridge.daemon.following.measuring import DriftModel, Measuring
 from hdbridge.daemon.following.servo import ServoWatch
 from hdbridge.daemon.following.statefile import AdaptationFiles
@@ -37,7 +37,7 @@ from hdbridge.daemon.machinefile import AdaptationSettings, Mode
 from hdbridge.daemon.memory import NO_FAULT, SampleArray, SampleFlag, joined_samples
 from hdbridge.errors import InputError
 
-SAMPLES_TOGETHER: Final = 25
+MIN_BATCH_SAMPLES: Final = 25
 """Minimum number of samples evaluated together: ten evaluations per second at 250 Hz."""
 NEEDED: Final = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN
 SAVE_S: Final = 300.0
@@ -51,14 +51,14 @@ UNIFORM: Final = 12.0**0.5
 class Outcome(NamedTuple):
     """Result of the samples taken: new verdicts, and a proposal if due."""
 
-    raised: list[Raised]
+    raised: list[RaisedVerdict]
     proposal: Proposal | None = None
 
 
 NO_LOAD_ENCODER: Final = (
     "the axis has no encoder at its load: neither gear nor encoder are watched, and the model is not adapted"
 )
-NOTHING: Final = Outcome([])
+NO_OUTCOME: Final = Outcome([])
 """Outcome of samples that are not evaluated yet."""
 
 
@@ -131,8 +131,8 @@ class Follower:
         """Takes the next samples of the loop, oldest first; evaluates several batches together."""
         if len(samples):
             self._waiting.append(samples)
-        if sum(map(len, self._waiting)) < SAMPLES_TOGETHER:
-            return NOTHING
+        if sum(map(len, self._waiting)) < MIN_BATCH_SAMPLES:
+            return NO_OUTCOME
         together, self._waiting = joined_samples(self._waiting), []
         status = EncoderStatus() if self.unwatched else self.health.take(together)
         return self.advance(together, status)
@@ -142,13 +142,13 @@ class Follower:
         axis: Any = samples["axes"][:, self._index]
         cycle, times_s = samples["cycle"], 1e-9 * samples["time_ns"].astype(np.float64)
         self._now_s = float(times_s[-1])
-        joined = self._next_cycle in {None, int(cycle[0])} and int(cycle[-1] - cycle[0]) == len(cycle) - 1
-        servo = self._servo.take(axis, joined=joined, believed=status.fault is None)
+        contiguous = self._next_cycle in {None, int(cycle[0])} and int(cycle[-1] - cycle[0]) == len(cycle) - 1
+        servo = self._servo.take(axis, contiguous=contiguous, encoder_trusted=status.fault is None)
         first = self._begin_of_path(axis, cycle)
-        raised: list[Raised] = []
+        raised: list[RaisedVerdict] = []
         if servo is not None:
             verdict = Verdict.RETUNED if self._servo.retuned else self.watch.verdict
-            raised.append(Raised(verdict, servo))
+            raised.append(RaisedVerdict(verdict, servo))
         if self.unwatched:
             return Outcome(raised)
         axis, times_s = axis[first:], times_s[first:]
@@ -157,11 +157,11 @@ class Follower:
         observations = self._measuring.take(times_s, axis, usable & (status.fault is None))
         if status.fault is not None:
             self._zero.forget()
-        moved = self._zero.take(observations)
-        if moved is not None:
-            status = self.health.accuse(*moved)
+        zero_fault = self._zero.take(observations)
+        if zero_fault is not None:
+            status = self.health.set_fault(*zero_fault)
         settled = [each for each in observations if each.settled]
-        raised = [*self.watch.take(settled, status, self._zero.moved, self._now_s), *raised]
+        raised = [*self.watch.take(settled, status, self._zero.displacement, self._now_s), *raised]
         proposal = None
         if self.adaptation is not None:
             fault = "the supervision has stopped the axis" if np.any(stopped) else status.reason
@@ -173,7 +173,7 @@ class Follower:
                 self.save()
         return Outcome(raised, proposal)
 
-    def in_force(self, model: TransmissionModel) -> None:
+    def use_model(self, model: TransmissionModel) -> None:
         """Switches to another model, which the control process uses from now on."""
         self.health.restart()
         self._servo.use(model.response)

@@ -104,18 +104,18 @@ RESIDUAL: Final = np.dtype([
     ("velocity_deg_s", np.float64),  # of the load target
     ("predicted_arcsec", np.float64),  # at the motor's actual position
     ("residual_arcsec", np.float64),  # includes the difference of the encoders' zeros
-    ("shaken_deg_s2", np.float64),  # largest acceleration of the load target, fading with `FADE_S`
+    ("peak_acceleration_deg_s2", np.float64),  # of the load target, decaying with `FADE_S`
     ("fresh", np.bool_),
     ("usable", np.bool_),  # fresh, driven, hysteresis state known, no model change under way
 ])  # fmt: skip
 
 
 def residuals(
-    samples: SampleArray, index: int, ratio: float, period_s: float, shaken_deg_s2: float = 0.0
+    samples: SampleArray, index: int, ratio: float, period_s: float, peak_acceleration_deg_s2: float = 0.0
 ) -> Residuals:
     """Returns the residuals of the axis at ``index`` in consecutive samples; ``ratio`` is the gear ratio.
 
-    ``shaken_deg_s2`` is the value of that column in the first sample.
+    ``peak_acceleration_deg_s2`` is the value of that column in the first sample.
     """
     axis: Any = samples["axes"][:, index]
     found = np.empty(len(samples), RESIDUAL)
@@ -125,11 +125,11 @@ def residuals(
     found["load_deg"] = load = axis["load_position_deg"]
     found["velocity_deg_s"] = velocity = axis["velocity_deg_s"]
     accelerations = np.abs(np.diff(velocity)) / period_s
-    found["shaken_deg_s2"] = list(
+    found["peak_acceleration_deg_s2"] = list(
         accumulate(
             accelerations.tolist(),
             lambda before, now: max(now, before * (1.0 - period_s / FADE_S)),
-            initial=shaken_deg_s2,
+            initial=peak_acceleration_deg_s2,
         )
     )
     predicted: FloatArray = axis["predicted_arcsec"]
@@ -197,13 +197,13 @@ def find_jump(
     return Jump(row + SIDE, float(steps_arcsec[row]), float(allowed[row]))
 
 
-def seen_swing_s2(found: Residuals, steps_arcsec: FloatArray) -> float:
+def visible_swing_s2(found: Residuals, steps_arcsec: FloatArray) -> float:
     """Returns the largest of the `steps` per acceleration, s2; 0 without acceleration."""
     if not len(steps_arcsec):
         return 0.0
-    shaken = _windows(found["shaken_deg_s2"], 2 * SIDE).max(axis=0)
-    rows = shaken > 0.5 * np.max(shaken)
-    return float(np.max(np.abs(steps_arcsec[rows]) / shaken[rows], initial=0.0)) / ARCSEC_PER_DEG
+    peak = _windows(found["peak_acceleration_deg_s2"], 2 * SIDE).max(axis=0)
+    rows = peak > 0.5 * np.max(peak)
+    return float(np.max(np.abs(steps_arcsec[rows]) / peak[rows], initial=0.0)) / ARCSEC_PER_DEG
 
 
 def steps(found: Residuals) -> FloatArray:
@@ -220,7 +220,7 @@ def steps(found: Residuals) -> FloatArray:
     return np.where(together, middle[SIDE:] - middle[:-SIDE], 0.0)
 
 
-def misread(found: Residuals, noise_arcsec: float, count_arcsec: float, swing_s2: float) -> int:
+def count_spikes(found: Residuals, noise_arcsec: float, count_arcsec: float, swing_s2: float) -> int:
     """Returns the number of samples that jump away and return with the next one or two."""
     if len(found) < SIDE:
         return 0
@@ -252,8 +252,8 @@ def _ranges(width: int, values: FloatArray) -> FloatArray:
 def _motion_arcsec(found: Residuals, width: int, swing_s2: float) -> FloatArray:
     """Returns the change of the residual that motion permits in each window."""
     predicted = _ranges(width, found["predicted_arcsec"])
-    shaken = _windows(found["shaken_deg_s2"], width).max(axis=0)
-    return np.asarray(PREDICTED_SHARE * predicted + swing_s2 * ARCSEC_PER_DEG * shaken)
+    peak = _windows(found["peak_acceleration_deg_s2"], width).max(axis=0)
+    return np.asarray(PREDICTED_SHARE * predicted + swing_s2 * ARCSEC_PER_DEG * peak)
 
 
 class EncoderFault(Enum):
@@ -294,8 +294,8 @@ class EncoderHealth:
         """Jitter of the first good blocks at rest (True) and in motion (False)."""
         self._swings_s2: list[float] = []
         """Largest step of the residual per acceleration in the first batches with motion."""
-        self._shaken_deg_s2 = 0.0
-        """Fading acceleration at the first sample of the tail."""
+        self._peak_acceleration_deg_s2 = 0.0
+        """Decaying peak acceleration at the first sample of the tail."""
         self._spikes: deque[float] = deque()
         self._noisy_blocks = 0
         self._bad_s = -math.inf
@@ -312,7 +312,7 @@ class EncoderHealth:
         """Forgets the last samples, for example after a change of the predicting model."""
         self._tail: SampleArray | None = None
         """Last samples, which are evaluated again with the next ones."""
-        self._held: tuple[float, float] | None = None
+        self._constant: tuple[float, float] | None = None
         """Load reading that does not change, and the motor angle since when."""
         self._pending: dict[bool, list[Residuals]] = {True: [], False: []}
         """Samples of the incomplete blocks at rest (True) and in motion (False)."""
@@ -329,8 +329,8 @@ class EncoderHealth:
             tail = None
         together = samples if tail is None else joined_samples([tail, samples])
         self._tail = together[-TAIL:].copy()
-        found = residuals(together, self._index, self._ratio, self._period_s, self._shaken_deg_s2)
-        self._shaken_deg_s2 = float(found["shaken_deg_s2"][-len(self._tail)])
+        found = residuals(together, self._index, self._ratio, self._period_s, self._peak_acceleration_deg_s2)
+        self._peak_acceleration_deg_s2 = float(found["peak_acceleration_deg_s2"][-len(self._tail)])
         self._now_s = float(found["time_s"][-1])
         old = len(together) - len(samples)
         frozen = self._judge_frozen(found[old:])
@@ -351,7 +351,7 @@ class EncoderHealth:
         typical = float(np.quantile(known, 0.5 if standing else 0.9))
         return max(typical, 0.3 * self._load_count_arcsec)
 
-    def accuse(self, fault: EncoderFault, why: str) -> EncoderStatus:
+    def set_fault(self, fault: EncoderFault, why: str) -> EncoderStatus:
         """Sets a fault and returns the state; a latched fault replaces one that is not."""
         self._bad_s = self._now_s
         if self.status.fault is None or (fault in LATCHED and self.status.fault not in LATCHED):
@@ -364,21 +364,21 @@ class EncoderHealth:
         if not len(found):
             return False
         load, motor = found["load_deg"], found["motor_deg"]
-        held = self._held
-        if held is not None and load[0] == held[0]:
-            load, motor = np.append(held[0], load), np.append(held[1], motor)
+        constant = self._constant
+        if constant is not None and load[0] == constant[0]:
+            load, motor = np.append(constant[0], load), np.append(constant[1], motor)
         changed = np.flatnonzero(np.diff(load) != 0.0)
         since = int(changed[-1]) + 1 if len(changed) else 0
-        gone = float(np.max(np.abs(motor[since:] - motor[since]))) / self._ratio * ARCSEC_PER_DEG
-        self._held = (float(load[since]), float(motor[since]))
+        travel_arcsec = float(np.max(np.abs(motor[since:] - motor[since]))) / self._ratio * ARCSEC_PER_DEG
+        self._constant = (float(load[since]), float(motor[since]))
         allowed = max(FROZEN_ARCSEC, FROZEN_COUNTS * self._load_count_arcsec)
-        if gone > allowed:
-            self.accuse(
+        if travel_arcsec > allowed:
+            self.set_fault(
                 EncoderFault.FROZEN,
-                f"it reads {self._held[0]:.5f} deg while the motor has turned by {gone:.0f} arcsec of the "
-                f"load (at most {allowed:.0f} are allowed)",
+                f"it reads {self._constant[0]:.5f} deg while the motor has turned by "
+                f"{travel_arcsec:.0f} arcsec of the load (at most {allowed:.0f} are allowed)",
             )
-        return gone > 2.0 * self._count_arcsec and gone > 3.0 * self._load_count_arcsec
+        return travel_arcsec > 2.0 * self._count_arcsec and travel_arcsec > 3.0 * self._load_count_arcsec
 
     def _judge_steps(self, found: Residuals) -> None:
         noise = self._usual(standing=bool(np.all(_standing(found))))
@@ -391,24 +391,24 @@ class EncoderHealth:
         jump = find_jump(found, steps_arcsec, noise, self._count_arcsec, swing)
         # A frozen reading ends with a jump.
         if jump is not None and self.status.fault is not EncoderFault.FROZEN:
-            moved = float(np.ptp(found["motor_deg"][jump.row - SIDE : jump.row + SIDE])) / self._ratio
-            self.accuse(
+            travel_deg = float(np.ptp(found["motor_deg"][jump.row - SIDE : jump.row + SIDE])) / self._ratio
+            self.set_fault(
                 EncoderFault.JUMPED,
                 f"by {jump.by_arcsec:+.1f} arcsec at {found['time_s'][jump.row]:.2f} s, while the motor "
-                f"moved by {moved * ARCSEC_PER_DEG:.1f} arcsec of the load (noise, counts and motion make "
-                f"at most {jump.allowed_arcsec:.1f})",
+                f"moved by {travel_deg * ARCSEC_PER_DEG:.1f} arcsec of the load (noise, counts and "
+                f"motion cause at most {jump.allowed_arcsec:.1f})",
             )
         if jump is None and len(self._swings_s2) < MAX_LEARNING_BLOCKS:
-            usual = seen_swing_s2(found, steps_arcsec)
+            usual = visible_swing_s2(found, steps_arcsec)
             if usual:
                 self._swings_s2.append(usual)
         # Excludes the samples that the next batch repeats.
-        wild = misread(found[SIDE:], noise, self._count_arcsec, swing)
-        self._spikes.extend([self._now_s] * wild)
+        spikes = count_spikes(found[SIDE:], noise, self._count_arcsec, swing)
+        self._spikes.extend([self._now_s] * spikes)
         while self._spikes and self._spikes[0] < self._now_s - 10.0:
             self._spikes.popleft()
         if len(self._spikes) >= SPIKES:
-            self.accuse(
+            self.set_fault(
                 EncoderFault.NOISY, f"{len(self._spikes)} readings of the last 10 s jumped there and back"
             )
 
@@ -439,7 +439,7 @@ class EncoderHealth:
         noisy = jitter > NOISE_RATIO * usual
         self._noisy_blocks = self._noisy_blocks + 1 if noisy else 0
         if self._noisy_blocks >= NOISY_BLOCKS:
-            self.accuse(
+            self.set_fault(
                 EncoderFault.NOISY,
                 f"its readings jitter by {jitter:.2f} arcsec {'at rest' if standing else 'in motion'}, "
                 f"usually by {usual:.2f} (at most {NOISE_RATIO:g} times as much is allowed)",

@@ -64,13 +64,13 @@ LOOP_SHARE: Final = 3.0 * Scales().calibrated
 """Smallest relevant change of a hysteresis loop: the larger of `LOOP_ARCSEC` and this share of the loop."""
 ZERO_ARCSEC: Final = 5.0
 """Smallest relevant change of the zero: the smallest effect of warming up (`effects.zero_drift`)."""
-LEFT_ARCSEC: Final = 0.5
+MIN_RESIDUAL_ARCSEC: Final = 0.5
 """Smallest relevant unexplained residual, rms, in addition to the noise."""
 MAX_OBSERVATIONS: Final = 600
 """Maximum number of observations that are evaluated together."""
-SPARE: Final = 20
+MIN_EXTRA_PLACES: Final = 20
 """Number of places required in addition to one per column."""
-CLEARLY: Final = 0.8
+CLEAR_SHARE: Final = 0.8
 """Share of a limit below which a value is clearly under it."""
 TREND_ARCSEC: Final = 60.0
 """Scale of the zero's trend, from the middle of the observations to one end."""
@@ -94,7 +94,7 @@ class Verdict(Enum):
     """The servo's response differs from the measured response, so the correction in motion is wrong."""
 
 
-class Raised(NamedTuple):
+class RaisedVerdict(NamedTuple):
     """A new verdict."""
 
     verdict: Verdict
@@ -107,7 +107,7 @@ class Raised(NamedTuple):
         return f"{self.verdict.value}: {self.evidence}" if self.evidence else self.verdict.value
 
 
-class Moved(NamedTuple):
+class PartChange(NamedTuple):
     """Changed part of the model."""
 
     text: str
@@ -126,33 +126,33 @@ class Evidence:
     """Rms difference of measured and predicted error about its zero."""
     allowed_arcsec: float
     """Upper limit of that difference by noise and the model's intervals."""
-    left_arcsec: float
+    residual_arcsec: float
     """Rms residual with every part of the model free to change."""
-    left_allowed_arcsec: float
-    moved: tuple[Moved, ...]
+    residual_limit_arcsec: float
+    changes: tuple[PartChange, ...]
 
     @property
     def unexplained(self) -> bool:
         """True if the residual exceeds what changes of the model's parts explain."""
-        return self.left_arcsec > self.left_allowed_arcsec
+        return self.residual_arcsec > self.residual_limit_arcsec
 
     def verdict(self, before: Verdict) -> Verdict:
         """Returns the verdict; if the residual is only just below its limit, the verdict ``before``."""
-        if not self.moved and not self.unexplained:
-            clear = self.left_arcsec < CLEARLY * self.left_allowed_arcsec
+        if not self.changes and not self.unexplained:
+            clear = self.residual_arcsec < CLEAR_SHARE * self.residual_limit_arcsec
             return Verdict.HOLDS if clear else before
-        wear = not self.unexplained and all(each.wear for each in self.moved)
+        wear = not self.unexplained and all(each.wear for each in self.changes)
         return Verdict.RECALIBRATE if wear else Verdict.SOMETHING_CHANGED
 
     @property
     def text(self) -> str:
         """Result in words with figures."""
-        moved = "; ".join(each.text for each in self.moved) or "no part of the model moved"
+        changes = "; ".join(each.text for each in self.changes) or "no part of the model changed"
         return (
-            f"{moved}. Over {self.places} places the load is {self.rms_arcsec:.2f} arcsec rms off the model "
-            f"(its intervals and the noise allow {self.allowed_arcsec:.2f}), "
-            f"{self.left_arcsec:.2f} with the model's parts free to move (the noise allows "
-            f"{self.left_allowed_arcsec:.2f})"
+            f"{changes}. At {self.places} places the load deviates from the model by {self.rms_arcsec:.2f} "
+            f"arcsec rms (its intervals and the noise allow {self.allowed_arcsec:.2f}). With all parts of "
+            f"the model free to change, {self.residual_arcsec:.2f} remain (the noise allows "
+            f"{self.residual_limit_arcsec:.2f})"
         )
 
 
@@ -202,11 +202,11 @@ class Watch:
         """Probability of a false positive in one test."""
         self._adopted = self._other = Verdict.HOLDS
         """Verdict on the gear, and the different verdict that must persist before it is adopted."""
-        self._lasted_s = 0.0
+        self._persisted_s = 0.0
         self._faulty = False
         self._observations: deque[Observation] = deque(maxlen=MAX_OBSERVATIONS)
         self._new = False
-        self._judged_s = -EVERY_S
+        self._tested_s = -EVERY_S
 
     @property
     def verdict(self) -> Verdict:
@@ -218,21 +218,21 @@ class Watch:
         status: EncoderStatus,
         zero: Displacement | None,
         now_s: float,
-    ) -> list[Raised]:
+    ) -> list[RaisedVerdict]:
         """Takes observations, state and zero of the load encoder; returns new verdicts."""
-        raised: list[Raised] = []
+        raised: list[RaisedVerdict] = []
         if (status.fault is not None) != self._faulty:
             self._faulty = status.fault is not None
             self._observations.clear()
             reason = status.reason or "no evidence against the load encoder"
-            raised.append(Raised(self.verdict, reason))
+            raised.append(RaisedVerdict(self.verdict, reason))
         self._observations.extend(observations)
         self._new |= bool(observations)
-        passed_s = now_s - self._judged_s
+        passed_s = now_s - self._tested_s
         if not 0.0 <= passed_s < EVERY_S:
-            self._judged_s = now_s
+            self._tested_s = now_s
             if self._test(zero, now_s, min(passed_s, 2.0 * EVERY_S)) and self.evidence is not None:
-                raised.append(Raised(self.verdict, self.evidence.text))
+                raised.append(RaisedVerdict(self.verdict, self.evidence.text))
         return raised
 
     def _test(self, zero: Displacement | None, now_s: float, passed_s: float) -> bool:
@@ -253,41 +253,41 @@ class Watch:
     def _adopts(self, verdict: Verdict, passed_s: float) -> bool:
         """Takes the present verdict and the time since the last; returns True once it has persisted."""
         if verdict is self._adopted or verdict is not self._other:
-            self._other, self._lasted_s = verdict, 0.0
+            self._other, self._persisted_s = verdict, 0.0
         if verdict is self._adopted:
             return False
-        self._lasted_s += passed_s
-        if self._lasted_s < (WITHDRAW_S if verdict is Verdict.HOLDS else RAISE_S):
+        self._persisted_s += passed_s
+        if self._persisted_s < (WITHDRAW_S if verdict is Verdict.HOLDS else RAISE_S):
             return False
-        self._adopted, self._lasted_s = verdict, 0.0
+        self._adopted, self._persisted_s = verdict, 0.0
         return True
 
     # ------------------------------------------------------------------ the tests
 
     def _evidence(self, observations: Sequence[Observation], zero: Displacement | None) -> Evidence | None:
         """Tests the observations; None if they are too few. ``zero`` is None if it is not known yet."""
-        least = self._drift.count + 1 + SPARE
-        if len(observations) < least:
+        required = self._drift.count + 1 + MIN_EXTRA_PLACES
+        if len(observations) < required:
             return None
         rows, observed = _places(observations)
         count, columns = rows.shape
-        if count < least:
+        if count < required:
             return None
         change, spread = ranged_fit(rows, observed, self._noise, self._information)
         free = max(count - columns, 1)
-        left = observed - rows @ change
+        residual = observed - rows @ change
         rms, allowed = self._as_calibrated(rows, observed)
-        moved = [self._moved(each, rows, change, spread) for each in self._drift.terms]
+        changes = [self._part_change(each, rows, change, spread) for each in self._drift.terms]
         if zero is not None:
-            moved.append(self._zero_moved(zero))
-        left_allowed = self._noise * float(np.sqrt(self._chi_square(free) / free))
+            changes.append(self._zero_change(zero))
+        residual_limit = self._noise * float(np.sqrt(self._chi_square(free) / free))
         return Evidence(
             places=count,
             rms_arcsec=rms,
             allowed_arcsec=allowed,
-            left_arcsec=float(np.sqrt(left @ left / free)),
-            left_allowed_arcsec=float(np.hypot(left_allowed, LEFT_ARCSEC)),
-            moved=tuple(each for each in moved if each is not None),
+            residual_arcsec=float(np.sqrt(residual @ residual / free)),
+            residual_limit_arcsec=float(np.hypot(residual_limit, MIN_RESIDUAL_ARCSEC)),
+            changes=tuple(each for each in changes if each is not None),
         )
 
     def _as_calibrated(self, rows: FloatArray, observed: FloatArray) -> tuple[float, float]:
@@ -308,28 +308,30 @@ class Watch:
 
         return float(chdtri(free, self._alpha))
 
-    def _moved(self, term: Term, rows: FloatArray, change: FloatArray, spread: FloatArray) -> Moved | None:
+    def _part_change(
+        self, term: Term, rows: FloatArray, change: FloatArray, spread: FloatArray
+    ) -> PartChange | None:
         """Returns the change of an effect if it exceeds the effect's interval and the errors of this fit."""
         at = term.columns
         own = change[at]
         variance = self._calibrated[at, at] + spread[at, at]
         if float(own @ np.linalg.solve(variance, own)) < self._chi_square(len(own)):
             return None
-        least = ORDER_ARCSEC
+        relevant = ORDER_ARCSEC
         if term.memory:
             loop = float(np.std(rows[:, at] @ term.effect.coefficients()))
-            least = max(LOOP_ARCSEC, LOOP_SHARE * loop)
-        if float(np.std(rows[:, at] @ own)) < least:
+            relevant = max(LOOP_ARCSEC, LOOP_SHARE * loop)
+        if float(np.std(rows[:, at] @ own)) < relevant:
             return None
         only = np.zeros(self._drift.zero)
         only[at] = own
         changed = self._drift.changed(only)
         wear = bool(np.all(np.abs(own) <= self._bounds[at]))
         wear &= not changed.effects[term.number].violations()
-        return Moved(_largest_changes(self._drift.model, changed), wear)
+        return PartChange(_largest_changes(self._drift.model, changed), wear)
 
-    def _zero_moved(self, zero: Displacement) -> Moved | None:
+    def _zero_change(self, zero: Displacement) -> PartChange | None:
         """Returns the change of the zero since it was learned; None if it is not significant."""
         if abs(zero.arcsec) < max(ZERO_ARCSEC, math.sqrt(self._chi_square(1)) * zero.error):
             return None
-        return Moved(f"zero: by {zero.arcsec:+.1f} arcsec", abs(zero.arcsec) <= self._zero_bound)
+        return PartChange(f"zero: by {zero.arcsec:+.1f} arcsec", abs(zero.arcsec) <= self._zero_bound)

@@ -54,7 +54,7 @@ LONGEST_S = 1.0
 zero."""
 FAST_S = 0.25
 """Duration of an observation in fast motion."""
-EVEN = 1e-3
+SPEED_TOLERANCE = 1e-3
 """Maximum relative change from one sample to the next at which a speed counts as constant."""
 CELL_DEG = 3.0
 """Motor travel of an observation in slow motion."""
@@ -246,9 +246,9 @@ class Measuring:
         self._observer = Observer()
         self._last: float | None = None
         self._collected: list[_Reading] = []
-        self._quiet_s = math.inf
+        self._steady_since_s = math.inf
         """Time since which the command has been at rest, slow in one direction, or at constant speed."""
-        self._done = True
+        self._standstill_used = True
         """True once this standstill has been used."""
         self._standing = self._slow = True
         self._longest_s = LONGEST_S
@@ -289,9 +289,9 @@ class Measuring:
                 found.append(ended)
             if not good:
                 self._collected.clear()
-                self._quiet_s = time_s
+                self._steady_since_s = time_s
                 continue
-            if time_s - self._quiet_s < SETTLE_S or not columns.known():
+            if time_s - self._steady_since_s < SETTLE_S or not columns.known():
                 continue
             error = (load_deg - position_deg / self._ratio) * ARCSEC_PER_DEG
             self._collected.append(_Reading(time_s, position_deg, speed_deg_s, error, columns.state()))
@@ -306,18 +306,23 @@ class Measuring:
         last = self._last
         self._last = motor_deg
         if last is None:
-            self._turn_deg, self._quiet_s = motor_deg, time_s
+            self._turn_deg, self._steady_since_s = motor_deg, time_s
             self._columns.advance(motor_deg, moment)
             return None
         step = motor_deg - last
         stands = speed_deg_s == 0.0 and step == 0.0
         slow = abs(speed_deg_s) <= self._slow_deg_s
-        even = slow or abs(speed_deg_s - self._speed_deg_s) <= EVEN * abs(speed_deg_s)
+        even = slow or abs(speed_deg_s - self._speed_deg_s) <= SPEED_TOLERANCE * abs(speed_deg_s)
         turned = self._count(motor_deg, step) if step else False
         ended = None
         if turned or not even or (stands, slow) != (self._standing, self._slow):
             ended = self._end_of_stretch()
-            self._standing, self._slow, self._quiet_s, self._done = stands, slow, time_s, False
+            self._standing, self._slow, self._steady_since_s, self._standstill_used = (
+                stands,
+                slow,
+                time_s,
+                False,
+            )
             self._longest_s = LONGEST_S if stands else math.inf if slow else FAST_S
         elif slow and self._cell_deg >= CELL_DEG:
             ended = self._end_of_stretch()
@@ -361,7 +366,7 @@ class Measuring:
         rows = self._columns.rows(motor, states)
         error = np.array([each.error_arcsec for each in used]) - states[:, 0]
         error -= rows[:, : self._drift.zero] @ self._drift.committed
-        settled = self._slow and not self._done
+        settled = self._slow and not self._standstill_used
         found = Observation(
             time_s=used[-1].time_s,
             error_arcsec=float(np.mean(error)),
@@ -374,7 +379,7 @@ class Measuring:
         self._collected = []
         if settled:
             self._travel_deg, self._reversals = 0.0, 0
-        self._done = self._standing
+        self._standstill_used = self._standing
         return found
 
     def _moment(self, time_s: float, sample: Any) -> Moment:

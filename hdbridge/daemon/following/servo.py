@@ -15,12 +15,12 @@ from hdbridge.analysis.response import DIFFERENT, Answers, Limits, lags_agree, m
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import Response
-from hdbridge.daemon.following.judging import CLEARLY
+from hdbridge.daemon.following.judging import CLEAR_SHARE
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleFlag
 from hdbridge.units import DEG_PER_TURN
 
-EVEN: Final = 1e-3
+SPEED_TOLERANCE: Final = 1e-3
 """Maximum relative deviation at which a speed counts as constant."""
 TRANSIENT_S: Final = 0.6
 """Time at constant speed before a run begins."""
@@ -29,7 +29,7 @@ RUN_TURNS: Final = 2.0
 """Minimum duration and number of motor turns of a run."""
 MIN_RUNS: Final = 4
 NEEDED: Final = SampleFlag.FRESH | SampleFlag.COMPENSATING
-SPOILT: Final = SampleFlag.CHANGING | SampleFlag.LIMITED
+EXCLUDED: Final = SampleFlag.CHANGING | SampleFlag.LIMITED
 
 
 class ServoWatch:
@@ -53,7 +53,7 @@ class ServoWatch:
         """Residual mean square of each order at each frequency with the committed response."""
         self._run: list[NDArray[Any]] = []
         self._speed_deg_s = 0.0
-        self._even = 0
+        self._samples_at_speed = 0
         """Number of samples at this speed so far."""
 
     def use(self, response: Response | None) -> None:
@@ -92,27 +92,30 @@ class ServoWatch:
         changed = self.retuned or self._response != self._committed
         return self._answers.refined(self._committed, self._limits, bound, retuned=changed)
 
-    def take(self, axis: NDArray[Any], *, joined: bool, believed: bool) -> str | None:
+    def take(self, axis: NDArray[Any], *, contiguous: bool, encoder_trusted: bool) -> str | None:
         """Takes the next samples of the axis; returns the evidence if the verdict changes.
 
-        ``joined`` is False if cycles are missing before or within the samples. ``believed`` is False during a
-        fault of the load encoder.
+        ``contiguous`` is False if cycles are missing before or within the samples, ``encoder_trusted``
+        during a fault of the load encoder.
         """
         if self._answers is None or not self._orders or not len(axis):
             return None
         velocity, flags = axis["velocity_deg_s"], axis["flags"]
         speed = float(velocity[0])
-        even = bool(speed and np.all(abs(velocity - speed) < EVEN * abs(speed)))
-        even &= bool(np.all((flags & (NEEDED | SPOILT)) == NEEDED))
+        even = bool(speed and np.all(abs(velocity - speed) < SPEED_TOLERANCE * abs(speed)))
+        even &= bool(np.all((flags & (NEEDED | EXCLUDED)) == NEEDED))
         even &= bool(np.all(axis["state"] == AxisState.ENABLED))
-        if not (even and joined and abs(speed - self._speed_deg_s) < EVEN * abs(speed)):
-            self._run, self._even = [], 0
+        if not (even and contiguous and abs(speed - self._speed_deg_s) < SPEED_TOLERANCE * abs(speed)):
+            self._run, self._samples_at_speed = [], 0
             self._speed_deg_s = speed if even else 0.0
         if not even:
             return None
-        self._even += len(axis)
+        self._samples_at_speed += len(axis)
         assert self._response is not None
-        if self._even * self._period_s < TRANSIENT_S or abs(speed) < self._response.filter.full_speed_deg_s:
+        if (
+            self._samples_at_speed * self._period_s < TRANSIENT_S
+            or abs(speed) < self._response.filter.full_speed_deg_s
+        ):
             return None
         self._run.append(axis)
         count = sum(map(len, self._run))
@@ -121,9 +124,9 @@ class ServoWatch:
         if duration_s < RUN_S or turns < RUN_TURNS or count < samples_needed(len(self._orders)):
             return None
         run, self._run = np.concatenate(self._run), []
-        return self._judge(run, speed, believed=believed)
+        return self._judge(run, speed, encoder_trusted=encoder_trusted)
 
-    def _judge(self, run: NDArray[Any], speed_deg_s: float, *, believed: bool) -> str | None:
+    def _judge(self, run: NDArray[Any], speed_deg_s: float, *, encoder_trusted: bool) -> str | None:
         """Adds a run; returns the evidence if the verdict changes."""
         stored, answers = self._response, self._answers
         assert stored is not None
@@ -132,19 +135,19 @@ class ServoWatch:
             return None
         names = ("load_target_deg", "issued_deg", "motor_position_deg", "load_position_deg")
         target, issued, motor, load = (run[each] for each in names)
-        if not believed:
+        if not encoder_trusted:
             self.forget_load()
             load = np.full(len(run), np.nan)
         answers.take(speed_deg_s, target, issued, motor, load, run["correction_arcsec"])
         if len(answers.lags_ms) < MIN_RUNS:
             return None
-        apart, lag_ms = answers.difference, median(answers.lags_ms)
-        limit = CLEARLY * DIFFERENT if self.retuned else DIFFERENT
-        retuned = apart > limit or not lags_agree(stored.following_lag_ms, lag_ms)
+        difference, lag_ms = answers.difference, median(answers.lags_ms)
+        limit = CLEAR_SHARE * DIFFERENT if self.retuned else DIFFERENT
+        retuned = difference > limit or not lags_agree(stored.following_lag_ms, lag_ms)
         if retuned == self.retuned:
             return None
         self.retuned = retuned
         return (
             f"following lag {lag_ms:.1f} ms, {stored.following_lag_ms:.1f} when the response was measured; "
-            f"the response differs by {100.0 * apart:.0f} %"
+            f"the response differs by {100.0 * difference:.0f} %"
         )

@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from hdbridge.axis.effects import FloatArray
-from hdbridge.daemon.following.estimator import calibrated_estimator, correlated, ranged_fit
+from hdbridge.daemon.following.estimator import calibrated_estimator, ranged_fit, variance_factor
 from hdbridge.daemon.following.health import EncoderFault
 from hdbridge.daemon.following.measuring import DriftModel, Observation
 from hdbridge.daemon.machinefile import AdaptationSettings
@@ -28,11 +28,11 @@ SPANS_S: Final = (15.0, 60.0, 180.0)
 """Durations of the spans up to now that are tested for a drift; the longest is also tested for a step."""
 EVERY_S: Final = 2.0
 """Minimum interval between fits."""
-LEAST: Final = 16
+MIN_OBSERVATIONS: Final = 16
 """Minimum number of observations in a span."""
 SIGMAS: Final = 8.0
 """Number of standard errors by which a rate must exceed its limit, and a step must exceed zero."""
-LASTING: Final = 3
+CONSECUTIVE_FITS: Final = 3
 """Number of successive fits that must agree on a drift; a knock does not last that long."""
 RATE_ARCSEC_MIN: Final = 3.0
 """Maximum rate of a gear's zero. Warming up moves it by 5 to 60 arcsec in 10 to 60 minutes, typically by 1
@@ -51,7 +51,7 @@ STEP_ARCSEC: Final = 6.0
 """Smallest change of the zero that counts as a step."""
 STEP_OBSERVATIONS: Final = 20
 """Minimum number of observations on either side of a step."""
-STEP_BETTER: Final = 0.6
+MAX_STEP_TO_DRIFT_RATIO: Final = 0.6
 """Maximum ratio of the residual mean square with a step to that with a drift that begins there."""
 
 
@@ -82,7 +82,7 @@ class Zero:
 
     def __init__(self, drift: DriftModel, sigma_arcsec: float) -> None:
         """``sigma_arcsec`` is the standard deviation of a single sample due to the encoders' counts."""
-        self._judged = bool(drift.model.effects)
+        self._has_model = bool(drift.model.effects)
         """False without a prediction, because the gear's own error may look like a moving zero."""
         self._sigma_arcsec = COUNTS_SHARE * sigma_arcsec
         self._at = 2 + drift.zero
@@ -94,7 +94,7 @@ class Zero:
     def restart(self) -> None:
         """Learns the zero again, because the drive was verified or homed."""
         self.forget()
-        self.moved: Displacement | None = None
+        self.displacement: Displacement | None = None
         """Displacement at the last judgement; None until the zero is learned."""
         self._learned: tuple[Displacement, FloatArray] | None = None
         """Zero, and coefficients of the disc, when they were learned."""
@@ -104,11 +104,11 @@ class Zero:
         self.rates: list[Rate] = []
         """Rates at the last judgement, one per span with enough observations."""
         self._recent: deque[Observation] = deque()
-        self._suspicions = 0
+        self._suspicious_fits = 0
 
     def take(self, observations: Sequence[Observation]) -> tuple[EncoderFault, str] | None:
         """Takes observations in order; returns a fault and its evidence once it is certain."""
-        if not (observations and self._judged):
+        if not (observations and self._has_model):
             return None
         recent = self._recent
         recent.extend(observations)
@@ -123,12 +123,14 @@ class Zero:
         rows = self._rows(time_s)
         error_arcsec = np.array([each.error_arcsec for each in recent])
         self.rates = [
-            self._rate(rows[span], error_arcsec[span]) for span in spans if np.count_nonzero(span) >= LEAST
+            self._rate(rows[span], error_arcsec[span])
+            for span in spans
+            if np.count_nonzero(span) >= MIN_OBSERVATIONS
         ]
         if not self.rates:
             return None
-        self._displaced(rows, error_arcsec)
-        return self._stepped(time_s, rows, error_arcsec) or self._drifts()
+        self._update_displacement(rows, error_arcsec)
+        return self._step_fault(time_s, rows, error_arcsec) or self._drift_fault()
 
     def _rows(self, time_s: FloatArray) -> FloatArray:
         """Returns minutes from the middle, share of the highest speed, and the columns of `DriftModel`."""
@@ -144,16 +146,16 @@ class Zero:
         sigma = self._sigma_arcsec
         for _ in range(2):  # the second pass uses the residual noise of the first
             change, covariance = ranged_fit(rows, error_arcsec, sigma, information)
-            left = error_arcsec - rows @ change
-            sigma = max(sigma, float(np.sqrt(left @ left / (len(left) - FREE_COLUMNS))))
-        errors = np.sqrt(np.diag(covariance) * correlated(left))
-        return change, errors, float(left @ left) / len(left)
+            residual = error_arcsec - rows @ change
+            sigma = max(sigma, float(np.sqrt(residual @ residual / (len(residual) - FREE_COLUMNS))))
+        errors = np.sqrt(np.diag(covariance) * variance_factor(residual))
+        return change, errors, float(residual @ residual) / len(residual)
 
     def _rate(self, rows: FloatArray, error_arcsec: FloatArray) -> Rate:
         change, errors, _ = self._fit(rows, error_arcsec, self._information)
         return Rate(float(change[0]), float(errors[0]), float(rows[-1, 0] - rows[0, 0]))
 
-    def _displaced(self, rows: FloatArray, error_arcsec: FloatArray) -> None:
+    def _update_displacement(self, rows: FloatArray, error_arcsec: FloatArray) -> None:
         """Learns the zero, or determines its displacement since then.
 
         The disc is fixed at its learned value, because over part of a turn it is hardly separable from the
@@ -174,9 +176,11 @@ class Zero:
         if self._learned is None:
             self._learned = zero, coefficients
         before, _ = self._learned
-        self.moved = Displacement(zero.arcsec - before.arcsec, float(np.hypot(zero.error, before.error)))
+        self.displacement = Displacement(
+            zero.arcsec - before.arcsec, float(np.hypot(zero.error, before.error))
+        )
 
-    def _stepped(
+    def _step_fault(
         self, time_s: FloatArray, rows: FloatArray, error_arcsec: FloatArray
     ) -> tuple[EncoderFault, str] | None:
         """Returns a fault if a step of the zero fits far better than a drift that begins at the same time."""
@@ -187,29 +191,29 @@ class Zero:
         change, *_ = self._fit(rows, error_arcsec, self._information)
         change[0] = 0.0
         total = np.cumsum(error_arcsec - rows @ change)
-        likely = np.abs(total[before - 1] - total[-1] * before / count)
-        row = int(before[np.argmax(likely / np.sqrt(before * (count - before)))])
+        statistic = np.abs(total[before - 1] - total[-1] * before / count)
+        row = int(before[np.argmax(statistic / np.sqrt(before * (count - before)))])
         information = np.append(0.0, self._information)
         stepped = np.column_stack([np.arange(count) >= row, rows])
-        change, errors, left_by_step = self._fit(stepped, error_arcsec, information)
+        change, errors, step_residual = self._fit(stepped, error_arcsec, information)
         step, error = float(change[0]), float(errors[0])
         if abs(step) < max(STEP_ARCSEC, SIGMAS * error):
             return None
-        bent = np.column_stack([np.maximum(rows[:, 0] - rows[row, 0], 0.0), rows])
-        *_, left_by_drift = self._fit(bent, error_arcsec, information)
-        if left_by_step > STEP_BETTER * left_by_drift:
+        drifted = np.column_stack([np.maximum(rows[:, 0] - rows[row, 0], 0.0), rows])
+        *_, drift_residual = self._fit(drifted, error_arcsec, information)
+        if step_residual > MAX_STEP_TO_DRIFT_RATIO * drift_residual:
             return None
         return EncoderFault.JUMPED, (
             f"its zero stepped by {step:+.1f} arcsec (standard error {error:.2f}) near {time_s[row]:.1f} s; "
-            "a gear's does not step"
+            "the zero of a gear cannot step"
         )
 
-    def _drifts(self) -> tuple[EncoderFault, str] | None:
+    def _drift_fault(self) -> tuple[EncoderFault, str] | None:
         """Returns a fault once a drift too fast or too large for a gear has lasted."""
-        away = 0.0 if self.moved is None else self.moved.arcsec
+        away = 0.0 if self.displacement is None else self.displacement.arcsec
         drifts = any(each.exceeds(RATE_ARCSEC_MIN) for each in self.rates)
-        self._suspicions = self._suspicions + 1 if drifts or abs(away) > MAX_ARCSEC else 0
-        if self._suspicions < LASTING:
+        self._suspicious_fits = self._suspicious_fits + 1 if drifts or abs(away) > MAX_ARCSEC else 0
+        if self._suspicious_fits < CONSECUTIVE_FITS:
             return None
         rate = max(self.rates, key=lambda each: abs(each.arcsec_min) - SIGMAS * each.error)
         return EncoderFault.DRIFTING, (

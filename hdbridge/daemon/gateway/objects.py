@@ -33,7 +33,7 @@ BRIDGE_VALUES: Final = (
     ("State of the axis in the control loop", _UNSIGNED8),
 )
 """Name and type of the sub-indices of this record, from 1."""
-_WITHOUT: Final = ("2100", "2101")
+_REMOVED_OBJECTS: Final = ("2100", "2101")
 """Objects that are removed, because they belong to the simulated drive's environment."""
 _PDOS: Final[Mapping[str, int | str]] = {
     "1400sub2": 255,
@@ -61,7 +61,7 @@ _PDOS: Final[Mapping[str, int | str]] = {
 """Default PDOs as in CiA 402: the first pair is event-driven; mode and position are mapped but not valid.
 
 The statusword is also sent every 50 ms, for masters that expect it periodically."""
-_MOST: Final = 0xFFFF_FFFF
+_UINT32_MAX: Final = 0xFFFF_FFFF
 _FOLLOWING_TIME_S: Final = 0.2
 """Default of 6065h as travel time at the highest speed."""
 
@@ -104,7 +104,7 @@ def _defaults(
     counts = settings.counts_per_turn / 360.0
 
     def unsigned(degrees: float) -> int:
-        return min(max(math.floor(degrees * counts), 1), _MOST)
+        return min(max(math.floor(degrees * counts), 1), _UINT32_MAX)
 
     velocity, acceleration = unsigned(limits.velocity_deg_s), unsigned(limits.acceleration_deg_s2)
     return {
@@ -161,7 +161,7 @@ def eds(axis: AxisConfig, settings: GatewaySettings, model: TransmissionModel | 
     for section, value in _defaults(axis, settings, model).items():
         made[section]["DefaultValue"] = str(value)
     made["6098"].update(LowLimit="35", HighLimit="37")
-    for section in _WITHOUT:
+    for section in _REMOVED_OBJECTS:
         made.remove_section(section)
     _add_bridge(made)
     text = io.StringIO()

@@ -52,7 +52,7 @@ POWER_S: Final = 5.0
 VELOCITY_S: Final = 0.02
 """Averaging time of the actual velocity."""
 
-TAKEN: Final = 0xFF01
+IN_USE_BY_OTHER: Final = 0xFF01
 """Error code: another client of the daemon uses the axis."""
 NOT_POWERED: Final = 0xFF02
 """Error code: the inner drive was not powered, or lost its power; the daemon's log has the reason."""
@@ -110,25 +110,25 @@ class LoadAxis(PowerStage):
         self.sample: SampleArray | None = None
         """Axis in the newest cycle; None before the first."""
         self._measured = (-math.inf, 0.0)
-        self._series = max(self._cells[OuterCell.WANTED], self._cells[OuterCell.GRANTED]) + 1
+        self._series = max(self._cells[OuterCell.REQUESTED], self._cells[OuterCell.GRANTED]) + 1
         """Number of the next series of set-points; no process uses a number twice, even after a restart."""
-        self._wanted = 0
-        self._wanted_s = 0.0
+        self._requested = 0
+        self._requested_s = 0.0
         self._begun = False
         self._resets = self._cells[OuterCell.RESETS_DONE]
-        self._cells[OuterCell.WANTED] = 0
+        self._cells[OuterCell.REQUESTED] = 0
         self._cells[OuterCell.RESETS] = self._resets
 
     # ---------------------------------------------------------------- the newest cycle
 
-    def look(self, newest: SampleArray | None, now_s: float, alive: bool) -> None:
+    def update(self, newest: SampleArray | None, now_s: float, alive: bool) -> None:
         """Takes the newest cycle, shape (1,), and checks for errors; ``newest`` is None without a new one."""
         if newest is not None:
             self._take(newest)
         sample = self.sample
         if sample is None:
             return
-        granted = self._wanted != 0 and self._cells[OuterCell.GRANTED] == self._wanted
+        granted = self._requested != 0 and self._cells[OuterCell.GRANTED] == self._requested
         follows = sample["state"] == AxisState.ENABLED and sample["mode"] == MotionMode.FOLLOW
         was_on, self.is_on = self.is_on, granted and bool(follows)
         if self.is_resetting and self._cells[OuterCell.RESETS_DONE] == self._resets:
@@ -154,36 +154,36 @@ class LoadAxis(PowerStage):
     def _judge(self, sample: SampleArray, was_on: bool, now_s: float, alive: bool) -> int:
         """Returns the error code of a condition that prevents operation, or 0."""
         if not alive:
-            return ERROR_CODES[Fault.HANG] if self._wanted else 0
+            return ERROR_CODES[Fault.HANG] if self._requested else 0
         if sample["state"] in STOPPED_STATES:
             fault = fault_of(int(sample["fault"]))
             return STOPPED if fault is None else ERROR_CODES.get(fault, STOPPED)
-        if not self._wanted:
+        if not self._requested:
             return 0
-        if self._cells[OuterCell.REFUSED] == self._wanted:
-            return NOT_POWERED if self._cells[OuterCell.HELD] else TAKEN
+        if self._cells[OuterCell.REFUSED] == self._requested:
+            return NOT_POWERED if self._cells[OuterCell.HELD] else IN_USE_BY_OTHER
         if was_on and not self.is_on:
             if sample["state"] == AxisState.ENABLED:
-                return TAKEN
+                return IN_USE_BY_OTHER
             # If this process was scheduled late, the set-points end before SYNC is overdue.
             node = self._node
             outer = node is not None and node.firmware.follows_the_bus and node.sync_is_late(now_s)
             return ErrorCode.SYNC_LOST if outer else NOT_POWERED
-        if not self.is_on and now_s - self._wanted_s > POWER_S:
+        if not self.is_on and now_s - self._requested_s > POWER_S:
             return NOT_POWERED
         return 0
 
     # ---------------------------------------------------------------- the power stage
 
     def switch(self, on: bool) -> None:
-        if not on and self._wanted:
+        if not on and self._requested:
             now_s = self._clock.now()
-            self._knots.add(OuterKnot(self._wanted, now_s, math.nan, now_s))
+            self._knots.add(OuterKnot(self._requested, now_s, math.nan, now_s))
         self.is_on = self._begun = False
-        self._wanted = self._series if on else 0
+        self._requested = self._series if on else 0
         self._series += on
-        self._wanted_s = self._clock.now()
-        self._cells[OuterCell.WANTED] = self._wanted
+        self._requested_s = self._clock.now()
+        self._cells[OuterCell.REQUESTED] = self._requested
 
     def reset(self) -> None:
         self._resets += 1
@@ -220,7 +220,7 @@ class LoadAxis(PowerStage):
     def _put(self, time_s: float, counts: float) -> None:
         assert self._node is not None
         received_s = self._node.now_s
-        self._knots.add(OuterKnot(self._wanted, time_s, counts / self._counts_per_deg, received_s))
+        self._knots.add(OuterKnot(self._requested, time_s, counts / self._counts_per_deg, received_s))
 
     def coast(self, substeps: int, braked: bool) -> None:
         """Writes nothing, because there are no set-points without power."""
@@ -289,7 +289,7 @@ class Gateway:
         self._bus, self._memory, self._clock = bus, memory, clock
         self._reader = memory.reader()
         self._turns, self._turned_s = -1, clock.now()
-        self._looked_s = -math.inf
+        self._updated_s = -math.inf
         self.axes: dict[str, LoadAxis] = {}
         self.nodes: dict[str, DriveNode] = {}
         for index, (axis, model) in enumerate(axes):
@@ -315,7 +315,7 @@ class Gateway:
             self.axes[axis.name], self.nodes[axis.name] = load, node
 
     def handle(self, message: can.Message, now_s: float) -> None:
-        self._look(now_s)
+        self._update_axes(now_s)
         for node in self.nodes.values():
             node.handle(message, now_s)
 
@@ -333,7 +333,7 @@ class Gateway:
 
     def run_until(self, now_s: float) -> None:
         """Runs everything due until ``now_s`` without reading the bus."""
-        self._look(now_s)
+        self._update_axes(now_s)
         for name, node in self.nodes.items():
             node.run_until(now_s)
             self.axes[name].publish(node)
@@ -347,11 +347,11 @@ class Gateway:
         for node in self.nodes.values():
             node.bus_failed()
 
-    def _look(self, now_s: float) -> None:
+    def _update_axes(self, now_s: float) -> None:
         """Updates the axes, at most twice per period of the loop."""
-        if now_s - self._looked_s < 0.5 * self._memory.period_s:
+        if now_s - self._updated_s < 0.5 * self._memory.period_s:
             return
-        self._looked_s = now_s
+        self._updated_s = now_s
         status = self._memory.status
         turns = status.loop_count
         if turns != self._turns:
@@ -360,4 +360,4 @@ class Gateway:
         newest = samples[-1:] if len(samples) else None
         alive = status.loop_pid != 0 and now_s - self._turned_s < DEAD_S
         for load in self.axes.values():
-            load.look(newest, now_s, alive)
+            load.update(newest, now_s, alive)

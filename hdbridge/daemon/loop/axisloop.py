@@ -2,8 +2,8 @@
 
 `AxisLoop.command` takes the service's commands between two turns. `AxisCycle` requests a target in each turn
 in which the drive is enabled. The state determines which function provides the target (`_enabling`,
-`Follower.follow` or `_pursue`), so the turn itself makes no decision. `AxisLoop.after` evaluates the result
-of the turn.
+`Follower.follow` or `_follow_gateway`), so the turn itself makes no decision. `AxisLoop.after` evaluates
+the result of the turn.
 """
 
 import math
@@ -15,7 +15,7 @@ from hdbridge.control.axiscycle import STILL_CYCLES, AxisCycle
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Report
 from hdbridge.daemon.loop.feeds import KnotFeed, OuterFeed
 from hdbridge.daemon.loop.follower import Follower
-from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, AxisState, Cause, Happening, refusal, target_of
+from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, AxisState, Cause, Trigger, refusal, target_of
 from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import NO_FAULT, Command, CommandKind, EventKind, Memory, SampleFlag
 from hdbridge.daemon.setting import CompensationSetting
@@ -28,7 +28,7 @@ from hdbridge.motion import MotionMode
 
 _OFF: Final = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
 _FOLLOW: Final = MotionMode.FOLLOW
-_LASTING: Final = {
+_MULTI_TURN_COMMANDS: Final = {
     CommandKind.ENABLE: (AxisState.ENABLING, AxisState.ENABLED),
     CommandKind.DISABLE: (AxisState.STOPPING, AxisState.DISABLED),
 }
@@ -63,7 +63,7 @@ class AxisLoop:
         self.set_point = self.follower.set_point
         self.group: frozenset[int] = frozenset()
         """Indices of the axes that began the same stream, which stop together with this axis."""
-        self.broken: frozenset[int] = frozenset()
+        self.left_group: frozenset[int] = frozenset()
         """Group whose stream this axis left before its end; the controller stops the others."""
 
         self._slot, self._report = memory.settings[index], report
@@ -83,17 +83,17 @@ class AxisLoop:
         self._doubt = ""
         """Last reported states of the compensation change, the stream underrun and the load loop."""
         self._pending: dict[CommandKind, int] = {}
-        """Ids of the pending commands of `_LASTING`."""
+        """Ids of the pending commands of `_MULTI_TURN_COMMANDS`."""
         self._motion_id = 0
         self._mode = MotionMode.HOLD
         self._powering_off = False
-        self._left = 0
+        self._turns_left = 0
         """Number of turns left before the drive's time-out."""
         self._why = ""
         """Reason for stopping, if the supervision did not report one."""
-        self.stands = True
+        self.stop_reported = True
         """True if the axis is at rest and its stop was reported; False only in QUICK_STOPPED and LATCHED."""
-        self._place = self._still = 0
+        self._last_counts = self._still_turns = 0
         """Motor counts in the last turn of a stop, and the number of consecutive turns at standstill."""
         self._handlers: dict[CommandKind, Callable[[Command], None]] = {
             CommandKind.VERIFIED: self._verified,
@@ -127,7 +127,7 @@ class AxisLoop:
         target = target_of(self.state, kind)
         assert target is not None
         if kind is CommandKind.DISABLE and target is AxisState.STOPPING:
-            self._refuse_pending(kind, "another one came")
+            self._refuse_pending(kind, "another disable command has replaced it")
             self._pending[kind] = command.id
         elif kind is not CommandKind.ENABLE:
             self._done(command.id)
@@ -154,13 +154,13 @@ class AxisLoop:
     def verification_lost(self) -> None:
         """Handles a bus failure, after which the drive must be verified again, even if lent."""
         self._why = "the bus went down while the axis was lent"
-        self._happened(Happening.VERIFICATION_LOST)
+        self._transition(Trigger.VERIFICATION_LOST)
 
     def _done(self, id_: int) -> None:
         if id_:
             self._report(EventKind.DONE, id_, 0)
 
-    def _happened(self, cause: Cause) -> None:
+    def _transition(self, cause: Cause) -> None:
         """Makes the transition for ``cause``, if there is one in this state."""
         if (target := target_of(self.state, cause)) is not None:
             self._enter(target)
@@ -174,14 +174,14 @@ class AxisLoop:
         if state is AxisState.STOPPING and before is not AxisState.ENABLED:
             self._power_off()
         if state not in MAY_MOVE:
-            self._stand()
+            self._end_motion()
         if state in STOPPED:
             self.image.power.quick_stop()  # overrides any power target: only ENABLE leads back to power
-            self.stands = False
-            self._still = 0
-            self._left = self._turns(STOP_TIMEOUT_S)
+            self.stop_reported = False
+            self._still_turns = 0
+            self._turns_left = self._turns(STOP_TIMEOUT_S)
         self._report(EventKind.STATE, 0, state)
-        for kind, (during, done) in _LASTING.items():
+        for kind, (during, done) in _MULTI_TURN_COMMANDS.items():
             if state is done:
                 self._done(self._pending.pop(kind, 0))
             elif state is not during:
@@ -192,7 +192,7 @@ class AxisLoop:
         if id_ := self._pending.pop(kind, 0):
             self._report(EventKind.REFUSED, id_, kind, why)
 
-    def _stand(self) -> None:
+    def _end_motion(self) -> None:
         """Ends the motion: stops following set-points, and leaves the stream and its group."""
         self.cycle.command = None
         self._powering_off = False
@@ -204,7 +204,7 @@ class AxisLoop:
     def _break_group(self) -> None:
         """Leaves the group of a coordinated move, which the controller then stops."""
         if self.group:
-            self.broken, self.group = self.group, frozenset()
+            self.left_group, self.group = self.group, frozenset()
 
     def _turns(self, time_s: float) -> int:
         return math.ceil(time_s / self._period_s)
@@ -213,7 +213,7 @@ class AxisLoop:
 
     def _verified(self, command: Command) -> None:
         self._seed(command)
-        self._aim_off()
+        self._request_power_off()
         self.cycle.begin()
 
     def _seed(self, command: Command) -> None:
@@ -238,7 +238,7 @@ class AxisLoop:
         self._why = ""
         self._pending[CommandKind.ENABLE] = command.id
         rarest = max((each.every_cycles for each in self.config.channels.values()), default=0)
-        self._left = self._turns(2 * ENABLE_TIMEOUT_S) + 2 * rarest
+        self._turns_left = self._turns(2 * ENABLE_TIMEOUT_S) + 2 * rarest
         self.cycle.command = self._enabling
         self.cycle.begin()
 
@@ -258,8 +258,8 @@ class AxisLoop:
 
     def _reset(self, command: Command) -> None:
         quick_stopped = self.state is AxisState.QUICK_STOPPED
-        if quick_stopped and not self.stands:
-            raise TransitionError(f"{self.config.name}: the axis is still stopping; wait until it stands")
+        if quick_stopped and not self.stop_reported:
+            raise TransitionError(f"{self.config.name}: the axis is still stopping; wait until it is at rest")
         if self.state is AxisState.LATCHED and not command.i:
             raise TransitionError(
                 f"{self.config.name}: boot and verify the drive again before this latch is released"
@@ -283,9 +283,9 @@ class AxisLoop:
         self.set_point.follow()
         self._outer.begin(command.j, command.a, self._due_s(), self.set_point.position_deg)
         self._motion_id, self._mode = command.id, MotionMode.FOLLOW
-        self.cycle.command = self._pursue
+        self.cycle.command = self._follow_gateway
 
-    def _pursue(self, feedback: Feedback) -> int | None:
+    def _follow_gateway(self, feedback: Feedback) -> int | None:
         """Follows the gateway's set-points one period late, because the newest may not have arrived yet."""
         if self.set_point.mode is MotionMode.FOLLOW:
             aim = self._outer.at(self._due_s() - self._period_s)
@@ -310,7 +310,7 @@ class AxisLoop:
 
     # ---------------------------------------------------------------- power
 
-    def _aim_off(self) -> None:
+    def _request_power_off(self) -> None:
         power = self.image.power
         try:
             power.go(State.SWITCH_ON_DISABLED)
@@ -320,8 +320,8 @@ class AxisLoop:
     def _power_off(self) -> None:
         self.cycle.command = None
         self._powering_off = True
-        self._left = self._turns(STOP_TIMEOUT_S)
-        self._aim_off()
+        self._turns_left = self._turns(STOP_TIMEOUT_S)
+        self._request_power_off()
 
     def _enabling(self, feedback: Feedback) -> int | None:
         """Holds position until every channel has a value, then follows from the actual position."""
@@ -331,7 +331,7 @@ class AxisLoop:
                 f"{self.config.where(waiting[0].key)}: no plausible reading arrived "
                 f"({waiting[0].why}); check the sensor, or leave the key out"
             )
-            self._left = 0
+            self._turns_left = 0
         if not waiting and feedback.fresh:
             self.follower.begin(feedback)
             self._underrun = False
@@ -353,18 +353,18 @@ class AxisLoop:
         supervision = self.supervision
         if supervision.stop is not None:
             latched = supervision.reaction is Reaction.LATCH
-            self._happened(Happening.VERIFICATION_LOST if latched else Happening.STOP_LATCHED)
+            self._transition(Trigger.VERIFICATION_LOST if latched else Trigger.STOP_LATCHED)
         state = self.state
         if state is AxisState.ENABLED:
             self._after_motion()
         elif state is AxisState.ENABLING:
             if self.cycle.command is self._follow:
-                self._happened(Happening.POWERED)
+                self._transition(Trigger.POWERED)
             else:
                 self._overdue(f"it did not reach 'operation enabled' within {2 * ENABLE_TIMEOUT_S:g} s")
         elif state is AxisState.STOPPING:
             self._after_stopping()
-        elif not self.stands:
+        elif not self.stop_reported:
             self._after_stop()
 
     def _after_motion(self) -> None:
@@ -386,7 +386,7 @@ class AxisLoop:
             if not set_point.at_rest:
                 words = "the set-points of the gateway ended in motion; it loses its power"
                 self._report(EventKind.UNDERRUN, self._motion_id, 0, words)
-            self._happened(Happening.UNFED)
+            self._transition(Trigger.UNFED)
         if set_point.underrun is not self._underrun:
             self._underrun = set_point.underrun
             if self._underrun:
@@ -406,13 +406,13 @@ class AxisLoop:
             if self.set_point.at_rest:
                 self._power_off()
         elif self.image.power.state in _OFF:
-            self._happened(Happening.POWER_OFF)
+            self._transition(Trigger.POWER_OFF)
         else:
             self._overdue(f"it did not switch power off within {STOP_TIMEOUT_S:g} s")
 
     def _overdue(self, what: str) -> None:
-        self._left -= 1
-        if self._left > 0:
+        self._turns_left -= 1
+        if self._turns_left > 0:
             return
         if not self._why:
             state = self.image.power.state.value
@@ -420,16 +420,16 @@ class AxisLoop:
                 f"{self.config.name}: the drive takes too long: {what}, it is in '{state}'; look at its "
                 "enable input, its supply and its fault history"
             )
-        self._happened(Happening.OVERDUE)
+        self._transition(Trigger.OVERDUE)
 
     def _after_stop(self) -> None:
         """Reports a stop once the axis is at rest or the time-out has passed."""
         if self.supervision.stop is None and self.state is AxisState.QUICK_STOPPED:
-            if not self._obeyed():
+            if not self._quick_stop_over():
                 return
         elif self.cycle.stopping:
             return
-        self.stands = True
+        self.stop_reported = True
         stop = self.supervision.stop
         code = FAULT_INDEX[stop.fault] if stop is not None else NO_FAULT
         error = self.cycle.stopped
@@ -437,18 +437,18 @@ class AxisLoop:
         text = error.text if error is not None else self._why
         self._report(EventKind.STOPPED, int(explained), code, text)
 
-    def _obeyed(self) -> bool:
+    def _quick_stop_over(self) -> bool:
         """Returns True if a commanded quick stop is over: the motor is at rest or the time-out has passed."""
-        counts, before = self.cycle.feedback.motor_counts, self._place
-        self._place = counts
+        counts, before = self.cycle.feedback.motor_counts, self._last_counts
+        self._last_counts = counts
         driven = self.image.power.state is State.OPERATION_ENABLED
-        self._still = self._still + 1 if not driven and abs(counts - before) <= 1 else 0
-        self._left -= 1
-        if self._left > 0:
-            return self._still >= STILL_CYCLES
+        self._still_turns = self._still_turns + 1 if not driven and abs(counts - before) <= 1 else 0
+        self._turns_left -= 1
+        if self._turns_left > 0:
+            return self._still_turns >= STILL_CYCLES
         if driven:
             self._why += "; the drive did not obey it, so its voltage is disabled"
-            self._aim_off()
+            self._request_power_off()
         return True
 
     # ---------------------------------------------------------------- the sample of a turn

@@ -15,7 +15,7 @@ from typing import Final
 from hdbridge.axis import AxisConfig
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.daemon.loop.axisloop import AxisLoop
-from hdbridge.daemon.loop.relay import incoming_ids, why_refused
+from hdbridge.daemon.loop.relay import incoming_ids, refusal_reason
 from hdbridge.daemon.loop.states import AxisState, label
 from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import Cell, Command, CommandKind, Event, EventKind, Memory, RelayedFrame
@@ -23,10 +23,10 @@ from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.states import State
 from hdbridge.errors import BusError, HdbridgeError, InputError
 
-COMMANDS_A_TURN: Final = 8
+COMMANDS_PER_TURN: Final = 8
 REOPEN_EVERY_S: Final = 0.5
 """Interval between attempts to reopen a failed interface."""
-REFUSALS_A_SECOND: Final = 10
+REFUSALS_PER_SECOND: Final = 10
 """Maximum rate of reports of refused relay frames."""
 ENDING_TIMEOUT_S: Final = 10.0
 """Time after which the process ends even if the drives have not confirmed power-off."""
@@ -67,16 +67,16 @@ class Controller:
 
         self._reopen = reopen
         self._axis_of_node = {node: axis for axis in self.axes for node in axis.config.nodes}
-        self._wanted = incoming_ids(self._axis_of_node)
+        self._incoming_ids = incoming_ids(self._axis_of_node)
         self._down = False
         self._reopen_in = 0
-        self._refusals = 0
+        self._last_refusal_cycle = 0
         self._ending = self._at_once = False
-        self._ending_left = 0
+        self._ending_turns_left = 0
         self._released: set[int] = set()
         self._turns = memory.status.loop_count
-        cycle.on_frame = self._pass_in
-        cycle.outgoing = self._pass_out
+        cycle.on_frame = self._relay_incoming
+        cycle.outgoing = self._relay_outgoing
         # Waiting commands, frames and knots were meant for an earlier loop with the axes in other states.
         memory.commands.clear()
         memory.outgoing.clear()
@@ -98,10 +98,10 @@ class Controller:
             self._bus_down()
         for axis in axes:
             axis.after()
-            if axis.broken:
+            if axis.left_group:
                 self._stop_group(axis)
         if self._ending:
-            self._go_on_ending()
+            self._continue_ending()
         self._sample()
 
     def _sample(self) -> None:
@@ -131,7 +131,7 @@ class Controller:
 
     def _take_commands(self) -> None:
         take = self.memory.commands.take
-        for _ in range(COMMANDS_A_TURN):
+        for _ in range(COMMANDS_PER_TURN):
             if (command := take()) is None:
                 break
             self._command(command)
@@ -174,31 +174,31 @@ class Controller:
 
     def _stop_group(self, stopped: AxisLoop) -> None:
         """Brakes the other axes of a group when one axis leaves it."""
-        for index in stopped.broken:
+        for index in stopped.left_group:
             axis = self.axes[index]
-            if axis.group == stopped.broken:
+            if axis.group == stopped.left_group:
                 axis.group = frozenset()
                 axis.stop()
-        stopped.broken = frozenset()
+        stopped.left_group = frozenset()
 
     # ---------------------------------------------------------------- the service's frames
 
-    def _pass_in(self, frame: Frame) -> None:
-        if frame.can_id in self._wanted:
+    def _relay_incoming(self, frame: Frame) -> None:
+        if frame.can_id in self._incoming_ids:
             self.memory.incoming.append(RelayedFrame(round(1e9 * frame.time_s), frame.can_id, frame.data))
 
-    def _pass_out(self) -> tuple[int, bytes] | None:
+    def _relay_outgoing(self) -> tuple[int, bytes] | None:
         frame = self.memory.outgoing.take()
         if frame is None:
             return None
         _, can_id, data = frame
         states = {node: axis.state for node, axis in self._axis_of_node.items()}
-        refusal = why_refused(can_id, data, states)
+        refusal = refusal_reason(can_id, data, states)
         if refusal is None:
             return can_id, data
         second = round(1.0 / self.cycle.period_s)
-        if self.cycle.count - self._refusals > second // REFUSALS_A_SECOND:
-            self._refusals = self.cycle.count
+        if self.cycle.count - self._last_refusal_cycle > second // REFUSALS_PER_SECOND:
+            self._last_refusal_cycle = self.cycle.count
             self._report(_ALL, EventKind.REFUSED, 0, 0, refusal)
         return None
 
@@ -241,7 +241,7 @@ class Controller:
         if self._ending:
             return
         self._ending = True
-        self._ending_left = round(ENDING_TIMEOUT_S / self.cycle.period_s)
+        self._ending_turns_left = round(ENDING_TIMEOUT_S / self.cycle.period_s)
         self._report(_ALL, EventKind.ENDING)
         for axis in self.axes:
             # The service can no longer stop a lent axis; the loop's quick stop overrides its SDO transfers.
@@ -252,14 +252,14 @@ class Controller:
         if axis.state not in _AT_REST:
             axis.command(Command(0, kind, axis.index))
 
-    def _go_on_ending(self) -> None:
-        self._ending_left -= 1
+    def _continue_ending(self) -> None:
+        self._ending_turns_left -= 1
         moving = False
         for axis in self.axes:
             if axis.state in _AT_REST:
                 continue
             power = axis.image.power
-            if axis.state is AxisState.QUICK_STOPPED and axis.stands:
+            if axis.state is AxisState.QUICK_STOPPED and axis.stop_reported:
                 if power.state in _OFF:
                     continue
                 if axis.index not in self._released:
@@ -267,4 +267,4 @@ class Controller:
                     self._released.add(axis.index)
                     self._order(axis, CommandKind.RESET)
             moving = True
-        self.ended = not moving or self._ending_left <= 0
+        self.ended = not moving or self._ending_turns_left <= 0

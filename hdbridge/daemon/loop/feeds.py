@@ -8,13 +8,13 @@ from hdbridge.daemon.memory.layout import Knot, OuterKnot
 from hdbridge.errors import InputError
 from hdbridge.motion import SetPoint
 
-KNOTS_A_TURN: Final = 4
+KNOTS_PER_TURN: Final = 4
 """Number of knots passed to the set-point before each turn."""
-STALE_KNOTS_A_TURN: Final = 64
+STALE_KNOTS_PER_TURN: Final = 64
 """Number of knots of other streams discarded before each turn."""
-OUTER_KNOTS_A_TURN: Final = 64
+OUTER_KNOTS_PER_TURN: Final = 64
 LONGEST_SPACING_S: Final = 0.05
-BRIDGED: Final = 0.2
+BRIDGED_SHARE: Final = 0.2
 """Time for which a moving axis keeps its speed without a set-point, as a share of the time-out at rest."""
 FIRST_KNOT_S: Final = 2.0
 """Maximum time from the beginning to the first set-point."""
@@ -58,14 +58,14 @@ class KnotFeed:
         """Passes on the next knots. If one is refused, brakes the axis and returns the reason, else None."""
         knots, set_point, stream = self._knots, self._set_point, self._stream
         taken = 0
-        for _ in range(STALE_KNOTS_A_TURN):
+        for _ in range(STALE_KNOTS_PER_TURN):
             knot = knots.peek()
             if knot is None or knot.stream > stream:
                 break
             if knot.stream < stream or not self._following:
                 knots.drop()
                 continue
-            if taken == KNOTS_A_TURN or not set_point.room:
+            if taken == KNOTS_PER_TURN or not set_point.room:
                 return None
             taken += 1
             knots.drop()
@@ -106,7 +106,7 @@ class OuterFeed:
 
     def at(self, time_s: float) -> float | None:
         """Returns the position at a time, which must not decrease; None once the set-points have ended."""
-        for _ in range(OUTER_KNOTS_A_TURN):
+        for _ in range(OUTER_KNOTS_PER_TURN):
             if self._last_s >= time_s:
                 break
             knot = self._knots.take()
@@ -133,4 +133,4 @@ class OuterFeed:
         self._rate_deg_s = step_deg / length_s if length_s > 0.0 else 0.0
         self.spacing_s = length_s if length_s < LONGEST_SPACING_S else LONGEST_SPACING_S
         patience_s = self._patience_s
-        self._end_s = due_s + (max(length_s, BRIDGED * patience_s) if step_deg else patience_s)
+        self._end_s = due_s + (max(length_s, BRIDGED_SHARE * patience_s) if step_deg else patience_s)

@@ -50,7 +50,7 @@ class Follower:
         self._load_loop = _load_loop(config, load_loop) if load_loop is not None else None
         self._load_loop_on = True
         self._issued = 0
-        self._most = fastest_counts(config, load_loop)
+        self._max_step_counts = max_step_counts(config, load_loop)
 
     # ---------------------------------------------------------------- compensation
 
@@ -92,15 +92,15 @@ class Follower:
         image = self._image
         image.check_target(feedback.motor_counts)
         motor_deg = image.motor_deg(feedback.motor_counts)
-        place_deg = self.target_deg = motor_deg / self._ratio
-        self.set_point.reset(place_deg)
+        load_deg = self.target_deg = motor_deg / self._ratio
+        self.set_point.reset(load_deg)
         self._issued = image.target_counts
         self._observer = Observer()
         sensed, correction = self.sensed, self.correction
         sensed.reset()
         sensed.take(feedback)
         correction.set_known_channels(sensed.known)
-        moment = Moment(time_s=feedback.time_s, measured=sensed.measured(feedback), load_deg=place_deg)
+        moment = Moment(time_s=feedback.time_s, measured=sensed.measured(feedback), load_deg=load_deg)
         correction.reset(motor_deg, moment)
         self.engage(self.compensating)
         self._needs = bool(correction.needs)
@@ -115,7 +115,7 @@ class Follower:
         """
         target_deg = self.target_deg = self.set_point.step()
         if self._load_loop is not None:
-            target_deg = self._trimmed(self._load_loop, target_deg, feedback)
+            target_deg = self._with_load_loop(self._load_loop, target_deg, feedback)
         correction = self.correction
         if self._needs:
             sensed = self.sensed
@@ -131,10 +131,10 @@ class Follower:
             moment = _AT_REST
         follow = correction.command if feedback.fresh else correction.hold
         counts = self._image.target_counts_for(follow(target_deg, moment))
-        if not -self._most <= counts - self._issued <= self._most:
+        if not -self._max_step_counts <= counts - self._issued <= self._max_step_counts:
             raise InputError(
-                f"target of {counts} motor counts after {self._issued}: more than the {self._most} that the "
-                "limits of velocity and slew allow in a cycle; the target was not sent"
+                f"target of {counts} motor counts after {self._issued}: the limits of velocity and "
+                f"slew allow {self._max_step_counts} in a cycle; the target was not sent"
             )
         self._issued = counts
         return counts
@@ -151,7 +151,7 @@ class Follower:
         """Reason for which the load loop does not act; empty while it may act."""
         return self._load_loop.doubt if self._load_loop is not None else ""
 
-    def _trimmed(self, load_loop: LoadLoop, target_deg: float, feedback: Feedback) -> float:
+    def _with_load_loop(self, load_loop: LoadLoop, target_deg: float, feedback: Feedback) -> float:
         """Returns the load target with the load loop's correction, within the limits."""
         image, correction = self._image, self.correction
         load: float | None = None
@@ -161,14 +161,14 @@ class Follower:
         by_motor += correction.predicted_arcsec
         moving = not self.set_point.at_rest or correction.changing
         self.loop_arcsec = load_loop.step(ARCSEC_PER_DEG * target_deg, load, by_motor, moving)
-        trimmed = target_deg + self.loop_arcsec / ARCSEC_PER_DEG
+        corrected_deg = target_deg + self.loop_arcsec / ARCSEC_PER_DEG
         limits = self._axis.limits
         # If the target is outside the limits, the load loop must not move it further out.
-        least, greatest = min(limits.position_min_deg, target_deg), max(limits.position_max_deg, target_deg)
-        return min(max(trimmed, least), greatest)
+        lower, upper = min(limits.position_min_deg, target_deg), max(limits.position_max_deg, target_deg)
+        return min(max(corrected_deg, lower), upper)
 
 
-def fastest_counts(config: AxisConfig, load_loop: LoadLoopSettings | None) -> int:
+def max_step_counts(config: AxisConfig, load_loop: LoadLoopSettings | None) -> int:
     """Returns the largest step of the target in one cycle within the velocity and slew limits; counts."""
     slew_arcsec_s = config.compensation.slew_arcsec_s
     if load_loop is not None:

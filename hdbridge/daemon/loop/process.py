@@ -26,7 +26,7 @@ from hdbridge.errors import BusError, HdbridgeError
 _POLLS: Final = 256
 """Number of frames read to test whether an opened interface works."""
 AT_ONCE: Final = 2
-"""Value of ``STOP_ASKED`` that requests an end by quick stop."""
+"""Value of ``STOP_REQUESTED`` that requests an end by quick stop."""
 SIMULATED_BITRATE_BPS: Final = 1_000_000
 
 
@@ -76,7 +76,7 @@ def listen(link: Link, axes: tuple[AxisConfig, ...]) -> None:
 
 
 def run(start: Start) -> None:
-    """Runs the loop of a machine until SIGTERM or ``STOP_ASKED`` has brought it to rest.
+    """Runs the loop of a machine until SIGTERM or ``STOP_REQUESTED`` has brought it to rest.
 
     Raises `BusError` if the bus cannot be opened, `BusInUseError` if another master is active on it.
     """
@@ -100,8 +100,8 @@ def run(start: Start) -> None:
                 {"conditions": str(conditions or "simulated")},
             )
             while not controller.ended:
-                if terminated() or status[Cell.STOP_ASKED]:
-                    controller.end(at_once=status[Cell.STOP_ASKED] >= AT_ONCE)
+                if terminated() or status[Cell.STOP_REQUESTED]:
+                    controller.end(at_once=status[Cell.STOP_REQUESTED] >= AT_ONCE)
                 controller.turn()
 
 

@@ -23,7 +23,7 @@ def incoming_ids(nodes: Iterable[int]) -> frozenset[int]:
     return frozenset(own | {COB_HEARTBEAT + node for node in range(1, _NODE + 1)})
 
 
-def why_refused(can_id: int, data: bytes, states: dict[int, AxisState]) -> str | None:
+def refusal_reason(can_id: int, data: bytes, states: dict[int, AxisState]) -> str | None:
     """Returns the reason for not sending a frame of the service; None if it may be sent.
 
     ``states`` maps each node of the machine to its axis's state.

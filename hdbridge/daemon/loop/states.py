@@ -44,7 +44,7 @@ UNKNOWN: Final = frozenset({AxisState.UNVERIFIED, AxisState.LATCHED})
 """States in which the drive must be verified before any other request."""
 
 
-class Happening(Enum):
+class Trigger(Enum):
     """Events other than commands that cause a transition."""
 
     POWERED = "operation is enabled and the channels are known"
@@ -55,7 +55,7 @@ class Happening(Enum):
     UNFED = "the gateway's set-points end"
 
 
-Cause = CommandKind | Happening
+Cause = CommandKind | Trigger
 
 
 class Transition(NamedTuple):
@@ -66,8 +66,9 @@ class Transition(NamedTuple):
     target: AxisState
 
 
-_S, _C, _H = AxisState, CommandKind, Happening
-_SPEAKING: Final = (_S.DISABLED, _S.ENABLING, _S.ENABLED, _S.STOPPING)
+_S, _C, _T = AxisState, CommandKind, Trigger
+_CONTROLLED: Final = (_S.DISABLED, _S.ENABLING, _S.ENABLED, _S.STOPPING)
+"""States in which the loop controls the drive and no stop is latched."""
 
 TRANSITIONS: Final[tuple[Transition, ...]] = (
     Transition(_S.UNVERIFIED, _C.VERIFIED, _S.DISABLED),
@@ -83,21 +84,21 @@ TRANSITIONS: Final[tuple[Transition, ...]] = (
     Transition(_S.LENT, _C.UNLEND, _S.DISABLED),
     Transition(_S.LENT, _C.RELEASE, _S.UNVERIFIED),
     Transition(_S.LENT, _C.QUICK_STOP, _S.QUICK_STOPPED),
-    Transition(_S.ENABLING, _H.POWERED, _S.ENABLED),
-    Transition(_S.ENABLING, _H.OVERDUE, _S.STOPPING),
+    Transition(_S.ENABLING, _T.POWERED, _S.ENABLED),
+    Transition(_S.ENABLING, _T.OVERDUE, _S.STOPPING),
     Transition(_S.ENABLING, _C.DISABLE, _S.STOPPING),
     Transition(_S.ENABLING, _C.QUICK_STOP, _S.QUICK_STOPPED),
     *(
         Transition(_S.ENABLED, kind, _S.ENABLED)
         for kind in (_C.MOVE, _C.JOG, _C.STREAM_BEGIN, _C.STREAM_END, _C.FOLLOW)
     ),
-    Transition(_S.ENABLED, _H.UNFED, _S.STOPPING),
+    Transition(_S.ENABLED, _T.UNFED, _S.STOPPING),
     Transition(_S.ENABLED, _C.DISABLE, _S.STOPPING),
     Transition(_S.ENABLED, _C.QUICK_STOP, _S.QUICK_STOPPED),
     Transition(_S.STOPPING, _C.DISABLE, _S.STOPPING),
     Transition(_S.STOPPING, _C.QUICK_STOP, _S.QUICK_STOPPED),
-    Transition(_S.STOPPING, _H.POWER_OFF, _S.DISABLED),
-    Transition(_S.STOPPING, _H.OVERDUE, _S.QUICK_STOPPED),
+    Transition(_S.STOPPING, _T.POWER_OFF, _S.DISABLED),
+    Transition(_S.STOPPING, _T.OVERDUE, _S.QUICK_STOPPED),
     Transition(_S.QUICK_STOPPED, _C.RESET, _S.STOPPING),
     Transition(_S.LATCHED, _C.RESET, _S.UNVERIFIED),
     # A stop is never refused, even if nothing moves.
@@ -108,10 +109,10 @@ TRANSITIONS: Final[tuple[Transition, ...]] = (
     ),
     # The service may change the compensation at any time.
     *(Transition(state, _C.CHANGE, state) for state in _S),
-    *(Transition(state, _H.STOP_LATCHED, _S.QUICK_STOPPED) for state in _SPEAKING),
+    *(Transition(state, _T.STOP_LATCHED, _S.QUICK_STOPPED) for state in _CONTROLLED),
     *(
-        Transition(state, _H.VERIFICATION_LOST, _S.LATCHED)
-        for state in (*_SPEAKING, _S.LENT, _S.QUICK_STOPPED)
+        Transition(state, _T.VERIFICATION_LOST, _S.LATCHED)
+        for state in (*_CONTROLLED, _S.LENT, _S.QUICK_STOPPED)
     ),
 )
 """All transitions; a command without a row in a state is refused there."""
@@ -152,7 +153,7 @@ def mermaid() -> str:
     causes: dict[tuple[AxisState, AxisState], list[str]] = {}
     for row in TRANSITIONS:
         if row.source is not row.target:
-            words = row.cause.value if isinstance(row.cause, Happening) else row.cause.name
+            words = row.cause.value if isinstance(row.cause, Trigger) else row.cause.name
             causes.setdefault((row.source, row.target), []).append(str(words))
     lines += [
         f"    {source.name} --> {target.name}: {', '.join(words)}"

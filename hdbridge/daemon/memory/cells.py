@@ -66,10 +66,10 @@ class Cell(IntEnum):
     SERVICE_TIME_NS = 1
     LOOP_PID = 2
     SERVICE_PID = 3
-    STOP_ASKED = 4
+    STOP_REQUESTED = 4
     GATEWAY_TIME_NS = 5
     GATEWAY_PID = 6
-    BUS_WANTED = 7
+    BUS_REQUESTED = 7
     """Service: 1 while it waits for the release of the bus to another program."""
     BUS_LENT = 8
     """Keeper: time at which it released the interface to another program (``time.monotonic_ns``); 0 if not

@@ -227,7 +227,7 @@ NO_OUTER: Final = OuterView(math.nan, 0, 0, 0, 0, 0)
 class OuterCell(IntEnum):
     """Cells of one axis that gateway process and service share, each with one writer."""
 
-    WANTED = 0
+    REQUESTED = 0
     """Gateway: number of the series of set-points for which power is wanted; 0 for no power."""
     GRANTED = 1
     """Service: number of the series that the loop follows."""

@@ -29,7 +29,7 @@ from hdbridge.files.atomic import new_folder, write_atomically
 DIAGNOSES: Final = "diagnoses"
 RECORD: Final = "record"
 RESULT: Final = "diagnosis.json"
-LONGEST_S: Final = 1800.0
+TIMEOUT_S: Final = 1800.0
 """Time-out of a diagnosis."""
 INTERVAL_S: Final = 3600.0
 """Minimum time between two diagnoses of one axis."""
@@ -113,7 +113,7 @@ class AutoDiagnosis:
                     os.sched_setscheduler(process.pid, os.SCHED_IDLE, os.sched_param(0))
                 if self._ended.is_set():
                     process.kill()
-                status = process.wait(LONGEST_S)
+                status = process.wait(TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
@@ -136,6 +136,6 @@ def summary(found: dict[str, Any]) -> str:
         for each in findings[:3]
     )
     return (
-        f"diagnosis: {named or 'nothing that it could name'}; the model is {baseline:.2f} arcsec rms off, "
-        f"the noise is {floor:.2f}"
+        f"diagnosis: {named or 'no known cause'}; the error deviates from the model by {baseline:.2f} "
+        f"arcsec rms, the noise is {floor:.2f}"
     )

@@ -26,7 +26,7 @@ from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import GAP_CYCLES, PART_SAMPLES, Recording
 
 ENABLED: Final = (AxisState.ENABLED, AxisState.STOPPING)
-UNSEATED: Final = (AxisState.UNVERIFIED, AxisState.LENT)
+ZEROS_MAY_DIFFER: Final = (AxisState.UNVERIFIED, AxisState.LENT)
 """States after which the encoders' zeros may have changed: the drive was booted or homed."""
 OUTER: Final = ("outer_target_deg", "outer_controlword", "outer_statusword", "outer_error_code")
 """Columns of an axis with a gateway: requests and view of its other master."""
@@ -165,7 +165,7 @@ def _notes(flights: Sequence[Flight], axis: str, parts: int, missing: int, short
         "model": model.version if model else None,
         "stops": [each.text for flight in flights for each in flight.events if each.kind == "STOPPED"],
         "zeros_may_differ": any(
-            bool(np.any(np.isin(each.axes[axis]["state"], UNSEATED))) for each in flights
+            bool(np.any(np.isin(each.axes[axis]["state"], ZEROS_MAY_DIFFER))) for each in flights
         ),
     }
     return {name: value for name, value in notes.items() if value not in (None, 0, [], False)}

@@ -104,8 +104,8 @@ class FlightLog:
         self.waiting: deque[Item] = deque()
         """Items since the last flush."""
         self._newest_ns = 0
-        self._trouble = ""
-        self._refused_now = 0
+        self._write_error = ""
+        self._refused_since_error = 0
         self.refused = 0
         """Cycles not written because the disk was full."""
         folder.mkdir(parents=True, exist_ok=True)
@@ -113,10 +113,12 @@ class FlightLog:
     def mend(self) -> None:
         """Mends the files of a dead process, and keeps those that contain a fault."""
         for path in mend_folder(self.folder, self._notify):
-            self._notify(f"{path.name}: was not finished; it is whole up to its last second")
+            self._notify(
+                f"{path.name}: was unfinished; it has been mended and is complete up to its last second"
+            )
             with suppress(InputError, OSError):
                 if any(each.kind in _KEPT_NAMES for each in overview(path).events):
-                    self._move_aside(path)
+                    self._move_to_kept(path)
         self._remove_old()
 
     def put(self, item: Item) -> None:
@@ -152,7 +154,7 @@ class FlightLog:
             self._refuse(cycles, problem)
             return
         self._recovered()
-        self._cut()
+        self._rotate()
 
     def close(self) -> None:
         """Writes the remaining items and finishes the file."""
@@ -192,24 +194,27 @@ class FlightLog:
     def _refuse(self, cycles: int, problem: OSError) -> None:
         """Counts cycles that cannot be written, and reports the first failure."""
         self.refused += cycles
-        self._refused_now += cycles
+        self._refused_since_error += cycles
         words = problem.strerror or str(problem)
-        if not self._trouble:
+        if not self._write_error:
             self._notify(f"{self.folder}: nothing is recorded: {words}; free some space")
-        self._trouble = words
+        self._write_error = words
 
     def _recovered(self) -> None:
-        if not self._trouble:
+        if not self._write_error:
             return
-        self._notify(f"{self.folder}: recorded again; {self._refused_now} cycles were not ({self._trouble})")
+        self._notify(
+            f"{self.folder}: recording has resumed; {self._refused_since_error} cycles were not recorded "
+            f"({self._write_error})"
+        )
         if self._file is not None:
             self._file.note(
                 self._newest_ns,
                 "REFUSED_BY_DISK",
-                f"{self._refused_now} cycles were not recorded",
+                f"{self._refused_since_error} cycles were not recorded",
                 logging.WARNING,
             )
-        self._trouble, self._refused_now = "", 0
+        self._write_error, self._refused_since_error = "", 0
 
     def _note_spans(self, items: Sequence[Item]) -> None:
         """Notes the time spans to keep."""
@@ -219,7 +224,7 @@ class FlightLog:
         before_ns, after_ns = (int(each * _NS) for each in (self._settings.before_s, self._settings.after_s))
         self._spans += [(each - before_ns, each + after_ns) for each in (*marks, *faults)]
 
-    def _cut(self) -> None:
+    def _rotate(self) -> None:
         """Begins a new file once this one is large or old enough, or a span to keep is over."""
         file, settings = self._file, self._settings
         if file is None:
@@ -241,17 +246,17 @@ class FlightLog:
             self._refuse(0, problem)
             return
         self._files.append((file.path, self._begun_ns, self._newest_ns))
-        self._keep()
+        self._keep_faults()
         self._remove_old()
 
-    def _keep(self) -> None:
+    def _keep_faults(self) -> None:
         """Moves files with a fault aside, and forgets files that can no longer contain one."""
         horizon_ns = self._newest_ns - int(self._settings.before_s * _NS)
         left = []
         for path, begin_ns, end_ns in self._files:
             if any(begin_ns <= until_ns and end_ns >= since_ns for since_ns, until_ns in self._spans):
                 with suppress(FileNotFoundError):  # removed by a user
-                    self._move_aside(path)
+                    self._move_to_kept(path)
             elif end_ns >= horizon_ns:
                 left.append((path, begin_ns, end_ns))
         self._files = left
@@ -271,7 +276,7 @@ class FlightLog:
             if not any((folder / each).exists() for folder in folders for each in (name, name + PART))
         )
 
-    def _move_aside(self, path: Path) -> None:
+    def _move_to_kept(self, path: Path) -> None:
         """Moves a finished file to the kept ones."""
         kept = self.folder / KEPT
         kept.mkdir(exist_ok=True)
@@ -284,7 +289,7 @@ class FlightLog:
         gone = _trim(self.folder / KEPT, limits.kept_mb * _MB, -1.0)
         if gone:
             self._notify(
-                f"{self.folder}: what is kept of faults is over {limits.kept_mb:g} MB; removed: "
+                f"{self.folder}: the recordings of faults exceed {limits.kept_mb:g} MB; removed: "
                 f"{', '.join(each.name for each in gone)}"
             )
 

@@ -27,7 +27,7 @@ from hdbridge.files.atomic import open_regular
 
 T = TypeVar("T")
 SUFFIX: Final = ".mcap"
-TORN: Final = (McapError, ZstdError, struct.error, ValueError, MemoryError)
+TRUNCATION_ERRORS: Final = (McapError, ZstdError, struct.error, ValueError, MemoryError)
 """Exceptions raised at the end of a truncated file; ValueError for a wrong checksum."""
 
 
@@ -140,7 +140,7 @@ def records_of(file: BinaryIO, where: Path) -> Iterator[McapRecord]:
         if file.tell() > 16:
             return
         raise InputError(f"{where}: is not an MCAP file; expected a flight recording") from problem
-    except TORN:
+    except TRUNCATION_ERRORS:
         return
 
 
@@ -200,7 +200,7 @@ def overview(path: Path) -> Flight:
                 raise EndOfFile
             metadata = {each.name: each.metadata for each in reader.iter_metadata()}
             events = tuple(_logged_event(message) for _, _, message in reader.iter_messages(EVENTS))
-        except (*TORN, OSError):
+        except (*TRUNCATION_ERRORS, OSError):
             return replace(read(path, ()), finished=False)
         size = os.fstat(file.fileno()).st_size
     about = About.from_metadata(metadata, path)

@@ -77,7 +77,7 @@ class ServiceAxis:
         """Returns the state of the axis in the newest cycle."""
         return self._report(self)
 
-    def hear(self, event: Event) -> None:
+    def on_event(self, event: Event) -> None:
         """Takes an event of the axis."""
         if event.kind is EventKind.STOPPED:
             self.stopped = event, datetime.now(UTC)
@@ -100,7 +100,7 @@ class ServiceAxis:
             )
 
     @asynccontextmanager
-    async def _alone(self, doing: str) -> AsyncIterator[None]:
+    async def _exclusive_use(self, doing: str) -> AsyncIterator[None]:
         """Reserves the drive for one request; a stop remains possible at any time."""
         self.check_free()
         holder = self.core.lease.holder
@@ -116,8 +116,8 @@ class ServiceAxis:
     async def enable(self, holder: str) -> None:
         """Switches power on, at rest; first boots and verifies the drive if this was not done."""
         self.check_may(holder)
-        async with self._alone("the axis is being enabled"):
-            self.motion.replace(None, "the axis was enabled anew")
+        async with self._exclusive_use("the axis is being enabled"):
+            self.motion.replace(None, "the axis was enabled again")
             await self.settle()
             link = self.link
             if link.state is AxisState.ENABLED:
@@ -151,23 +151,23 @@ class ServiceAxis:
         """Brakes to rest, then switches power off."""
         self.core.lease.check(holder)
         self.motion.replace(None, "the axis was disabled")
-        async with self._alone("the axis is being disabled"):
+        async with self._exclusive_use("the axis is being disabled"):
             await self.link.do(CommandKind.DISABLE, POWER_S)
             await self._rest()
 
-    def give_up(self, why: str) -> None:
+    def cancel_activity(self, why: str) -> None:
         """Ends the present activity and interrupts SDO requests to the drive; a homing axis stops."""
         self.motion.replace(None, why)
         self.commissioning.interrupt(f"{self.name}: {why}")
 
     async def quick_stop(self) -> None:
         """Quick-stops the axis and latches the stop until `reset`. Requires no lease."""
-        self.give_up("it was stopped by a quick stop")
+        self.cancel_activity("it was stopped by a quick stop")
         await self.link.do(CommandKind.QUICK_STOP)
 
     async def stop(self) -> None:
         """Brakes to rest and stays enabled. Cancels queue and stream. Requires no lease."""
-        self.give_up("it was stopped by a client")
+        self.cancel_activity("it was stopped by a client")
         await self.link.do(CommandKind.STOP)
 
     async def reset(self, holder: str) -> None:
@@ -176,7 +176,7 @@ class ServiceAxis:
         The axis is disabled afterwards.
         """
         self.check_may(holder)
-        async with self._alone("the axis is being reset"):
+        async with self._exclusive_use("the axis is being reset"):
             self.motion.replace(None, "the axis was reset")
             link = self.link
             if link.state in UNKNOWN:
@@ -216,7 +216,7 @@ class ServiceAxis:
     async def home(self, holder: str, run: messages.Home) -> None:
         """Homes by a method of 6098h. The axis is disabled before and after."""
         self.check_may(holder)
-        async with self._alone("the axis is being homed"):
+        async with self._exclusive_use("the axis is being homed"):
             self.is_prepared = False
             await self.link.do(CommandKind.LEND)
             try:
@@ -273,15 +273,13 @@ class ServiceAxis:
     async def follow(self, model: TransmissionModel) -> None:
         """Compensates with the adapted parameters of the chosen model, whose version does not change."""
         async with self._changing:
-            await self._use(await self._work(self.models.moved, model))
+            await self._use(await self._work(self.models.with_adapted, model))
 
-    def followed(self, holder: str) -> Following:
+    def following_for(self, holder: str) -> Following:
         """Returns the adaptation, for a change by ``holder``; raises InputError for an axis without one."""
         self.core.lease.check(holder)
         if self.following is None:
-            raise InputError(
-                f"{self.name}: nothing adapts on this axis; give it an adaptation in the machine file"
-            )
+            raise InputError(f"{self.name}: this axis has no adaptation; configure one in the machine file")
         return self.following
 
     async def switch_load_loop(self, holder: str, *, on: bool) -> None:

@@ -126,7 +126,7 @@ class AxisLink:
         """
         stopping = False
         while True:
-            done, stopping = self._look(activity, stopping)
+            done, stopping = self._poll_motion(activity, stopping)
             if done:
                 return
             why = activity.over or (waiting.over if waiting is not None else "")
@@ -134,18 +134,18 @@ class AxisLink:
                 raise RefusedError(f"{self.name}: {why}")
             if not self.core.observer.alive:
                 raise DaemonError(
-                    f"{self.name}: the control process has not turned lately: it hangs or is gone; the drive "
-                    "stops by itself, and the axis comes back disabled"
+                    f"{self.name}: the control process has completed no cycle lately: it hangs or has died; "
+                    "the drive stops automatically, and the axis will be disabled"
                 )
             await self.core.timing.sleep(POLL_S)
 
-    def look(self, activity: Activity) -> None:
+    def check(self, activity: Activity) -> None:
         """Checks a motion without waiting. Raises like `arrival`, and RefusedError if it has ended."""
-        done, _ = self._look(activity, stopping=False)
+        done, _ = self._poll_motion(activity, stopping=False)
         if done or activity.over:
             raise RefusedError(f"{self.name}: {activity.over}")
 
-    def _look(self, activity: Activity, stopping: bool) -> tuple[bool, bool]:
+    def _poll_motion(self, activity: Activity, stopping: bool) -> tuple[bool, bool]:
         """Returns (motion has ended, axis is stopping for a reason not yet reported)."""
         self.core.observer.poll()
         log = self.core.log
@@ -176,7 +176,7 @@ class AxisLink:
             why = activity.over or "it was braked before its end"
             activity.end(why)
             raise RefusedError(f"{self.name}: {why}")
-        activity.end("it came to its end")
+        activity.end("it is complete")
         return True
 
 

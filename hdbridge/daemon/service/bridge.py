@@ -158,7 +158,7 @@ class ServiceBridge:
         """Takes the loop's events from the observer: those of an axis, and failures of the bus."""
         for event in events:
             if event.axis >= 0:
-                self.axes[self._names[event.axis]].hear(event)
+                self.axes[self._names[event.axis]].on_event(event)
             elif event.kind in (EventKind.BUS_DOWN, EventKind.BUS_UP):
                 self._bus_up = event.kind is EventKind.BUS_UP
 
@@ -262,12 +262,12 @@ class ServiceBridge:
         warnings = []
         if (borrower := self.lending.borrower) is not None:
             warnings.append(
-                f"the bus is lent to {borrower}, for {self.lending.lent_s or 0.0:.0f} s now; the axes come "
-                "back disabled when it ends"
+                f"the bus is lent to {borrower}, for {self.lending.lent_s or 0.0:.0f} s now; its axes will "
+                "be disabled when it ends"
             )
         elif not core.observer.alive:
             warnings.append(
-                "the control process does not turn: it hangs or is gone, and is restarted automatically"
+                "the control process completes no cycles: it hangs or has died; it is restarted automatically"
             )
         if not self._bus_up:
             warnings.append("the bus is down: bring the interface up; it is reopened automatically")
@@ -296,7 +296,7 @@ class ServiceBridge:
     async def quick_stop(self) -> None:
         """Quick-stops all axes. Requires no lease."""
         for axis in self.axes.values():
-            axis.give_up("it was stopped by a quick stop")
+            axis.cancel_activity("it was stopped by a quick stop")
         await self.core.do(CommandKind.QUICK_STOP)
 
     async def lend_bus(self, holder: str) -> None:
@@ -323,9 +323,9 @@ class ServiceBridge:
     def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(coroutine)
         self._tasks.add(task)
-        task.add_done_callback(self._done)
+        task.add_done_callback(self._log_error)
 
-    def _done(self, task: asyncio.Task[None]) -> None:
+    def _log_error(self, task: asyncio.Task[None]) -> None:
         """Logs an unexpected error of a task. If `_watch` fails, the keeper restarts the service."""
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:

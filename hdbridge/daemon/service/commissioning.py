@@ -138,7 +138,7 @@ class Commissioning:
         ``clear_fault`` also resets a fault of the drive, to which the control process sends nothing. Raises
         like `Drive.boot`.
         """
-        with self._asked("it is being booted"):
+        with self._request("it is being booted"):
             self._drive.boot()
             if clear_fault and self._drive.state() is State.FAULT:
                 self._drive.fault_reset()
@@ -146,24 +146,24 @@ class Commissioning:
 
     def take_over(self) -> None:
         """Compares a drive under control of the control process with the axis file, without writing."""
-        with self._asked("it is being compared with its axis file"):
+        with self._request("it is being compared with its axis file"):
             self._drive.take_over()
 
     def abandon_homing(self) -> None:
         """Stops a drive that was lent to an earlier service, and switches its power off."""
-        with self._asked("it is being stopped"):
+        with self._request("it is being stopped"):
             if self._drive.state() is State.OPERATION_ENABLED:
                 self._drive.quick_stop()
             self._drive.disable()
 
     def prepare(self) -> Arguments:
         """Prepares the drive for being enabled by the control process. Raises like `Drive.enable`."""
-        with self._asked("it is being made ready"):
+        with self._request("it is being prepared"):
             return self._seeds(self._drive.prepare())
 
     def rest(self) -> None:
         """Ends the drive's monitoring of the master; power is off already."""
-        with self._asked("it is being switched off"):
+        with self._request("it is being switched off"):
             self._drive.disable()
 
     def home(self, run: messages.Home) -> Arguments:
@@ -171,7 +171,7 @@ class Commissioning:
 
         Raises like `Drive.home`; even then, the axis stops and its power is off if the drive answers.
         """
-        with self._asked("it is being homed"):
+        with self._request("it is being homed"):
             try:
                 positions = self._drive.home(**run.model_dump())
             finally:
@@ -188,7 +188,7 @@ class Commissioning:
         wanted = find_object(object_, self._drive.sdo.od)
         if not wanted.readable:
             raise InputError(f"{wanted}: is write-only in the EDS")
-        with self._asked(f"{object_} is being read"):
+        with self._request(f"{object_} is being read"):
             return wanted, wanted.decode(self._drive.sdo.read_bytes(wanted.index, wanted.sub))
 
     def write(self, object_: str, text: str) -> Object:
@@ -197,7 +197,7 @@ class Commissioning:
         if not wanted.writable:
             raise InputError(f"{wanted}: is read-only in the EDS")
         data = wanted.encode(text)
-        with self._asked(f"{object_} is being written"):
+        with self._request(f"{object_} is being written"):
             self._drive.sdo.write_bytes(wanted.index, wanted.sub, data)
         return wanted
 
@@ -212,7 +212,7 @@ class Commissioning:
         return Arguments(i=positions.motor_counts, j=positions.load_counts, k=statusword)
 
     @contextmanager
-    def _asked(self, doing: str) -> Iterator[None]:
+    def _request(self, doing: str) -> Iterator[None]:
         if not self._busy.acquire(timeout=BUSY_S):
             raise RefusedError(f"the drive of axis '{self._drive.axis.name}' is busy: {self._doing}")
         self._doing = doing

@@ -2,7 +2,7 @@
 
 One list has every entry, for the service itself. Clients see the other list, which omits routine entries
 (`_routine`), because the thousands of motions of a calibration must not displace yesterday's stop. Each list
-has its own numbering. `Journal` writes the log lines of the control process, which itself writes none.
+has its own numbering. `EventLogger` writes the log lines of the control process, which itself writes none.
 """
 
 import logging
@@ -19,7 +19,7 @@ from hdbridge.daemon.memory.layout import LEVELS
 from hdbridge.drive.supervision import Reaction
 from hdbridge.motion import MotionMode
 
-KEPT = 4096
+ENTRIES_KEPT = 4096
 ANSWERS_KEPT = 1024
 _ANSWERS = (EventKind.DONE, EventKind.REFUSED)
 _log = logging.getLogger(__name__)
@@ -39,13 +39,13 @@ class Entry(NamedTuple):
 
 
 class EventLog:
-    """Newest `KEPT` entries, and the answers to the newest commands."""
+    """Newest `ENTRIES_KEPT` entries, and the answers to the newest commands."""
 
     def __init__(self, reader: RingReader[Event]) -> None:
         self._reader = reader
         self._lock = threading.Lock()
-        self._entries: deque[Entry] = deque(maxlen=KEPT)
-        self._public: deque[Entry] = deque(maxlen=KEPT)
+        self._entries: deque[Entry] = deque(maxlen=ENTRIES_KEPT)
+        self._public: deque[Entry] = deque(maxlen=ENTRIES_KEPT)
         self._answers: dict[int, Event] = {}
         self.newest = self.newest_public = 0
         """Numbers of the newest entry, and of the newest for clients; 0 before the first."""
@@ -105,7 +105,7 @@ def _routine(event: Event) -> bool:
     return stream or event.kind is EventKind.DONE
 
 
-class Journal:
+class EventLogger:
     """Sink of the observer that logs one line per event, with the name of its axis."""
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -117,9 +117,9 @@ class Journal:
         for event in events:
             level = LEVELS.get(event.kind, logging.INFO)
             if _log.isEnabledFor(level):
-                _log.log(level, event.kind.name.lower().replace("_", " "), self._facts(event))
+                _log.log(level, event.kind.name.lower().replace("_", " "), self._fields(event))
 
-    def _facts(self, event: Event) -> dict[str, object]:
+    def _fields(self, event: Event) -> dict[str, object]:
         facts: dict[str, object] = {"cycle": event.cycle}
         if 0 <= event.axis < len(self._names):
             facts["axis"] = self._names[event.axis]

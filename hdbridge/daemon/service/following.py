@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.client import messages
-from hdbridge.daemon.following.follower import NOTHING, Follower, Outcome
+from hdbridge.daemon.following.follower import NO_OUTCOME, Follower, Outcome
 from hdbridge.daemon.following.judging import WINDOW_S, Verdict
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.machinefile import AdaptationSettings
@@ -102,7 +102,7 @@ class Following:
             self._not_applied = str(problem)
         else:
             self._not_applied = ""
-            self._do(follower.in_force, model)
+            self._do(follower.use_model, model)
             _log.info("adaptation applied", {"axis": self._axis.name})
 
     def close(self) -> None:
@@ -147,7 +147,7 @@ class Following:
     def _process(self, samples: SampleArray) -> None:
         try:
             follower = self._follower
-            if follower is not None and (outcome := follower.take(samples)) is not NOTHING:
+            if follower is not None and (outcome := follower.take(samples)) is not NO_OUTCOME:
                 self._report(outcome, follower.model)
                 self._publish()
         finally:

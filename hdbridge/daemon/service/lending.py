@@ -36,7 +36,7 @@ class Lending:
         self._status = core.memory.status
         self._lock = InterfaceLock(bus.interface, bus.channel)
         self._signalled_s = 0.0
-        self._status[Cell.BUS_WANTED] = 0
+        self._status[Cell.BUS_REQUESTED] = 0
         core.refuse = self.refuse
 
     @property
@@ -63,14 +63,14 @@ class Lending:
             raise RefusedError(f"the bus cannot be lent: {self._reason_against}")
         timing = self._core.timing
         deadline_s = timing.clock.now() + LEND_S
-        self._status[Cell.BUS_WANTED] = 1
+        self._status[Cell.BUS_REQUESTED] = 1
         try:
             while not self._status[Cell.BUS_LENT]:
                 if timing.clock.now() > deadline_s:
                     raise DaemonError(f"the axes did not come to rest within {LEND_S:g} s: nothing was lent")
                 await timing.sleep(POLL_S)
         finally:
-            self._status[Cell.BUS_WANTED] = 0
+            self._status[Cell.BUS_REQUESTED] = 0
 
     def refuse(self, kind: CommandKind | None = None) -> None:
         """Raises RefusedError while the bus is lent. A stop is passed on to the borrower as SIGTERM."""

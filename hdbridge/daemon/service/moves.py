@@ -49,7 +49,7 @@ class AxisMotion:
         """Number of waiting way points."""
         return len(self._points)
 
-    def under_way(self, *kinds: Kind) -> Activity | None:
+    def in_progress(self, *kinds: Kind) -> Activity | None:
         """Returns the activity in progress if it is of one of these kinds."""
         activity = self.activity
         return activity if activity is not None and not activity.over and activity.kind in kinds else None
@@ -78,7 +78,7 @@ class AxisMotion:
         activity = Activity(Kind.MOVE, holder)
         async with self.commanding:
             await self._goto(activity, target_deg, velocity_deg_s, acceleration_deg_s2)
-            self.replace(activity, "another move took its place")
+            self.replace(activity, "it was replaced by another move")
         if wait:
             await self._link.arrival(activity)
 
@@ -88,7 +88,7 @@ class AxisMotion:
         activity = Activity(Kind.JOG, holder)
         async with self.commanding:
             await self._link.begin(activity, CommandKind.JOG, a=float(velocity_deg_s), b=float(timeout_s))
-            self.replace(activity, "a jog took its place")
+            self.replace(activity, "it was replaced by a jog")
 
     async def stream(self, holder: str, timeout_s: float = 0.5) -> ServiceStream:
         """Opens a stream of set-points, which begins at rest with the first set-points.
@@ -102,7 +102,7 @@ class AxisMotion:
             if link.state is not AxisState.ENABLED:
                 await link.do(CommandKind.STREAM_BEGIN, a=timeout_s)  # raises RefusedError with the reason
             stream = ServiceStream(link, activity, timeout_s)
-            self.replace(activity, "a stream took its place")
+            self.replace(activity, "it was replaced by a stream")
         return stream
 
     async def queue(self, holder: str, points: Sequence[QueueItem]) -> int:
@@ -115,14 +115,14 @@ class AxisMotion:
         name = self._link.name
         for point in points:
             self._check_target(point.target_deg)
-        if (other := self.under_way(Kind.JOG, Kind.STREAM, Kind.COORDINATED)) is not None:
-            raise RefusedError(f"{name}: {other.kind.value} is under way; stop it, or wait for its end")
+        if (other := self.in_progress(Kind.JOG, Kind.STREAM, Kind.COORDINATED)) is not None:
+            raise RefusedError(f"{name}: {other.kind.value} is in progress; stop it, or wait for its end")
         if self.queued + len(points) > QUEUE_MOST:
-            raise RefusedError(f"{name}: {self.queued} way points wait; more than {QUEUE_MOST} are not taken")
+            raise RefusedError(f"{name}: {self.queued} way points are waiting; the maximum is {QUEUE_MOST}")
         if points and self._link.state is not AxisState.ENABLED:
             await self.move(holder, points[0].target_deg)  # raises RefusedError with the reason
         self._points.extend(points)
-        if (present := self.under_way(Kind.QUEUE)) is not None:
+        if (present := self.in_progress(Kind.QUEUE)) is not None:
             present.holder = holder
         elif points:
             before, self.activity = self.activity, Activity(Kind.QUEUE, holder)
@@ -154,7 +154,7 @@ class AxisMotion:
             await link.do(CommandKind.STOP)
 
     def _without_lease(self) -> Activity | None:
-        activity, lease = self.under_way(*ENDS_WITH_LEASE), self._link.core.lease
+        activity, lease = self.in_progress(*ENDS_WITH_LEASE), self._link.core.lease
         return None if activity is None or lease.holds(activity.holder) else activity
 
     async def close(self) -> None:
@@ -200,7 +200,7 @@ class AxisMotion:
                 self._points.clear()
                 link.core.log.note(f"the queue of way points has ended: {error}", link.index)
         finally:
-            activity.end("the queue came to its end")
+            activity.end("the queue is complete")
 
     def _check_target(self, target_deg: float) -> None:
         limits = self._link.config.limits
@@ -247,7 +247,7 @@ async def run_together(
         answer = await axes[0].link.do(CommandKind.STREAM_BEGIN, a=STREAM_TIMEOUT_S, i=mask, j=stream)
         for axis, activity in activities.items():
             activity.command_id = answer.id
-            axis.motion.replace(activity, "a coordinated move took its place")
+            axis.motion.replace(activity, "it was replaced by a coordinated move")
     following = asyncio.ensure_future(_follow(waiting, activities))
     if wait:
         await asyncio.shield(following)  # the move is supervised even if its client disconnects

@@ -9,7 +9,7 @@ from hdbridge.daemon.memory import Event, Memory, SampleArray
 from hdbridge.daemon.service.eventlog import EventLog
 
 PERIOD_S = 0.02
-GONE_S = 3.0
+DEAD_S = 3.0
 """Time without a turn after which the control process counts as hung or dead."""
 _log = logging.getLogger(__name__)
 
@@ -34,7 +34,7 @@ class Observer:
         self._log = log
         self._seen = log.newest
         self._sinks: list[Sink] = []
-        self._broken: set[int] = set()
+        self._failed_sinks: set[int] = set()
         self.newest: SampleArray | None = None
         """Newest sample, shape (1,); None before the first."""
         self.lost = 0
@@ -50,8 +50,8 @@ class Observer:
 
     @property
     def alive(self) -> bool:
-        """True if the control process has completed a turn within `GONE_S`."""
-        return self._clock.now() - self._turned_s < GONE_S
+        """True if the control process has completed a turn within `DEAD_S`."""
+        return self._clock.now() - self._turned_s < DEAD_S
 
     def poll(self) -> None:
         """Reads the rings and calls the sinks. An error of a sink is logged once and affects no other."""
@@ -72,6 +72,6 @@ class Observer:
             try:
                 sink.take(samples, events, lost)
             except Exception:
-                if id(sink) not in self._broken:
-                    self._broken.add(id(sink))
+                if id(sink) not in self._failed_sinks:
+                    self._failed_sinks.add(id(sink))
                     _log.exception("a sink failed", extra={"sink": type(sink).__name__})

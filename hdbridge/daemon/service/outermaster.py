@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from hdbridge.daemon.service.core import Core
 
 _log: Final = logging.getLogger(__name__)
-_OWN: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED})
+_POWERED: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED})
 _STOPPED: Final = frozenset({AxisState.UNVERIFIED, AxisState.QUICK_STOPPED, AxisState.LATCHED})
 SETTLES_S: Final = 2.0
 """Maximum time for an axis to brake and lose its power before a reset or the next enable."""
@@ -73,7 +73,7 @@ class OuterMaster:
     def __init__(self, core: Core, settings: GatewaySettings, mark: Callable[[str, int], None]) -> None:
         """``mark`` reports a fault and makes the recorder keep the time around it."""
         self._core, self._mark = core, mark
-        self._patience_s = 1e-3 * settings.timeout_ms
+        self._timeout_s = 1e-3 * settings.timeout_ms
         self._name = f"the master on {settings.bus.interface}:{settings.bus.channel}"
         self._token = ""
 
@@ -107,14 +107,14 @@ class OuterMaster:
             try:
                 if cells[OuterCell.RESETS] != cells[OuterCell.RESETS_DONE]:
                     await self._reset(axis, cells, holds)
-                elif (series := cells[OuterCell.WANTED]) > max(
+                elif (series := cells[OuterCell.REQUESTED]) > max(
                     cells[OuterCell.GRANTED], cells[OuterCell.REFUSED]
                 ):
                     granted_by = self._token
                     await self._enable(axis, cells, series)
                 elif axis.link.value("mode") == MotionMode.FOLLOW and not self._core.lease.holds(granted_by):
                     await axis.link.do(CommandKind.STOP)
-                elif holds and self._is_left(axis, cells):
+                elif holds and self._has_stale_power(axis, cells):
                     await axis.disable(self._token)
                 elif (
                     holds
@@ -131,17 +131,17 @@ class OuterMaster:
                     noted = str(error)
                     self._core.log.note(f"for {self._name}: {error}", axis.link.index)
 
-    def _is_left(self, axis: ServiceAxis, cells: OuterCells) -> bool:
+    def _has_stale_power(self, axis: ServiceAxis, cells: OuterCells) -> bool:
         """Returns True if the axis has power from a request that is over, of this or an earlier process."""
         granted = cells[OuterCell.GRANTED]
-        return axis.link.state in _OWN and granted != 0 and cells[OuterCell.WANTED] != granted
+        return axis.link.state in _POWERED and granted != 0 and cells[OuterCell.REQUESTED] != granted
 
     async def _enable(self, axis: ServiceAxis, cells: OuterCells, series: int) -> None:
         link, token = axis.link, self._token
 
         def is_withdrawn() -> bool:
             """Returns True if the request is withdrawn, or the lease was taken even if it is free again."""
-            return not self._core.lease.holds(token) or cells[OuterCell.WANTED] != series
+            return not self._core.lease.holds(token) or cells[OuterCell.REQUESTED] != series
 
         try:
             # A master may enable again while the axis still brakes from the last time.
@@ -153,7 +153,7 @@ class OuterMaster:
             )
             await axis.enable(token)
             if not is_withdrawn():
-                await link.do(CommandKind.FOLLOW, a=self._patience_s, j=series)
+                await link.do(CommandKind.FOLLOW, a=self._timeout_s, j=series)
             if is_withdrawn():
                 cells[OuterCell.REFUSED] = series
                 await axis.disable(self._token)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 STATES: Final = tuple(messages.ControlState)
 MODES: Final = tuple(messages.MotionMode)
-GATEWAY_GONE_NS: Final = 2_000_000_000
+GATEWAY_DEAD_NS: Final = 2_000_000_000
 _NUMBERS: Final = (
     "velocity_deg_s", "motor_target_deg", "motor_position_deg", "motor_torque_nm", "correction_arcsec",
     "predicted_arcsec", "weight",
@@ -108,7 +108,7 @@ def outer_state(
     period_s = 1e-9 * cells[OuterCell.PERIOD_NS]
     return messages.OuterState(
         node_id=cells[OuterCell.NODE_ID] or node_id,
-        alive=time.monotonic_ns() - alive_ns < GATEWAY_GONE_NS,
+        alive=time.monotonic_ns() - alive_ns < GATEWAY_DEAD_NS,
         nmt=view.nmt,
         statusword=view.statusword,
         error_code=view.error_code,

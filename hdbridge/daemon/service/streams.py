@@ -72,7 +72,7 @@ class Knots:
         begin_deg = self._begin.position_deg
         if first.time_s == 0.0 and abs(first.position_deg - begin_deg) > BEGIN_DEG:
             raise InputError(
-                f"a stream begins at {first.position_deg:.9g} deg, but the axis stands at {begin_deg:.9g}: "
+                f"a stream begins at {first.position_deg:.9g} deg, but the axis is at {begin_deg:.9g}: "
                 "begin there, or move there first"
             )
         if first.time_s == 0.0 and first.velocity_deg_s:
@@ -116,7 +116,7 @@ class ServiceStream:
         self._check_open()
         if self._knots is None:
             self._ended = True
-            self._activity.end("it came to its end")
+            self._activity.end("it is complete")
             return
         await self._hand_over(self._knots.end())
         if not self._has_begun:
@@ -146,7 +146,7 @@ class ServiceStream:
         """Raises RefusedError with the reason if the stream has ended, LeaseError if the lease has."""
         self._link.core.lease.check(self._activity.holder)
         if self._has_begun and not self._ended:
-            self._link.look(self._activity)
+            self._link.check(self._activity)
         if self._activity.over or self._ended:
             why = self._activity.over or "it was ended"
             raise RefusedError(f"{self._link.name}: the stream has ended: {why}")

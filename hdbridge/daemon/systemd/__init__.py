@@ -97,7 +97,7 @@ def _folders(machine: Machine) -> list[Path]:
     """Returns the folders that must be writable: those of models, recordings, adaptation and the socket."""
     folders = {machine.folder, *(axis.profile.folder for axis in machine.axes)}
     if machine.api.socket is not None:
-        folders.add(machine.beside(machine.api.socket).parent)
+        folders.add(machine.resolve_path(machine.api.socket).parent)
     return sorted(each for each in folders if not any(other in each.parents for other in folders))
 
 

@@ -68,7 +68,7 @@ OF_AN_AXIS = {
     "activate_model": lambda a: a.activate_model("active"),
     "load_loop": lambda a: a.load_loop(True),
     "adapt": lambda a: a.adapt("observe"),
-    "adaptation_back": lambda a: a.adaptation_back(),
+    "revert_adaptation": lambda a: a.revert_adaptation(),
     "move": lambda a: a.move(0.01),
     "jog": lambda a: a.jog(0.1),
     "queue": lambda a: a.queue([0.0, 0.01]),

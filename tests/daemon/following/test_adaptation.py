@@ -268,7 +268,7 @@ def test_the_path_must_be_known_again_after_power_off():
     times, samples = axis.measures(MODEL, axis.path[-1:])
     samples["state"] = AxisState.DISABLED
     axis.takes(times, samples)
-    assert "turned past its loop" in axis.waiting
+    assert "beyond the hysteresis width" in axis.waiting
     axis.works(stands=60)
     assert axis.waiting is None
 

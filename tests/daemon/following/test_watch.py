@@ -93,8 +93,8 @@ def test_wear_requests_a_calibration_and_names_the_change(truth, named):
     assert [each.verdict for each in raised] == [Verdict.RECALIBRATE]
     assert named in raised[0].evidence
     assert raised[0].text.startswith("recalibrate: ")
-    assert "arcsec rms off the model" in raised[0].evidence
-    assert watch.evidence.rms_arcsec > 1.0 > watch.evidence.left_arcsec - 0.5
+    assert "arcsec rms (its intervals" in raised[0].evidence
+    assert watch.evidence.rms_arcsec > 1.0 > watch.evidence.residual_arcsec - 0.5
 
 
 @pytest.mark.parametrize("truth", [with_order(5, 5.0), model_of(offset=31.6 * 1.8)])

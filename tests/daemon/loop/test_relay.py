@@ -3,7 +3,7 @@
 import pytest
 from support.daemon import SteppedDaemon
 
-from hdbridge.daemon.loop.relay import incoming_ids, why_refused
+from hdbridge.daemon.loop.relay import incoming_ids, refusal_reason
 from hdbridge.daemon.loop.states import MAY_MOVE, AxisState
 from hdbridge.daemon.memory import RelayedFrame
 
@@ -15,11 +15,11 @@ WRITES = [DOWNLOAD, bytes(8), bytes([0xC0, *bytes(7)]), bytes([0xE0, *bytes(7)])
 @pytest.mark.parametrize("state", list(AxisState))
 def test_reads_are_always_allowed_and_writes_only_without_motion(state: AxisState) -> None:
     for data in READS:
-        assert why_refused(0x601, data, {1: state}) is None
+        assert refusal_reason(0x601, data, {1: state}) is None
     for data in WRITES:
-        refused = why_refused(0x601, data, {1: state})
+        refused = refusal_reason(0x601, data, {1: state})
         assert (refused is not None) == (state in MAY_MOVE)
-    assert (why_refused(0x000, b"\x82\x01", {1: state}) is not None) == (state in MAY_MOVE)
+    assert (refusal_reason(0x000, b"\x82\x01", {1: state}) is not None) == (state in MAY_MOVE)
 
 
 @pytest.mark.parametrize(
@@ -40,13 +40,13 @@ def test_reads_are_always_allowed_and_writes_only_without_motion(state: AxisStat
 )
 def test_other_requests_of_the_service_are_refused(can_id: int, data: bytes) -> None:
     states = {1: AxisState.UNVERIFIED, 2: AxisState.DISABLED}
-    assert why_refused(can_id, data, states) is not None
+    assert refusal_reason(can_id, data, states) is not None
 
 
 def test_a_moving_axis_does_not_block_writes_to_others() -> None:
     states = {1: AxisState.ENABLED, 2: AxisState.DISABLED}
-    assert why_refused(0x602, DOWNLOAD, states) is None
-    assert why_refused(0x601, DOWNLOAD, states) == (
+    assert refusal_reason(0x602, DOWNLOAD, states) is None
+    assert refusal_reason(0x601, DOWNLOAD, states) == (
         "SDO request to node 1: not while the axis is enabled; disable it first"
     )
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hdbridge.daemon.loop.states import TRANSITIONS, AxisState, Happening, mermaid, refusal, target_of
+from hdbridge.daemon.loop.states import TRANSITIONS, AxisState, Trigger, mermaid, refusal, target_of
 from hdbridge.daemon.memory import CommandKind
 
 S = AxisState
@@ -18,13 +18,13 @@ def test_only_an_enable_command_leads_towards_power() -> None:
     ways = [row for row in TRANSITIONS if row.target is S.ENABLING and row.source is not S.ENABLING]
     assert [(row.source, row.cause) for row in ways] == [(S.DISABLED, CommandKind.ENABLE)]
     ways = [row for row in TRANSITIONS if row.target is S.ENABLED and row.source is not S.ENABLED]
-    assert [(row.source, row.cause) for row in ways] == [(S.ENABLING, Happening.POWERED)]
+    assert [(row.source, row.cause) for row in ways] == [(S.ENABLING, Trigger.POWERED)]
 
 
 def test_only_a_reset_leaves_the_latch() -> None:
     for latched in (S.QUICK_STOPPED, S.LATCHED):
         causes = {row.cause for row in TRANSITIONS if row.source is latched and row.target is not latched}
-        assert causes - {Happening.VERIFICATION_LOST} == {CommandKind.RESET}
+        assert causes - {Trigger.VERIFICATION_LOST} == {CommandKind.RESET}
 
 
 @pytest.mark.parametrize("state", list(AxisState))
@@ -37,7 +37,7 @@ def test_stopping_is_never_refused(state: AxisState) -> None:
 
 @pytest.mark.parametrize("state", [S.DISABLED, S.ENABLING, S.ENABLED, S.STOPPING, S.LENT, S.QUICK_STOPPED])
 def test_a_lost_drive_latches_from_every_known_state(state: AxisState) -> None:
-    assert target_of(state, Happening.VERIFICATION_LOST) is S.LATCHED
+    assert target_of(state, Trigger.VERIFICATION_LOST) is S.LATCHED
 
 
 def test_every_state_is_reached_and_left() -> None:

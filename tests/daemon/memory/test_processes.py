@@ -130,7 +130,7 @@ def test_status_cells_are_shared(memory: Memory) -> None:
             status.loop_pid,
             status[Cell.SERVICE_PID],
         ] == [(1 << 40) + place for place in range(4)]
-        assert status[Cell.STOP_ASKED]
+        assert status[Cell.STOP_REQUESTED]
 
 
 def foreign(data: bytes, size: int) -> int:

@@ -33,15 +33,15 @@ def main(kind: str, *arguments: str) -> int:
         own = {"control": Cell.LOOP_PID, "service": Cell.SERVICE_PID, "gateway": Cell.GATEWAY_PID}
         status[own[kind]] = os.getpid()
         say(f"{kind} {os.getpid()}")
-        while not signals and not (kind == "control" and status[Cell.STOP_ASKED]):
+        while not signals and not (kind == "control" and status[Cell.STOP_REQUESTED]):
             if kind == "control":
                 status[Cell.LOOP_COUNT] = status.loop_count + 1
             else:
                 if wanted:
-                    status[Cell.BUS_WANTED] = 1
+                    status[Cell.BUS_REQUESTED] = 1
                     if status[Cell.BUS_LENT]:
                         wanted.clear()
-                        status[Cell.BUS_WANTED] = 0
+                        status[Cell.BUS_REQUESTED] = 0
                         say("bus is lent")
                 alive = Cell.SERVICE_TIME_NS if kind == "service" else Cell.GATEWAY_TIME_NS
                 status[alive] = time.monotonic_ns()

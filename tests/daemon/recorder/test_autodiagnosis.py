@@ -92,4 +92,6 @@ def test_diagnosis_ends_with_the_service(recorded):
 
 def test_a_diagnosis_without_findings_is_reported():
     found = {"findings": [], "baseline": {"rms_arcsec": 2.0}, "noise_floor_arcsec": 1.0}
-    assert summary(found).startswith("diagnosis: nothing that it could name; the model is 2.00 arcsec")
+    assert summary(found).startswith(
+        "diagnosis: no known cause; the error deviates from the model by 2.00 arcsec"
+    )

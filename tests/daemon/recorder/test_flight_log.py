@@ -142,7 +142,7 @@ def test_kept_files_are_limited_and_removals_reported(tmp_path):
     log, clock = flight_log(tmp_path, reports, file_s=5.0, before_s=1.0, after_s=1.0, kept_mb=1.0)
     run(log, clock, 100, events={each: [event(each + 0.5)] for each in range(5, 100, 10)})
     assert sum(each.stat().st_size for each in (tmp_path / "kept").iterdir()) <= 1.0e6
-    assert any("over 1 MB; removed: " in each for each in reports)
+    assert any("exceed 1 MB; removed: " in each for each in reports)
 
 
 def test_lost_cycles_are_recorded(tmp_path):

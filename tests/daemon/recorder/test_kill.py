@@ -137,7 +137,7 @@ def test_the_next_start_mends_files_and_keeps_those_with_faults(killed, tmp_path
     recorder.put(ModelUse("demo", "3", "text"))
     recorder.close()
     assert not list(tmp_path.glob("*.part"))
-    assert any("was not finished" in each for each in said)
+    assert any("was unfinished" in each for each in said)
     kept = [read(each) for each in flight_files([tmp_path / "kept"])]
     assert sorted(len(each.machine["cycle"]) for each in kept)[0] == 100
     assert len(kept) == 2

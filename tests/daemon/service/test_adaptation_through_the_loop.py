@@ -96,7 +96,7 @@ async def test_the_model_in_the_loop_is_adapted_and_reverted(service: Service) -
         assert state.updated is not None
         assert state.parameters["hysteresis.offset_arcsec"] == pytest.approx(4.0, abs=1.0)
 
-        await bridge.axes["axis1"].followed(token).revert()
+        await bridge.axes["axis1"].following_for(token).revert()
         assert offset_arcsec(bridge) == 40.0
         await work(bridge, token, 20, seed=1)
         assert offset_arcsec(bridge) == 40.0

@@ -4,7 +4,7 @@ from support.service import Service
 
 from hdbridge.daemon.memory import Event, EventKind
 from hdbridge.daemon.service.bridge import EVENTS_RETURNED
-from hdbridge.daemon.service.eventlog import KEPT, EventLog
+from hdbridge.daemon.service.eventlog import ENTRIES_KEPT, EventLog
 from hdbridge.motion import MotionMode
 
 
@@ -28,14 +28,14 @@ def test_routine_events_do_not_displace_stops() -> None:
     log = EventLog(reader)
     reader.events = [event(EventKind.STOPPED, text="cycle 1: lost")]
     leg = [event(EventKind.DONE), event(EventKind.MOTION_ENDED, MotionMode.STREAM)]
-    reader.events += leg * KEPT
+    reader.events += leg * ENTRIES_KEPT
     reader.events.append(event(EventKind.MOTION_ENDED, MotionMode.GOTO))
     log.poll()
     assert [(each.number, each.text) for each in log.public(0)] == [(1, "cycle 1: lost"), (2, "")]
     assert log.newest_public == 2
     assert log.public(1)[0].event == event(EventKind.MOTION_ENDED, MotionMode.GOTO)
     assert log.public(2) == log.public(99) == []
-    assert log.newest == 2 * KEPT + 2  # the service's own reader receives all events
+    assert log.newest == 2 * ENTRIES_KEPT + 2  # the service itself sees all
     assert log.answer(7) is not None
 
 

@@ -129,14 +129,14 @@ async def switch_load_loop(
 @routes.post("/adaptation", tags=["Compensate"], responses=refusals(MOVING))
 async def adapt(axis: FoundAxis, adapt: messages.Adapt, holder: Holder = "") -> messages.AxisState:
     """Set the adaptation mode: apply changes of parameters, only report them, or neither."""
-    await axis.followed(holder).set_mode(adapt.mode)
+    await axis.following_for(holder).set_mode(adapt.mode)
     return axis.state()
 
 
 @routes.delete("/adaptation", tags=["Compensate"], responses=refusals(MOVING))
 async def take_adaptation_back(axis: FoundAxis, holder: Holder = "") -> messages.AxisState:
     """Discard the changes by the adaptation since the model was activated."""
-    await axis.followed(holder).revert()
+    await axis.following_for(holder).revert()
     return axis.state()
 
 

@@ -40,16 +40,16 @@ BEGIN_S: Final = 10.0
 """Time-out for the first message of a stream."""
 _REASON_MAXIMUM: Final = 120
 """Maximum length in bytes of a WebSocket's close reason; RFC 6455 permits 123."""
-_NOT_VALID: Final = 1008
+_POLICY_VIOLATION: Final = 1008
 _NEWEST: Final = 2**62
 """Number greater than that of any event."""
-_NORMAL: Final = 1000
-_GONE: Final = 1006
+_NORMAL_CLOSURE: Final = 1000
+_ABNORMAL_CLOSURE: Final = 1006
 
 
 routes = APIRouter()
 _STATES: Final = [each.value for each in ControlState]
-_AS_THEY_ARE: Final = (
+_COPIED_FIELDS: Final = (
     "load_target_deg", "load_position_deg", "motor_position_deg", "motor_torque_nm", "velocity_deg_s",
     "correction_arcsec", "predicted_arcsec", "loop_arcsec", "weight", "reading0", "reading1",
 )  # fmt: skip
@@ -127,7 +127,7 @@ async def _stream(bridge: ServiceBridge, websocket: WebSocket, axis: str) -> Non
                 await stream.end()
             await _send(websocket, StreamAnswer(accepted=len(given.points)))
             if given.end:
-                await websocket.close(_NORMAL)
+                await websocket.close(_NORMAL_CLOSURE)
                 return
 
 
@@ -155,11 +155,11 @@ async def _send(websocket: WebSocket, message: BaseModel) -> None:
         async with asyncio.timeout(SEND_S):
             await websocket.send_text(message.model_dump_json())
     except TimeoutError:
-        raise WebSocketDisconnect(_GONE) from None
+        raise WebSocketDisconnect(_ABNORMAL_CLOSURE) from None
 
 
 async def _close(websocket: WebSocket, reason: str) -> None:
-    await websocket.close(_NOT_VALID, reason.encode()[:_REASON_MAXIMUM].decode(errors="ignore"))
+    await websocket.close(_POLICY_VIOLATION, reason.encode()[:_REASON_MAXIMUM].decode(errors="ignore"))
 
 
 def columns(
@@ -190,7 +190,7 @@ def columns(
 
 
 def _axis(rows: NDArray[Any]) -> AxisColumns:
-    found: dict[str, Any] = {name: rows[name].tolist() for name in _AS_THEY_ARE}
+    found: dict[str, Any] = {name: rows[name].tolist() for name in _COPIED_FIELDS}
     error_arcsec = ARCSEC_PER_DEG * (rows["load_position_deg"] - rows["load_target_deg"])
     return AxisColumns.model_construct(
         state=[_STATES[each] for each in rows["state"].tolist()], error_arcsec=error_arcsec.tolist(), **found
