@@ -122,7 +122,7 @@ def _over_branches(blocks: Blocks, length_deg: float) -> _Chain:
 
 
 def _over_legs(blocks: Blocks) -> _Chain:
-    """Returns the chain of each leg's constant rounding error; its loadings are standard deviations, arcsec."""
+    """Returns the chain of each leg's constant rounding error; the loadings are its standard deviations."""
     step = np.where(np.diff(blocks.leg) != 0, np.inf, 0.0)
     return _chain(step, blocks.locked_arcsec, np.zeros(len(blocks)))
 
