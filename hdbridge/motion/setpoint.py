@@ -347,7 +347,7 @@ class SetPoint:
 
 def _check_finite(name: str, value: float) -> None:
     if not math.isfinite(value):
-        raise InputError(f"a {name} of {value!r}; expected a finite number")
+        raise InputError(f"the {name} is {value!r}; expected a finite number")
 
 
 def _positive(name: str, value: float | None) -> float:
