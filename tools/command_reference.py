@@ -57,10 +57,10 @@ third one ends the program at once.
 """
 
 _COMMON = 2
-"""Minimum number of commands with an option for which it is described only once."""
+"""Number of commands from which an option that they share is described only once."""
 
 _MANY = 4
-"""Minimum number of commands with an option for which these commands are not listed."""
+"""Number of commands in a group from which the options that all of them share are not listed for each."""
 
 _SETS = {
     "*axis*": ("--interface", "--channel", "--force", "--borrow", "--simulate", "--truth", "--seed"),

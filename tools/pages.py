@@ -69,7 +69,7 @@ class Command:
     shell: str
     shown: tuple[str, ...] = ()
     at: tuple[int, ...] = ()
-    """Line numbers of the shown lines in the page."""
+    """Line numbers, in the page, of the lines in ``shown``."""
     status: int | None = 0
     exact: bool = True
 
@@ -253,7 +253,7 @@ def words(line: str) -> str:
 
 
 def compared(command: Command, printed: str) -> tuple[list[str], dict[int, str]]:
-    """Returns the deviations of the output from the page, and the printed line for each shown line."""
+    """Returns the differences of the output from the page, and the output's line for each line number."""
     lines = [line.rstrip() for line in printed.splitlines() if line.strip()]
     wrong: list[str] = []
     found: dict[int, str] = {}

@@ -131,7 +131,7 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
 
 
 def gate_of_change(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gate:
-    """Tests a change of a part of the model; ``without`` is the fit with this part unchanged."""
+    """Runs the tests for a change of a part of the model; ``without`` is the fit with this part unchanged."""
     change = without.residual - fitted.residual
     columns = np.column_stack([without.tangent, change])
     known = np.vstack([without.linearised.known, np.zeros(2)])
@@ -144,7 +144,7 @@ def gate_of_change(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gat
 
 
 def evident(effect: Effect) -> list[int]:
-    """Returns the indices of the coefficients that are evidence of an effect, all except incidental ones."""
+    """Returns the indices of the coefficients that are evidence of an effect: all but the incidental ones."""
     named = effect.named_coefficients()
     return [column for each in named if each.name not in effect.incidental for column in each.columns]
 
@@ -156,7 +156,7 @@ def law_discrepancies(estimator: Estimator, hypothesis: Hypothesis) -> FloatArra
 
 
 def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:
-    """Returns True if each piece of a finding is significant, and not just a law error of a larger piece."""
+    """Returns True if each component of a finding exceeds the noise and the law errors of larger ones."""
     effect = fitted.hypothesis.effects[place]
     pieces = range(len(effect.coefficients()))
     if not effect.inexact or len(pieces) != len(effect.pieces()):

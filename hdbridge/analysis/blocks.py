@@ -25,8 +25,8 @@ from hdbridge.units import ARCSEC_PER_DEG
 TARGET_BLOCKS = 30_000
 LONGEST_S = 0.25
 FINE_DEG = 0.4
-"""Scale of the block length after a reversal. A block is a twentieth of this angle plus the angle since the
-reversal."""
+"""Scale of the block length after a reversal. The length of a block is a twentieth of the sum of this angle
+and the travel since the reversal."""
 REST_DEG_S = 0.05
 """Maximum motor speed at which an axis counts as resting."""
 AVERAGED_COUNTS_S = 200.0
@@ -178,7 +178,7 @@ def _heading(motor_deg: FloatArray) -> FloatArray:
 def _cells(motor_deg: FloatArray, turning: Sequence[int], coarsest_deg: float) -> IntArray:
     """Divides the travel since the last turning point into cells, and returns each sample's cell number."""
     cells = np.zeros(len(motor_deg), dtype=np.int64)
-    edge = 20.0 * coarsest_deg - FINE_DEG  # from here on all cells have the coarsest size
+    edge = 20.0 * coarsest_deg - FINE_DEG  # beyond it, all cells have the coarsest size
     base = 0
     for first, last in pairwise(turning):
         since = np.abs(motor_deg[first + 1 : last + 1] - motor_deg[first])
@@ -208,7 +208,7 @@ class Design:
         return cls(samples, blocks, tuple(starts), Regressors(motions, blocks.mean, len(blocks)))
 
     def beginning(self, starts: Sequence[Start]) -> Design:
-        """Returns the design with other elastic states at the start of each chain."""
+        """Returns the design with the given elastic states at the starts of its chains."""
         return replace(self, starts=tuple(starts))
 
     def columns(self, effect: Effect) -> FloatArray:

@@ -56,7 +56,7 @@ class Identifiability:
 
 @dataclass(frozen=True, slots=True)
 class Capability:
-    """Subjects of the catalogue that a record can show, from the identifiability of their causes."""
+    """Subjects of the catalogue that a record can show, derived from the identifiability of their causes."""
 
     lacks: tuple[str, ...]
     """Kinds of motion and channels that the record does not have."""

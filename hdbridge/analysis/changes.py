@@ -43,7 +43,7 @@ def findings(
         usual = [each for each in parts if each.place == place]
         change: _Change | None = None
         if given.part is Part.LOOP:
-            if estimator.data.reversals >= 2:  # a loop shows only where the axis reverses
+            if estimator.data.reversals >= 2:  # a loop is visible only near reversals
                 same = type(given) is type(precise.hypothesis.effects[place])
                 change = (
                     _loop(search, fitted, precise, usual[0], given, spread)

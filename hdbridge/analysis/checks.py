@@ -17,7 +17,7 @@ from hdbridge.records.wraps import Wraps, count_of, find_wraps, period_in, unwra
 from hdbridge.units import DEG_PER_TURN
 
 LEAST_WHOLE = 10.0
-"""Minimum travel for the check for whole numbers. Over this travel, they cannot be a coincidence."""
+"""Minimum travel for the whole-number check. Over so long a travel, whole numbers are no coincidence."""
 SLOWEST_DEG_S = 6.0
 """Minimum peak motor speed of a plausible record, equal to one motor turn per minute."""
 MOST_COUNTS = 2**32
@@ -25,14 +25,14 @@ MOST_COUNTS = 2**32
 TURNS_SEEN = 4.0
 """Minimum number of motor turns for testing whether the error repeats."""
 PLACES = 8
-"""Number of sectors into which a motor turn is divided, to count the visited ones."""
+"""Number of sectors into which a motor turn is divided. The visited sectors are counted."""
 REPEATS_SHARE = 0.5
 """Minimum fraction of the error's variance that repeats with each motor turn, for `TURNS_SEEN` turns. For
 more turns the minimum is smaller, because a chance repetition explains less."""
 LEAST_REPEATS_SHARE = 0.1
 """Lower bound of the required repeating fraction, reached in records of many turns."""
 FOLLOWS_SHARE = 0.1
-"""Maximum ratio of the deviations between command and motor after and before unwrapping the command."""
+"""Maximum ratio of the deviation between command and motor after unwrapping the command to that before."""
 
 
 def check_records(records: Mapping[Path, Record], ratio: float) -> None:

@@ -99,7 +99,7 @@ def _between_legs(waves: FloatArray, precision: Precision, residual: FloatArray,
 SURE = 3.0
 """Minimum size of a significant deviation, standard errors."""
 WORTH_ARCSEC = 0.3
-"""Smallest deviation that fails a test; even a significant smaller one passes."""
+"""Smallest deviation that fails a test. A smaller one passes even if it is significant."""
 LEAST_REPORTED_ARCSEC = 0.005
 """Smallest deviation mentioned in the text; a smaller one would be printed as 0.00."""
 

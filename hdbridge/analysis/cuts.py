@@ -29,7 +29,7 @@ JUMP_DEG = 30.0
 SPIKE_ARCSEC = 900.0
 """Minimum deviation of a misread sample from its neighbours' transmission error; no gear can produce it."""
 SLOWEST_S = 1.0
-"""Sample period from which a record is implausible, because it has too few samples per motor turn."""
+"""Shortest implausible sample period; such a record has too few samples per motor turn."""
 MISREAD_ROWS = 2
 """Maximum length of a misreading, samples."""
 MISREAD_SHARE = 0.01
@@ -119,7 +119,7 @@ def jumps(motor_deg: FloatArray, time_s: FloatArray) -> IntArray:
 
 
 def _misread(record: Record, ratio: float) -> BoolArray:
-    """Returns a mask of samples to which an angle jumps, only to return at once."""
+    """Returns a mask of the samples at which an angle jumps away, to return within `MISREAD_ROWS`."""
     window = 2 * MISREAD_ROWS + 1
     found = np.zeros(len(record), dtype=np.bool_)
     if len(record) <= 2 * window:

@@ -1,4 +1,4 @@
-"""Motor angle at which the effects are evaluated, with speed and acceleration, freed of chatter.
+"""Motor angle at which the effects are evaluated, without chatter, and its speed and acceleration.
 
 A reversal counts only if the motor moves back by more than the chatter.
 """
@@ -105,7 +105,7 @@ class Driven(NamedTuple):
 
 
 def reading_of_all(angle_deg: FloatArray, parts: Sequence[slice]) -> Reading:
-    """Returns the reading properties of an encoder: noise from the longest part, count from all parts."""
+    """Returns the resolution of an encoder: its noise from the longest part, its count from all parts."""
     largest = max(parts, key=lambda rows: rows.stop - rows.start)
     return replace(reading_of(angle_deg[largest]), count_deg=quantum_deg(angle_deg))
 

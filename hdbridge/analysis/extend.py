@@ -15,7 +15,7 @@ from hdbridge.axis.model import TransmissionModel
 
 
 def as_named(estimator: Estimator, fitted: Fitted, given: Sequence[Effect], named: Container[str]) -> Fitted:
-    """Returns a fit with the ``given`` hysteresis law if a better law was found but is not in ``named``."""
+    """Returns the fit, repeated with the ``given`` hysteresis law if its own law is not in ``named``."""
     for place, (old, new) in enumerate(zip(given, fitted.hypothesis.effects, strict=False)):
         if type(old) is not type(new) and new.changes is not None and new.name not in named:
             return estimator.fit(fitted.hypothesis.instead(place, *in_place(new, [type(old)])))

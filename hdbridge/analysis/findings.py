@@ -180,7 +180,7 @@ class Finding:
 
     @property
     def undetermined(self) -> bool:
-        """True if the 95 % interval of the only size includes zero, and no alias could be meant instead."""
+        """True if the finding has a single size, whose 95 % interval includes zero, and no aliases."""
         sizes = [each for each in self.parameters.values() if each.is_size]
         return len(sizes) == 1 and not self.aliases and sizes[0].low <= 0.0 <= sizes[0].high
 

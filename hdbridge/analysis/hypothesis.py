@@ -97,7 +97,7 @@ class Fitted:
     _weight: FloatArray = field(repr=False)
 
     def having(self, effects: tuple[Effect, ...]) -> Fitted:
-        """Returns the fit with its effects replaced one by one, and all else unchanged."""
+        """Returns the fit with its effects replaced by these, in the same order, and all else unchanged."""
         return replace(self, hypothesis=replace(self.hypothesis, effects=effects))
 
     @cached_property

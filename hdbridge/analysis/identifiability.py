@@ -95,7 +95,7 @@ def identifiability(
 
 
 class _Example(NamedTuple):
-    """The candidate effect of a cause that is most visible in a record."""
+    """Most visible candidate effect of a cause in a record."""
 
     effect: Effect
     per_arcsec: FloatArray
@@ -178,7 +178,7 @@ def _injected(estimator: Estimator, fitted: Fitted, example: _Example, base: Seq
 
 
 def _named_from(injected: Gate, context: Context, scales: Scales) -> float:
-    """Returns the smallest peak, arcsec, at which a cause passes its tests and is probable; else infinity."""
+    """Returns the smallest peak, arcsec, at which a cause passes its tests and is probable; or infinity."""
     per_arcsec = math.sqrt(max(injected.robust, 0.0)) / WORST_ARCSEC
     for peak_arcsec in np.geomspace(scales.floor_arcsec, WORST_ARCSEC, PEAKS).tolist():
         robust = max(peak_arcsec * per_arcsec - POWER, 0.0) ** 2
@@ -196,7 +196,7 @@ def _usual_changes_arcsec(estimator: Estimator, base: Sequence[Effect], start: S
         * float(np.ptp(estimator.contribution(given, start)))
         * scales.calibrations
         * scales.calibrated
-        for given in reversed(base)  # of several loops, the first one counts
+        for given in reversed(base)  # if there are several loops, use the first
         if given.part is Part.LOOP
         for cause in causes_of(given, given.fitted(2.0 * given.coefficients()))
     }

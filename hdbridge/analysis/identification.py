@@ -169,9 +169,9 @@ class FitResult:
     noise: NoiseFigures
     outliers: Outliers
     orders: tuple[Line, ...]
-    """Lines of the motor orders in the model."""
+    """Spectral lines of the motor orders in the model."""
     spectrum: tuple[Line, ...]
-    """Lines of all candidate orders."""
+    """Spectral lines of all candidate orders."""
     residual_tests: tuple[ResidualTest, ...]
     held_out: HeldOut
     traces: Traces

@@ -279,7 +279,7 @@ class Linearised:
         return Linearised(self.columns[:, places], self.residual, self.known[places])
 
     def left(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Returns the Gram matrix (k, k) and the moment (k,) that the fit leaves of other columns (m, k)."""
+        """Returns Gram matrix (k, k) and moment (k,) of other columns (m, k), less what the fit explains."""
         shadow = self.basis.T @ columns
         return columns.T @ columns - shadow.T @ shadow, columns.T @ self.residual - shadow.T @ self.slack
 

@@ -85,10 +85,10 @@ class White:
 
 
 class _Chain(NamedTuple):
-    """A drift of unit size along the blocks: its tridiagonal inverse covariance, and its load on each block.
+    """Drift of unit size along the blocks: tridiagonal inverse covariance, and loading on each block.
 
-    The load is the factor with which the drift enters the block's mean. Each quantity is followed by its
-    derivative with respect to the logarithm of the correlation length.
+    The loading (``load``) is the factor with which the drift enters the block's mean. Each quantity is
+    followed by its derivative with respect to the logarithm of the correlation length.
     """
 
     diagonal: FloatArray
@@ -102,7 +102,7 @@ class _Chain(NamedTuple):
 
 
 def _along(blocks: Blocks, place: FloatArray, extent: FloatArray, length: float) -> _Chain:
-    """Returns a drift along ``place`` (time or travel), averaged over the ``extent`` of each block."""
+    """Returns the chain of a drift along ``place`` (time or travel), averaged over each block's extent."""
     step = np.where(np.diff(blocks.chain) != 0, np.inf, np.abs(np.diff(place)) / length)
     # Variance of the mean over x correlation lengths.
     x = np.maximum(extent / length, 1e-6)
@@ -113,7 +113,7 @@ def _along(blocks: Blocks, place: FloatArray, extent: FloatArray, length: float)
 
 
 def _over_branches(blocks: Blocks, length_deg: float) -> _Chain:
-    """Returns the misfit of the loop's shape, which decays over each branch and differs between branches."""
+    """Returns the chain of the loop's shape misfit, which decays over each branch, independently."""
     crossed = blocks.since_turn_deg / length_deg
     fresh = (np.diff(blocks.chain) != 0) | (np.diff(blocks.leg) != 0)
     step = np.where(fresh, np.inf, np.abs(np.diff(crossed)) / LOOP_LENGTH)
@@ -122,7 +122,7 @@ def _over_branches(blocks: Blocks, length_deg: float) -> _Chain:
 
 
 def _over_legs(blocks: Blocks) -> _Chain:
-    """Returns the rounding error that is constant over a leg, with the size given by the blocks."""
+    """Returns the chain of each leg's constant rounding error; the loadings are its standard deviations."""
     step = np.where(np.diff(blocks.leg) != 0, np.inf, 0.0)
     return _chain(step, blocks.locked_arcsec, np.zeros(len(blocks)))
 
@@ -150,8 +150,8 @@ def _chain(step: FloatArray, load: FloatArray, load_slope: FloatArray) -> _Chain
 class Precision:
     """Inverse covariance of the noise of a set of blocks, applied without forming the matrix.
 
-    The covariance is K = W + H S H', with the white noise W, the drifts' covariance S and their loads H. With
-    w = W^-1 and P = S^-1 (tridiagonal for each drift), Woodbury's identity gives
+    The covariance is K = W + H S H', with the white noise W, the drifts' covariance S and their loadings H.
+    With w = W^-1 and P = S^-1 (tridiagonal for each drift), Woodbury's identity gives
     K^-1 = w - w H (P + H' w H)^-1 H' w. The bracket is banded.
     """
 

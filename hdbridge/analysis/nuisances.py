@@ -47,7 +47,8 @@ coarser encoder also depends on speed and looks like swing."""
 MOST_TURNS = 80
 SMALLEST_TURN = 1e-3
 COUNTS = 0.29
-"""Standard deviation of a uniform distribution over a count or over a turning point's reach, in that unit."""
+"""Standard deviation of a uniform distribution over a count or a turning point's reach, relative to that
+range."""
 SPEEDS_COUNTS_S = (
     0, 25, *range(50, 800, 50), *range(800, 1600, 100), *range(1600, 3200, 200),
     3200, 4800, 6400, 12800, np.inf,

@@ -60,7 +60,7 @@ def noise_arcsec(
     for rows, part in ((still, third[inner]), (~still, third[~inner])):
         size = third_deviation(part) if len(part) >= 20 else 0.0
         result[rows] = max(min(size, between_lines(error_arcsec, rows, starts)), floor, 0.02)
-    if np.any(still) and np.any(~still):  # assume at least half of the noise at rest in motion
+    if np.any(still) and np.any(~still):  # in motion, assume at least half of the noise at rest
         result[~still] = max(float(result[~still][0]), 0.5 * float(result[still][0]))
     return result
 
@@ -305,7 +305,7 @@ AVERAGED_POINTS = 50_000
 """Approximate number of points after averaging, which bounds time and memory and suffices for slow
 effects."""
 SHORT = 0.77
-"""Length of every other run, relative to the mean length. The runs between are 1.6 times as long."""
+"""Length of every other run, relative to the mean length. The runs in between are 1.6 times as long."""
 LEAST_SAMPLES = 60
 LEAST_SETTLED = 0.2
 """Minimum fraction of samples outside fast moves; below it, fast moves are used as well."""

@@ -1,7 +1,7 @@
 """Probability of a finding: a logistic function of the evidence for and against it.
 
 `Scales` contains the coefficients. tools/fit_probabilities.py fits them, by ridge regression with fixed
-signs, to findings with known causes from blind suites (the present ones also from records computed from
+signs, to findings with known causes from blind suites (the current ones also from records computed from
 formulas). docs/how-well.md has the figures.
 """
 

@@ -74,7 +74,7 @@ class Scales:
         0.01, "share of the chi square of a cause", 0.0, "a real law differs from its formula by some 7 %"
     )
 
-    # Loops of another shape, and changes of the model's parts.
+    # Loops of a different shape, and changes of the model's parts.
     calibrated: float = _scale(0.04, "share of a coefficient", 0.04, "typical change by temperature and age")
     calibrated_shape: float = _scale(
         0.06,

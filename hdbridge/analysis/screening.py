@@ -107,7 +107,7 @@ def _score(
     """Computes a score.
 
     ``size`` and ``taken`` are the total and the explained sum of squares of each column. ``gram`` and
-    ``moment`` are what the hypothesis leaves.
+    ``moment`` exclude the part that the hypothesis explains.
     """
     seen = size > 0.0
     if not np.any(seen):

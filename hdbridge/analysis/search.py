@@ -73,7 +73,7 @@ class Search:
             slow = left > self.scales.slow * fitted.chi_square
             fitted = found
             if number >= self.scales.few - 1 and slow and left > self.scales.large * len(found.residual):
-                break  # many small pieces approximate a cause that is not in the catalogue
+                break  # many small effects approximate a cause that is not in the catalogue
             if number < LAW_ROUNDS:
                 fitted = self.with_best_law(fitted)
         if len(fitted.hypothesis.effects) - self.base <= self.scales.few:
@@ -271,10 +271,11 @@ class Search:
         return reason
 
     def _extrapolated(self, trial: Fitted, place: int) -> bool:
-        """Returns True if a piece of an effect is much larger than the visible sum of its kind of effects.
+        """Returns True if an effect or a component of it far exceeds its visible net contribution.
 
-        In the positions that the record covers, pieces of one effect, two effects, or an effect and a change
-        of the model can cancel.
+        Components of one effect, two effects, or an effect and a change of the model can cancel at the
+        positions that the record covers. The net contribution is therefore the smallest sum of all effects of
+        this kind with any other effect.
         """
         effects, start = trial.hypothesis.effects, trial.hypothesis.start
         contribution = [self.estimator.contribution(each, start) for each in effects]
@@ -358,7 +359,7 @@ class Search:
         return fitted.chi_square + self.scales.penalty * fitted.free()
 
     def alternatives_to_change(self, fitted: Fitted, place: int, given: Effect) -> list[str]:
-        """Returns the causes that explain the data as well as a change of the model part at ``place``."""
+        """Returns the causes that explain the data as well as a change of the model's part at ``place``."""
         with self.held({place}):
             return self.equal_alternatives(fitted, self.with_given(fitted, place, given), given.name)
 
@@ -467,7 +468,7 @@ def with_measured(search: Search, fitted: Fitted) -> Fitted:
 
 
 def together(pieces: Sequence[Effect]) -> Effect:
-    """Joins several pieces into one effect."""
+    """Joins several components into one effect."""
     whole = pieces[0]
     for each in pieces[1:]:
         both = whole.joined(each)
@@ -477,9 +478,9 @@ def together(pieces: Sequence[Effect]) -> Effect:
 
 
 def lookalikes(effect: Effect, ratio: float) -> list[tuple[type[Effect], Effect]]:
-    """Returns the kinds that would resemble a piece of the effect if their channel were not recorded.
+    """Returns the kinds that would resemble a component of the effect if their channel were not recorded.
 
-    Each kind is paired with that piece.
+    Each kind is paired with that component.
     """
     result = []
     for name in aliases_of(effect.name):

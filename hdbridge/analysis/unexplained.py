@@ -99,9 +99,11 @@ def is_unexplained(estimator: Estimator, left: Rest) -> bool:
     if not of_the_loop(estimator, left):
         return True
     data, scales = estimator.data, estimator.scales
-    # An axis rests anywhere within a count of its motor encoder, and noise drifts. Neither is a cause.
+    # An axis may rest anywhere within a count of its motor encoder, and part of the noise is a slow drift.
+    # Neither is a cause.
     counts = data.motor_count_arcsec / np.sqrt(12.0)
-    # Fast residuals count only if command and standstill separate noise and following error from the gear.
+    # Fast residuals are evaluated only if the record contains the command and a standstill. Only then can
+    # noise and following error be distinguished from errors of the gear.
     fast = float(np.hypot(max(scales.plain_arcsec, data.noise_arcsec), left.standing_arcsec))
     if data.full.commanded and data.standstill and left.fast_arcsec > fast:
         return True

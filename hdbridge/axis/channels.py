@@ -1,7 +1,7 @@
 """Optional measured channels of the axis file, in addition to the encoders.
 
-Each channel is an object of the drive that is received by PDO. It has a unit, a plausible range, and a time
-for which the last reading is held. `hdbridge.drive.channels` tracks the channels on line.
+Each channel is an object of the drive, received by PDO. It has a unit, a plausible range, and a time for
+which the last reading is held. `hdbridge.drive.channels` tracks the channels on line.
 """
 
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, Self

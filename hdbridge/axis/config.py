@@ -380,7 +380,7 @@ class AxisConfig(OtherChannels):
         return self._document.path if self._document is not None else Path("axis.yaml")
 
     def states(self, key: str) -> bool:
-        """Returns True if the file sets a key such as ``drive.halt_option``; False if it has its default."""
+        """Returns True if the file sets a key such as ``drive.halt_option``, False if the default applies."""
         part: object = self
         for name in key.split("."):
             if not isinstance(part, Strict) or name not in part.model_fields_set:

@@ -105,9 +105,8 @@ def diagnose(
     elif model is None:
         given = shlex.join(map(str, records)) if records else "RECORD"
         raise InputError(
-            "--model is missing: the records are compared with a model; fit one, hdbridge fit "
-            f"{given} --ratio N --out model.yaml, and pass --model model.yaml, or pass the profile of an "
-            "axis that was calibrated, --model PROFILE"
+            "--model is missing; pass the profile of a calibrated axis (--model PROFILE), or fit a model "
+            f"first: 'hdbridge fit {given} --ratio N --out model.yaml', then pass --model model.yaml"
         )
     else:
         path = model_file(model)

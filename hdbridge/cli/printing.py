@@ -59,7 +59,7 @@ def progress_bar() -> Progress:
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str = "") -> None:
-    """Prints a table uncropped; in a pipe or a file always as one table. An empty row ends a section."""
+    """Prints a table uncropped, split only on a narrow terminal. An empty row ends a section."""
     for each in tables(columns, rows, title):
         console.print(each, crop=False)
 

@@ -31,7 +31,7 @@ _REGISTER: Final = (0x1001, 0, 8)
 _NOT_MAPPABLE: Final = (0x06040041, 0x06040042, 0x06010002, 0x06010000, *ABSENT)
 _TOO_LONG: Final = (0x06040042, *RANGE)
 _SPARE_ID: Final = 0x57D
-"""Identifier of the fourth RPDO of node 125, which is not a default identifier of other nodes."""
+"""Identifier to which tests move PDOs and SYNC: the default of RPDO4 of node 125, not used by other nodes."""
 
 
 def _word(index: int, sub: int, bits: int) -> bytes:

@@ -337,7 +337,7 @@ class AxisCycle:
         return reaction
 
     def _latch(self) -> None:
-        """Stops sending set-points to the axis, and gives up the aim of enabling it, so it restarts
+        """Stops sending set-points to the axis and withdraws the request to enable it, so that it restarts
         disabled.
         """
         self.image.power.quick_stop()
@@ -345,7 +345,7 @@ class AxisCycle:
             self.silence()
 
     def _step_channels(self) -> None:
-        """Holds missing readings, gives up lost channels, and awaits recovered channels."""
+        """Holds missing readings; stops waiting for lost channels and waits for recovered ones again."""
         image = self.image
         faults = image.step_channels()
         if faults or len(self._awaited_channels) < len(self._channel_ids):

@@ -46,8 +46,8 @@ READERS: Final[dict[str, Any]] = {
 """Readers by file name suffix, which .gz may follow."""
 _BINARY: Final = {".blf", ".mf4"}
 FOLLOWED_SHARE: Final = 0.5
-"""Minimum fraction of the samples in motion with a changing target, for the target to count as the command
-of each cycle."""
+"""Minimum fraction of the samples in motion at which the target changes. Above it, the target counts as the
+command of each cycle."""
 _SINCE_1970_S: Final = 1e9
 """Smallest time stamp that counts as absolute (seconds since 1970); smaller ones are relative."""
 _RESETS: Final = (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION)
@@ -179,7 +179,7 @@ class _Bus:
         return sum(map(len, self._parts))
 
     def take(self, can_id: int, data: bytes, time_s: float) -> None:
-        """Takes the next frame of the log."""
+        """Processes the next frame of the log."""
         if can_id in self._requests or can_id in self._answers:
             if len(data) == 8:
                 self._take_sdo(can_id, data)
@@ -200,7 +200,7 @@ class _Bus:
     # -- SDO ----------------------------------------------------------------------------------------------
 
     def _take_sdo(self, can_id: int, data: bytes) -> None:
-        """Takes an SDO frame of an expedited transfer (up to 4 bytes). A write counts only once confirmed."""
+        """Processes an SDO frame of an expedited transfer (up to 4 bytes). A write counts once confirmed."""
         command, index, sub = data[0], int.from_bytes(data[1:3], "little"), data[3]
         size = 4 - (command >> 2 & 3) if command & 1 else 4
         value = int.from_bytes(data[4 : 4 + size], "little")

@@ -33,7 +33,7 @@ class ChannelState:
         self._values = list(AT_REST)
 
     def take(self, feedback: Feedback) -> bool:
-        """Takes one cycle's readings; returns True if the known channels changed."""
+        """Stores one cycle's readings; returns True if the known channels changed."""
         for slot, reading in zip(self._slots, feedback.readings, strict=True):
             if reading is not None:
                 self._values[slot] = reading

@@ -132,7 +132,7 @@ class Inverse:
         self._forward: bool | None = None
         """True if the last motion was forward; None before the first motion."""
         self._known = not self.memory_deg
-        """True if an earlier run in one direction was longer than the memory, or if the model has none."""
+        """True if an earlier run in one direction exceeded the memory, or if the model has no memory."""
         self._turns = deque([0.0], _TURNS)
         """Motor angles of the start and the reversals of the issued path."""
 
@@ -152,7 +152,7 @@ class Inverse:
         return self._known or abs(self._motor_deg - self._turns[-1]) >= self.memory_deg
 
     def error_at(self, motor_deg: float, moment: Moment = _NOWHERE) -> float:
-        """Returns the model's error at a motor angle ahead, arcsec; the state does not change."""
+        """Returns the error predicted after a move to ``motor_deg``, arcsec, without changing the state."""
         return self._tracker.peek(motor_deg, moment) + (
             self._offset if moment is self._moment else self._level(moment)
         )
@@ -404,7 +404,7 @@ class Compensation:
         return min(max(min(max(wanted, last - slew), last + slew), -most), most)
 
     def _predicted(self, load_deg: float, moment: Moment) -> float:
-        """Returns the correction at a load target ahead, arcsec; the state does not change."""
+        """Returns the correction predicted for a future load target, arcsec, without changing the state."""
         motor = self._ratio * (load_deg - self._static / ARCSEC_PER_DEG)
         return self.weight * self._inverse.error_at(motor, moment)
 

@@ -120,7 +120,7 @@ RULE: Final = (
     f"{100 * RULE_SHARE:g} % of it and none by more than {100 * RULE_MAXIMUM_SHARE:g} %"
 )
 ENOUGH: Final = 10_000
-"""Minimum number of wake-ups needed to determine the latest ten-thousandth."""
+"""Minimum number of wake-ups needed to determine the 99.99th percentile."""
 
 
 def sustains(histogram: Histogram, period_s: float) -> bool:

@@ -11,9 +11,9 @@ cases, with the reason in `LoadLoop.doubt`:
 
 The last two compare the load encoder with the load angle from motor encoder and model. A difference is
 explained up to one count of each encoder at the load plus the noise of the difference. In the last case, the
-possible error of the model's hysteresis (the slack) is added to this limit. The noise is measured at rest,
-and a slow drift of the load against the motor is tracked. If a doubt about the encoder does not end at the
-position where it arose, it ends when both encoders have agreed at rest after motion in both directions.
+assumed maximum error of the model's hysteresis (the slack) is added to this limit. The noise is measured at
+rest, and a slow drift of the load against the motor is tracked. If a doubt about the encoder does not end at
+the position where it arose, it ends when both encoders have agreed at rest after motion in both directions.
 
 Pure: no clock, no bus.
 """
@@ -50,7 +50,7 @@ _OUTLIERS: Final = 2
 _AGREEMENT: Final = 1.0 / 3.0
 """Fraction of the greatest disagreement below which the encoders count as agreeing again."""
 _MODEL_ERROR: Final = 0.25
-"""Possible relative error of a model's hysteresis."""
+"""Assumed maximum relative error of a model's hysteresis."""
 _PLACES: Final = 24
 """Number of intervals between the positions at which the width of a hysteresis loop is evaluated."""
 _BOTH: Final = frozenset({-1, 1})
@@ -122,7 +122,7 @@ class LoadLoop:
         self._patience_max = math.ceil(_AGREED_MAX_S / period_s)
         self._settled = max(math.ceil(SETTLED_S / period_s), 1)
         self._slack = maximum_arcsec
-        """Possible lag of the load behind the motor beyond the model's hysteresis."""
+        """Assumed maximum lag of the load behind the motor beyond the predicted hysteresis."""
         self._value = 0.0
         self._standing = self._outliers = 0
         """Number of periods at rest, and of consecutive readings outside the explained range."""

@@ -65,17 +65,18 @@ class Times:
     """Time-outs of the keeper, seconds."""
 
     begin_s: float = 60.0
-    """Start-up of a child."""
+    """Maximum duration of a child's start-up."""
     hung_s: float = 5.0
-    """Time without a completed cycle of the control process; the drives' own watchdogs act much earlier."""
+    """Maximum time without a completed cycle of the control process; the drives' own watchdogs act much
+    earlier."""
     service_hung_s: float = 30.0
-    """Interval without a sign of life of the service."""
+    """Maximum time without a heartbeat of the service process."""
     gateway_hung_s: float = 5.0
-    """Interval without a sign of life of the gateway."""
+    """Maximum time without a heartbeat of the gateway process."""
     stop_s: float = 30.0
-    """Braking of all axes by the control process."""
+    """Maximum time for the control process to brake all axes and exit."""
     service_stop_s: float = 10.0
-    """Exit of service and gateway after that."""
+    """Maximum time for service and gateway to exit after the control process."""
 
 
 SIMULATED: Final = Times(begin_s=600.0, gateway_hung_s=120.0, stop_s=300.0, service_stop_s=120.0)
@@ -185,12 +186,12 @@ class Heartbeat:
         return advanced
 
     def restart(self, value: int) -> None:
-        """Restarts the detection for a restarted process; ``value`` is the present value of its counter."""
+        """Restarts the detection for a restarted process; ``value`` is the current value of its counter."""
         self._last, self.misses, self.begun = value, 0, False
 
 
 class Notifier:
-    """Sends notifications (sd_notify) to the service manager, if there is one. Errors are ignored."""
+    """Notifies the service manager (sd_notify), if there is one. Errors are ignored."""
 
     def __init__(self, address: str | None = None, watchdog_s: float | None = None) -> None:
         """``address`` is the manager's socket; an address that begins with @ is abstract."""
@@ -212,7 +213,7 @@ class Notifier:
         self._send("READY=1", PATIENCE_S)
 
     def alive(self) -> None:
-        """Sends a sign of life to the watchdog."""
+        """Sends a heartbeat to the service manager's watchdog."""
         if self.watchdog_s is not None:
             self._send("WATCHDOG=1")
 
@@ -244,7 +245,7 @@ class _Helper:
     program: Sequence[str]
     listening: tuple[int, ...]
     alive: Cell
-    """Cell with the time of its last sign of life."""
+    """Cell with the time of its last heartbeat."""
     begun: Cell
     """Cell to which the process writes its id when it is ready."""
     hung_s: float
@@ -444,7 +445,7 @@ class Keeper:
             self._start_control(now_s)
 
     def _supervise(self, now_s: float) -> None:
-        """Kills hung children; reports readiness, sign of life and status to the service manager."""
+        """Kills hung children; reports readiness, heartbeat and status to the service manager."""
         status = self._memory.status
         axes = ", ".join(axis.name for axis in self._start.machine.axes)
         running = self._turns.check(status.loop_count)

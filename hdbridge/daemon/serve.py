@@ -1,7 +1,7 @@
 """Service process: ``python -m hdbridge.daemon.serve FD``, started by the keeper.
 
 This process assembles bridge, API, recorder, watch, adaptation and log, and closes them in order. It has one
-event loop; blocking work runs in threads. If it dies, the axes complete their present commands.
+event loop; blocking work runs in threads. If it dies, the axes complete their current commands.
 """
 
 import asyncio

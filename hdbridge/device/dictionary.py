@@ -245,8 +245,8 @@ class Dictionary:
         entry = Entry(variable, own)
         if own is not None and (entry.codec is None) != (own.data_type not in NUMBERS):
             raise InputError(
-                f"{self._path}: {entry} is of data type {variable.data_type:04X}h, and the simulated drive's "
-                f"of {own.data_type:04X}h; a drive with this EDS cannot be simulated"
+                f"{self._path}: {entry} has data type {variable.data_type:04X}h, but the simulated drive "
+                f"uses {own.data_type:04X}h; a drive with this EDS cannot be simulated"
             )
         self._entries[entry.index, entry.sub] = entry
         return entry

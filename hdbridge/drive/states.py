@@ -232,7 +232,7 @@ class PowerWalk:
 
     @property
     def aim(self) -> State:
-        """Target state of the walk."""
+        """State to which the drive is to be taken."""
         return self._aim
 
     @property

@@ -13,7 +13,7 @@ class Unwrap:
 
     def __init__(self, modulus: int = INT32_RANGE) -> None:
         if modulus < 2:
-            raise ValueError(f"the modulus of a counter is at least 2, not {modulus}")
+            raise ValueError(f"the modulus of a counter must be at least 2, not {modulus}")
         self._modulus = modulus
         self._half = modulus // 2
         self._value: int | None = None

@@ -149,7 +149,8 @@ def _member(place: Field, key: str) -> Field | None:
                     return Field(field.annotation, tuple(field.metadata), field.description or "")
         elif get_origin(member) is dict:
             return _annotated(get_args(member)[1])
-    # pydantic includes the name of a union's member in a location, which is not a step in the file.
+    # pydantic inserts the name of the union member into a location. The file has no such key, so stay at this
+    # field.
     return place if len(list(place.types())) > 1 else None
 
 

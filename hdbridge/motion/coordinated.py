@@ -123,7 +123,7 @@ def _eased(limits: MotionLimits, period_s: float, share: float) -> _Eased:
 
 
 def _straight(corners: Sequence[FloatArray]) -> list[tuple[FloatArray, FloatArray]]:
-    """Returns the legs from corner to corner; merges legs in the same direction, and omits empty legs."""
+    """Returns the legs between corners; merges successive legs in the same direction and omits empty ones."""
     legs: list[tuple[FloatArray, FloatArray]] = []
     for begin, end in pairwise(corners):
         way = end - begin
@@ -143,7 +143,7 @@ def _straight(corners: Sequence[FloatArray]) -> list[tuple[FloatArray, FloatArra
 def _leg(
     begin: FloatArray, end: FloatArray, limits: Sequence[_Eased], period_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns positions and velocities of a leg from rest to rest in each period, shape (n, axes) each."""
+    """Returns position and velocity of a leg, from rest to rest, in each period; shape (n, axes) each."""
     count = len(begin)
     demand = InputParameter(count)
     demand.synchronization = Synchronization.Phase

@@ -50,10 +50,10 @@ class SetPoint:
         self._path: Plan | Cubic | None = None
         """Path in progress; None at rest, in a stream and in a pursuit."""
         self._steps = 0
-        """Number of periods since ``_path`` was set; ``_since_s`` of the path had elapsed then."""
+        """Number of periods since ``_path`` was set, when ``_since_s`` of the path had already elapsed."""
         self._since_s = 0.0
         self._left = self._stream_timeout = 0
-        """Remaining periods before a jog or a resting stream times out, and time-out of a stream, periods."""
+        """Periods left before a jog or a resting stream times out, and time-out of a stream in periods."""
         self._mode = MotionMode.HOLD
         self._underrun = False
         self._position_deg = self._velocity_deg_s = self._acceleration_deg_s2 = 0.0
@@ -347,7 +347,7 @@ class SetPoint:
 
 def _check_finite(name: str, value: float) -> None:
     if not math.isfinite(value):
-        raise InputError(f"a {name} of {value!r}; expected a finite number")
+        raise InputError(f"the {name} is {value!r}; expected a finite number")
 
 
 def _positive(name: str, value: float | None) -> float:

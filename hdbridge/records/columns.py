@@ -212,9 +212,10 @@ class CsvColumns:
 
     @classmethod
     def of(cls, columns: Said = None, units: Said = None, unwrap: Said = None) -> Self:
-        """Parses ``motor=theta_m,time=t``, ``motor=counts:65536,time=ms`` and ``motor=65536``, or mappings.
+        """Parses texts such as ``motor=theta_m,time=t``, ``motor=counts:65536,time=ms``, ``motor=65536``.
 
-        Later texts take precedence. Raises `InputError` for an impossible channel, unit or period.
+        Each argument may also be a mapping or a sequence. Later entries override earlier ones. Raises
+        `InputError` for an unknown channel or an invalid unit or period.
         """
         periods: dict[str, float] = {}
         for channel, text in _pairs(unwrap, "--unwrap", "PERIOD").items():

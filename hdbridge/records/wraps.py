@@ -40,7 +40,7 @@ class Wraps(NamedTuple):
     rows: NDArray[np.intp]
     """Index of the first sample after each jump."""
     period_deg: float
-    """Period of the counter: the size of the jumps, or one turn if they are whole turns."""
+    """Period of the counter: the size of its jumps, or one turn if the jumps are multiples of a turn."""
     jump_deg: float
     """Measured size of the jumps, a whole number of periods."""
     tolerance_deg: float

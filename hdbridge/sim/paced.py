@@ -29,7 +29,7 @@ class PacedClock(VirtualClock):
     ) -> None:
         """``real_s`` and ``sleep`` are the computer's clock. InputError if ``speed`` is not positive."""
         if not (math.isfinite(speed) and speed > 0.0):
-            raise InputError(f"a simulation at {speed!r} times real time; expected a finite number above 0")
+            raise InputError(f"the simulation speed is {speed!r}; expected a finite number above 0")
         super().__init__(start_s)
         self._speed = speed
         self._real_s, self._sleep = real_s, sleep

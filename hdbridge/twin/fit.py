@@ -228,9 +228,10 @@ def sandwich(slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], sprea
     Methodology 28, 2002). A leg that a replay cannot follow shifts the fit in every direction that the other
     legs leave undetermined, although its own residuals stay small.
 
-    Variances are estimated by principal direction, because a few legs do not determine more. Each variance is
-    at least that of independent residuals of the same size, and at most that of the prior. The part of the
-    residuals that the slopes can still explain is removed first, because it is not scatter between legs.
+    Only one variance per principal direction is estimated, because a few legs do not determine the full
+    covariance. Each variance is at least that of independent residuals of the same size, and at most that of
+    the prior. The part of the residuals that the slopes can still explain is removed first, because it is not
+    scatter between legs.
     """
     along = principal(slopes, spread)
     rows = slopes @ along

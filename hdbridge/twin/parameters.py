@@ -250,7 +250,7 @@ RATED_SPEED_RAD_S: Final = 3000.0 * math.tau / 60.0
 STRIBECK_RAD_S: Final = 5.0
 """Stribeck speed of bearings and teeth in grease: the film forms at some tens of revolutions per minute."""
 COUPLING_HZ: Final = 1000.0
-"""Resonance of an encoder on an unknown coupling: stiffer than a recording shows."""
+"""Assumed resonance of an encoder whose coupling is unknown; too high to be visible in a recording."""
 COUPLING_DAMPING: Final = 0.1
 """Damping ratio of metal bellows couplings: 0.05 to 0.2 with the bearings of the encoder."""
 NOTCH_HZ: Final = 100.0

@@ -26,10 +26,10 @@ from hdbridge.twin.parameters import FOLLOWING, TORQUE
 from hdbridge.twin.replay import demand_deg
 
 SPEED_S: Final = 0.4
-"""Length of the responses to the speed: a load that rings at 15 Hz with a damping ratio of 0.06 decays to a
+"""Length of the responses to the speed. A load that rings at 15 Hz with a damping ratio of 0.06 decays to a
 tenth."""
 DIRECTION_S: Final = 0.12
-"""Length of the responses to the direction: three periods of a velocity loop of 25 Hz."""
+"""Length of the torque's response to the direction of motion: three periods of a velocity loop at 25 Hz."""
 RIDGES: Final = (1e-1, 1e-2, 1e-3, 1e-4)
 """Ridge weights of the squared taps, as fractions of each tap's information in the rows; held-out legs decide
 between them."""

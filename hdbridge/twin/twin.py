@@ -326,7 +326,7 @@ TWINS: Final = Store(
 
 
 # ----------------------------------------------------------------
-# Makes a twin from recordings: fit, causes of the errors of the start, inseparable sets, residuals.
+# Builds a twin from recordings: fit, causes of initial errors, inseparable parameters, residuals.
 
 
 def fit_twin(

@@ -123,7 +123,7 @@ class Disorder(RuleBasedStateMachine):
     @precondition(stopped)
     @rule()
     def start(self) -> None:
-        """Takes all steps of user and service to restart a stopped machine."""
+        """Performs every step by which the user and the service restart a stopped machine."""
         for node in self.daemon.nodes:
             node.faults.silent = node.faults.mute_heartbeat = False
         self.go(5)

@@ -23,7 +23,7 @@ def set_point(master, target: int, bits: int = 0) -> None:
 
 @pytest.fixture
 def ip(master):
-    """A cycle in IP: ``ip(word, target)``; the node is started and RPDO1 carries 6040h and 60C1h:01."""
+    """Provides ``ip(word, target)``: one cycle in interpolated position mode (RPDO1: 6040h, 60C1h:01)."""
     for index, sub, value, size in (
         (0x1400, 1, 0x80000201, 4), (0x1600, 0, 0, 1), (0x1600, 2, 0x60C10120, 4), (0x1600, 0, 2, 1),
         (0x1400, 1, 0x201, 4), (0x6060, 0, 7, 1),

@@ -108,7 +108,7 @@ class Slow(PowerStage):
 
 
 class Slave:
-    """The slave over frames."""
+    """Accesses the slave by raw CAN frames."""
 
     def __init__(self, bus, clock, node, motor, stage) -> None:
         self.bus, self.clock, self.node, self.motor, self.stage = bus, clock, node, motor, stage

@@ -1,4 +1,4 @@
-"""Tests of parts with few samples, and of the motion before a record."""
+"""Tests of records with a very short part, and of the influence of the motion before a record begins."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ ARCSEC_PER_RAD = math.degrees(1.0) * 3600.0
 
 
 def axis(**changes: Any) -> Truth:
-    """The article's axis with a perfect gear and fine encoders, keys like ``load__gravity`` changed."""
+    """Returns the article's axis with a perfect gear and fine encoders; ``load__gravity`` sets its key."""
     data = Truth.load(ARTICLE).model_dump(by_alias=True)
     data["gear"].update(motor_orders=[], hysteresis=None)
     data["motor"]["encoder"].update(counts_per_turn=512_000, interpolation=1)

@@ -42,7 +42,7 @@ def trajectory(distance_counts: int) -> list[int]:
 
 
 class Axis:
-    """A machine with a master that sends whole counts each cycle."""
+    """Simulated axis with a master that sends a target in whole counts every cycle."""
 
     def __init__(self, known: Truth, seed: int = 1) -> None:
         self.machine = Machine(known, seed)

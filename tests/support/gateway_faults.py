@@ -14,7 +14,8 @@ from support.service import play
 
 SPEED_DEG_S = 10.0
 STANDING_DEG = 0.005
-"""Maximum movement of a load at rest, degrees; it rings, and at 10 deg/s it moves 0.04 deg per cycle."""
+"""Maximum movement of a load that counts as standing, degrees. It allows for ringing; at 10 deg/s, the load
+would move by 0.04 deg in each cycle."""
 OBSERVED_S = 0.7
 STANDS_S = 0.3
 

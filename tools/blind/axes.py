@@ -403,7 +403,7 @@ def _everyday_orders(rng: random.Random) -> list[dict[str, Any]]:
 
 
 def _give_law(rng: random.Random, law: str, gear: dict[str, Any], load: dict[str, Any]) -> None:
-    """Sets the loop of the gear, and of the load's friction if that is the law."""
+    """Gives the gear a loop with this law; with `PRESLIDING`, most of the friction is at the load."""
     rolling = RollingFriction(
         law="rolling_friction",
         offset_arcsec=_stretched(rng, 8.0, 60.0),

@@ -168,7 +168,7 @@ def common(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
 
 
 def probabilities(verdicts: Sequence[Verdict]) -> list[Pair]:
-    """Returns each name's stated probability, and True if the name was right."""
+    """Returns, for each reported cause, its stated probability and whether the cause was correct."""
     return [pair for each in verdicts for pair in each.probabilities]
 
 

@@ -54,10 +54,9 @@ class Reparametrised:
     """Factors that convert growth relative to the former ripple or loop to growth relative to the new one."""
 
     def counted(self, effect: Effect) -> Effect:
-        """Converts the parameters of an effect to the new reference temperature.
+        """Converts the parameters of an effect to the new reference temperature, if they depend on it.
 
-        Only ripple, loop and growth of the loop with speed depend on it; other effects are returned as they
-        are.
+        Only ripple, loop and growth of the loop with speed depend on it; all others are returned unchanged.
         """
         if isinstance(effect, Synchronous):
             return effect.fitted(self.orders)
@@ -164,7 +163,7 @@ class AmplitudeDrift(Modulating, Warmed):
                 )  # fmt: skip
 
     def scales(self) -> tuple[Part, Effect]:
-        """Returns the part that changes by more arcsec, loop or ripple."""
+        """Returns the part with the larger change in arcsec: the loop or the ripple."""
         ripple = math.sqrt(0.5 * sum(each.amplitude_arcsec**2 for each in self.orders))
         friction = abs(self.friction_percent_per_k * self.loop.offset_arcsec)
         if abs(self.ripple_percent_per_k) * ripple <= friction:

@@ -65,7 +65,7 @@ class Backlash(Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields gaps with crossing angles from hard to soft contact."""
+        """Yields a unit backlash for each of several crossing angles, from hard to soft contact."""
         yield from (cls(gap_arcsec=1.0, crossing_deg=each) for each in (0.05, 0.15, 0.4, 1.0, 2.5, 6.0))
 
     def unidentifiable(self, observations: Observations) -> str:

@@ -55,7 +55,7 @@ class Law(Strict, ABC):
     channels: ClassVar[frozenset[Channel]] = frozenset()
     """Channels usually required in addition to the motor angle; for those of an instance see `needs`."""
     compensable: ClassVar[Compensable]
-    """States whether the effect is compensated, and why; see `is_compensable`."""
+    """Whether effects of this kind are compensated, and the reason; see `is_compensable`."""
     shape: ClassVar[tuple[Shape, ...]] = ()
     """Shape parameters, in which the error is non-linear; `columns` covers the linear parameters."""
 
@@ -142,7 +142,7 @@ class Effect(Law):
     ordinary_arcsec: ClassVar[float] = 0.0
     """Peak error that this cause, or an indistinguishable one, has on a healthy axis."""
     incidental: ClassVar[frozenset[str]] = frozenset()
-    """Names of coefficients that are no evidence of the cause, because they can be non-zero without it."""
+    """Names of coefficients that are not evidence of the cause, because they can be non-zero without it."""
     inexact: ClassVar[float] = 0.0
     """Fraction of the effect's mean square that may appear as a smaller instance, because a real effect
     deviates from its law."""
@@ -172,7 +172,7 @@ class Effect(Law):
         """Yields candidates of this kind for a record and the model ``base``, over their shape parameters.
 
         Their coefficients are arbitrary. By default, they are `candidate` with shape parameters on a grid
-        over their ranges. A model that lacks a part which the effect would scale has no candidate.
+        over their ranges. There is no candidate if the model lacks the part that the effect would scale.
         """
         if not set(cls.carries) <= {each.part for each in base} | {Part.GROWTH}:
             return
@@ -226,9 +226,9 @@ class Effect(Law):
     def changing(self, motion: Motion) -> FloatArray | None:
         """Returns test columns that must have zero coefficients if the effect is as its law states, (n, k).
 
-        Each column is either the change of the prediction if the coefficient changes by one from some
-        location of the record on, or a similar effect nearby. The effect must consist of one piece. Returns
-        None if such changes do not contradict the effect.
+        Each column is either the change of the prediction if the coefficient changes by one at some point of
+        the record and keeps the new value, or a similar effect nearby. The effect must have a single
+        component. Returns None if such changes do not contradict the effect.
         """
         return None
 
@@ -245,7 +245,7 @@ class Effect(Law):
         return None
 
     def largest_piece_arcsec(self) -> float:
-        """Returns the largest component's amplitude over its full range, of which a record may show a part.
+        """Returns the largest component's amplitude over its full range, even if a record covers only a part.
 
         Returns 0 for an effect that a record always shows in full.
         """
@@ -288,7 +288,7 @@ class Effect(Law):
         return None
 
     def found_in(self, effects: Sequence[Effect]) -> Effect:
-        """Returns the effect of this kind among ``effects``; this effect if no other is of its kind."""
+        """Returns the effect of this kind among ``effects``, or this effect itself if there is none."""
         return next((each for each in effects if type(each) is type(self)), self)
 
     def tidied(self, ratio: float) -> Self:
@@ -362,7 +362,7 @@ class Angleless(Momentary):
 def missing_channels(
     effects: Iterable[Effect], available: frozenset[Channel]
 ) -> dict[str, frozenset[Channel]]:
-    """Returns the missing channels of each effect, by name; empty if all channels are available.
+    """Returns the missing channels of each effect that lacks any, by the name of the effect.
 
     ``available`` is `Motion.available()` for a record, or the channels that a control loop can supply. Check
     this before the axis moves. On line, a missing channel raises no error, because a `Moment` has defaults.

@@ -99,7 +99,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class Compensable:
-    """States whether an effect is compensated, and why."""
+    """Whether effects of a kind are compensated, and the reason."""
 
     possible: bool
     why: str
@@ -119,7 +119,7 @@ class Coefficient:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretch:
-    """Samples that alone must show an effect, because other effects may imitate it in other samples."""
+    """Samples in which an effect must be visible, because elsewhere other effects may imitate it."""
 
     rows: BoolArray
     """Mask of the samples, shape (n,)."""

@@ -59,7 +59,7 @@ class Hysteresis(ElasticLoop):
         return _HysteresisTracker(self.offset_arcsec, width_deg, self.exponent, start, steepest)
 
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
-        """Returns the loop for an offset of 1 arcsec; only reversals need a Python loop."""
+        """Returns the hysteresis for an offset of 1 arcsec; vectorised except for a loop over branches."""
         path = path_of(motor_deg, start)
         value = float(start.value)
         values = []

@@ -78,7 +78,7 @@ class HysteresisMemory(ElasticLoop):
         return {}
 
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
-        """Returns the loop for an offset of 1 arcsec; only reversals need a Python loop."""
+        """Returns the hysteresis for an offset of 1 arcsec; vectorised except for a loop over branches."""
         # A saturated start implies a direction, but only reversals of the motion begin a branch here.
         way = path_of(motor_deg, start)
         turning, signs = way.turning, way.signs

@@ -101,7 +101,7 @@ class OrderSeries(HarmonicSum):
 
     usual = 2
     searched: ClassVar[Sequence[int]] = ()
-    """Orders that are proposed for a record, one by one."""
+    """Orders that are proposed for a record, each as a separate candidate."""
 
     def turns_per_motor_turn(self) -> float:
         """Returns c, the number of periods of order 1 per motor turn."""

@@ -9,7 +9,7 @@ from hdbridge.axis.effects.path import path_of
 def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:
     """Returns s[i] = clip(s[i-1] + 2 (theta[i] - theta[i-1]) / width, -1, 1), shape (n,), in linear time.
 
-    Between two reversals, clipping once suffices, so only the reversals need a Python loop.
+    Between two reversals, clipping once suffices, so the Python loop runs over the reversals only.
     """
     if not len(motor_deg):
         return np.empty(0)

@@ -89,5 +89,5 @@ class TorqueGrowth(Strict):
         return 1.0 + 0.01 * self.growth_percent_per_nm * self.load_at_nm(moment)
 
     def most(self) -> float:
-        """Returns the largest relative growth of the amplitudes, that at the torque limit."""
+        """Returns the largest relative growth of the amplitudes, which is reached at the torque limit."""
         return 0.01 * abs(self.growth_percent_per_nm) * self.limit_nm

@@ -36,7 +36,9 @@ class LeadFilter(Strict):
     def _check(self) -> Self:
         first, second = (*self.feedback, 0.0, 0.0)[:2]
         if not abs(first) < 1.0 + second < 2.0:
-            raise ValueError(f"feedback {list(self.feedback)} is not stable: measure the response again")
+            raise ValueError(
+                f"the feedback {list(self.feedback)} makes the filter unstable; measure the response again"
+            )
         found, wanted = math.fsum(self.weights), 1.0 + math.fsum(self.feedback)
         if not math.isclose(found, wanted, abs_tol=1e-6):
             raise ValueError(f"the weights sum to {found:.6g}; expected {wanted:.6g}")

@@ -92,9 +92,10 @@ def run_checks(
 ) -> list[Row[P]]:
     """Runs the checks in order; ``notify`` receives each row as soon as it is complete.
 
-    A check whose dependencies have not passed is not possible. ``permitted`` is called once, before the first
-    check that moves the axis; a returned text is the reason for not moving. An `HdbridgeError` is a failure
-    of the check that raised it; all other exceptions propagate.
+    A check whose dependencies have not all passed is not run; its outcome is `Outcome.NOT_POSSIBLE`.
+    ``permitted`` is called once, before the first check that moves the axis; if it returns a text, no check
+    moves the axis, and the text is given as the reason. A check that raises an `HdbridgeError` has failed;
+    all other exceptions propagate.
     """
     rows: list[Row[P]] = []
     outcomes: dict[str, Outcome] = {}

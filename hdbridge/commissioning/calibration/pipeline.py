@@ -289,7 +289,7 @@ def concluded(folder: Path) -> Calibration:
         model = TransmissionModel.load(folder / MODEL_NAME)
     except (ValueError, KeyError, TypeError, OSError):
         raise InputError(
-            f"{path}: not the result of a calibration; restore it, or remove it and report without it"
+            f"{path}: not a calibration result; restore the file, or delete it to report without it"
         ) from None
     return replace(result, model=model, validation=validation, motion=motion, offer=offer)
 

@@ -29,8 +29,8 @@ CONNECTIONS_MAXIMUM: Final = 256
 """Maximum number of connections per listener. It exceeds the limits of requests and WebSockets in progress,
 whose connections are never closed for others."""
 ACCEPTED_AT_ONCE: Final = 64
-"""Connections accepted at once. Fewer than `CONNECTIONS_MAXIMUM`, so that a request that arrives with its
-connection is read before the connection can be closed in favour of others."""
+"""Number of connections accepted at once. It is less than `CONNECTIONS_MAXIMUM`, so that a request that
+arrives with its connection is read before the connection can be closed in favour of others."""
 HEAD_S: Final = 10.0
 """Time-out for receiving the head of a request."""
 HEAD_BYTES: Final = 16 << 10
@@ -66,7 +66,7 @@ class ApiServer:
         return all(server.started for server, _ in self._servers)
 
     async def run(self) -> None:
-        """Serves until `stop` or cancellation; open requests have a moment to complete."""
+        """Serves until `stop` or cancellation; open requests are given a short time to complete."""
         # At DEBUG the server's libraries log headers, including the token.
         for name in ("uvicorn", "uvicorn.error", "websockets"):
             logging.getLogger(name).setLevel(logging.WARNING)

@@ -116,7 +116,7 @@ def _clear(path: Path) -> None:
     except OSError:
         return
     if not stat.S_ISSOCK(mode):
-        raise InputError(f"{path}: is not a socket; expected the path of one, or a free one")
+        raise InputError(f"{path}: not a socket; expected a socket, or a path that does not exist yet")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(1.0)
         try:

@@ -39,13 +39,13 @@ ONE_WAY_TURNS = 4.0
 """Multiple of `Excitation.turns` at which a window with too few reversals is complete. It updates only the
 terms without hysteresis."""
 CLEAR_WINDOWS = 3
-"""Consecutive plausible windows that end a freeze."""
+"""Number of consecutive plausible windows that end a freeze."""
 REVERTED_WINDOWS = 3
 """Number of windows before a fault whose updates are reverted."""
 RATE_INTERVALS = 2.0
 """Maximum number of update intervals that count for the rate limit after a pause."""
 MIN_RATE_LIMITED_SHARE = 0.99
-"""Share of the permitted change per interval from which a change is applied, even below
+"""Fraction of the permitted change per interval from which a change is applied, even below
 `AdaptationSettings.smallest_arcsec`."""
 GATE_SIGMAS = 6.0
 """Maximum deviation of an observation from the model, in standard deviations."""
@@ -119,12 +119,12 @@ class Adaptation:
         self._now_s = 0.0
         self._window: list[Observation] = []
         self._zero_arcsec: float | None = None
-        """Zero when it was learned."""
+        """Zero as it was learned; None until then."""
         self._plausible_windows = 0
         self._previous_estimates: deque[tuple[FloatArray, FloatArray]] = deque(maxlen=REVERTED_WINDOWS)
         """Estimates and covariances before each of the last windows."""
         self._learning_since_s: float | None = None
-        """Begin of the first window learned since the start or the last freeze; None before."""
+        """Start of the first window learned since the start or the last freeze; None before."""
         self._window_s: float | None = None
         """End of the last window, used or not."""
         self._proposed = self._used = np.zeros(drift.zero)
@@ -164,7 +164,8 @@ class Adaptation:
             self._reset_zero()
             self._unfreeze("by command")
         if mode != self.mode:
-            # Changes that were only observed are not applied at once: start from the model in use.
+            # Changes estimated in the mode "observe" must not be applied suddenly, so start from the model in
+            # use.
             self._refined_s = self._now_s
             self._proposed, self._changed_s = self._used, self._now_s
             if self.mode == "off":
@@ -186,7 +187,7 @@ class Adaptation:
 
     @property
     def may_refine(self) -> bool:
-        """False if the adaptation is off or frozen, or the last refinement of the response too recent."""
+        """False if the adaptation is off or frozen, or if the response was refined too recently."""
         recent = self._now_s - self._refined_s < self.settings.interval_s
         return not (self.mode == "off" or self.freeze_reason is not None or recent)
 
@@ -436,7 +437,7 @@ class Adaptation:
         return Proposal(model, changes, apply, self._now_s)
 
     def _changed(self, change: FloatArray) -> TransmissionModel:
-        """Returns the committed model with changed coefficients and their present intervals."""
+        """Returns the committed model with changed coefficients and their current intervals."""
         response = self.model.response
         if not np.any(change):
             return replace(self.committed, response=response)

@@ -30,7 +30,7 @@ EXCITED = 1.0
 """Information of a batch along a direction, in units of 1 / scale^2, above which the direction counts as
 excited."""
 RANK_TOLERANCE = 1e-12
-"""Eigenvalue, as a share of the largest, below which a direction counts as unobserved."""
+"""Eigenvalue, relative to the largest, below which a direction counts as unobserved."""
 DISC_ARCSEC = 10.0
 """Expected size of the load encoder's own errors per turn."""
 ZERO_ARCSEC = 1000.0

@@ -43,7 +43,7 @@ NEEDED: Final = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN
 SAVE_S: Final = 300.0
 """Maximum interval in axis time between stores of a changing state."""
 LEAST_CHANGE: Final = 0.01
-"""Smallest reported change of the response in motion, as a share."""
+"""Smallest relative change of the response in motion that is reported."""
 UNIFORM: Final = 12.0**0.5
 """Range of a uniform distribution, relative to its standard deviation."""
 

@@ -51,7 +51,7 @@ SIDE = 5
 MEDIAN_ERROR = 1.25
 """Standard deviation of a median of few values, relative to that of their mean."""
 PREDICTED_SHARE = 0.5
-"""Share of the predicted change within a window that may appear too early or too late."""
+"""Fraction of the predicted change within a window that may appear too early or too late."""
 UNMODELLED_ARCSEC = 20.0
 UNMODELLED_DEG = 36.0
 """Motor travel of the largest unmodelled change of the gear's error: an order of 10 per turn with an
@@ -70,25 +70,26 @@ BLOCK_S = 0.25
 BLOCK_SAMPLES = 20
 """Minimum duration and number of samples of a block."""
 SETTLE_S = 0.1
-"""Time in which the load's oscillation after the start or end of a motion fades."""
+"""Time in which the load's oscillation decays after the start or end of a motion."""
 LEARNING_BLOCKS = 40
 """Number of blocks after which the usual jitter counts as known."""
 MAX_LEARNING_BLOCKS = 480
 """Maximum number of blocks for the usual jitter; later ones might include a slow fault."""
 NOISY_BLOCKS = 3
-"""Number of consecutive noisy blocks that count as a fault; fewer may be a knock against the machine."""
+"""Number of consecutive noisy blocks that count as a fault; fewer may be due to a knock."""
 UNTESTED_ARCSEC = 3.0
 """Assumed residual of a model without a held-out result."""
 SIGMAS = 8.0
-"""Standard deviations of noise that no reading exceeds: probability 1e-15."""
+"""Maximum deviation of a reading due to noise, in standard deviations; a larger one has a probability of
+1e-15."""
 NOISE_RATIO = 4.0
 """Maximum ratio of jitter to its usual value. Normal is 1; a damaged track results in 10."""
 SPIKES = 3
-"""Minimum number of readings that jump there and back within ten seconds for a fault."""
+"""Minimum number of readings within ten seconds that jump away and back, for a fault."""
 FROZEN_ARCSEC = 120.0
 """Load travel within which the reading must change; more than any backlash."""
 FROZEN_COUNTS = 20.0
-"""Minimum of that travel, in counts of the load encoder."""
+"""Lower limit of this travel, in counts of the load encoder."""
 RECOVERED_S = 10.0
 """Duration of good readings that ends a fault."""
 STANDING_DEG_S = 1e-6
@@ -173,7 +174,7 @@ class Jump(NamedTuple):
 def find_jump(
     found: Residuals, steps_arcsec: FloatArray, noise_arcsec: float, count_arcsec: float, swing_s2: float
 ) -> Jump | None:
-    """Returns the first step of the residual that neither noise nor motion nor model can cause.
+    """Returns the first step of the residual that noise, motion and model errors cannot explain.
 
     ``noise_arcsec`` is the standard deviation of one reading, ``count_arcsec`` a motor encoder count at the
     load, ``swing_s2`` the largest step per acceleration.
@@ -313,11 +314,11 @@ class EncoderHealth:
         self._tail: SampleArray | None = None
         """Last samples, which are evaluated again with the next ones."""
         self._constant: tuple[float, float] | None = None
-        """Load reading that does not change, and the motor angle since when."""
+        """Latest constant load reading, and the motor angle at its first sample."""
         self._pending: dict[bool, list[Residuals]] = {True: [], False: []}
         """Samples of the incomplete blocks at rest (True) and in motion (False)."""
         self._since = (True, -math.inf)
-        """True at rest, and the time since when."""
+        """True at rest, False in motion; and the time at which this state began."""
 
     def take(self, samples: SampleArray) -> EncoderStatus:
         """Judges the next samples of the loop, oldest first: a tenth of a second or more at a time."""
@@ -352,7 +353,7 @@ class EncoderHealth:
         return max(typical, 0.3 * self._load_count_arcsec)
 
     def set_fault(self, fault: EncoderFault, why: str) -> EncoderStatus:
-        """Sets a fault and returns the state; a latched fault replaces one that is not."""
+        """Sets a fault and returns the state; a latched fault replaces one that is not latched."""
         self._bad_s = self._now_s
         if self.status.fault is None or (fault in LATCHED and self.status.fault not in LATCHED):
             self.status = EncoderStatus(fault, f"load encoder {fault.value}: {why}")

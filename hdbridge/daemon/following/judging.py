@@ -61,7 +61,7 @@ ORDER_ARCSEC: Final = 0.8
 """Smallest relevant change of the orders, at the load."""
 LOOP_ARCSEC: Final = 1.5
 LOOP_SHARE: Final = 3.0 * Scales().calibrated
-"""Smallest relevant change of a hysteresis loop: the larger of `LOOP_ARCSEC` and this share of the loop."""
+"""Smallest relevant change of a loop: the larger of `LOOP_ARCSEC` and this fraction of the loop."""
 ZERO_ARCSEC: Final = 5.0
 """Smallest relevant change of the zero: the smallest effect of warming up (`effects.zero_drift`)."""
 MIN_RESIDUAL_ARCSEC: Final = 0.5
@@ -71,7 +71,7 @@ MAX_OBSERVATIONS: Final = 600
 MIN_EXTRA_PLACES: Final = 20
 """Number of places required in addition to one per column."""
 CLEAR_SHARE: Final = 0.8
-"""Share of a limit below which a value is clearly under it."""
+"""Fraction of a limit below which a value counts as clearly within the limit."""
 TREND_ARCSEC: Final = 60.0
 """Scale of the zero's trend, from the middle of the observations to one end."""
 REPORTED_SHARE: Final = 0.02
@@ -125,7 +125,7 @@ class Evidence:
     rms_arcsec: float
     """Rms difference of measured and predicted error about its zero."""
     allowed_arcsec: float
-    """Upper limit of that difference by noise and the model's intervals."""
+    """Upper limit of that difference, given the noise and the model's intervals."""
     residual_arcsec: float
     """Rms residual with every part of the model free to change."""
     residual_limit_arcsec: float
@@ -251,7 +251,7 @@ class Watch:
         return self._adopts(evidence.verdict(self._adopted), passed_s)
 
     def _adopts(self, verdict: Verdict, passed_s: float) -> bool:
-        """Takes the present verdict and the time since the last; returns True once it has persisted."""
+        """Takes the current verdict and the time since the last test; returns True once it has persisted."""
         if verdict is self._adopted or verdict is not self._other:
             self._other, self._persisted_s = verdict, 0.0
         if verdict is self._adopted:

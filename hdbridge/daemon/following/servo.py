@@ -83,9 +83,9 @@ class ServoWatch:
         return sum(now[each] for each in both) > sum(before[each] for each in both)
 
     def refined(self, bound: float) -> Response | None:
-        """Returns a response that leaves less load error than the present one; None if uncertain.
+        """Returns a response that leaves less load error than the current one; None if uncertain.
 
-        ``bound`` limits the deviation from the committed response, as a share.
+        ``bound`` limits the relative deviation from the committed response.
         """
         if self._answers is None or self._committed is None or len(self._answers.lags_ms) < MIN_RUNS:
             return None
@@ -93,7 +93,7 @@ class ServoWatch:
         return self._answers.refined(self._committed, self._limits, bound, retuned=changed)
 
     def take(self, axis: NDArray[Any], *, contiguous: bool, encoder_trusted: bool) -> str | None:
-        """Takes the next samples of the axis; returns the evidence if the verdict changes.
+        """Processes the next samples of the axis; returns the evidence if the verdict changes.
 
         ``contiguous`` is False if cycles are missing before or within the samples, ``encoder_trusted``
         during a fault of the load encoder.

@@ -44,7 +44,7 @@ LEARNED_MIN: Final = 0.5
 FREE_COLUMNS: Final = 4
 """Number of columns without a known range: time, step, zero, and one for the speed."""
 COUNTS_SHARE: Final = 0.3
-"""Minimum noise of an observation (a mean), as a share of the quantisation noise of a single sample."""
+"""Minimum noise of an observation (a mean), as a fraction of the quantisation noise of a single sample."""
 SPEED_ARCSEC: Final = 5.0
 """Expected size of the error proportional to speed, at the highest speed of the span."""
 STEP_ARCSEC: Final = 6.0
@@ -133,7 +133,7 @@ class Zero:
         return self._step_fault(time_s, rows, error_arcsec) or self._drift_fault()
 
     def _rows(self, time_s: FloatArray) -> FloatArray:
-        """Returns minutes from the middle, share of the highest speed, and the columns of `DriftModel`."""
+        """Returns minutes from the middle, fraction of the highest speed, and the columns of `DriftModel`."""
         speed = np.array([each.speed_deg_s for each in self._recent])
         columns = np.array([each.row for each in self._recent])
         share = speed / max(float(np.max(np.abs(speed))), 1e-9)

@@ -63,7 +63,7 @@ _PDOS: Final[Mapping[str, int | str]] = {
 The statusword is also sent every 50 ms, for masters that expect it periodically."""
 _UINT32_MAX: Final = 0xFFFF_FFFF
 _FOLLOWING_TIME_S: Final = 0.2
-"""Default of 6065h as travel time at the highest speed."""
+"""Default of 6065h (following error window), as a travel time at the highest speed."""
 
 
 def nameplate(axis: AxisConfig, settings: GatewaySettings) -> Nameplate:

@@ -34,9 +34,9 @@ ALIVE_S: Final = 0.1
 
 
 class SimulatedClock:
-    """Virtual clock of simulated drives: time of the last turn of the loop, plus the time since then.
+    """Virtual clock of simulated drives: time of the control loop's last cycle, plus the time since then.
 
-    It waits for a late loop, but not for a loop whose process is gone.
+    It waits for a late control loop, but not for one whose process has ended.
     """
 
     def __init__(self, memory: Memory, speed: float) -> None:

@@ -46,7 +46,7 @@ lost.
 
 Its node id is that of the machine file."""
 DEAD_S: Final = 0.3
-"""Time without a turn after which the control loop counts as hung or dead."""
+"""Time without a cycle after which the control loop counts as hung or dead."""
 POWER_S: Final = 5.0
 """Time-out of the service and the inner drive for switching power on."""
 VELOCITY_S: Final = 0.02

@@ -1,4 +1,4 @@
-"""Trace of the other master on the outer bus: its configuration, its actions and its mistakes.
+"""Trace of the master on the outer bus: its configuration, its actions and its mistakes.
 
 It takes frames and returns lines, without I/O. It sends nothing, so it may observe a bus in operation or read
 a bus log.
@@ -96,7 +96,7 @@ class Trace:
         """Number of occurrences of each piece of advice."""
         self._begun_s: float | None = None
         self._time_s = 0.0
-        """Time of the present frame."""
+        """Time of the current frame."""
         self._lines: list[Line] = []
 
     # ---------------------------------------------------------------- frames

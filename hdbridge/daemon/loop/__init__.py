@@ -1,1 +1,1 @@
-"""The control process: one thread, one bus, one turn per cycle."""
+"""The control process: one thread, one bus, and one iteration of the loop per cycle."""

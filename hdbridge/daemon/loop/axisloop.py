@@ -1,9 +1,9 @@
 """One axis in the control loop: its state, the commands it accepts and the events it reports.
 
-`AxisLoop.command` takes the service's commands between two turns. `AxisCycle` requests a target in each turn
-in which the drive is enabled. The state determines which function provides the target (`_enabling`,
-`Follower.follow` or `_follow_gateway`), so the turn itself makes no decision. `AxisLoop.after` evaluates
-the result of the turn.
+`AxisLoop.command` takes the service's commands between two cycles. `AxisCycle` requests a target in each
+cycle in which the drive is enabled. The state determines which function provides the target (`_enabling`,
+`Follower.follow` or `_follow_gateway`), so the cycle itself makes no decision. `AxisLoop.after` evaluates the
+result of the cycle.
 """
 
 import math
@@ -32,7 +32,7 @@ _MULTI_TURN_COMMANDS: Final = {
     CommandKind.ENABLE: (AxisState.ENABLING, AxisState.ENABLED),
     CommandKind.DISABLE: (AxisState.STOPPING, AxisState.DISABLED),
 }
-"""State while a command that takes several turns is pending, and the state that completes it."""
+"""State while a command that takes several cycles is pending, and the state that completes it."""
 _POWER_INDEX: Final = {state: place for place, state in enumerate(State)}
 # Plain integers: combining enum flags would cost more than the rest of the sample.
 _FRESH, _COMPENSATING, _LIMITED, _MEMORY_KNOWN, _CHANGING, _AT_REST, _UNDERRUN, _DOUBTED, _KNOWN0, _KNOWN1 = (
@@ -52,7 +52,7 @@ class AxisLoop:
         report: Report,
         due_s: Callable[[], float],
     ) -> None:
-        """``index`` is its place in ``memory``; ``due_s`` returns the due time of the present turn."""
+        """``index`` is its place in ``memory``; ``due_s`` returns the due time of the current cycle."""
         self.index = index
         self.config = config
         self.state = AxisState.UNVERIFIED
@@ -88,13 +88,13 @@ class AxisLoop:
         self._mode = MotionMode.HOLD
         self._powering_off = False
         self._turns_left = 0
-        """Number of turns left before the drive's time-out."""
+        """Number of cycles left before the drive's time-out."""
         self._why = ""
         """Reason for stopping, if the supervision did not report one."""
         self.stop_reported = True
         """True if the axis is at rest and its stop was reported; False only in QUICK_STOPPED and LATCHED."""
         self._last_counts = self._still_turns = 0
-        """Motor counts in the last turn of a stop, and the number of consecutive turns at standstill."""
+        """Motor counts in the last cycle of a stop, and the number of consecutive cycles at standstill."""
         self._handlers: dict[CommandKind, Callable[[Command], None]] = {
             CommandKind.VERIFIED: self._verified,
             CommandKind.RELEASE: self._silence,
@@ -113,7 +113,7 @@ class AxisLoop:
             CommandKind.DRIVE_FAULT_RESET: lambda _: self.image.power.reset_fault(),
         }
 
-    # ---------------------------------------------------------------- commands, between two turns
+    # ---------------------------------------------------------------- commands, between two cycles
 
     def command(self, command: Command) -> None:
         """Carries out a command, or refuses it and changes nothing; reports either to the service."""
@@ -134,12 +134,12 @@ class AxisLoop:
         self._enter(target)
 
     def check(self, kind: CommandKind) -> None:
-        """Raises TransitionError if a command is not possible in the present state."""
+        """Raises TransitionError if a command is not possible in the current state."""
         if target_of(self.state, kind) is None:
             raise TransitionError(f"{self.config.name}: {refusal(self.state, kind)}")
 
     def begin_stream(self, command: Command, group: frozenset[int]) -> None:
-        """Follows knots from the next turn on, together with the other axes of ``group``.
+        """Follows knots from the next cycle on, together with the other axes of ``group``.
 
         Raises InputError if the axis is in motion or the time-out is invalid.
         """
@@ -272,7 +272,7 @@ class AxisLoop:
         velocity = None if math.isnan(command.b) else command.b
         acceleration = None if math.isnan(command.c) else command.c
         self.set_point.goto(command.a, velocity, acceleration)
-        # A move to the present position ends within a turn; its end is reported as well.
+        # A move to the current position ends within one cycle; its end is reported as well.
         self._motion_id, self._mode = command.id, MotionMode.GOTO
 
     def _jog(self, command: Command) -> None:
@@ -338,17 +338,17 @@ class AxisLoop:
             self.cycle.command = self._follow
         return None
 
-    # ---------------------------------------------------------------- before and after each turn
+    # ---------------------------------------------------------------- before and after each cycle
 
     def before(self) -> None:
-        """Prepares the turn: feeds the next knots of a stream to the set-point."""
+        """Prepares the next cycle: feeds the next knots of a stream to the set-point."""
         refusal_ = self._feed.feed()
         if refusal_ is not None:
             self._report(EventKind.STREAM_REFUSED, self._motion_id, 0, refusal_)
             self._break_group()
 
     def after(self) -> None:
-        """Evaluates the turn: reports faults and ended motions, and makes the resulting transitions."""
+        """Evaluates the last cycle: reports faults and ended motions, and makes the resulting transitions."""
         self._faults.report()
         supervision = self.supervision
         if supervision.stop is not None:
@@ -451,10 +451,10 @@ class AxisLoop:
             self._request_power_off()
         return True
 
-    # ---------------------------------------------------------------- the sample of a turn
+    # ---------------------------------------------------------------- the sample of a cycle
 
     def sample(self) -> tuple[float, ...]:
-        """Returns the fields of `layout.Axis` for the turn that has just ended."""
+        """Returns the fields of `layout.Axis` for the cycle that has just ended."""
         image, feedback, follower = self.image, self.cycle.feedback, self.follower
         state, set_point, motor_deg = self.state, self.set_point, self._motor_deg
         position_deg = motor_deg * feedback.motor_counts

@@ -1,4 +1,5 @@
-"""The control loop of one machine, one cycle per turn. Clock, bus and memory are passed in.
+"""The control loop of one machine; each call of `Controller.turn` runs one cycle. Clock, bus and memory are
+passed in.
 
     commands - knots - [wait - SYNC - TPDOs - judge - targets - RPDOs - service's frame] - states - sample
 
@@ -63,7 +64,7 @@ class Controller:
         for axis in self.axes:
             cycle.join(axis.cycle)
         self.ended = False
-        """True once `end` has switched all axes off, or has timed out; no more turns are due."""
+        """True once `end` has switched all axes off, or has timed out; no further cycles are due."""
 
         self._reopen = reopen
         self._axis_of_node = {node: axis for axis in self.axes for node in axis.config.nodes}
@@ -85,7 +86,7 @@ class Controller:
             followed.clear()
         memory.status[Cell.LOOP_PID] = os.getpid()
 
-    # ---------------------------------------------------------------- a turn
+    # ---------------------------------------------------------------- one cycle
 
     def turn(self) -> None:
         """Runs one cycle. Does not raise errors of the bus or the service."""

@@ -36,7 +36,7 @@ class FaultLog:
         """Last cycle and most severe reported reaction of each fault."""
 
     def report(self) -> None:
-        """Reports the new faults since the last turn."""
+        """Reports the new faults since the last cycle."""
         supervision = self._supervision
         if supervision.noted == self._noted:
             return

@@ -9,33 +9,33 @@ from hdbridge.errors import InputError
 from hdbridge.motion import SetPoint
 
 KNOTS_PER_TURN: Final = 4
-"""Number of knots passed to the set-point before each turn."""
+"""Number of knots passed to the set-point before each cycle."""
 STALE_KNOTS_PER_TURN: Final = 64
-"""Number of knots of other streams discarded before each turn."""
+"""Number of knots of other streams discarded before each cycle."""
 OUTER_KNOTS_PER_TURN: Final = 64
 LONGEST_SPACING_S: Final = 0.05
 BRIDGED_SHARE: Final = 0.2
-"""Time for which a moving axis keeps its speed without a set-point, as a share of the time-out at rest."""
+"""Time for which a moving axis keeps its speed without a set-point, as a fraction of the time-out at rest."""
 FIRST_KNOT_S: Final = 2.0
-"""Maximum time from the beginning to the first set-point."""
+"""Maximum time from `OuterFeed.begin` to the first set-point."""
 
 
 class KnotFeed:
     """Passes the knots of a client's stream to the set-point of one axis; idle until a stream begins.
 
     Stream numbers increase. Knots of an ended stream are discarded. Knots of a later stream wait until it
-    begins, because the service may queue them shortly before the present stream ends.
+    begins, because the service may queue them shortly before the current stream ends.
     """
 
     def __init__(self, knots: Queue[Knot], set_point: SetPoint) -> None:
         self._knots, self._set_point = knots, set_point
         self._stream = 0
-        """Number of the present stream, or of the last one."""
+        """Number of the current stream or, without one, of the last stream."""
         self._following = False
         self._ending = False
 
     def begin(self, stream: int, timeout_s: float) -> None:
-        """Follows the knots of this stream from the next turn on.
+        """Follows the knots of this stream from the next cycle on.
 
         Raises InputError if the axis is in motion, the time-out is invalid, or the number is not above the
         last number.
@@ -84,8 +84,8 @@ class OuterFeed:
     """Set-points of the outer master for one axis, with linear motion between them (CiA 402).
 
     A late set-point is bridged at the speed of the last two, because the gateway process has no real-time
-    priority. An axis at rest waits for longer. Set-points of another series are dropped, so none from before
-    an interruption takes effect.
+    priority. At rest the axis waits longer. Set-points of another series are dropped, so none from before an
+    interruption takes effect.
     """
 
     def __init__(self, knots: Queue[OuterKnot]) -> None:
@@ -126,7 +126,7 @@ class OuterFeed:
         return self._last_deg + rate * (time_s - self._last_s) if rate else self._last_deg
 
     def _take(self, time_s: float, due_s: float, position_deg: float) -> None:
-        """Continues with the next set-point; the first is approached from the present time."""
+        """Continues with the next set-point; the motion to the first one starts at the current time."""
         begin_s = time_s if self._last_s == -math.inf else self._last_s
         length_s, step_deg = due_s - begin_s, position_deg - self._last_deg
         self._last_s, self._last_deg = due_s, position_deg

@@ -1,8 +1,8 @@
-"""Target of an enabled axis in each turn: set-point, load loop, compensation, motor counts.
+"""Target of an enabled axis in each cycle: set-point, load loop, compensation, motor counts.
 
 load target -> + load loop -> inverse of the model -> motor counts -> checked against the last counts
 
-`Follower.begin` starts all of these at the actual position. `Follower.follow` is called once per turn.
+`Follower.begin` starts all of these at the actual position. `Follower.follow` is called once per cycle.
 """
 
 import math
@@ -30,7 +30,7 @@ _AT_REST: Final = Moment()
 
 
 class Follower:
-    """Computes the target of one axis, turn by turn; uncompensated until `use`."""
+    """Computes the target of one axis, cycle by cycle; uncompensated until `use`."""
 
     def __init__(self, config: AxisConfig, load_loop: LoadLoopSettings | None, image: ProcessImage) -> None:
         view = axis_view(config)
@@ -39,7 +39,7 @@ class Follower:
         self.compensating = False
         """True if the correction is faded in or fading in."""
         self.target_deg = 0.0
-        """Load target of the last turn, without the load loop's correction."""
+        """Load target of the last cycle, without the load loop's correction."""
         self.loop_arcsec = 0.0
         """Correction by the load loop."""
         self.sensed = ChannelState(config)
@@ -82,7 +82,7 @@ class Follower:
         if self._load_loop is not None:
             self._load_loop.use_models(setting.adapted or setting.model, self.correction.model)
 
-    # ---------------------------------------------------------------- turn by turn
+    # ---------------------------------------------------------------- cycle by cycle
 
     def begin(self, feedback: Feedback) -> None:
         """Starts set-point, compensation and load loop at the actual position, at rest.
@@ -148,7 +148,7 @@ class Follower:
 
     @property
     def loop_doubt(self) -> str:
-        """Reason for which the load loop does not act; empty while it may act."""
+        """Reason why the load loop does not act; empty while it may act."""
         return self._load_loop.doubt if self._load_loop is not None else ""
 
     def _with_load_loop(self, load_loop: LoadLoop, target_deg: float, feedback: Feedback) -> float:

@@ -1,6 +1,6 @@
 """The control process: ``python -m hdbridge.daemon.loop.process FD``, started by the keeper.
 
-It has one thread, one bus and the shared memory. All memory is allocated before the first turn. While the
+It has one thread, one bus and the shared memory. All memory is allocated before the first cycle. While the
 loop runs, the process opens no files, writes no log and makes no SDO transfers of its own.
 """
 

@@ -100,7 +100,7 @@ class Status(Cells):
 
     @property
     def loop_count(self) -> int:
-        """Number of turns of the loop, summed over all control processes so far."""
+        """Number of cycles of the loop, summed over all control processes so far."""
         return self[Cell.LOOP_COUNT]
 
     @property

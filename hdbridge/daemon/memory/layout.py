@@ -73,7 +73,7 @@ class CommandKind(IntEnum):
     VERIFIED = 1
     """i motor counts, j load counts, k statusword. The drive is verified; its RPDO may be sent."""
     RELEASE = 2
-    """Returns to unverified: no RPDO."""
+    """Returns the axis to the unverified state; the loop sends it no RPDO."""
     LEND = 3
     """Stops the RPDO until UNLEND, while the service controls the drive by SDO."""
     UNLEND = 4

@@ -1,7 +1,7 @@
 """Reading of flight recordings, finished or not, up to their last complete chunk.
 
 The recorder may be active in the same folder. It renames a file when it is finished or kept, and removes old
-files. A recording is found under its present name as long as it exists.
+files. A recording is found under its current name as long as it exists.
 """
 
 import json
@@ -60,7 +60,7 @@ class Flight:
     """Content of one file, or its summary."""
 
     path: Path
-    """Present name."""
+    """Current name."""
     about: About
     finished: bool
     """True if the file has its index; else it was cut off or is being written."""
@@ -213,7 +213,7 @@ def overview(path: Path) -> Flight:
 
 
 def _opened(path: Path) -> tuple[Path, BinaryIO]:
-    """Opens a recording; returns its present name and the open file."""
+    """Opens a recording; returns its current name and the open file."""
     for place in _places(path):
         try:
             return place, open_regular(place)

@@ -60,7 +60,8 @@ class ServiceAxis:
         self.stopped: tuple[Event, datetime] | None = None
         """Last stop and its time of day, once the axis is at rest; None before."""
         self.loop_doubt = "the reason is in the log of an earlier service"
-        """Text of the last event of the load loop."""
+        """Reason why the load loop does not act, from its last event; a placeholder before the first
+        event."""
         self.following: Following | None = None
         """Watch and adaptation; None without."""
         self._report = report
@@ -156,7 +157,7 @@ class ServiceAxis:
             await self._rest()
 
     def cancel_activity(self, why: str) -> None:
-        """Ends the present activity and interrupts SDO requests to the drive; a homing axis stops."""
+        """Ends the current activity and interrupts SDO requests to the drive; a homing axis stops."""
         self.motion.replace(None, why)
         self.commissioning.interrupt(f"{self.name}: {why}")
 
@@ -315,6 +316,6 @@ class ServiceAxis:
         return await self._work(self.commissioning.write, object_, value)
 
     async def close(self) -> None:
-        """Ends queue and SDO access; the axis completes its present motion."""
+        """Ends queue and SDO access; the axis completes its current motion."""
         await self.motion.close()
         self.commissioning.close()

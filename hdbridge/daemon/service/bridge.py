@@ -4,14 +4,14 @@
         ...
 
 Everything runs in one event loop. The axes do not depend on this process. If it dies, they complete their
-present commands, and the next service process takes them over in their present state.
+current commands, and the next service process takes them over in their current state.
 
 Angles are load angles in degrees, speeds in deg/s. ``holder`` is the lease token. All coroutines of machine
 and axes raise an `HdbridgeError` whose text is one line with the cause and the remedy:
 
     InputError      a value is invalid: outside the limits, not finite, no such model or object
     RefusedError    not possible in this state: not enabled, in motion, the bus is lent, a fault is latched
-    LeaseError      ``holder`` is not the token of the present lease
+    LeaseError      ``holder`` is not the token of the current lease
     DriveError      the drive refuses the request or does not answer
     SafetyStop      the supervision stopped the axis during the call
     BusError        the CAN interface is gone
@@ -91,7 +91,7 @@ class ServiceBridge:
         self.core.lease.doing = self._doing
 
     def _doing(self) -> str:
-        """Describes the present motions for a client without the lease."""
+        """Describes the current motions for a client without the lease."""
         states = [axis.state() for axis in self.axes.values()]
         return "; ".join(
             f"axis '{each.name}' is in motion ({each.mode})" for each in states if each.mode != "hold"
@@ -105,7 +105,7 @@ class ServiceBridge:
     # ---------------------------------------------------------------- begin and end
 
     async def __aenter__(self) -> Self:
-        """Takes over every axis in its present state and monitors all of them from now on.
+        """Takes over every axis in its current state and monitors all of them from now on.
 
         Returns once the control process compensates each axis by its setting, or does not answer.
         """
@@ -128,7 +128,7 @@ class ServiceBridge:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Stops monitoring; the axes complete their present commands."""
+        """Stops monitoring; the axes complete their current commands."""
         for task in tuple(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -307,7 +307,7 @@ class ServiceBridge:
     async def coordinated(
         self, holder: str, moves: Mapping[str, float], speed: float = 1.0, wait: bool = True
     ) -> None:
-        """Moves several axes so that all begin and end together; ``speed`` is a share of the limits."""
+        """Moves several axes so that all begin and end together; ``speed`` is a fraction of the limits."""
         if not moves:
             raise InputError("a coordinated move without an axis; expected a target for at least one")
         for name in moves.keys() - self.axes.keys():

@@ -57,10 +57,10 @@ class RelayBus(can.BusABC):
         self._nodes = nodes
         self._waiting: deque[RelayedFrame] = deque()
         self._interruption = ""
-        """Reason for which the present operation is to fail; empty without one."""
+        """Reason with which the current operation is to fail; empty if it is not to fail."""
 
     def interrupt(self, reason: str) -> None:
-        """Makes the present operation fail at its next wait, once, with ``reason``."""
+        """Makes the current operation fail at its next wait, once, with ``reason``."""
         self._interruption = reason
 
     def begin(self) -> None:
@@ -179,7 +179,7 @@ class Commissioning:
             return self._seeds(positions)
 
     def interrupt(self, reason: str) -> None:
-        """Interrupts the present request with this reason; a homing axis stops. Thread-safe."""
+        """Interrupts the current request with this reason; a homing axis stops. Thread-safe."""
         if self._busy.locked():
             self.bus.interrupt(reason)
 

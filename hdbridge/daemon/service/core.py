@@ -12,8 +12,8 @@ from hdbridge.daemon.service.timing import POLL_S, Timing
 from hdbridge.errors import DaemonError, RefusedError
 
 ANSWER_S: Final = 5.0
-"""Time-out of an answer. The control process normally answers within a few cycles, but to ENABLE and DISABLE
-only on completion."""
+"""Time-out of an answer. The control process normally answers within a few cycles, but answers ENABLE and
+DISABLE only on completion."""
 
 
 class Arguments(TypedDict, total=False):
@@ -39,7 +39,7 @@ class Core:
         self.lease = Lease(lease_s, timing.clock.now)
         self.refuse: Callable[[CommandKind | None], None] = lambda _: None
         """Raises RefusedError if the bus is lent and no command (None: no frame) can be sent."""
-        # Start from the present time, so that the numbers differ from those of an earlier service.
+        # Start from the current time, so that the numbers differ from those of an earlier service.
         self._streams = count(int(1000.0 * timing.clock.now()) + 1)
 
     def next_stream(self) -> int:

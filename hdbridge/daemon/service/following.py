@@ -53,7 +53,7 @@ class Following:
         self.state = messages.AdaptationState(mode=messages.AdaptationMode(settings.mode))
         """State of the adaptation."""
         self.advice: list[str] = []
-        """Present verdict of the watch unless the model is valid; the reason if the axis is not watched."""
+        """Current verdict of the watch unless the model is valid; the reason if the axis is not watched."""
         self._index, self._axis = index, axis
         self._settings, self._folder = settings, folder
         self._worker, self._recorder, self._diagnosis = worker, recorder, diagnosis

@@ -24,7 +24,7 @@ class Holder:
 
     client: str
     taken_s: float
-    """Time at which it was taken; lease's clock."""
+    """Time at which the lease was taken, on the lease's clock."""
     expires_s: float
     """Time at which the lease expires without a further request; infinite for the gateway."""
     token: str = field(repr=False)
@@ -34,16 +34,16 @@ class Lease:
     """Lease of a machine. Not thread-safe: to be used from one thread."""
 
     def __init__(self, timeout_s: float, now: Callable[[], float]) -> None:
-        """``now`` returns the seconds of a monotonic clock."""
+        """``now`` returns the time of a monotonic clock, seconds."""
         self.timeout_s = timeout_s
         self._now = now
         self._holder: Holder | None = None
         self.doing: Callable[[], str] = lambda: ""
-        """Returns a description of the present motions, for refusals; empty at rest."""
+        """Returns a description of the current motions, for refusals; empty at rest."""
 
     @property
     def holder(self) -> Holder | None:
-        """Present holder; None if the lease is free."""
+        """Current holder; None if the lease is free."""
         if self._holder is not None and self._now() >= self._holder.expires_s:
             self._holder = None
         return self._holder
@@ -81,7 +81,7 @@ class Lease:
         self._holder = None
 
     def check(self, token: str) -> None:
-        """Raises LeaseError unless ``token`` is the present holder's; extends the lease by its time-out."""
+        """Raises LeaseError unless ``token`` is the current holder's; extends the lease by its time-out."""
         holder = self.holder
         if holder is None:
             raise LeaseError("the lease is free or has expired: take it first")
@@ -93,7 +93,7 @@ class Lease:
             self._holder = replace(holder, expires_s=self._now() + self.timeout_s)
 
     def holds(self, token: str) -> bool:
-        """Returns True if ``token`` is the present holder's; does not extend the lease."""
+        """Returns True if ``token`` is the current holder's; does not extend the lease."""
         return (holder := self.holder) is not None and token == holder.token
 
     def _doing(self) -> str:

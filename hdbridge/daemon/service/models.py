@@ -74,7 +74,7 @@ class AxisModels:
         return replace(self.chosen, load_loop=on)
 
     def found(self, version: int | Literal["pending", "active"], identity: Identity) -> CompensationSetting:
-        """Returns the setting of another model of the profile, with the present scheme.
+        """Returns the setting of another model of the profile, with the current scheme.
 
         Raises InputError if the model does not exist, or belongs to another axis, drive or gear.
         """

@@ -1,7 +1,7 @@
 """Motion of one axis for clients: moves, jogs, streams and a queue of way points.
 
-The newest request takes precedence: a move replaces any present motion and clears the queue. The control
-process decides whether a motion is possible, before the present motion changes. In a coordinated move,
+The newest request takes precedence: a move replaces any motion in progress and clears the queue. The control
+process decides whether a motion is possible, before the motion in progress changes. In a coordinated move,
 several axes follow one plan, as streams that begin in the same cycle.
 """
 
@@ -33,7 +33,7 @@ ROOM_POLL_S: Final = 0.05
 
 
 class AxisMotion:
-    """Present motion of one axis and its queue. Every method that begins a motion requires the lease."""
+    """Current motion of one axis and its queue. Every method that begins a motion requires the lease."""
 
     def __init__(self, link: AxisLink, check: Callable[[str], None]) -> None:
         """``check`` raises if the holder of a token may not move the axis."""
@@ -55,7 +55,7 @@ class AxisMotion:
         return activity if activity is not None and not activity.over and activity.kind in kinds else None
 
     def replace(self, activity: Activity | None, why: str) -> None:
-        """Replaces the present activity by another or by none, and clears the queue."""
+        """Replaces the current activity by another or by none, and clears the queue."""
         if self.activity is not None:
             self.activity.end(why)
         self._points.clear()
@@ -69,7 +69,7 @@ class AxisMotion:
         acceleration_deg_s2: float | None = None,
         wait: bool = True,
     ) -> None:
-        """Moves to ``target_deg``, or redirects a present motion; with ``wait``, returns at rest there.
+        """Moves to ``target_deg``, or redirects a motion in progress; with ``wait``, returns at rest there.
 
         Raises RefusedError if another command replaced this move before its end.
         """
@@ -130,7 +130,7 @@ class AxisMotion:
         return self.queued
 
     async def clear_queue(self, holder: str) -> int:
-        """Discards the waiting moves and returns their number. The present move continues."""
+        """Discards the waiting moves and returns their number. The current move continues."""
         self._check(holder)
         forgotten = self.queued
         self._points.clear()
@@ -158,7 +158,7 @@ class AxisMotion:
         return None if activity is None or lease.holds(activity.holder) else activity
 
     async def close(self) -> None:
-        """Ends the queue; the axis completes its present motion."""
+        """Ends the queue; the axis completes its current motion."""
         for task in tuple(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -219,7 +219,7 @@ class AxisMotion:
 async def run_together(
     holder: str, axes: Sequence[ServiceAxis], targets_deg: Mapping[str, float], share: float, *, wait: bool
 ) -> None:
-    """Plans a move from the present targets and begins it on all axes in one cycle; ``wait`` awaits its end.
+    """Plans a move from the current targets and begins it on all axes in one cycle; ``wait`` awaits its end.
 
     Raises InputError for targets outside the limits, and RefusedError for an axis that is in motion or not
     enabled; in both cases before any motion.

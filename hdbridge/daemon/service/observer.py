@@ -10,7 +10,7 @@ from hdbridge.daemon.service.eventlog import EventLog
 
 PERIOD_S = 0.02
 DEAD_S = 3.0
-"""Time without a turn after which the control process counts as hung or dead."""
+"""Time without a cycle after which the control process counts as hung or dead."""
 _log = logging.getLogger(__name__)
 
 
@@ -50,7 +50,7 @@ class Observer:
 
     @property
     def alive(self) -> bool:
-        """True if the control process has completed a turn within `DEAD_S`."""
+        """True if the control process has completed a cycle within the last `DEAD_S`."""
         return self._clock.now() - self._turned_s < DEAD_S
 
     def poll(self) -> None:

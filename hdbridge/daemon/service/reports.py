@@ -101,7 +101,7 @@ def outer_state(
 ) -> messages.OuterState:
     """Returns the state of an axis as seen by the outer master.
 
-    ``alive_ns`` is the time of the gateway process's last sign of life. ``latency_s`` holds median and 99th
+    ``alive_ns`` is the time of the gateway process's last heartbeat. ``latency_s`` holds median and 99th
     percentile of the time from an outer SYNC to the drive's first frame with its target.
     """
     view, (median_s, most_s) = cells.view, latency_s or (None, None)

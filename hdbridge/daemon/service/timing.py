@@ -17,12 +17,12 @@ POLL_S = 0.005
 
 
 CREDIT_S: Final = 0.25
-"""Maximum simulated time of completed turns that has not yet passed on the clock; the rest is forfeited."""
+"""Maximum simulated time of completed cycles not yet passed on the clock; any excess is discarded."""
 STEP_S: Final = 0.1
 """Maximum time by which one reading advances the clock. A longer interval between two readings means that the
 service itself was suspended."""
 HANG_S: Final = 5.0
-"""Time without a turn after which the loop counts as hung or dead, and the clock follows real time."""
+"""Time without a cycle after which the loop counts as hung or dead, and the clock follows real time."""
 SHORTEST_WAIT_S: Final = 0.001
 
 
@@ -40,7 +40,7 @@ class SimulatedClock:
         real_s: Callable[[], float] = time.monotonic,
         hang_s: float = HANG_S,
     ) -> None:
-        """``turns`` returns the number of turns of the loop, ``period_s`` each; ``real_s`` is real time."""
+        """``turns`` returns the number of the loop's cycles of ``period_s``; ``real_s`` returns real time."""
         self._turns, self._period_s, self._real_s, self._hang_s = turns, period_s, real_s, hang_s
         self._lock = threading.Lock()
         self._now_s = self._read_s = real_s()

@@ -183,7 +183,8 @@ class ValidationEntry(Strict):
     def _enough(self) -> Self:
         if self.cycles == 1:
             raise wrong(
-                "one approach shows no repeatability; expected 0, or at least 2 (the standard: 5)", "cycles"
+                "repeatability needs several approaches; expected 0, or at least 2 (ISO 230-2: 5)",
+                "cycles",
             )
         return self
 

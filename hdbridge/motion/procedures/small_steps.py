@@ -32,7 +32,7 @@ class SmallSteps:
         ways: tuple[list[Standing], list[Standing]] = ([], [])
         last = self.centre_deg
         for index in range(1, self.count + 1):
-            # Steps have all lengths: the differences of n^2 g modulo 1 are distributed as evenly as the
+            # Steps of all lengths occur: the differences of n^2 g modulo 1 are distributed as evenly as the
             # values.
             share = (index * index * _GOLDEN) % 1.0
             target = self.centre_deg + (2.0 * share - 1.0) * self.reach_deg / axis.ratio
