@@ -25,11 +25,17 @@ from hdbridge.axis.model import TransmissionModel
 
 
 def findings(
-    search: Search, model: TransmissionModel, fitted: Fitted, precise: Fitted, spread: FloatArray
+    search: Search,
+    model: TransmissionModel,
+    fitted: Fitted,
+    plain: Fitted,
+    precise: Fitted,
+    spread: FloatArray,
 ) -> list[Finding]:
     """Returns the changed parts of the baseline as findings.
 
-    ``precise`` is the fit that determines the parameters, and ``spread`` is its covariance.
+    ``plain`` is the fit without a free-form loop, ``precise`` the fit that determines the parameters, and
+    ``spread`` the covariance of ``precise``.
     """
     estimator = search.estimator
     # The file's intervals are ignored, because temperature and time shift every calibration by a few per
@@ -37,7 +43,6 @@ def findings(
     parts = calibrated(
         model.effects, {}, lambda effect: estimator.columns(effect, Start.VIRGIN), estimator.scales
     )
-    plain = estimator.fit(replace(fitted.hypothesis, nuisances=None))
     result: list[Finding | None] = []
     for place, given in enumerate(model.effects):
         usual = [each for each in parts if each.place == place]
@@ -46,7 +51,7 @@ def findings(
             if estimator.data.reversals >= 2:  # a loop is visible only near reversals
                 same = type(given) is type(precise.hypothesis.effects[place])
                 change = (
-                    _loop(search, fitted, precise, usual[0], given, spread)
+                    _loop(search, fitted, plain, precise, usual[0], given, spread)
                     if same
                     else _another_law(search, fitted, precise, place, given, spread)
                 )
@@ -116,6 +121,7 @@ def _another_law(
 def _loop(
     search: Search,
     fitted: Fitted,
+    plain: Fitted,
     precise: Fitted,
     usual: CalibratedPart,
     given: Effect,
@@ -126,7 +132,7 @@ def _loop(
     scales = estimator.scales
     change = _change(estimator, precise, place, given)
     peak = 0.5 * float(np.ptp(change))
-    lawless = _lawless_arcsec(estimator, fitted)
+    lawless = _lawless_arcsec(estimator, fitted, plain)
     small = peak < estimator.floor_arcsec or strain(precise, usual, spread) < scales.calibrations**2
     causes = causes_of(given, precise.hypothesis.effects[place])
     if (small and not lawless) or not causes:
@@ -149,7 +155,7 @@ def _apart_arcsec(estimator: Estimator, one: Fitted, other: Fitted) -> float:
     return float(np.quantile(apart, 1.0 - estimator.rare))
 
 
-def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
+def _lawless_arcsec(estimator: Estimator, fitted: Fitted, plain: Fitted) -> float:
     """Returns the peak contribution of a free-form loop beyond the hysteresis law, arcsec.
 
     The result is 0 if the law alone fits as well.
@@ -157,7 +163,6 @@ def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
     scales, free = estimator.scales, fitted.hypothesis.nuisances
     if free is None:
         return 0.0
-    plain = estimator.fit(replace(fitted.hypothesis, nuisances=None))
     apart = _apart_arcsec(estimator, plain, fitted)
     gained = plain.chi_square - fitted.chi_square > scales.enter + scales.penalty * len(free.names)
     return apart if gained and apart > scales.plain_arcsec else 0.0

@@ -118,8 +118,8 @@ def diagnose(
     if swing is None or not between.names:  # a larger cause may mask them
         # Inertial wind-up is the slow part of the swing and of the motion between samples, so the base
         # excludes it.
-        lawful = search.estimator.fit(replace(found.hypothesis, nuisances=None))  # without a free-form loop
-        others = [each for each in lawful.hypothesis.effects if each.channels != {Channel.ACCELERATION}]
+        lawful = search.estimator.lawful(found).hypothesis
+        others = [each for each in lawful.effects if each.channels != {Channel.ACCELERATION}]
         base, before = Base.of(data, others), (between.names, swing)
         between = between if between.names else between_samples(base, scales)
         swing = swing or visible_swing(base, between, scales)
@@ -136,22 +136,23 @@ def _searched(
     """Returns the search and its result, for the data after subtraction of the load's swing."""
     if swing is not None:
         data = without(data, swing)
-    if swing is not None and swing.soft:
-        search = _search(data, model, scales, between.without(lambda _: True))
-    else:
-        search = _search(data, model, scales, between)
-        calm = settled(search.estimator, search.begun(), model.effects, swing)
-        search = _search(calm, model, scales, between)
-    if (quieter := noise_bounded(search.estimator, search.begun())) is not search.estimator.data:
-        soft = swing is not None and swing.soft
-        search = _search(quieter, model, scales, between.without(lambda _: soft))
+    soft = swing is not None and swing.soft
+    between = between.without(lambda _: soft)
+    search = _search(data, model, scales, between)
+    begun = search.begun()
+    if not soft:
+        search = _search(settled(search.estimator, begun, model.effects, swing), model, scales, between)
+        begun = search.begun()
+    if (quieter := noise_bounded(search.estimator, begun)) is not search.estimator.data:
+        search = _search(quieter, model, scales, between)
+        begun = search.begun()
     estimator = search.estimator
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)
     dynamics = () if swing is None else (swing.remark(),)
     of_record = (*((first,) if first else ()), *held, *data.remarks, *dynamics)
     estimator.data = replace(estimator.data, remarks=of_record)
-    return search, search.run()
+    return search, search.run(begun)
 
 
 def _search(data: Observed, model: TransmissionModel, scales: Scales, between: Nuisances) -> Search:
@@ -384,11 +385,12 @@ class _Judge:
             replace(self._finding(fitted, place), parameters=parameters_of(estimator, precise, place, spread))
             for place in range(base, len(fitted.hypothesis.effects))
         ]
-        findings += changes.findings(self.search, self.model, fitted, precise, spread)
+        plain = estimator.lawful(fitted)
+        findings += changes.findings(self.search, self.model, fitted, plain, precise, spread)
         findings.sort(key=lambda each: -each.robust)
         excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
         # A model cannot contain a free-form loop, so the figures exclude it.
-        whole, fitted = fitted, estimator.fit(replace(fitted.hypothesis, nuisances=None))
+        whole, fitted = fitted, plain
         left = rest(estimator, fitted)
         unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
         context = Context(left.arcsec, excess, unknown)

@@ -45,7 +45,7 @@ class Gain:
     after_arcsec2: FloatArray
     """Sum of squared errors with the tested part."""
     weighted_fall: FloatArray | None = None
-    """Fall of the squared error of each stretch, each sample weighted by the variance of its noise; None if
+    """Fall of the squared error of each stretch, each sample weighted by one over its noise variance; None if
     all samples have the same noise. The figures in arcsec are not weighted, but all decisions are."""
 
     @property
@@ -179,7 +179,7 @@ class _Parts:
     """Number of each point's repetition, shape (m,)."""
     over: str
     weight: FloatArray
-    """Weight of each point's squared residual, by the variance of its noise; the mean is one, shape (m,)."""
+    """Weight of each point's squared residual, one over its noise variance; the mean is one, shape (m,)."""
 
     @classmethod
     def of(cls, estimator: Estimator, parameters: int) -> _Parts | None:

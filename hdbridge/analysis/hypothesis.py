@@ -334,6 +334,10 @@ class Estimator:
             costs += most.change_cost
             hypothesis = fitted.hypothesis
 
+    def lawful(self, fitted: Fitted) -> Fitted:
+        """Refits without a free-form loop, which a model cannot contain."""
+        return self.fit(replace(fitted.hypothesis, nuisances=None))
+
     def _prior(
         self, hypothesis: Hypothesis, parts: Sequence[CalibratedPart]
     ) -> tuple[dict[tuple[int, str], Prior], float]:

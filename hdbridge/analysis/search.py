@@ -57,9 +57,9 @@ class Search:
         if law is not None:
             estimator.loop_sign = -1.0 if law.coefficients()[0] < 0.0 else 1.0
 
-    def run(self) -> Fitted:
-        """Adds causes, best first, then removes those that no longer improve the fit enough."""
-        fitted = self.with_best_law(self._with_best_sign(self.begun()))
+    def run(self, begun: Fitted) -> Fitted:
+        """Adds causes to the fit of the model alone (`begun`), best first, then removes superfluous ones."""
+        fitted = self.with_best_law(self._with_best_sign(begun))
         for number in range(MOST):
             found = self._best_addition(fitted)
             if number < LAW_ROUNDS and fitted.hypothesis.nuisances is None:

@@ -114,7 +114,7 @@ def _print_position(drive: Drive) -> None:
 def _compensating(
     files: Profile, given: Path | None, ratio: float, *, compensated: bool
 ) -> TransmissionModel:
-    """Returns the model for the compensation; one without effects if there is none or not ``compensated``."""
+    """Returns the compensation model; it has no effects without a model file, or if not ``compensated``."""
     from hdbridge.axis.model import TransmissionModel
 
     if not compensated:

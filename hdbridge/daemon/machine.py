@@ -188,7 +188,7 @@ class Machine:
         return replace(self, axes=axes, bus=axes[0].config.bus)
 
     def axis(self, name: str) -> Axis:
-        """Returns the axis with this name; raises InputError, which lists the names, if there is none."""
+        """Returns the axis with this name. For an unknown name, raises InputError with all names."""
         for axis in self.axes:
             if axis.name == name:
                 return axis

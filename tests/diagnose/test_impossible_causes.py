@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.ideal_record import RATE_HZ, ideal_record
 
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.identifiability import examined
-from hdbridge.axis.effects import Motion, Start
+from hdbridge.axis.effects import Motion
 from hdbridge.axis.effects.hysteresis import Hysteresis
 from hdbridge.axis.effects.orders import MotorOrder
 from hdbridge.axis.effects.ratio_error import RatioError
@@ -24,7 +25,6 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 RATIO = 50.0
-RATE_HZ = 20.0
 MODEL = TransmissionModel(
     RATIO,
     (
@@ -42,15 +42,7 @@ def sweeps(error_arcsec: Callable[[Any], Any], *legs: tuple[float, float]) -> Re
         angles.append(np.linspace(at, at + turns, count, endpoint=False))
         at += turns
     motor = 360.0 * RATIO * np.concatenate(angles)
-    time = np.arange(len(motor)) / RATE_HZ
-    noise = 0.5 * np.random.default_rng(5).standard_normal(len(motor))
-    error = MODEL.predict(Motion(motor, time), Start.FORWARD) + error_arcsec(motor / RATIO) + noise
-    columns = {
-        "time_s": time,
-        "motor_position_deg": motor,
-        "load_position_deg": motor / RATIO + error / 3600.0,
-    }
-    return Record({**columns, "motor_target_deg": motor})
+    return ideal_record(MODEL, motor, error_arcsec(motor / RATIO))
 
 
 def judged(ratio: float, true_ratio: float, load_turns: float) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.ideal_record import ideal_record
 
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.gain import held_out
@@ -17,10 +18,8 @@ from hdbridge.axis.effects.hysteresis import Hysteresis
 from hdbridge.axis.effects.orders import MotorOrder
 from hdbridge.axis.effects.synchronous import Synchronous
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.records.record import Record
 
 RATIO = 50.0
-RATE_HZ = 20.0
 MODEL = TransmissionModel(
     RATIO,
     (
@@ -28,20 +27,6 @@ MODEL = TransmissionModel(
         Hysteresis(offset_arcsec=30.0, width_deg=15.0, exponent=1.6),
     ),
 )
-
-
-def record(motor: Any, error_arcsec: Any, **channels: Any) -> Record:
-    """Returns a record of an axis with an error in addition to the model's, and 0.5 arcsec of noise."""
-    time = np.arange(len(motor)) / RATE_HZ
-    noise = 0.5 * np.random.default_rng(5).standard_normal(len(motor))
-    error = MODEL.predict(Motion(motor, time), Start.FORWARD) + error_arcsec + noise
-    columns = {
-        "time_s": time,
-        "motor_position_deg": motor,
-        "load_position_deg": motor / RATIO + error / 3600.0,
-        "motor_target_deg": motor,
-    }
-    return Record({**columns, **channels})
 
 
 def sweeps(number: int, turns: float = 2.0, begin_turns: float = 0.0) -> Any:
@@ -58,7 +43,7 @@ def test_noisy_samples_do_not_decide_about_a_gain(seed: int) -> None:
     rng = np.random.default_rng(seed)
     noisy = rng.random(len(motor)) < 0.05
     wild = 20.0 * rng.standard_normal(len(motor)) * noisy
-    data = gather(record(motor, 0.05 * motor / 360.0 + wild), RATIO)
+    data = gather(ideal_record(MODEL, motor, 0.05 * motor / 360.0 + wild), RATIO)
     full = replace(data.full, sigma_arcsec=np.where(noisy, 20.0, 0.5))
     estimator = Estimator(data.having(full))
     effects = (*MODEL.effects, RatioError(ramp_arcsec_per_turn=0.1))
@@ -74,7 +59,7 @@ def test_a_ripple_that_falls_to_a_fifth_is_a_drift() -> None:
     motor = sweeps(12)
     warmer = np.linspace(4.0, 10.0, len(motor))
     ripple = MODEL.effects[0].predict(Motion(motor), Start.FORWARD)
-    made = record(motor, -0.08 * warmer * ripple, temperature_c=20.0 + warmer)
+    made = ideal_record(MODEL, motor, -0.08 * warmer * ripple, temperature_c=20.0 + warmer)
     found = diagnose(made, MODEL)
     assert [each.cause for each in found.findings] == ["amplitude_drift"]
     assert abs(found.findings[0].parameters["ripple_percent_per_k"].value + 8.0) < 1.0
@@ -90,7 +75,7 @@ def test_a_wave_over_the_load_angle_and_a_change_of_the_model_do_not_cancel(size
     near, far = sweeps(4, 1.0), sweeps(4, 1.0, begin_turns=2.5)
     motor = np.concatenate([near, np.linspace(near[-1], far[0], 80), far])
     pose = np.clip(motor / 360.0 - 1.75, -1.0, 1.0)
-    found = diagnose(record(motor, size_arcsec * pose * np.cos(np.radians(2.0 * motor))), MODEL)
+    found = diagnose(ideal_record(MODEL, motor, size_arcsec * pose * np.cos(np.radians(2.0 * motor))), MODEL)
     assert all(each.peak_arcsec < 1.5 * size_arcsec for each in found.findings), found.verdict()
 
 
@@ -98,5 +83,5 @@ def test_noise_is_at_most_what_the_model_leaves() -> None:
     """The error alternates from sample to sample, so differences of samples are larger than the error."""
     rng = np.random.default_rng(3)
     motor = np.cumsum(rng.uniform(100.0, 900.0, 400) * np.repeat(rng.choice([-1.0, 1.0], 40), 10))
-    found = diagnose(record(motor, (-1.0) ** np.arange(400)), MODEL)
+    found = diagnose(ideal_record(MODEL, motor, (-1.0) ** np.arange(400)), MODEL)
     assert found.noise_floor_arcsec < 1.2 * found.baseline.rms_arcsec

@@ -105,7 +105,7 @@ class Case:
     """Permitted residual due to the plant's dynamics at these speeds."""
     plant: Callable[[Truth], Truth] = lambda truth: truth
     in_python: bool = False
-    """True if the plant runs uncompiled, because compiling an axis with room for so many elements takes far
+    """True if the plant runs uncompiled, because compiling an axis with that many elements takes far
     longer.
     """
 

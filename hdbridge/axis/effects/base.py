@@ -55,7 +55,7 @@ class Law(Strict, ABC):
     channels: ClassVar[frozenset[Channel]] = frozenset()
     """Channels usually required in addition to the motor angle; for those of an instance see `needs`."""
     compensable: ClassVar[Compensable]
-    """Whether effects of this kind are compensated, and the reason; see `is_compensable`."""
+    """Possibility of compensating effects of this kind, with the reason; see `is_compensable`."""
     shape: ClassVar[tuple[Shape, ...]] = ()
     """Shape parameters, in which the error is non-linear; `columns` covers the linear parameters."""
 
@@ -288,7 +288,7 @@ class Effect(Law):
         return None
 
     def found_in(self, effects: Sequence[Effect]) -> Effect:
-        """Returns the effect of this kind among ``effects``, or this effect itself if there is none."""
+        """Returns the effect of this kind among ``effects``, by default this effect itself."""
         return next((each for each in effects if type(each) is type(self)), self)
 
     def tidied(self, ratio: float) -> Self:

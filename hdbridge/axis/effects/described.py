@@ -99,7 +99,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class Compensable:
-    """Whether effects of a kind are compensated, and the reason."""
+    """Possibility of compensating effects of a kind, with the reason."""
 
     possible: bool
     why: str

@@ -233,8 +233,8 @@ def _journal(
 ) -> tuple[Journal | None, tuple[str, ...]]:
     """Returns the journal of the next experiment, and the alternatives that it separates.
 
-    An experiment already in ``folder`` is resumed, otherwise the most useful one is chosen; the journal is
-    None if there is none.
+    An experiment already in ``folder`` is resumed, otherwise the most useful one is chosen. The
+    journal is None if no experiment separates any alternatives.
     """
     axis = bench.drive.axis
     if (folder / ABOUT_NAME).exists():

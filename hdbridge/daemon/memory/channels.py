@@ -233,7 +233,7 @@ class Queue(_Slots[T]):
         return added
 
     def peek(self) -> T | None:
-        """Returns the next item, on the consumer's side; None if there is none."""
+        """Returns the next item, on the consumer's side; None if the channel is empty."""
         sequence: int = self._tail[0] + 1
         if sequence > self._head[0]:
             return None
@@ -263,7 +263,7 @@ class Queue(_Slots[T]):
         self._tail[0] += 1
 
     def take(self) -> T | None:
-        """Removes and returns the next item; None if there is none."""
+        """Removes and returns the next item; None if the channel is empty."""
         item = self.peek()
         if item is not None:
             self.drop()

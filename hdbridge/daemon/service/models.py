@@ -68,7 +68,7 @@ class AxisModels:
         return self._checked(replace(self.chosen, scheme=scheme))
 
     def with_load_loop(self, on: bool) -> CompensationSetting:
-        """Returns the chosen setting with the load loop on or off; raises InputError if there is none."""
+        """Returns the setting with the load loop on or off. Raises InputError without a load loop."""
         if self._axis.load_loop is None:
             raise InputError(f"{self._axis.name}: has no load loop; give the axis one in the machine file")
         return replace(self.chosen, load_loop=on)
