@@ -8,7 +8,7 @@ from itertools import pairwise, product
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, uniform_filter1d
 
 from hdbridge.analysis.blocks import REST_DEG_S, Design, harmonics, make_blocks
 from hdbridge.analysis.driving import SETTLE_S, settling
@@ -287,6 +287,42 @@ def _accelerating(samples: Samples) -> BoolArray:
     acceleration = samples.motion.motor_acceleration_deg_s2
     assert acceleration is not None
     return np.asarray(np.abs(acceleration / samples.ratio) > GENTLE_DEG_S2)
+
+
+SWAY_ARCSEC = 1.0
+"""Minimum deviation of an oscillating motor from its command, arcsec at the load."""
+SWAY_COUNTS = 1.5
+"""Minimum deviation of an oscillating motor from its command, counts; rounding deviates by less."""
+
+
+def oscillation(measured: Measured, samples: Samples) -> str:
+    """Returns a warning if the motor oscillates about its command in slow motion, else an empty text.
+
+    Such a motor reverses where the command does not, so the state of the hysteresis loop is unknown. The
+    deviation is a median, because a motor may swing after a start or a reversal.
+    """
+    target, position = measured.record.motor_target_deg, measured.record.motor_position_deg
+    if target is None or not samples.commanded:
+        return ""
+    off = target - position
+    for chain in samples.chains:
+        rows = chain.rows
+        period_s = np.median(np.diff(samples.time_s[rows])) if rows.stop - rows.start > 1 else SETTLE_S
+        off[rows] -= uniform_filter1d(off[rows], max(round(SETTLE_S / max(float(period_s), 1e-6)), 1))
+    slow = [
+        samples.usable & samples.of_kind(kind)
+        for kind in samples.kinds
+        if kind not in {*RESTING, *ON_THE_WAY}
+    ]
+    sway_deg = max((median_deviation(off[rows]) for rows in slow if rows.any()), default=0.0)
+    least_deg = max(SWAY_ARCSEC / ARCSEC_PER_DEG * samples.ratio, SWAY_COUNTS * samples.count_deg)
+    if sway_deg < least_deg:
+        return ""
+    return (
+        f"the motor oscillates about its command in slow motion, by {sway_deg:.2g} deg (expected less "
+        f"than {least_deg:.2g}): the hysteresis in this record is not that of the command; tune the drive's "
+        "control loops, then record again"
+    )
 
 
 # Selection of the quasi-static samples of a calibration.

@@ -14,6 +14,7 @@ from hdbridge.analysis.identification import (
     FitResult,
     State,
     candidate_orders,
+    oscillation,
     outlying,
     searched,
     swinging,
@@ -85,6 +86,7 @@ def fit(measured: Measured, ratio: float, options: FitOptions | None = None) -> 
         warnings.append(
             f"only {usable} of {len(samples)} samples were used: what is fast or accelerates is left out"
         )
+    warnings += filter(None, [oscillation(measured, samples)])
     state = _prepare(samples, options, warnings)
     state, solution, system = _with_best_law(*_settle(_search(state, warnings)))
     solution, cov = _hold_what_is_unknown(state, solution, warnings)

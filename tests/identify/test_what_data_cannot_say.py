@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.legs import Leg, fit
+from typer.testing import CliRunner
 
 from hdbridge.analysis.identification import FitOptions
 from hdbridge.axis.effects import Compliance, Hysteresis
+from hdbridge.cli import app
 from hdbridge.errors import InputError
 
 
@@ -59,6 +61,34 @@ def test_an_effect_without_its_channel_is_omitted_with_a_note(bench):
     effects = (*bench.options.effects, Compliance.candidate(axis.ratio))
     result = fit(axis.record(bench.plan(turns=8.0)), axis.ratio, replace(bench.options, effects=effects))
     assert any("compliance: not fitted, the record has no load_torque_nm" in each for each in result.warnings)
+
+
+@pytest.mark.parametrize(
+    ("servo_deg", "oscillates"),
+    [
+        (lambda time_s: 0.6 * np.sin(np.pi * 60.0 * time_s), True),
+        (lambda time_s: 0.2 * np.sin(np.pi * 24.0 * time_s) * (np.sin(time_s) > -0.5), True),
+        (lambda time_s: np.where(np.cos(0.25 * time_s) > 0.0, -0.4, 0.4), False),
+        (lambda time_s: 0.02 * np.random.default_rng(3).normal(size=len(time_s)), False),
+    ],
+    ids=["oscillating", "most of the time", "lagging", "flickering"],
+)
+def test_a_motor_that_oscillates_about_its_command_is_reported(tmp_path, servo_deg, oscillates):
+    time_s, count_deg = np.arange(4_000) / 200.0, 360.0 / 10_000
+    target_deg = 400.0 * np.sin(0.25 * time_s)
+    motor_deg = target_deg + servo_deg(time_s)
+    error_deg = (8.0 * np.cos(np.deg2rad(2.0 * motor_deg)) + 20.0 * np.sign(np.cos(0.25 * time_s))) / 3600.0
+    columns = {
+        "time_s": time_s,
+        "motor_position_deg": np.round(motor_deg / count_deg) * count_deg,
+        "load_position_deg": motor_deg / 100.0 + error_deg,
+        "motor_target_deg": target_deg,
+    }
+    rows = np.column_stack(list(columns.values()))
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header=",".join(columns), comments="", fmt="%.7f")
+    done = CliRunner().invoke(app, ["fit", str(tmp_path / "a.csv"), "--ratio", "100"])
+    assert done.exit_code == 0, done.output
+    assert ("oscillates about its command" in " ".join(done.output.split())) == oscillates
 
 
 def test_noise_alone_yields_no_order(bench):
