@@ -56,7 +56,7 @@ def findings(
                     else _another_law(search, fitted, precise, place, given, spread)
                 )
         elif given.part is Part.ORDERS:
-            change = _orders(estimator, precise, usual, given, spread) if usual else None
+            change = _orders(search, fitted, precise, usual, given, spread) if usual else None
         else:
             change = _freed(search, fitted, precise, place, given, spread)
         if change is not None:
@@ -169,12 +169,17 @@ def _lawless_arcsec(estimator: Estimator, fitted: Fitted, plain: Fitted) -> floa
 
 
 def _orders(
-    estimator: Estimator, fitted: Fitted, usual: Sequence[CalibratedPart], given: Effect, spread: FloatArray
+    search: Search,
+    fitted: Fitted,
+    precise: Fitted,
+    usual: Sequence[CalibratedPart],
+    given: Effect,
+    spread: FloatArray,
 ) -> _Change | None:
     """Returns a change that combines all changed motor orders; None if no order has changed."""
-    place, scales = usual[0].place, estimator.scales
-    now = fitted.hypothesis.effects[place]
-    columns = fitted.places(place)
+    estimator, place = search.estimator, usual[0].place
+    scales, now = estimator.scales, precise.hypothesis.effects[place]
+    columns = precise.places(place)
     changed: list[tuple[Effect, Effect]] = []
     own: list[int] = []
     known: list[FloatArray] = []
@@ -182,17 +187,17 @@ def _orders(
         before, after = old.coefficients(), new.coefficients()
         # Effects that change sign with the direction of motion reduce an order's mean over both directions.
         number = round(new.waves()[0][0]) if new.waves() else 0
-        share = math.prod(each.symmetric_fraction(number) for each in fitted.hypothesis.effects)
+        share = math.prod(each.symmetric_fraction(number) for each in precise.hypothesis.effects)
         part = next(each for each in usual if str(named.columns[0]) in each.parameters).times(share)
         large = float(np.linalg.norm(after - share * before)) >= estimator.floor_arcsec
-        if large and strain(fitted, part, spread) >= scales.calibrations**2:
+        if large and strain(precise, part, spread) >= scales.calibrations**2:
             changed.append((old, new))
             own += [columns[each] for each in named.columns]
             known.append(variances(estimator.calibrated, place, named.columns))
     if not changed:
         return None
     all_of_it = now.fitted(now.coefficients() - given.coefficients())
-    seen = 0.5 * float(np.ptp(estimator.contribution(all_of_it, fitted.hypothesis.start)))
+    seen = 0.5 * float(np.ptp(estimator.contribution(all_of_it, precise.hypothesis.start)))
     was, is_now = (together(each) for each in zip(*changed, strict=True))
     difference = is_now.fitted(is_now.coefficients() - was.coefficients())
     causes = causes_of(was, is_now)
@@ -205,7 +210,14 @@ def _orders(
         difference.bound_arcsec(),
         named_parameters(difference, [Column(0, str(i)) for i in range(len(own))], apart),
         "orders of the model have changed, or were wrong: its synchronous part absorbs the change",
-        tuple(each.name for each in causes[1:]),
+        tuple(
+            dict.fromkeys(
+                (
+                    *(each.name for each in causes[1:]),
+                    *search.alternatives_to_change(fitted, place, given),
+                )
+            )
+        ),
     )
 
 

@@ -85,3 +85,12 @@ def test_noise_is_at_most_what_the_model_leaves() -> None:
     motor = np.cumsum(rng.uniform(100.0, 900.0, 400) * np.repeat(rng.choice([-1.0, 1.0], 40), 10))
     found = diagnose(ideal_record(MODEL, motor, (-1.0) ** np.arange(400)), MODEL)
     assert found.noise_floor_arcsec < 1.2 * found.baseline.rms_arcsec
+
+
+def test_a_changed_order_states_the_order_of_the_flexspline_that_explains_as_much() -> None:
+    """Order 2 of the flexspline is order 2.04 of the motor, and the record covers 7 degrees of the load."""
+    motor = sweeps(2, 1.0)
+    ripple = MODEL.effects[0].predict(Motion(motor), Start.FORWARD)
+    (found,) = diagnose(ideal_record(MODEL, motor, 0.4 * ripple), MODEL).findings
+    assert found.within, "the model's own order has changed"
+    assert {"motor_order", "flexspline_order"} <= {found.cause, *found.aliases}
