@@ -29,6 +29,7 @@ from hdbridge.sim.truth.motor import TrueObserver
 from hdbridge.twin.misfit import (
     CHANNELS,
     FINE,
+    MOST_SCATTER,
     Data,
     Mask,
     Replays,
@@ -206,6 +207,8 @@ def _with_loop(truth: Truth, loop: Hysteresis) -> Truth:
 # ----------------------------------------------------------------
 # Uncertainty of the coordinates: information from the slopes, and a jackknife over legs.
 
+DETERMINED = 10.0
+"""Minimum information about a principal direction, relative to the prior's, for it to count as determined."""
 JACKKNIFE_RIDGE = 1e-9
 """Regularisation of the jackknife: fraction of the information that no single leg may contribute alone."""
 
@@ -234,7 +237,29 @@ def sandwich(slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], sprea
     scatter between legs.
     """
     along = principal(slopes, spread)
-    rows = slopes @ along
+    squares, white = _jackknife(slopes, left, legs, spread)
+    before = 1.0 / np.sum(np.square(along / spread[:, None]), axis=0)
+    times = np.minimum(np.maximum(squares, white), before)
+    return np.asarray(along * times @ along.T, dtype=np.float64)
+
+
+def scatter(slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], spread: FloatArray) -> float:
+    """Returns the variance of the fit between legs, relative to that of independent residuals.
+
+    The mean over the principal directions that the residuals determine; NaN if there are none. It is about
+    one if the simulated drive can do what the axis does. If it cannot, each leg has parameters of its own,
+    however small the residuals are (information matrix test, White, Econometrica 50, 1982).
+    """
+    squares, white = _jackknife(slopes, left, legs, spread)
+    shown = squares[eigen(slopes, spread)[0] > DETERMINED]
+    return float(np.mean(shown)) / white if len(shown) else math.nan
+
+
+def _jackknife(
+    slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], spread: FloatArray
+) -> tuple[FloatArray, float]:
+    """Returns the variance of each principal direction between legs, (p,), and that of the residuals."""
+    rows = slopes @ principal(slopes, spread)
     left = left - slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
     numbers = numbered(legs)
     order = np.argsort(numbers, kind="stable")
@@ -243,10 +268,7 @@ def sandwich(slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], sprea
         others = (1.0 + JACKKNIFE_RIDGE) * np.eye(len(spread)) - rows[leg].T @ rows[leg]
         drawn.append(np.linalg.solve(others, rows[leg].T @ left[leg]))
     squares = np.sum(np.square(drawn), axis=0) * (1.0 - 1.0 / len(drawn))
-    before = 1.0 / np.sum(np.square(along / spread[:, None]), axis=0)
-    white = max(1.0, float(left @ left) / max(len(left) - len(spread), 1))
-    times = np.minimum(np.maximum(squares, white), before)
-    return np.asarray(along * times @ along.T, dtype=np.float64)
+    return squares, max(1.0, float(left @ left) / max(len(left) - len(spread), 1))
 
 
 def eigen(slopes: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -307,6 +329,8 @@ class Fitted:
     """Softened scaled residuals of the fitted rows, shape (n,)."""
     jacobian: FloatArray
     """Derivatives of `vector` with respect to the coordinates, shape (n, p)."""
+    scatter: float = math.nan
+    """Variance of the parameters between legs, relative to that of independent residuals (`scatter`)."""
     interrupted: bool = False
     """True if the fit was ended before it reached a minimum."""
 
@@ -463,12 +487,15 @@ def solve(
     found = problem.found(place)
     problem.scale = known or scales(data, found)
     left = softened(found, problem.scale, rows)
-    slopes, covariance = problem.along, np.diag(problem.spread**2)
+    slopes, covariance, between = problem.along, np.diag(problem.spread**2), math.nan
     if linear or slopes is None:
-        slopes = problem.slopes(place, wide=wide)
-        covariance = sandwich(slopes, left, legs_of_rows(data, rows), problem.spread)
+        slopes, legs = problem.slopes(place, wide=wide), legs_of_rows(data, rows)
+        covariance = sandwich(slopes, left, legs, problem.spread)
+        between = scatter(slopes, left, legs, problem.spread)
     truth = at_coordinates(start, parameters, place.tolist())
-    return Fitted(truth, parameters, prior, place, covariance, problem.scale, found, rows, left, slopes)
+    return Fitted(
+        truth, parameters, prior, place, covariance, problem.scale, found, rows, left, slopes, between
+    )
 
 
 def continued(
@@ -974,8 +1001,8 @@ def fit(replays: Replays, progress: Progress = lambda _: None) -> Fitted:
     """Fits the parameters, starting from the truth with which the recordings were prepared.
 
     If the residuals with this truth's servo are many times the noise, other servo structures are tried as
-    well. If a channel remains unexplained afterwards, blocks are added. Ctrl-C ends the fit at the best point
-    so far, if there is one.
+    well. If a channel remains unexplained afterwards, or the legs disagree about the parameters, blocks are
+    added. Ctrl-C ends the fit at the best point so far, if there is one.
     """
     reached: list[Fitted] = []
     try:
@@ -1007,17 +1034,27 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
         best = in_best_structure(few, best, others, keep)
     progress(0.5)
     polished = None
-    if near(best):
-        polished = _polished(replays, best, begun, keep)
-        if values_of(channel_residuals(data, polished.residuals, noise_in_motion(data))) is Values.AXIS:
+    while near(best):
+        polished, before = _polished(replays, best, begun, keep), polished
+        if values_in(data, polished) is Values.AXIS:
             return polished
+        if before is not None and misfit(data, before.residuals) <= misfit(data, polished.residuals):
+            polished = before
+            break
         best = in_best_structure(few, polished, ())
+        if len(best.parameters) == len(polished.parameters):
+            break
     progress(0.8)
     scale = Scales(units(data))
     whole = solve(replays, best.truth, best.parameters, STEPS, known=scale, linear=False)
     if polished is not None and misfit(data, polished.residuals) <= misfit(data, whole.residuals):
         return polished
     return _linearised(replays, whole)
+
+
+def values_in(data: Data, fitted: Fitted) -> Values:
+    """Returns the origin of the values of a fit: the axis if its residuals and its legs allow this."""
+    return values_of(channel_residuals(data, fitted.residuals, noise_in_motion(data)), fitted.scatter)
 
 
 def _polished(replays: Replays, near: Fitted, begun: Truth, keep: Callable[[Fitted], None]) -> Fitted:
@@ -1059,15 +1096,19 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
     The fit must be near a minimum, because the alternatives are equally good until the other parameters are
     known.
     """
-    few, noise = replays.rough, expected(replays.rough.data)
-    least = least_deviation(replays.data) | {LOAD: noise.deviation[LOAD]}
+    least = least_deviation(replays.data) | {LOAD: expected(replays.rough.data).deviation[LOAD]}
+    searched = False
     while True:
         # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
         # the next substep increases the residuals too little for any channel to show it.
         places = [exchanged(best.truth), *neighbours(best.truth)]
-        if any(best.scales.deviation[name] > EXCESS_RATIO * least[name] for name in CHANNELS):
-            tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
-            places.append(by_halving(few, tried, noise).truth)
+        excess = any(best.scales.deviation[name] > EXCESS_RATIO * least[name] for name in CHANNELS)
+        if excess or best.scatter > MOST_SCATTER:
+            # Along a bent valley a fit ends too early; new difference steps continue it.
+            places.append(best.truth)
+            if not searched:
+                places.append(_farther(replays.rough, best, begun))
+                searched = True
         last = best
         for place in places:
             other = continued(replays, best, MORE_STEPS, place)
@@ -1075,6 +1116,12 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
                 best = _ended(replays, other)
         if best is last:
             return best
+
+
+def _farther(few: Replays, best: Fitted, begun: Truth) -> Truth:
+    """Returns the best place that a few legs show from the alternative start values."""
+    tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
+    return by_halving(few, tried, expected(few.data)).truth
 
 
 def _ended(replays: Replays, near: Fitted) -> Fitted:

@@ -653,11 +653,11 @@ class Values(StrEnum):
     USUAL = "usual"
     """Not fitted: the usual values of axes of this kind."""
     AXIS = "axis"
-    """Fitted, and the twin explains every channel (`ChannelResidual.explained`): the values are those of the
-    axis."""
+    """Fitted, the twin explains every channel (`ChannelResidual.explained`), and its legs agree about the
+    parameters: the values are those of the axis."""
     REPLAY = "replay"
-    """Fitted, but the fit was interrupted or at least one channel has larger residuals: the twin replays the
-    motion, but its values belong to a different drive."""
+    """Fitted, but the fit was interrupted, at least one channel has larger residuals, or the legs disagree:
+    the twin replays the motion, but its values belong to a different drive."""
 
     @classmethod
     def of(cls, truth: Truth) -> Values | None:
@@ -715,6 +715,14 @@ def channel_residuals(
     return tuple(found)
 
 
-def values_of(left: Sequence[ChannelResidual]) -> Values:
-    """Returns the origin of fitted values: the axis if all channels are explained, else a replay."""
-    return Values.AXIS if all(each.explained for each in left) else Values.REPLAY
+MOST_SCATTER: Final = 4.0
+"""Maximum variance of the parameters between legs, relative to that of independent residuals
+(`fit.scatter`)."""
+
+
+def values_of(left: Sequence[ChannelResidual], scatter: float) -> Values:
+    """Returns the origin of fitted values: the axis if all channels are explained and its legs agree about
+    the parameters, else a replay.
+    """
+    explained = all(each.explained for each in left)
+    return Values.AXIS if explained and not scatter > MOST_SCATTER else Values.REPLAY

@@ -41,6 +41,7 @@ from hdbridge.twin.compare import (
 from hdbridge.twin.fit import FIT_S, MOST_DEAD_CYCLES, Fitted, by_law_of, fit, fitted_rows, legs_of_rows
 from hdbridge.twin.misfit import (
     CHANNELS,
+    MOST_SCATTER,
     NOISE_LEVEL,
     ChannelResidual,
     Data,
@@ -86,6 +87,8 @@ class Twin:
     """Comparison of the recordings with the initial simulation; the kind `HELD_OUT` is the held-out legs."""
     after: Comparison
     """Comparison of the recordings with the twin."""
+    scatter: float = math.nan
+    """Variance of the parameters between legs, relative to that of independent residuals (`fit.scatter`)."""
     impossible: tuple[str, ...] = ()
     """Implausible values, each in a sentence; only for a twin whose values are not the axis's."""
 
@@ -179,6 +182,10 @@ def replays_only(twin: Twin) -> str:
         for each in twin.channel_residuals
         if not each.explained
     ]
+    if twin.scatter > MOST_SCATTER:
+        lost.append(
+            f"the legs disagree about its parameters: {figure(math.sqrt(twin.scatter), 2)} times their errors"
+        )
     if twin.truth.servo.response is not None:
         lost.append("a measured response supplies the part that its loops cannot reproduce")
     why = f": {'; '.join(lost)}" if lost else ""
@@ -352,7 +359,7 @@ def fit_twin(
         noise = noise_in_motion(data)
         fitted = fit(replays, lambda share: progress(0.9 * share))
         remaining = channel_residuals(data, fitted.residuals, noise)
-        values = Values.REPLAY if fitted.interrupted else values_of(remaining)
+        values = Values.REPLAY if fitted.interrupted else values_of(remaining, fitted.scatter)
         if values is Values.REPLAY and not fitted.interrupted:
             fitted = with_response(replays, fitted)
             remaining = channel_residuals(data, fitted.residuals, noise)
@@ -377,6 +384,7 @@ def fit_twin(
         remaining,
         before,
         after,
+        fitted.scatter,
         impossible(truth, axis, cycle_s) if values is Values.REPLAY else (),
     )
 

@@ -30,6 +30,7 @@ from hdbridge.twin.fit import (
     neighbours,
     principal,
     sandwich,
+    scatter,
     slopes_at,
     solve,
     springs,
@@ -65,6 +66,22 @@ def test_intervals_cover_the_truth_with_a_dominant_leg() -> None:
         covariance = sandwich(slopes, seen - slopes @ found, legs, np.full(1, 10.0))
         off.append(float(found[0]) / float(np.sqrt(covariance[0, 0])))
     assert 0.88 <= np.mean(np.abs(off) < 1.96) <= 0.98
+
+
+@pytest.mark.parametrize(("size", "low", "high"), [(0.0, 0.3, 2.0), (0.6, 4.0, 15.0), (1.2, 12.0, 60.0)])
+def test_legs_agree_about_the_parameters_of_a_right_simulation_only(
+    size: float, low: float, high: float
+) -> None:
+    """A wrong simulation has a smooth error in each leg, which is not larger than the noise."""
+    rng = np.random.default_rng(4)
+    place, legs = np.linspace(0.0, 1.0, 200), np.repeat(np.arange(20), 200)
+    slopes = np.tile(np.column_stack([np.ones(200), place, place**2]), (20, 1))
+    bends = np.concatenate([np.sin(np.pi * frequency * place) for frequency in rng.uniform(0.3, 2.0, 20)])
+    seen = rng.standard_normal(4000) + size * bends
+    left = seen - slopes @ np.linalg.lstsq(slopes, seen, rcond=None)[0]
+    between = scatter(slopes, left, legs, np.full(3, 10.0))
+    assert np.sqrt(np.mean(np.square(left))) < 1.3
+    assert low < between < high
 
 
 def test_a_nearly_unstable_simulation_informs_one_direction_only() -> None:

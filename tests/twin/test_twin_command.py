@@ -154,7 +154,9 @@ def test_a_recording_of_another_axis_or_without_commands_is_refused(profile: Pat
         assert complaint in done.stderr
 
 
-def fitted(truth: Truth, values: str = "axis", times_noise: float = 2.5) -> Callable[..., Twin]:
+def fitted(
+    truth: Truth, values: str = "axis", times_noise: float = 2.5, scatter: float = 1.0
+) -> Callable[..., Twin]:
     """Result of a fit, which itself would take minutes."""
 
     def fit_twin(recordings: Any, axis: AxisConfig, start: Truth, progress: Any) -> Twin:
@@ -171,7 +173,7 @@ def fitted(truth: Truth, values: str = "axis", times_noise: float = 2.5) -> Call
         left = (ChannelResidual("motor torque", 0.04, times_noise, "step"),)
         findings = (finding,) if values == "axis" and "values" not in start.provenance else ()
         wrong = impossible(truth, axis, 0.01) if values == "replay" else ()
-        return Twin(known, findings, (), left, before, after, wrong)
+        return Twin(known, findings, (), left, before, after, scatter, wrong)
 
     return fit_twin
 
@@ -239,6 +241,12 @@ def test_values_fitting_the_replay_only_are_offered_as_such(profile: Path, run: 
     pending = TwinFile.load(profile / "pending-twin.yaml").truth
     assert pending.provenance["values"] == "replay"
     assert pending.intervals == {}
+
+
+def test_a_twin_whose_legs_disagree_replays_only(profile: Path, run: Run) -> None:
+    said, report, _ = run(fitted(TRUTH, "replay", 0.9, scatter=9.0))
+    assert "but its values are not the axis's: the legs disagree about its parameters: 3 times their" in said
+    assert [each["explained"] for each in report["left"]] == [True]
 
 
 def test_implausible_values_are_refused(profile: Path, run: Run) -> None:
