@@ -1096,16 +1096,16 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
     The fit must be near a minimum, because the alternatives are equally good until the other parameters are
     known.
     """
+    known, searched = expected(replays.data), False
     least = least_deviation(replays.data) | {LOAD: expected(replays.rough.data).deviation[LOAD]}
-    searched = False
     while True:
         # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
         # the next substep increases the residuals too little for any channel to show it.
         places = [exchanged(best.truth), *neighbours(best.truth)]
         excess = any(best.scales.deviation[name] > EXCESS_RATIO * least[name] for name in CHANNELS)
         if excess or best.scatter > MOST_SCATTER:
-            # Along a bent valley a fit ends too early; new difference steps continue it.
-            places.append(best.truth)
+            # With the expected scales, which are larger than those of the residuals, the misfit is smoother.
+            places.append(continued(replays, best, STEPS, known=known, near=best, linear=False).truth)
             if not searched:
                 places.append(_farther(replays.rough, best, begun))
                 searched = True
