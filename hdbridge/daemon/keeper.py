@@ -363,7 +363,7 @@ class Keeper:
 
     def _start_control(self, now_s: float) -> None:
         self._control = self._started(self._programs.control, "control", (), now_s)
-        self._turns.restart(self._memory.status.loop_count)
+        self._turns.restart(self._memory.status[Cell.LOOP_COUNT])
 
     def _start_helper(self, helper: _Helper, now_s: float) -> None:
         helper.due_s = None
@@ -401,7 +401,7 @@ class Keeper:
             return
         _log.error("control process died", {"how": end, "lived_s": round(now_s - child.started_s, 1)})
         known = status if status in _ERRORS else HdbridgeError.exit_status
-        if status in _ERRORS and not self._memory.status.loop_count:
+        if status in _ERRORS and not self._memory.status[Cell.LOOP_COUNT]:
             self._stop(now_s, known, f"the control process cannot start ({end})")
         elif not self._budget.spend(now_s):
             self._stop(now_s, known, "the control process keeps dying")
@@ -448,7 +448,7 @@ class Keeper:
         """Kills hung children; reports readiness, heartbeat and status to the service manager."""
         status = self._memory.status
         axes = ", ".join(axis.name for axis in self._start.machine.axes)
-        running = self._turns.check(status.loop_count)
+        running = self._turns.check(status[Cell.LOOP_COUNT])
         self._kill_hung(self._control, self._turns, self._times.hung_s)
         serving = True
         for helper in self._helpers:

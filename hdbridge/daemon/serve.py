@@ -57,7 +57,7 @@ async def serve(start: Start, memory: Memory) -> None:
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, terminated.set)
     async with AsyncExitStack() as stack:
         simulated = start.simulation is not None
-        clock = SimulatedClock(lambda: memory.status.loop_count, machine.cycle_s) if simulated else None
+        clock = SimulatedClock(lambda: memory.status[Cell.LOOP_COUNT], machine.cycle_s) if simulated else None
         timing = Timing(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS, clock)
         stack.callback(timing.close)
         bridge = ServiceBridge(machine, memory, timing, simulated=simulated, forced=start.force)
@@ -170,7 +170,7 @@ async def _last_words(bridge: ServiceBridge, memory: Memory) -> None:
     """Keeps serving while the axes are brought to rest, so that clients see the stop and it is recorded."""
     end_s = asyncio.get_running_loop().time() + LAST_WORDS_S
     status = memory.status
-    while bridge.core.observer.alive and status.loop_pid and asyncio.get_running_loop().time() < end_s:
+    while bridge.core.observer.alive and status[Cell.LOOP_PID] and asyncio.get_running_loop().time() < end_s:
         await asyncio.sleep(0.05)
     bridge.core.observer.poll()
 

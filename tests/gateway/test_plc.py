@@ -209,7 +209,7 @@ async def test_a_fault_of_the_gateway_is_reported_once_with_its_cause_and_record
     await swing(bench)
     await bench.wait(0.6)
     status = bench.daemon.memory.status
-    pid = status.loop_pid
+    pid = status[Cell.LOOP_PID]
     status[Cell.LOOP_PID] = 0  # as the keeper does when the control process has died
     await faulted(bench, 0x6010)
     status[Cell.LOOP_PID] = pid

@@ -18,7 +18,7 @@ from hdbridge.daemon.gateway.objects import BRIDGE, nameplate, write_eds
 from hdbridge.daemon.loop.faultlog import fault_of
 from hdbridge.daemon.loop.states import STOPPED as STOPPED_STATES
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import Memory, OuterCell, OuterKnot, OuterView, SampleArray, SampleFlag
+from hdbridge.daemon.memory import Cell, Memory, OuterCell, OuterKnot, OuterView, SampleArray, SampleFlag
 from hdbridge.device.behaviour import Behaviour, Controlword
 from hdbridge.device.emergency import ErrorCode
 from hdbridge.device.modes import InterpolatedPosition
@@ -353,11 +353,11 @@ class Gateway:
             return
         self._updated_s = now_s
         status = self._memory.status
-        turns = status.loop_count
+        turns = status[Cell.LOOP_COUNT]
         if turns != self._turns:
             self._turns, self._turned_s = turns, now_s
         samples, _ = self._reader.read()
         newest = samples[-1:] if len(samples) else None
-        alive = status.loop_pid != 0 and now_s - self._turned_s < DEAD_S
+        alive = status[Cell.LOOP_PID] != 0 and now_s - self._turned_s < DEAD_S
         for load in self.axes.values():
             load.update(newest, now_s, alive)

@@ -296,7 +296,8 @@ class ServiceAxis:
         await self.link.do(CommandKind.CHANGE, i=self.models.send(setting))
         self.models.chosen = setting
         await self.link.until(
-            lambda: any(each.kind is EventKind.CHANGED for each in log.of_axis(index, since)), CHANGE_S
+            lambda: any(each.kind is EventKind.CHANGED and each.axis == index for each in log.since(since)),
+            CHANGE_S,
         )
 
     # ---------------------------------------------------------------- objects of the drive

@@ -138,11 +138,11 @@ class ServiceBridge:
     async def _watch(self) -> None:
         """Reads samples and events, checks the lease and notices a new control process, every `PERIOD_S`."""
         core, status = self.core, self.core.memory.status
-        known = status.loop_pid
+        known = status[Cell.LOOP_PID]
         while True:
             core.observer.poll()
             status[Cell.SERVICE_TIME_NS] = time.monotonic_ns()
-            if (pid := status.loop_pid) and pid != known:
+            if (pid := status[Cell.LOOP_PID]) and pid != known:
                 if known:
                     core.log.note("the control process was started again: every axis is disabled")
                     self._bus_up = True
@@ -234,7 +234,7 @@ class ServiceBridge:
                 period_s=core.memory.period_s,
                 cycle=core.observer.cycle,
                 alive=core.observer.alive,
-                pid=core.memory.status.loop_pid,
+                pid=core.memory.status[Cell.LOOP_PID],
                 skipped=int(head["skipped"]) if head is not None else 0,
                 late_us=float(head["late_us"]) if head is not None else None,
                 busy_us=float(head["busy_us"]) if head is not None else None,
@@ -280,7 +280,7 @@ class ServiceBridge:
     def events(self, since: int = 0) -> messages.Events:
         """Returns at most the newest `EVENTS_RETURNED` events after number ``since``, oldest first."""
         events = self.core.log.public(since)[-EVENTS_RETURNED:]
-        newest = events[-1].number if events else self.core.log.newest_public
+        newest = events[-1].sequence if events else self.core.log.newest_public
         return messages.Events(
             events=[reports.event_message(each, self._names) for each in events],
             lost=max(newest - since - len(events), 0),

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from itertools import count
 from typing import Final, TypedDict, Unpack
 
-from hdbridge.daemon.memory import CommandKind, Event, EventKind, Memory
+from hdbridge.daemon.memory import Cell, CommandKind, Event, EventKind, Memory
 from hdbridge.daemon.service.eventlog import EventLog
 from hdbridge.daemon.service.lease import Lease
 from hdbridge.daemon.service.observer import Observer
@@ -55,20 +55,23 @@ class Core:
         does not answer within ``within_s``.
         """
         self.refuse(kind)
-        loop_pid = self.memory.status.loop_pid
+        loop_pid = self.memory.status[Cell.LOOP_PID]
         if not loop_pid:
             raise RefusedError(
                 f"{kind.name} was not sent, because there is no control process: the daemon is starting one, "
                 "with every axis disabled; wait for it and repeat the request"
             )
+        since = self.log.newest
         command_id = self.memory.commands.post(kind, axis, **arguments)
         deadline_s = self.timing.clock.now() + within_s
         while True:
             self.log.poll()
-            answer = self.log.answer(command_id)
-            if answer is not None:
-                break
-            if self.memory.status.loop_pid != loop_pid:
+            for event in self.log.since(since):
+                if event.id == command_id and event.kind is EventKind.DONE:
+                    return event
+                if event.id == command_id and event.kind is EventKind.REFUSED:
+                    raise RefusedError(event.text)
+            if self.memory.status[Cell.LOOP_PID] != loop_pid:
                 raise DaemonError(
                     f"the control process died before it answered {kind.name}; another one has taken its "
                     "place, with every axis disabled"
@@ -79,6 +82,3 @@ class Core:
                     "gone; it is restarted automatically, with every axis disabled"
                 )
             await self.timing.sleep(POLL_S)
-        if answer.kind is EventKind.REFUSED:
-            raise RefusedError(answer.text)
-        return answer

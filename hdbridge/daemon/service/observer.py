@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from hdbridge.clock import Clock
-from hdbridge.daemon.memory import Event, Memory, SampleArray
+from hdbridge.daemon.memory import Cell, Event, Memory, SampleArray
 from hdbridge.daemon.service.eventlog import EventLog
 
 PERIOD_S = 0.02
@@ -57,12 +57,11 @@ class Observer:
         """Reads the rings and calls the sinks. An error of a sink is logged once and affects no other."""
         samples, lost = self._reader.read()
         self._log.poll()
-        turns = self._status.loop_count
+        turns = self._status[Cell.LOOP_COUNT]
         if turns != self._turns:
             self._turns, self._turned_s = turns, self._clock.now()
-        entries = self._log.since(self._seen)
-        self._seen = entries[-1].number if entries else self._seen
-        events = [each.event for each in entries if each.event is not None]
+        events = self._log.since(self._seen)
+        self._seen = events[-1].sequence if events else self._seen
         self.lost += lost
         if len(samples):
             self.newest = samples[-1:].copy()

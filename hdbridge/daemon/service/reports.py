@@ -61,7 +61,7 @@ def event_message(entry: Entry, names: Sequence[str]) -> messages.Event:
             case EventKind.STOPPED:
                 hint = stop_hint(event, axis or "AXIS")
     return messages.Event(
-        sequence=entry.number, kind=kind, date=entry.date, cycle=cycle, axis=axis, text=text, hint=hint
+        sequence=entry.sequence, kind=kind, date=entry.date, cycle=cycle, axis=axis, text=text, hint=hint
     )
 
 

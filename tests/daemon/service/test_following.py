@@ -37,8 +37,7 @@ def following(bridge: ServiceBridge, settings: AdaptationSettings, folder: Path)
 
 
 def changes(bridge: ServiceBridge) -> int:
-    entries = bridge.core.log.since(0)
-    return sum(each.event is not None and each.event.kind is EventKind.CHANGED for each in entries)
+    return sum(each.kind is EventKind.CHANGED for each in bridge.core.log.since(0))
 
 
 async def test_a_disabled_adaptation_learns_and_writes_nothing(service: Service, tmp_path: Path) -> None:

@@ -165,7 +165,7 @@ def begin_uncompensated(service: Service) -> None:
             compensation_for(axis.config, TransmissionModel(axis.config.gear.ratio))
         )
     status = service.daemon.memory.status
-    status[Cell.LOOP_PID] = status.loop_pid + 1
+    status[Cell.LOOP_PID] = status[Cell.LOOP_PID] + 1
 
 
 async def choose(bridge: ServiceBridge, token: str) -> None:

@@ -56,7 +56,7 @@ async def test_without_a_control_process_nothing_is_sent(service: Service) -> No
     async with service.ready() as bridge:
         axis, token = bridge.axes["axis1"], bridge.lease.take("test")
         status = service.daemon.memory.status
-        pid = status.loop_pid
+        pid = status[Cell.LOOP_PID]
         status[Cell.LOOP_PID] = 0
         with pytest.raises(RefusedError, match="there is no control process"):
             await axis.enable(token)
