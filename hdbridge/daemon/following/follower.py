@@ -21,10 +21,10 @@ from hdbridge.client import messages
 from hdbridge.daemon.following.adaptation import Adaptation, Proposal
 from hdbridge.daemon.following.health import (
     DRIVEN,
+    UNTESTED_ARCSEC,
     ZERO_UNKNOWN,
     EncoderHealth,
     EncoderStatus,
-    held_out_arcsec,
     in_states,
 )
 from hdbridge.daemon.following.judging import RaisedVerdict, Verdict, Watch
@@ -86,7 +86,7 @@ class Follower:
         motor_count = axis.motor_encoder.resolution_arcsec / axis.gear.ratio
         self._sigma_arcsec = math.hypot(motor_count, axis.load_encoder.resolution_arcsec) / UNIFORM
         """Standard deviation of an observation due to quantisation by the encoders' counts."""
-        noise = max(held_out_arcsec(model), motor_count / UNIFORM)
+        noise = max(model.held_out_arcsec or UNTESTED_ARCSEC, motor_count / UNIFORM)
         self.watch = Watch(self._drift, noise)
         self._zero = Zero(self._drift, self._sigma_arcsec)
         channels = tuple(BY_KEY[key] for key in axis.channels)
