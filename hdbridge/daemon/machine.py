@@ -26,7 +26,7 @@ from hdbridge.daemon.machinefile import (
     LoadLoopSettings,
     MachineFile,
     RecorderSettings,
-    token_complaint,
+    read_token,
 )
 from hdbridge.drive import plan
 from hdbridge.drive.busload import check_bus_load
@@ -330,5 +330,7 @@ def _check_tcp(file: MachineFile, places: _Places) -> None:
     tcp = file.api.tcp
     if tcp is None:
         return
-    if complaint := token_complaint(places.folder / tcp.token_file):
-        raise places.error(("api", "tcp", "token_file"), complaint)
+    try:
+        read_token(places.folder / tcp.token_file)
+    except InputError as problem:
+        raise places.error(("api", "tcp", "token_file"), str(problem)) from None

@@ -13,6 +13,7 @@ from pydantic import Field
 from hdbridge.axis import BusConfig, RealtimeConfig
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.memory.layout import AXES_AT_MOST
+from hdbridge.errors import InputError
 from hdbridge.strictness import Strict
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
@@ -195,18 +196,22 @@ class MachineFile(Strict):
     )
 
 
-def token_complaint(path: Path) -> str | None:
-    """Returns the error message for a token file; None if the file is valid."""
+def read_token(path: Path) -> str:
+    """Returns the token in a file; raises InputError if it is invalid, or if others can read the file."""
     try:
         content, mode = path.read_text(encoding="ascii").strip(), path.stat().st_mode
     except (OSError, UnicodeDecodeError) as problem:
         reason = problem.strerror if isinstance(problem, OSError) else "not ASCII text"
-        return f"{path}: cannot be read: {reason}; expected a file with the token in one line"
+        raise InputError(
+            f"{path}: cannot be read: {reason}; expected a file with the token in one line"
+        ) from None
     if mode & 0o077:
-        return f"{path} can be read by others (mode {mode & 0o777:o}); expected mode 600: chmod 600 {path}"
+        raise InputError(
+            f"{path} can be read by others (mode {mode & 0o777:o}); expected mode 600: chmod 600 {path}"
+        )
     if not _TOKEN.fullmatch(content):
-        return (
+        raise InputError(
             f"{path}: expected a token of 16 to 200 letters, digits, '-', '.', '_' or '~'; make one: "
             f"openssl rand -hex 16 > {path}"
         )
-    return None
+    return content

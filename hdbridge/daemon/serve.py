@@ -20,6 +20,7 @@ from hdbridge.daemon.api.server import ApiServer, Listener
 from hdbridge.daemon.api.sockets import file_of, unix_socket
 from hdbridge.daemon.logs import begin_log
 from hdbridge.daemon.machine import Machine
+from hdbridge.daemon.machinefile import read_token
 from hdbridge.daemon.memory import Cell, Memory
 from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
 from hdbridge.daemon.recorder.flightfile import About, AxisAbout
@@ -129,7 +130,7 @@ def listeners(machine: Machine, descriptors: Sequence[int], page_token: str | No
     if page_token is not None:
         made.append(Listener(others[0], Policy(page_token)))
     elif tcp is not None:
-        token = machine.resolve_path(tcp.token_file).read_text(encoding="ascii").strip()
+        token = read_token(machine.resolve_path(tcp.token_file))
         made.append(Listener(others[0], Policy(token, frozenset(each.lower() for each in tcp.names))))
     return made
 

@@ -179,7 +179,7 @@ class SteppedDaemon:
 
     def drive(self, axis: int) -> Drive:
         """Returns the service's drive object of an axis."""
-        return self.commissioning(axis)._drive
+        return self.commissioning(axis).drive
 
     def verify(self, axis: int = 0) -> None:
         """Boots the drive by SDO over the relay, and reports it as verified."""

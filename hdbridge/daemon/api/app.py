@@ -49,8 +49,8 @@ def create_app(bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> Fas
         openapi_tags=[{"name": name, "description": about} for name, about in TAGS],
         generate_unique_id_function=lambda route: route.name,
         redirect_slashes=False,
+        exception_handlers=problems.HANDLERS,
     )
-    problems.register(app)
     app.state.bridge = bridge
     for each in (machine, axis, sockets):
         app.include_router(each.routes, prefix=PREFIX)

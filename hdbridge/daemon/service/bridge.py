@@ -24,6 +24,7 @@ import logging
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -43,9 +44,7 @@ from hdbridge.errors import HdbridgeError, InputError
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Machine
     from hdbridge.daemon.memory import Event, Memory, SampleArray
-    from hdbridge.daemon.memory.channels import SampleReader
     from hdbridge.daemon.recorder.recorder import FlightRecorder
-    from hdbridge.daemon.service.lease import Lease
 
 VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
 """Pauses before successive attempts to verify a drive that did not answer; the last pause repeats."""
@@ -75,9 +74,11 @@ class ServiceBridge:
             against = "its axes are simulated; a command has a simulated axis of its own with --simulate"
         self.lending = Lending(self.core, machine.bus, against)
         self.axes: dict[str, ServiceAxis] = {
-            axis.name: ServiceAxis(index, axis, self.core, self._axis_state)
+            axis.name: ServiceAxis(index, axis, self.core, partial(self._outer, index))
             for index, axis in enumerate(machine.axes)
         }
+        self.reader = memory.reader
+        """Returns a reader of samples from now on."""
         self.recorder: FlightRecorder | None = None
         self._names = tuple(self.axes)
         self._simulated = simulated
@@ -88,7 +89,9 @@ class ServiceBridge:
         if machine.gateway is not None:
             self.core.observer.add(self._latency)
         self._tasks: set[asyncio.Task[None]] = set()
-        self.core.lease.doing = self._doing
+        self.lease = self.core.lease
+        """Right to move."""
+        self.lease.doing = self._doing
 
     def _doing(self) -> str:
         """Describes the current motions for a client without the lease."""
@@ -96,11 +99,6 @@ class ServiceBridge:
         return "; ".join(
             f"axis '{each.name}' is in motion ({each.mode})" for each in states if each.mode != "hold"
         )
-
-    @property
-    def lease(self) -> Lease:
-        """Lease, which is the right to move."""
-        return self.core.lease
 
     # ---------------------------------------------------------------- begin and end
 
@@ -221,7 +219,7 @@ class ServiceBridge:
             version=version("hdbridge"),
             started=self._started,
             simulated=self._simulated,
-            axes=[self._axis_state(axis) for axis in self.axes.values()],
+            axes=[axis.state() for axis in self.axes.values()],
             bus=messages.BusState(
                 interface=self.machine.bus.interface,
                 channel=str(self.machine.bus.channel),
@@ -244,18 +242,14 @@ class ServiceBridge:
             warnings=self._warnings(),
         )
 
-    def _axis_state(self, axis: ServiceAxis) -> messages.AxisState:
-        """Returns the state of one axis in the newest cycle."""
-        return reports.axis_state(axis, self._outer(axis))
-
-    def _outer(self, axis: ServiceAxis) -> messages.OuterState | None:
+    def _outer(self, index: int) -> messages.OuterState | None:
+        """Returns the state of an axis as seen by the outer master; None without one."""
         gateway, memory = self.machine.gateway, self.core.memory
-        node_id = gateway.nodes.get(axis.name) if gateway is not None else None
+        node_id = gateway.nodes.get(self._names[index]) if gateway is not None else None
         if node_id is None:
             return None
         alive_ns = memory.status[Cell.GATEWAY_TIME_NS]
-        place = axis.link.index
-        return reports.outer_state(memory.outer[place], node_id, alive_ns, self._latency.of(place))
+        return reports.outer_state(memory.outer[index], node_id, alive_ns, self._latency.of(index))
 
     def _warnings(self) -> list[str]:
         core = self.core
@@ -286,10 +280,6 @@ class ServiceBridge:
             lost=max(newest - since - len(events), 0),
             newest=newest,
         )
-
-    def reader(self) -> SampleReader:
-        """Returns a reader of samples from now on."""
-        return self.core.memory.reader()
 
     # ---------------------------------------------------------------- requests
 

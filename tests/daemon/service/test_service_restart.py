@@ -19,7 +19,7 @@ async def test_a_new_service_finds_the_axis_where_it_is(service: Service) -> Non
     assert service.daemon.states == [AxisState.ENABLED]
     async with service.bridge() as bridge:
         axis = bridge.axes["axis1"]
-        await until(bridge, lambda: axis.commissioning.report is not None)
+        await until(bridge, lambda: axis.commissioning.drive.report is not None)
         state = axis.state()
         assert state.state == "enabled"
         assert state.load_target_deg == pytest.approx(30.0)
@@ -46,7 +46,7 @@ async def test_no_request_is_made_before_the_axis_state_is_known(service: Servic
         axis = bridge.axes["axis1"]
         token = bridge.lease.take("at once")
         await axis.reset(token)  # waits until the state is known
-        assert axis.commissioning.report is not None
+        assert axis.commissioning.drive.report is not None
         assert daemon.states == [AxisState.DISABLED]
         assert 0x000 not in sent  # no NMT command has been sent
 
