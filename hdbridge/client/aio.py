@@ -39,6 +39,7 @@ from hdbridge.client.messages import (
     Problem,
     SdoValue,
 )
+from hdbridge.enums import AdaptationMode, Scheme
 from hdbridge.errors import DaemonError, HdbridgeError, LeaseError, SafetyStop
 
 M = TypeVar("M", bound=BaseModel)
@@ -386,7 +387,7 @@ class AsyncAxis:
             yield stream
             await stream.end()
 
-    async def compensate(self, scheme: messages.Scheme | str) -> AxisState:
+    async def compensate(self, scheme: Scheme | str) -> AxisState:
         """Selects the part of the model that compensates; ``none`` switches compensation off."""
         return await self._post("compensate", messages.Compensate.given(scheme=scheme))
 
@@ -398,7 +399,7 @@ class AsyncAxis:
         """Switches the load loop (integral of the measured error) on or off."""
         return await self._post("load-loop", messages.SwitchLoadLoop.given(on=on))
 
-    async def adapt(self, mode: messages.AdaptationMode | str) -> AxisState:
+    async def adapt(self, mode: AdaptationMode | str) -> AxisState:
         """Sets the adaptation mode: ``off``, ``observe`` or ``on``."""
         return await self._post("adaptation", messages.Adapt.given(mode=mode))
 

@@ -14,7 +14,6 @@ from typing import Self, TypeVar
 
 from hdbridge.axis import AxisConfig, BusConfig, RealtimeConfig
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.busroutes import conflict
 from hdbridge.daemon.machinefile import (
@@ -31,6 +30,7 @@ from hdbridge.daemon.machinefile import (
 from hdbridge.drive import plan
 from hdbridge.drive.busload import check_bus_load
 from hdbridge.drive.link import unknown_interface
+from hdbridge.enums import Scheme
 from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile, bundled_folder
 from hdbridge.files.yamlfile import Document, Location, read_yaml

@@ -11,15 +11,14 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from hdbridge.axis import BusConfig, RealtimeConfig
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.memory.layout import AXES_AT_MOST
+from hdbridge.enums import AdaptationMode, Scheme
 from hdbridge.errors import InputError
 from hdbridge.strictness import Strict
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
 """Pattern of a machine's name, which is also the name of its socket and service."""
 _TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")
-Mode = Literal["off", "observe", "on"]
 Parameter = Annotated[str, Field(pattern=r"^[a-z_]+\.[a-z_]+$")]
 
 
@@ -55,7 +54,7 @@ class Excitation(Strict):
 class AdaptationSettings(Strict):
     """Settings of the adaptation. Rates are per hour of axis time, bounds relative to the committed model."""
 
-    mode: Mode = Field("off", description="observe only reports what would change")
+    mode: AdaptationMode = Field(AdaptationMode.OFF, description="observe only reports what would change")
     parameters: tuple[Parameter, ...] | None = Field(
         None,
         description="adapted parameters, as EFFECT.PARAMETER; by default all that wear or temperature move",
@@ -111,7 +110,9 @@ class AxisEntry(Strict):
     compensation: Scheme = Field(
         Scheme.EXTENDED, description="part of the active model that compensates; extended is the whole model"
     )
-    adapt: Mode | None = Field(None, description="adaptation mode of this axis; by default adaptation.mode")
+    adapt: AdaptationMode | None = Field(
+        None, description="adaptation mode of this axis; by default adaptation.mode"
+    )
     load_loop: LoadLoopSettings | None = Field(
         None, description="slow control loop on the load encoder; by default none"
     )

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.machine import Machine, machine_file
+from hdbridge.enums import Scheme
 from hdbridge.errors import InputError
 from hdbridge.files.profile import bundled_folder, bundled_profile
 

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from hdbridge.client import messages
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.memory import sample_dtype
 from hdbridge.daemon.service.lease import Lease
 from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.values import Object, Value
+from hdbridge.enums import Scheme
 from hdbridge.errors import InputError, RefusedError
 
 BEGAN = datetime(2025, 1, 31, 12, 0, tzinfo=UTC)

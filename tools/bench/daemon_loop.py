@@ -26,7 +26,6 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.clock import Clock
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.control.channelstate import ChannelState
@@ -40,6 +39,7 @@ from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
+from hdbridge.enums import Scheme
 from hdbridge.motion import SetPoint
 
 GOAL = 1.3

@@ -33,8 +33,9 @@ from hdbridge.daemon.following.servo import ServoWatch
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.following.zero import Zero
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.machinefile import AdaptationSettings, Mode
+from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import NO_FAULT, SampleArray, SampleFlag, joined_samples
+from hdbridge.enums import AdaptationMode
 from hdbridge.errors import InputError
 
 MIN_BATCH_SAMPLES: Final = 25
@@ -100,7 +101,7 @@ class Follower:
         self._now_s = 0.0
         self._refined_at: datetime | None = None
 
-    def adapt(self, mode: Mode, files: AdaptationFiles | None = None) -> None:
+    def adapt(self, mode: AdaptationMode, files: AdaptationFiles | None = None) -> None:
         """Changes the mode of the adaptation, or starts it, from the state in ``files`` if any.
 
         Raises InputError if the settings name a parameter that the model lacks, or the axis has no encoder at
@@ -195,7 +196,7 @@ class Follower:
         adaptation = self.adaptation
         assert adaptation is not None
         return messages.AdaptationState(
-            mode=messages.AdaptationMode(adaptation.mode),
+            mode=adaptation.mode,
             frozen=adaptation.waiting_reason(path_known=self._measuring.known),
             updated=self.updated,
             parameters=adaptation.estimated_changes(),

@@ -11,7 +11,6 @@ from typing import Final
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.channelstate import ChannelState
 from hdbridge.control.loadloop import LoadLoop
@@ -20,6 +19,7 @@ from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
+from hdbridge.enums import Scheme
 from hdbridge.errors import InputError
 from hdbridge.motion import SetPoint
 from hdbridge.units import ARCSEC_PER_DEG

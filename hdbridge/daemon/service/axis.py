@@ -14,7 +14,6 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Literal
 
 from hdbridge.client import messages
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, UNKNOWN, AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind
 from hdbridge.daemon.service import reports
@@ -25,6 +24,7 @@ from hdbridge.daemon.service.models import AxisModels
 from hdbridge.daemon.service.moves import AxisMotion
 from hdbridge.drive.states import State
 from hdbridge.drive.values import Object, Value
+from hdbridge.enums import Scheme
 from hdbridge.errors import DriveError, HdbridgeError, InputError, RefusedError
 
 if TYPE_CHECKING:

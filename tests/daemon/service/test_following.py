@@ -17,13 +17,13 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Hysteresis
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.client.messages import AdaptationMode
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import EventKind
 from hdbridge.daemon.recorder.flightlog import Note
 from hdbridge.daemon.serve import follow
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
+from hdbridge.enums import Scheme
 
 DEMO = Path("profiles/demo/axis.yaml")
 

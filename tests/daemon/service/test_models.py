@@ -13,13 +13,13 @@ from support.service import Service, stepped_service, until
 
 from hdbridge.axis.effects import Hysteresis
 from hdbridge.axis.model import TransmissionModel, store
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.switchover import Correction
 from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import Cell
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.setting import CompensationSetting
+from hdbridge.enums import Scheme
 from hdbridge.errors import DaemonError, InputError, RefusedError
 
 NOW = datetime(2026, 3, 1, tzinfo=UTC)

@@ -3,9 +3,9 @@
 import pytest
 from support.service import Service, until
 
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import Cell, CommandKind
+from hdbridge.enums import Scheme
 from hdbridge.errors import LeaseError, RefusedError
 
 
