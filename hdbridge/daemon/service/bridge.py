@@ -110,8 +110,12 @@ class ServiceBridge:
         self._start(self._watch())
         for axis in self.axes.values():
             self._start(self._take_over(axis))
-            self._start(self._settle(axis))
-            self._start(self._verify(axis))
+            # The drive is booted and verified whenever necessary; the axis stays disabled.
+            for is_due, attempt, pauses_s, failure in (
+                (self._is_unsettled, axis.settle, SETTLE_AGAIN_S, "the compensation could not be put back"),
+                (self._is_unverified, axis.verify, VERIFY_AGAIN_S, "the drive could not be verified"),
+            ):
+                self._start(self._persist(axis, is_due, attempt, pauses_s, failure))
         if (gateway := self.machine.gateway) is not None:
             master = OuterMaster(self.core, gateway, self.mark)
             self._start(master.keep())
@@ -160,23 +164,16 @@ class ServiceBridge:
             elif event.kind in (EventKind.BUS_DOWN, EventKind.BUS_UP):
                 self._bus_up = event.kind is EventKind.BUS_UP
 
-    async def _settle(self, axis: ServiceAxis) -> None:
-        """Sends the chosen compensation whenever the control process does not use it."""
-        what = "the compensation could not be put back"
-        await self._persist(axis, lambda: not axis.models.settled, axis.settle, SETTLE_AGAIN_S, what)
+    def _is_unsettled(self, axis: ServiceAxis) -> bool:
+        return not axis.models.settled
 
-    async def _verify(self, axis: ServiceAxis) -> None:
-        """Boots and verifies the drive whenever necessary. The axis stays disabled."""
-
-        def is_due() -> bool:
-            return axis.link.state in UNKNOWN and self._bus_up
-
-        await self._persist(axis, is_due, axis.verify, VERIFY_AGAIN_S, "the drive could not be verified")
+    def _is_unverified(self, axis: ServiceAxis) -> bool:
+        return axis.link.state in UNKNOWN and self._bus_up
 
     async def _persist(
         self,
         axis: ServiceAxis,
-        is_due: Callable[[], bool],
+        is_due: Callable[[ServiceAxis], bool],
         attempt: Callable[[], Awaitable[None]],
         pauses_s: Sequence[float],
         failure: str,
@@ -184,14 +181,14 @@ class ServiceBridge:
         """Repeats an attempt while it is due, until cancelled; notes each different error."""
         timing, attempts, noted = self.core.timing, 0, ""
         while True:
-            if not is_due():
+            if not is_due(axis):
                 attempts, noted = 0, ""
                 await timing.sleep(PERIOD_S)
                 continue
             await timing.sleep(pauses_s[min(attempts, len(pauses_s) - 1)])
             attempts += 1
             try:
-                if is_due():
+                if is_due(axis):
                     await attempt()
             except HdbridgeError as error:
                 if str(error) != noted:
@@ -298,8 +295,6 @@ class ServiceBridge:
         self, holder: str, moves: Mapping[str, float], speed: float = 1.0, wait: bool = True
     ) -> None:
         """Moves several axes so that all begin and end together; ``speed`` is a fraction of the limits."""
-        if not moves:
-            raise InputError("a coordinated move without an axis; expected a target for at least one")
         for name in moves.keys() - self.axes.keys():
             raise InputError(f"there is no axis '{name}'; expected one of: {', '.join(self.axes)}")
         await run_together(holder, [self.axes[name] for name in moves], moves, speed, wait=wait)

@@ -105,11 +105,11 @@ class AxisMotion:
             self.replace(activity, "it was replaced by a stream")
         return stream
 
-    async def queue(self, holder: str, points: Sequence[QueueItem]) -> int:
+    async def queue(self, holder: str, points: Sequence[QueueItem]) -> None:
         """Appends all or none of these moves, each of which begins at the end of the one before.
 
-        Returns the number of waiting moves. Raises InputError for an invalid point, RefusedError if another
-        motion is in progress or the queue is full.
+        Raises InputError for an invalid point, RefusedError if another motion is in progress or the queue is
+        full.
         """
         self._check(holder)
         name = self._link.name
@@ -127,14 +127,11 @@ class AxisMotion:
         elif points:
             before, self.activity = self.activity, Activity(Kind.QUEUE, holder)
             self._start(self._run(self.activity, before))
-        return self.queued
 
-    async def clear_queue(self, holder: str) -> int:
-        """Discards the waiting moves and returns their number. The current move continues."""
+    async def clear_queue(self, holder: str) -> None:
+        """Discards the waiting moves. The current move continues."""
         self._check(holder)
-        forgotten = self.queued
         self._points.clear()
-        return forgotten
 
     async def end_without_lease(self) -> None:
         """Stops an activity that must end with its lease, if that lease has ended."""
