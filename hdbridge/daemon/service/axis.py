@@ -316,8 +316,3 @@ class ServiceAxis:
             )
         self.is_prepared = False
         return await self._work(self.commissioning.write, object_, value)
-
-    async def close(self) -> None:
-        """Ends queue and SDO access; the axis completes its current motion."""
-        await self.motion.close()
-        self.commissioning.close()

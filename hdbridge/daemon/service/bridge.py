@@ -22,11 +22,11 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from hdbridge.client import messages
 from hdbridge.daemon.loop.states import UNKNOWN
@@ -88,7 +88,6 @@ class ServiceBridge:
         self._latency = Latency(memory.axes)
         if machine.gateway is not None:
             self.core.observer.add(self._latency)
-        self._tasks: set[asyncio.Task[None]] = set()
         self.lease = self.core.lease
         """Right to move."""
         self.lease.doing = self._doing
@@ -107,20 +106,20 @@ class ServiceBridge:
 
         Returns once the control process compensates each axis by its setting, or does not answer.
         """
-        self._start(self._watch())
+        self.core.start(self._watch())
         for axis in self.axes.values():
-            self._start(self._take_over(axis))
+            self.core.start(self._take_over(axis))
             # The drive is booted and verified whenever necessary; the axis stays disabled.
             for is_due, attempt, pauses_s, failure in (
                 (self._is_unsettled, axis.settle, SETTLE_AGAIN_S, "the compensation could not be put back"),
                 (self._is_unverified, axis.verify, VERIFY_AGAIN_S, "the drive could not be verified"),
             ):
-                self._start(self._persist(axis, is_due, attempt, pauses_s, failure))
+                self.core.start(self._persist(axis, is_due, attempt, pauses_s, failure))
         if (gateway := self.machine.gateway) is not None:
             master = OuterMaster(self.core, gateway, self.mark)
-            self._start(master.keep())
+            self.core.start(master.keep())
             for name in gateway.nodes:
-                self._start(master.serve(self.axes[name]))
+                self.core.start(master.serve(self.axes[name]))
         # Let each take-over start, so that no other request precedes it.
         await asyncio.sleep(0)
         timing = self.core.timing
@@ -131,14 +130,15 @@ class ServiceBridge:
 
     async def __aexit__(self, *_: object) -> None:
         """Stops monitoring; the axes complete their current commands."""
-        for task in tuple(self._tasks):
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self.core.close()
         for axis in self.axes.values():
-            await axis.close()
+            axis.commissioning.close()
 
     async def _watch(self) -> None:
-        """Reads samples and events, checks the lease and notices a new control process, every `PERIOD_S`."""
+        """Reads samples and events, checks the lease and notices a new control process, every `PERIOD_S`.
+
+        If it fails, the keeper restarts the service.
+        """
         core, status = self.core, self.core.memory.status
         known = status[Cell.LOOP_PID]
         while True:
@@ -304,14 +304,3 @@ class ServiceBridge:
         self.core.log.note(text, axis)
         if self.recorder is not None:
             self.recorder.mark(text)
-
-    def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.get_running_loop().create_task(coroutine)
-        self._tasks.add(task)
-        task.add_done_callback(self._log_error)
-
-    def _log_error(self, task: asyncio.Task[None]) -> None:
-        """Logs an unexpected error of a task. If `_watch` fails, the keeper restarts the service."""
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            _log.error("an error in hdbridge", exc_info=error)

@@ -1,8 +1,10 @@
 """Shared parts of the service: control process, event log, samples, clock and lease."""
 
-from collections.abc import Callable
+import asyncio
+import logging
+from collections.abc import Callable, Coroutine
 from itertools import count
-from typing import Final, TypedDict, Unpack
+from typing import Any, Final, TypedDict, Unpack
 
 from hdbridge.daemon.memory import Cell, CommandKind, Event, EventKind, Memory
 from hdbridge.daemon.service.eventlog import EventLog
@@ -11,6 +13,7 @@ from hdbridge.daemon.service.observer import Observer
 from hdbridge.daemon.service.timing import POLL_S, Timing
 from hdbridge.errors import DaemonError, RefusedError
 
+_log = logging.getLogger(__name__)
 ANSWER_S: Final = 5.0
 """Time-out of an answer. The control process normally answers within a few cycles, but answers ENABLE and
 DISABLE only on completion."""
@@ -39,8 +42,27 @@ class Core:
         self.lease = Lease(lease_s, timing.clock.now)
         self.refuse: Callable[[CommandKind | None], None] = lambda _: None
         """Raises RefusedError if the bus is lent and no command (None: no frame) can be sent."""
+        self._tasks: set[asyncio.Task[None]] = set()
         # Start from the current time, so that the numbers differ from those of an earlier service.
         self._streams = count(int(1000.0 * timing.clock.now()) + 1)
+
+    def start(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        """Runs a coroutine in the background, until its end or until `close`."""
+        task = asyncio.get_running_loop().create_task(coroutine)
+        self._tasks.add(task)
+        task.add_done_callback(self._ended)
+
+    async def close(self) -> None:
+        """Cancels what `start` has begun."""
+        for task in tuple(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        """Logs an unexpected error of a task."""
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            _log.error("an error in hdbridge", exc_info=error)
 
     def next_stream(self) -> int:
         """Returns an unused stream number."""
@@ -65,7 +87,7 @@ class Core:
         command_id = self.memory.commands.post(kind, axis, **arguments)
         deadline_s = self.timing.clock.now() + within_s
         while True:
-            self.log.poll()
+            self.observer.poll()
             for event in self.log.since(since):
                 if event.id == command_id and event.kind is EventKind.DONE:
                     return event

@@ -51,8 +51,8 @@ class EventLog:
         self.newest = self.newest_public = 0
         """Numbers of the newest event, and of the newest entry for clients; 0 before the first."""
 
-    def poll(self) -> None:
-        """Reads new events of the control process."""
+    def poll(self) -> list[Event]:
+        """Reads new events of the control process and returns them."""
         with self._lock:
             events, _ = self._reader.read()
             for event in events:
@@ -60,6 +60,7 @@ class EventLog:
                 self.newest = event.sequence
                 if not _routine(event):
                     self._add(event.axis, event, event.text)
+        return events
 
     def note(self, text: str, axis: int = -1) -> None:
         """Adds a note of the service."""

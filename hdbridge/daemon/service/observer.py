@@ -32,7 +32,6 @@ class Observer:
         self._turns = -1
         self._turned_s = clock.now()
         self._log = log
-        self._seen = log.newest
         self._sinks: list[Sink] = []
         self._failed_sinks: set[int] = set()
         self.newest: SampleArray | None = None
@@ -56,12 +55,10 @@ class Observer:
     def poll(self) -> None:
         """Reads the rings and calls the sinks. An error of a sink is logged once and affects no other."""
         samples, lost = self._reader.read()
-        self._log.poll()
+        events = self._log.poll()
         turns = self._status[Cell.LOOP_COUNT]
         if turns != self._turns:
             self._turns, self._turned_s = turns, self._clock.now()
-        events = self._log.since(self._seen)
-        self._seen = events[-1].sequence if events else self._seen
         self.lost += lost
         if len(samples):
             self.newest = samples[-1:].copy()
