@@ -59,12 +59,8 @@ class RelayBus(can.BusABC):
         """Reason with which the current operation is to fail; empty if it is not to fail."""
 
     def interrupt(self, reason: str) -> None:
-        """Makes the current operation fail at its next wait, once, with ``reason``."""
+        """Makes the current operation fail at its next wait, once, with ``reason``; empty: not any more."""
         self._interruption = reason
-
-    def begin(self) -> None:
-        """Begins another operation, discarding an interruption of the last one."""
-        self._interruption = ""
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Sends a frame. Drops the master's heartbeat, which the control process sends."""
@@ -205,7 +201,7 @@ class Commissioning:
         if not self._busy.acquire(timeout=BUSY_S):
             raise RefusedError(f"the drive of axis '{self.drive.axis.name}' is busy: {self._doing}")
         self._doing = doing
-        self._bus.begin()
+        self._bus.interrupt("")
         try:
             yield
         finally:
