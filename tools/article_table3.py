@@ -23,8 +23,9 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Hysteresis, HysteresisMemory, Moment, Motion, Start, Tracker
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.comparison import compare_schemes
-from hdbridge.commissioning.evaluation.stepping import Scheme, quantisation_floor_arcsec
+from hdbridge.commissioning.evaluation.stepping import quantisation_floor_arcsec
 from hdbridge.drive.drive import Drive
+from hdbridge.enums import Scheme
 from hdbridge.files.profile import bundled_profile
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import simulated_bench

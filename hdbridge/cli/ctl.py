@@ -23,7 +23,7 @@ from hdbridge.cli import options as opt
 from hdbridge.cli.options import taking
 from hdbridge.cli.printing import console, note, print_object, print_table, say, tables, write_json
 from hdbridge.cli.session import note_clamped
-from hdbridge.client.messages import AdaptationMode, Scheme
+from hdbridge.enums import AdaptationMode, Scheme
 from hdbridge.errors import DaemonError, HdbridgeError, InputError
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from hdbridge.cli import options as opt
 from hdbridge.cli.calibration import phases, print_steps
 from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_result
 from hdbridge.cli.session import Session, compensating_model, note_clamped, on_axis
-from hdbridge.commissioning.evaluation.stepping import Scheme
+from hdbridge.enums import Scheme
 from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.files.atomic import make_folder, new_folder
 from hdbridge.files.outputs import Kind, writing

@@ -19,7 +19,8 @@ from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
-    from hdbridge.daemon.recorder.reading import Flight, ModelUsed
+    from hdbridge.daemon.recorder.flightfile import ModelUse
+    from hdbridge.daemon.recorder.reading import Flight
     from hdbridge.records.recording import Recording
 
 
@@ -47,7 +48,7 @@ class Part:
         str | None, Option("--to", metavar="TIME", help="End of the flight, ISO 8601; UTC without an offset.")
     ] = None
 
-    def read(self, paths: Sequence[Path], *, all_states: bool = False) -> tuple[Recording, ModelUsed | None]:
+    def read(self, paths: Sequence[Path], *, all_states: bool = False) -> tuple[Recording, ModelUse | None]:
         """Reads MCAP files and folders of them; returns the recording and the model last used, or None.
 
         Raises `InputError` if the axis or the period is not in the recordings.

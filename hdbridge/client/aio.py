@@ -39,6 +39,7 @@ from hdbridge.client.messages import (
     Problem,
     SdoValue,
 )
+from hdbridge.enums import AdaptationMode, Scheme
 from hdbridge.errors import DaemonError, HdbridgeError, LeaseError, SafetyStop
 
 M = TypeVar("M", bound=BaseModel)
@@ -186,7 +187,6 @@ class AsyncClient:
         }
         url = f"{address.websocket_url}{PREFIX}{path}"
         async with AsyncExitStack() as stack:
-            _check(address)
             try:
                 connection: ClientConnection = await stack.enter_async_context(
                     connect(url, **options, ssl=self._tls, proxy=None)
@@ -194,7 +194,7 @@ class AsyncClient:
                     else unix_connect(self._uds, url, **options)
                 )
             except FAILURES as problem:
-                raise _disconnected(address, problem) from None
+                raise _failure(address, problem) from None
             yield AsyncLink(connection, address)
 
     async def ask(
@@ -219,13 +219,12 @@ class AsyncClient:
         async with self._held() if moving else nullcontext():
             if self._grant is not None:
                 headers["X-Lease"] = self._grant.token
-            _check(self.address)
             try:
                 response = await self._http.request(
                     method, path, content=content, headers=headers, params=query, timeout=timeout
                 )
             except httpx.TransportError as problem:
-                raise _unreachable(self.address, problem) from None
+                raise _failure(self.address, problem) from None
         if response.is_error:
             kind = response.headers.get("content-type", "")
             raise _refused(response.status_code, kind, response.content)
@@ -386,7 +385,7 @@ class AsyncAxis:
             yield stream
             await stream.end()
 
-    async def compensate(self, scheme: messages.Scheme | str) -> AxisState:
+    async def compensate(self, scheme: Scheme | str) -> AxisState:
         """Selects the part of the model that compensates; ``none`` switches compensation off."""
         return await self._post("compensate", messages.Compensate.given(scheme=scheme))
 
@@ -398,7 +397,7 @@ class AsyncAxis:
         """Switches the load loop (integral of the measured error) on or off."""
         return await self._post("load-loop", messages.SwitchLoadLoop.given(on=on))
 
-    async def adapt(self, mode: messages.AdaptationMode | str) -> AxisState:
+    async def adapt(self, mode: AdaptationMode | str) -> AxisState:
         """Sets the adaptation mode: ``off``, ``observe`` or ``on``."""
         return await self._post("adaptation", messages.Adapt.given(mode=mode))
 
@@ -470,21 +469,15 @@ class AsyncLink:
         try:
             await self._connection.send(message.model_dump_json())
         except FAILURES as problem:
-            raise _disconnected(self._address, problem) from None
+            raise _failure(self._address, problem) from None
 
     async def receive(self, kind: type[M]) -> M:
         """Receives the next message."""
         try:
             text = await self._connection.recv()
         except FAILURES as problem:
-            raise _disconnected(self._address, problem) from None
+            raise _failure(self._address, problem) from None
         return _read(kind, text, kind.__name__)
-
-
-def _check(address: Address) -> None:
-    """Raises DaemonError if the socket does not exist, with the same message for all requests."""
-    if address.socket is not None and not address.socket.is_socket():
-        raise DaemonError(f"{address}: there is no such socket; start the daemon with 'hdbridge run'")
 
 
 def _read(kind: type[M], content: str | bytes, what: str) -> M:
@@ -511,23 +504,18 @@ def _refused(status: int, kind: str, content: bytes) -> HdbridgeError:
     )
 
 
-def _unreachable(address: Address, problem: Exception) -> DaemonError:
-    """Returns the error for a daemon that cannot be reached or has disconnected."""
-    if isinstance(problem, httpx.ConnectError):
-        return DaemonError(f"{address}: no daemon answers ({problem}); start it with 'hdbridge run'")
-    what = "did not answer in time" if isinstance(problem, httpx.TimeoutException) else "disconnected"
-    return DaemonError(
-        f"{address}: the daemon {what} ({problem or type(problem).__name__}); the outcome is unknown: "
-        f"check the state first"
-    )
-
-
-def _disconnected(address: Address, problem: Exception) -> HdbridgeError:
-    """Returns the error for a failure of a WebSocket."""
+def _failure(address: Address, problem: Exception) -> HdbridgeError:
+    """Returns the error for a daemon that cannot be reached, refuses a WebSocket or has disconnected."""
     if isinstance(problem, InvalidStatus):
         response = problem.response
         kind = response.headers.get("Content-Type", "")
         return _refused(response.status_code, kind, bytes(response.body or b""))
     if isinstance(problem, ConnectionClosed) and problem.rcvd is not None and problem.rcvd.reason:
         return DaemonError(problem.rcvd.reason)
-    return DaemonError(f"{address}: the connection was lost ({problem or type(problem).__name__})")
+    if isinstance(problem, httpx.ConnectError | FileNotFoundError | ConnectionRefusedError):
+        return DaemonError(f"{address}: no daemon answers ({problem}); start it with 'hdbridge run'")
+    what = "did not answer in time" if isinstance(problem, httpx.TimeoutException) else "disconnected"
+    return DaemonError(
+        f"{address}: the daemon {what} ({problem or type(problem).__name__}); the outcome is unknown: "
+        f"check the state first"
+    )

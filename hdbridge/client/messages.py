@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from hdbridge import errors
+from hdbridge.enums import AdaptationMode, PowerState, Scheme
 from hdbridge.errors import HdbridgeError, InputError
 
 WORDS_MAXIMUM: Final = 400
@@ -86,40 +87,6 @@ class MotionMode(StrEnum):
     STOP = "stop"
     FOLLOW = "follow"
     """Following the set-points of another master, through the gateway."""
-
-
-class PowerState(StrEnum):
-    """CiA 402 state, from the drive's statusword."""
-
-    NOT_READY_TO_SWITCH_ON = "not ready to switch on"
-    SWITCH_ON_DISABLED = "switch on disabled"
-    READY_TO_SWITCH_ON = "ready to switch on"
-    SWITCHED_ON = "switched on"
-    OPERATION_ENABLED = "operation enabled"
-    QUICK_STOP_ACTIVE = "quick stop active"
-    FAULT_REACTION_ACTIVE = "fault reaction active"
-    FAULT = "fault"
-    UNKNOWN = "unknown"
-
-
-class Scheme(StrEnum):
-    """Parts of the model that compensate."""
-
-    NONE = "none"
-    SYNCHRONOUS = "synchronous"
-    HYSTERESIS = "hysteresis"
-    BOTH = "both"
-    EXTENDED = "extended"
-    """Whole model, including effects added by a diagnosis."""
-
-
-class AdaptationMode(StrEnum):
-    """Mode in which the model's parameters follow the load encoder."""
-
-    OFF = "off"
-    OBSERVE = "observe"
-    """Estimates and reports changes without applying them."""
-    ON = "on"
 
 
 # ---------------------------------------- errors

@@ -16,7 +16,7 @@ import numpy as np
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
-from hdbridge.axis.effects import Channel, Moment, Observer, compensable, missing_channels
+from hdbridge.axis.effects import Channel, Moment, compensable, missing_channels
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.channelstate import ChannelState
 from hdbridge.control.compensation import Compensation, CompensationLimits
@@ -186,7 +186,6 @@ class Bench:
         self._image = drive.image
         self._compensation = compensation
         self._interrupted = interrupted
-        self._observer = Observer()
         self._channel_state = ChannelState(axis)
         self._place = 0.0
         self._most = math.inf
@@ -295,18 +294,7 @@ class Bench:
         feedback = self._await_channels(feedback)
         motor_deg = self._image.motor_deg(feedback.motor_counts)
         self._place = motor_deg / self.view.ratio
-        self._observer = Observer()
-        self._channel_state.reset()
-        self._channel_state.take(feedback)
-        self._compensation.set_known_channels(self._channel_state.known)
-        self._compensation.reset(
-            motor_deg,
-            Moment(
-                time_s=feedback.time_s,
-                measured=self._channel_state.measured(feedback),
-                load_deg=self._place,
-            ),
-        )
+        self._channel_state.begin(feedback, motor_deg, self._compensation)
         self._compensation.engage()
 
     def _await_channels(self, feedback: Feedback) -> Feedback:
@@ -339,26 +327,15 @@ class Bench:
         axis, torque_nm = image.axis, self._channel_state.torque_nm
         motor_deg, load_deg = axis.motor_encoder.scale.degrees, axis.load_encoder.scale.degrees
         period_s, duration_s, at = self.cycle.period_s, path.duration_s, path.at
-        observe, ratio = self._observer.moment, self.view.ratio
-        compensation, channel_state = self._compensation, self._channel_state
-        needs, has_channels = bool(compensation.needs), bool(image.channels)
+        compensation, moment_of = self._compensation, self._channel_state.moment
+        needs = bool(compensation.needs)
         target_deg, most = self._place, self._most
         # Counted in completed cycles, not in clock time: a skipped period must not make the
         # target jump ahead.
         elapsed_s = 0.0
 
         def answer(feedback: Feedback) -> int:
-            if not needs:
-                moment = _AT_REST
-            else:
-                if has_channels and channel_state.take(feedback):
-                    compensation.set_known_channels(channel_state.known)
-                moment = observe(
-                    ratio * target_deg,
-                    feedback.time_s,
-                    measured=channel_state.measured(feedback),
-                    load_deg=target_deg,
-                )
+            moment = moment_of(feedback, target_deg, compensation) if needs else _AT_REST
             return counts_for(command(target_deg, moment) if feedback.fresh else hold(target_deg, moment))
 
         try:

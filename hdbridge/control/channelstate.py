@@ -1,21 +1,26 @@
-"""Measured channels, cycle by cycle: values for the effects, and lost channels."""
+"""Moments of one axis, cycle by cycle: motion of the command, measured channels, and lost channels."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from hdbridge.axis.channels import BY_KEY
-from hdbridge.axis.effects.motion import AT_REST, SLOT, Channel
+from hdbridge.axis.effects.kinematics import Observer
+from hdbridge.axis.effects.motion import AT_REST, SLOT, Channel, Moment
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
+    from hdbridge.control.compensation import Compensation
+    from hdbridge.control.switchover import Correction
     from hdbridge.drive.feedback import Feedback
 
 
 class ChannelState:
-    """Channels of one axis; the last reading of each is held."""
+    """Channels of one axis for its effects; the last reading of each measured channel is held."""
 
-    __slots__ = ("_channels", "_motor_torque", "_present", "_slots", "_values", "known", "torque_nm")
+    __slots__ = (
+        "_channels", "_motor_torque", "_observer", "_present", "_ratio", "_slots", "_values", "torque_nm",
+    )  # fmt: skip
 
     def __init__(self, axis: AxisConfig) -> None:
         self.torque_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
@@ -23,29 +28,47 @@ class ChannelState:
         self._channels = tuple(BY_KEY[key] for key in axis.channels)
         self._slots = tuple(SLOT[each] for each in self._channels)
         self._motor_torque = SLOT[Channel.MOTOR_TORQUE]
-        self.reset()
-
-    def reset(self) -> None:
-        """Forgets all readings."""
-        self.known: frozenset[Channel] = frozenset()
-        """Channels with their own sensors that have a current reading."""
-        self._present: tuple[bool, ...] = (False,) * len(self._channels)
+        self._ratio = axis.gear.ratio
+        self._present: tuple[bool, ...] | None = None
         self._values = list(AT_REST)
+        self.restart()
 
-    def take(self, feedback: Feedback) -> bool:
-        """Stores one cycle's readings; returns True if the known channels changed."""
+    def restart(self) -> None:
+        """Forgets the motion of the command."""
+        self._observer = Observer()
+
+    def begin(self, feedback: Feedback, motor_deg: float, compensation: Compensation | Correction) -> None:
+        """Starts a compensation at rest at a motor angle, with the readings of this cycle only."""
+        self.restart()
+        self._present, self._values = None, list(AT_REST)
+        self._take(feedback, compensation)
+        measured = self._measured(feedback)
+        moment = Moment(time_s=feedback.time_s, measured=measured, load_deg=motor_deg / self._ratio)
+        compensation.reset(motor_deg, moment)
+
+    def moment(self, feedback: Feedback, load_deg: float, compensation: Compensation | Correction) -> Moment:
+        """Returns the moment of a control cycle with this load target; must be called once per cycle.
+
+        Passes a change of the known channels to the compensation.
+        """
+        if self._channels:
+            self._take(feedback, compensation)
+        return self._observer.moment(
+            self._ratio * load_deg, feedback.time_s, measured=self._measured(feedback), load_deg=load_deg
+        )
+
+    def _take(self, feedback: Feedback, compensation: Compensation | Correction) -> None:
+        """Stores one cycle's readings."""
         for slot, reading in zip(self._slots, feedback.readings, strict=True):
             if reading is not None:
                 self._values[slot] = reading
         present = tuple([reading is not None for reading in feedback.readings])
-        if present == self._present:
-            return False
-        self._present = present
-        pairs = zip(self._channels, present, strict=True)
-        self.known = frozenset(channel for channel, there in pairs if there)
-        return True
+        if present != self._present:
+            self._present = present
+            pairs = zip(self._channels, present, strict=True)
+            compensation.set_known_channels(frozenset(channel for channel, there in pairs if there))
 
-    def measured(self, feedback: Feedback) -> tuple[float, ...]:
+    def _measured(self, feedback: Feedback) -> tuple[float, ...]:
         """Returns the measured channels of this cycle for a `Moment`."""
         torque_nm = feedback.torque_permille * self.torque_nm
         if torque_nm == torque_nm:  # noqa: PLR0124 - not NaN, in a third of the time of isnan()

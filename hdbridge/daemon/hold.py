@@ -4,7 +4,6 @@ the keeper.
 
 import os
 import secrets
-import socket
 import sys
 from contextlib import ExitStack
 
@@ -50,7 +49,9 @@ def hold(
             token = secrets.token_urlsafe(32)
             listeners.append(stack.enter_context(tcp_socket(page, "--port")))
         if page is not None:
-            _print_page(listeners[-1], token)
+            host, port = listeners[-1].getsockname()
+            address = f"http://{host}:{port}/{f'#token={token}' if token else ''}"
+            print(f"page: {address}", file=sys.stderr, flush=True)  # not in the log, because of the token
         memory = stack.enter_context(Memory.create(len(machine.axes), machine.cycle_s))
         start = Start(
             machine, memory.fd, os.getpid(), simulation=simulation, force=force, socket=path,
@@ -58,9 +59,3 @@ def hold(
         )  # fmt: skip
         times = Times() if simulation is None else SIMULATED
         return Keeper(start, memory, listeners, Notifier.of_environment(), times=times, lock=lock).run()
-
-
-def _print_page(listener: socket.socket, token: str | None) -> None:
-    """Prints the address of the page to standard error and not to the log, which must not contain a token."""
-    host, port = listener.getsockname()
-    print(f"page: http://{host}:{port}/{f'#token={token}' if token else ''}", file=sys.stderr, flush=True)

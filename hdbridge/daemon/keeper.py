@@ -238,19 +238,21 @@ class Notifier:
 
 
 @dataclass(slots=True)
-class _Helper:
-    """Child other than the control process. It is restarted after increasing delays, whatever ended it."""
+class _Process:
+    """Process of the daemon, with its present child."""
 
     name: str
     program: Sequence[str]
-    listening: tuple[int, ...]
     alive: Cell
-    """Cell with the time of its last heartbeat."""
+    """Cell that it advances while it runs."""
     begun: Cell
-    """Cell to which the process writes its id when it is ready."""
+    """Cell to which it writes its id when it is ready."""
     hung_s: float
+    listening: tuple[int, ...] = ()
     child: Child | None = None
     due_s: float | None = None
+    """Time of its next start; None if it runs or is not to be started."""
+    restarts: int = 0
     heartbeat: Heartbeat = field(default_factory=Heartbeat)
     back_off: BackOff = field(default_factory=lambda: BackOff(0.5, 30.0, 60.0))
 
@@ -304,16 +306,15 @@ class Keeper:
         self._start, self._memory, self._listeners = start, memory, listeners
         self._notifier, self._programs, self._times = notifier, programs, times
         self._budget = Budget(start.machine.limits.restarts_per_minute, 60.0)
-        self._turns = Heartbeat()
-        self._control: Child | None = None
         self._loan = Loan(lock) if lock is not None else None
+        self._control = _Process("control", programs.control, Cell.LOOP_COUNT, Cell.LOOP_PID, times.hung_s)
         api = tuple(each.fileno() for each in listeners)
-        service = programs.service, api, Cell.SERVICE_TIME_NS, Cell.SERVICE_PID, times.service_hung_s
-        gateway = programs.gateway, (), Cell.GATEWAY_TIME_NS, Cell.GATEWAY_PID, times.gateway_hung_s
-        self._helpers = [_Helper("service", *service)]
+        service = programs.service, Cell.SERVICE_TIME_NS, Cell.SERVICE_PID, times.service_hung_s, api
+        gateway = programs.gateway, Cell.GATEWAY_TIME_NS, Cell.GATEWAY_PID, times.gateway_hung_s
+        self._helpers = [_Process("service", *service)]
         if start.machine.gateway is not None:
-            self._helpers.append(_Helper("gateway", *gateway))
-        self._restarts = {"control": 0, **{each.name: 0 for each in self._helpers}}
+            self._helpers.append(_Process("gateway", *gateway))
+        self._processes = [self._control, *self._helpers]
         self._ready = False
         self._status = 0
         """Exit status of the daemon."""
@@ -329,13 +330,9 @@ class Keeper:
             stack.callback(self._selector.close)
             stack.enter_context(self._deferred_signals())
             stack.callback(self._end_all)
-            now_s = time.monotonic()
-            self._start_control(now_s)
-            for helper in self._helpers:
-                self._start_helper(helper, now_s)
-            while self._control is not None or any(
-                each.child is not None or each.due_s is not None for each in self._helpers
-            ):
+            for process in self._processes:
+                self._begin(process, time.monotonic())
+            while any(each.child is not None or each.due_s is not None for each in self._processes):
                 for key, _ in self._selector.select(TICK_S):
                     if key.data is not None:
                         key.data()
@@ -344,8 +341,8 @@ class Keeper:
 
     def _turn(self, now_s: float) -> None:
         self._handle_signals(now_s)
-        if self._control is not None and self._control.ended is not None:
-            self._control_ended(self._control, now_s)
+        if self._control.child is not None and self._control.child.ended is not None:
+            self._control_ended(self._control.child, now_s)
         for helper in self._helpers:
             if helper.child is not None and helper.child.ended is not None:
                 self._helper_ended(helper, helper.child, now_s)
@@ -356,40 +353,33 @@ class Keeper:
             self._lend(self._loan, now_s)
         for helper in self._helpers:
             if helper.due_s is not None and now_s >= helper.due_s:
-                self._start_helper(helper, now_s)
+                self._begin(helper, now_s)
         self._supervise(now_s)
 
     # ------------------------------------------------------------------ children
 
-    def _start_control(self, now_s: float) -> None:
-        self._control = self._started(self._programs.control, "control", (), now_s)
-        self._turns.restart(self._memory.status.loop_count)
-
-    def _start_helper(self, helper: _Helper, now_s: float) -> None:
-        helper.due_s = None
-        self._memory.status[helper.alive] = 0
-        helper.child = self._started(helper.program, helper.name, helper.listening, now_s)
-        helper.heartbeat.restart(0)
-
-    def _started(self, program: Sequence[str], name: str, listening: tuple[int, ...], now_s: float) -> Child:
-        fd = self._start.hand_over(api_fds=listening)
+    def _begin(self, process: _Process, now_s: float) -> None:
+        """Starts the child of a process."""
+        fd = self._start.hand_over(api_fds=process.listening)
         try:
-            child = Child(program, fd, (self._memory.fd, *listening), now_s)
+            child = Child(process.program, fd, (self._memory.fd, *process.listening), now_s)
         finally:
             os.close(fd)
+        process.child, process.due_s = child, None
+        process.heartbeat.restart(self._memory.status[process.alive])
         self._selector.register(child.pidfd, selectors.EVENT_READ)
-        _log.info(f"{name} process started", {"pid": child.pid, "restarts": self._restarts[name]})
-        return child
+        _log.info(f"{process.name} process started", {"pid": child.pid, "restarts": process.restarts})
 
-    def _forget(self, child: Child) -> None:
-        self._selector.unregister(child.pidfd)
-        child.close()
+    def _forget(self, process: _Process) -> None:
+        if process.child is not None:
+            self._selector.unregister(process.child.pidfd)
+            process.child.close()
+            process.child = None
 
     def _control_ended(self, child: Child, now_s: float) -> None:
         status, end = child.ended, child.end_description
         assert status is not None
-        self._forget(child)
-        self._control = None
+        self._forget(self._control)
         self._memory.status[Cell.LOOP_PID] = 0
         if self._stopping_since_s is not None:
             self._status = self._status or max(status, 0)
@@ -401,25 +391,25 @@ class Keeper:
             return
         _log.error("control process died", {"how": end, "lived_s": round(now_s - child.started_s, 1)})
         known = status if status in _ERRORS else HdbridgeError.exit_status
-        if status in _ERRORS and not self._memory.status.loop_count:
+        if status in _ERRORS and not self._memory.status[Cell.LOOP_COUNT]:
             self._stop(now_s, known, f"the control process cannot start ({end})")
         elif not self._budget.spend(now_s):
             self._stop(now_s, known, "the control process keeps dying")
         else:
-            self._restarts["control"] += 1
-            self._start_control(now_s)
+            self._control.restarts += 1
+            self._begin(self._control, now_s)
 
-    def _helper_ended(self, helper: _Helper, child: Child, now_s: float) -> None:
+    def _helper_ended(self, helper: _Process, child: Child, now_s: float) -> None:
         name, status, end = helper.name, child.ended, child.end_description
         assert status is not None
-        self._forget(child)
-        helper.child = None
+        self._forget(helper)
+        self._memory.status[helper.alive] = 0
         if self._stopping_since_s is not None:
             return
         lived_s = now_s - child.started_s
         _log.error(f"{name} process died", {"how": end, "lived_s": round(lived_s, 1)})
-        self._restarts[name] += 1
-        if not self._ready and (status in _ERRORS or self._restarts[name] >= _MAX_START_ATTEMPTS):
+        helper.restarts += 1
+        if not self._ready and (status in _ERRORS or helper.restarts >= _MAX_START_ATTEMPTS):
             known = status if status in _ERRORS else HdbridgeError.exit_status
             self._stop(now_s, known, f"the {name} cannot start ({end})")
         else:
@@ -431,31 +421,29 @@ class Keeper:
         """Ends the control process if a loan is requested; starts a new one when the bus is free again."""
         status = self._memory.status
         if loan.requested_s is None:
-            if status[Cell.BUS_REQUESTED] and self._control is not None:
+            if status[Cell.BUS_REQUESTED] and self._control.child is not None:
                 loan.requested_s = now_s
                 status[Cell.STOP_REQUESTED] = 1
-        elif self._control is not None:
+        elif self._control.child is not None:
             if now_s - loan.requested_s > self._times.stop_s:
                 _log.error("the axes do not come to rest", {"after_s": self._times.stop_s})
-                self._control.send(signal.SIGKILL)
+                self._control.child.send(signal.SIGKILL)
         elif loan.is_over(now_s):
             _log.info("the bus is taken back")
             for cell in (Cell.BUS_LENT, Cell.STOP_REQUESTED):
                 status[cell] = 0
-            self._start_control(now_s)
+            self._begin(self._control, now_s)
 
     def _supervise(self, now_s: float) -> None:
         """Kills hung children; reports readiness, heartbeat and status to the service manager."""
         status = self._memory.status
         axes = ", ".join(axis.name for axis in self._start.machine.axes)
-        running = self._turns.check(status.loop_count)
-        self._kill_hung(self._control, self._turns, self._times.hung_s)
-        serving = True
-        for helper in self._helpers:
-            helper.heartbeat.check(status[helper.alive])
-            self._kill_hung(helper.child, helper.heartbeat, helper.hung_s)
-            serving &= helper.child is not None and status[helper.begun] == helper.child.pid
-        if not self._ready and self._turns.begun and serving:
+        running = False
+        for process in self._processes:
+            running |= process.heartbeat.check(status[process.alive]) and process is self._control
+            self._kill_hung(process)
+        serving = all(each.child and status[each.begun] == each.child.pid for each in self._helpers)
+        if not self._ready and serving and self._control.heartbeat.begun:
             self._ready = True
             self._notifier.ready()
             machine, names = self._start.machine, [each.getsockname() for each in self._listeners]
@@ -466,14 +454,16 @@ class Keeper:
         if running and now_s - self._alive_sent_s >= (self._notifier.watchdog_s or 0.0) / 4.0:
             self._alive_sent_s = now_s
             self._notifier.alive()
-        restarts = ", ".join(f"{name} restarted {n} times" for name, n in self._restarts.items() if n)
+        restarts = ", ".join(
+            f"{each.name} restarted {each.restarts} times" for each in self._processes if each.restarts
+        )
         words = f"holds {axes}" if self._ready else "begins"
         self._notifier.status(f"{words}; {restarts}" if restarts else words)
 
-    def _kill_hung(self, child: Child | None, heartbeat: Heartbeat, limit_s: float) -> None:
-        if child is not None and heartbeat.misses * TICK_S >= (
-            limit_s if heartbeat.begun else self._times.begin_s
-        ):
+    def _kill_hung(self, process: _Process) -> None:
+        child, heartbeat = process.child, process.heartbeat
+        limit_s = process.hung_s if heartbeat.begun else self._times.begin_s
+        if child is not None and heartbeat.misses * TICK_S >= limit_s:
             _log.error("process hangs", {"pid": child.pid, "for_s": heartbeat.misses * TICK_S})
             child.send(signal.SIGKILL)
 
@@ -503,11 +493,11 @@ class Keeper:
 
     def _continue_stopping(self, now_s: float) -> None:
         assert self._stopping_since_s is not None
-        if self._control is not None:
+        if self._control.child is not None:
             if now_s - self._stopping_since_s > self._times.stop_s:
                 _log.error("the axes do not come to rest", {"after_s": self._times.stop_s})
                 self._status = self._status or HdbridgeError.exit_status
-                self._control.send(signal.SIGKILL)
+                self._control.child.send(signal.SIGKILL)
             return
         number, terminated_s = signal.SIGTERM, self._helpers_terminated_s
         if terminated_s is None:
@@ -523,12 +513,9 @@ class Keeper:
                 helper.child.send(number)
 
     def _end_all(self) -> None:
-        for child in (self._control, *(each.child for each in self._helpers)):
-            if child is not None:
-                self._forget(child)
-        self._control = None
-        for helper in self._helpers:
-            helper.child = helper.due_s = None
+        for process in self._processes:
+            self._forget(process)
+            process.due_s = None
 
     @contextmanager
     def _deferred_signals(self) -> Iterator[None]:

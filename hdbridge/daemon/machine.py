@@ -14,7 +14,6 @@ from typing import Self, TypeVar
 
 from hdbridge.axis import AxisConfig, BusConfig, RealtimeConfig
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.busroutes import conflict
 from hdbridge.daemon.machinefile import (
@@ -26,11 +25,12 @@ from hdbridge.daemon.machinefile import (
     LoadLoopSettings,
     MachineFile,
     RecorderSettings,
-    token_complaint,
+    read_token,
 )
 from hdbridge.drive import plan
 from hdbridge.drive.busload import check_bus_load
 from hdbridge.drive.link import unknown_interface
+from hdbridge.enums import Scheme
 from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile, bundled_folder
 from hdbridge.files.yamlfile import Document, Location, read_yaml
@@ -330,5 +330,7 @@ def _check_tcp(file: MachineFile, places: _Places) -> None:
     tcp = file.api.tcp
     if tcp is None:
         return
-    if complaint := token_complaint(places.folder / tcp.token_file):
-        raise places.error(("api", "tcp", "token_file"), complaint)
+    try:
+        read_token(places.folder / tcp.token_file)
+    except InputError as problem:
+        raise places.error(("api", "tcp", "token_file"), str(problem)) from None

@@ -11,14 +11,14 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from hdbridge.axis import BusConfig, RealtimeConfig
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.memory.layout import AXES_AT_MOST
+from hdbridge.enums import AdaptationMode, Scheme
+from hdbridge.errors import InputError
 from hdbridge.strictness import Strict
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
 """Pattern of a machine's name, which is also the name of its socket and service."""
 _TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")
-Mode = Literal["off", "observe", "on"]
 Parameter = Annotated[str, Field(pattern=r"^[a-z_]+\.[a-z_]+$")]
 
 
@@ -54,7 +54,7 @@ class Excitation(Strict):
 class AdaptationSettings(Strict):
     """Settings of the adaptation. Rates are per hour of axis time, bounds relative to the committed model."""
 
-    mode: Mode = Field("off", description="observe only reports what would change")
+    mode: AdaptationMode = Field(AdaptationMode.OFF, description="observe only reports what would change")
     parameters: tuple[Parameter, ...] | None = Field(
         None,
         description="adapted parameters, as EFFECT.PARAMETER; by default all that wear or temperature move",
@@ -110,7 +110,9 @@ class AxisEntry(Strict):
     compensation: Scheme = Field(
         Scheme.EXTENDED, description="part of the active model that compensates; extended is the whole model"
     )
-    adapt: Mode | None = Field(None, description="adaptation mode of this axis; by default adaptation.mode")
+    adapt: AdaptationMode | None = Field(
+        None, description="adaptation mode of this axis; by default adaptation.mode"
+    )
     load_loop: LoadLoopSettings | None = Field(
         None, description="slow control loop on the load encoder; by default none"
     )
@@ -195,18 +197,22 @@ class MachineFile(Strict):
     )
 
 
-def token_complaint(path: Path) -> str | None:
-    """Returns the error message for a token file; None if the file is valid."""
+def read_token(path: Path) -> str:
+    """Returns the token in a file; raises InputError if it is invalid, or if others can read the file."""
     try:
         content, mode = path.read_text(encoding="ascii").strip(), path.stat().st_mode
     except (OSError, UnicodeDecodeError) as problem:
         reason = problem.strerror if isinstance(problem, OSError) else "not ASCII text"
-        return f"{path}: cannot be read: {reason}; expected a file with the token in one line"
+        raise InputError(
+            f"{path}: cannot be read: {reason}; expected a file with the token in one line"
+        ) from None
     if mode & 0o077:
-        return f"{path} can be read by others (mode {mode & 0o777:o}); expected mode 600: chmod 600 {path}"
+        raise InputError(
+            f"{path} can be read by others (mode {mode & 0o777:o}); expected mode 600: chmod 600 {path}"
+        )
     if not _TOKEN.fullmatch(content):
-        return (
+        raise InputError(
             f"{path}: expected a token of 16 to 200 letters, digits, '-', '.', '_' or '~'; make one: "
             f"openssl rand -hex 16 > {path}"
         )
-    return None
+    return content

@@ -20,6 +20,7 @@ from hdbridge.daemon.api.server import ApiServer, Listener
 from hdbridge.daemon.api.sockets import file_of, unix_socket
 from hdbridge.daemon.logs import begin_log
 from hdbridge.daemon.machine import Machine
+from hdbridge.daemon.machinefile import read_token
 from hdbridge.daemon.memory import Cell, Memory
 from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
 from hdbridge.daemon.recorder.flightfile import About, AxisAbout
@@ -57,7 +58,7 @@ async def serve(start: Start, memory: Memory) -> None:
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, terminated.set)
     async with AsyncExitStack() as stack:
         simulated = start.simulation is not None
-        clock = SimulatedClock(lambda: memory.status.loop_count, machine.cycle_s) if simulated else None
+        clock = SimulatedClock(lambda: memory.status[Cell.LOOP_COUNT], machine.cycle_s) if simulated else None
         timing = Timing(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS, clock)
         stack.callback(timing.close)
         bridge = ServiceBridge(machine, memory, timing, simulated=simulated, forced=start.force)
@@ -129,7 +130,7 @@ def listeners(machine: Machine, descriptors: Sequence[int], page_token: str | No
     if page_token is not None:
         made.append(Listener(others[0], Policy(page_token)))
     elif tcp is not None:
-        token = machine.resolve_path(tcp.token_file).read_text(encoding="ascii").strip()
+        token = read_token(machine.resolve_path(tcp.token_file))
         made.append(Listener(others[0], Policy(token, frozenset(each.lower() for each in tcp.names))))
     return made
 
@@ -170,7 +171,7 @@ async def _last_words(bridge: ServiceBridge, memory: Memory) -> None:
     """Keeps serving while the axes are brought to rest, so that clients see the stop and it is recorded."""
     end_s = asyncio.get_running_loop().time() + LAST_WORDS_S
     status = memory.status
-    while bridge.core.observer.alive and status.loop_pid and asyncio.get_running_loop().time() < end_s:
+    while bridge.core.observer.alive and status[Cell.LOOP_PID] and asyncio.get_running_loop().time() < end_s:
         await asyncio.sleep(0.05)
     bridge.core.observer.poll()
 

@@ -7,9 +7,9 @@ from typing import Self
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.compensation import Compensation
+from hdbridge.enums import Scheme
 from hdbridge.errors import InputError
 
 

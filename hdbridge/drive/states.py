@@ -15,27 +15,10 @@ from collections.abc import Iterator
 from enum import Enum
 from typing import Final, NamedTuple
 
+from hdbridge.enums import PowerState
 from hdbridge.errors import RESET, TransitionError
 
-
-class State(Enum):
-    """State of the power drive system, as reported by the statusword."""
-
-    NOT_READY_TO_SWITCH_ON = "not ready to switch on"
-    SWITCH_ON_DISABLED = "switch on disabled"
-    READY_TO_SWITCH_ON = "ready to switch on"
-    SWITCHED_ON = "switched on"
-    OPERATION_ENABLED = "operation enabled"
-    QUICK_STOP_ACTIVE = "quick stop active"
-    FAULT_REACTION_ACTIVE = "fault reaction active"
-    FAULT = "fault"
-    UNKNOWN = "unknown"
-    """No statusword yet, or one that matches no row."""
-
-    # Hash by identity: Enum's own hash is computed in Python, which is measurable in a control cycle.
-    __hash__ = object.__hash__
-
-
+State = PowerState
 # The control cycle uses module names because looking up an enum member in its class takes five times as long.
 _ENABLED: Final = State.OPERATION_ENABLED
 _QUICK_STOP: Final = State.QUICK_STOP_ACTIVE

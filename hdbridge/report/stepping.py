@@ -7,7 +7,8 @@ from typing import Final
 from hdbridge import __version__
 from hdbridge.commissioning.calibration.pipeline import Offer
 from hdbridge.commissioning.calibration.validation import Validation
-from hdbridge.commissioning.evaluation.stepping import Scheme, Stepped
+from hdbridge.commissioning.evaluation.stepping import Stepped
+from hdbridge.enums import Scheme
 from hdbridge.report.page import (
     SCATTER,
     SIGMA,

@@ -9,10 +9,10 @@ from support.exercised import booted
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.comparison import compare_schemes
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.drive import State
 from hdbridge.drive.supervision import Fault
+from hdbridge.enums import Scheme
 from hdbridge.errors import InputError, SafetyStop
 from hdbridge.motion.procedures.moves import Dwell, MoveTo
 from hdbridge.motion.procedures.stepping import Stepping

@@ -11,8 +11,6 @@ from pydantic import ValidationError
 from hdbridge import errors
 from hdbridge.client import messages
 from hdbridge.client.messages import STATUS, Request
-from hdbridge.commissioning.evaluation.stepping import Scheme
-from hdbridge.drive.states import State
 
 REQUESTS = Request.__subclasses__()
 RAISED = [
@@ -85,11 +83,6 @@ def test_client_texts_are_one_line_without_control_characters(wrong):
 def test_reports_ignore_unknown_keys():
     state = messages.LeaseState.model_validate({"held": False, "timeout_s": 5.0, "colour": "red"})
     assert not state.held
-
-
-def test_enumerations_match_those_of_drive_and_evaluation():
-    assert [each.value for each in messages.PowerState] == [each.value for each in State]
-    assert [each.value for each in messages.Scheme] == [each.value for each in Scheme]
 
 
 @pytest.mark.parametrize("kind", RAISED, ids=lambda each: each.__name__)

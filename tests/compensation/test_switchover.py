@@ -22,10 +22,10 @@ from hdbridge.axis.effects import (
     Synchronous,
 )
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.switchover import Correction
+from hdbridge.enums import Scheme
 from hdbridge.errors import InputError
 
 PROFILES = Path(__file__).parents[2] / "profiles"

@@ -19,10 +19,10 @@ from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
 from support.daemonlaws import Laws
 
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Knot, MailboxFullError, RelayedFrame
 from hdbridge.drive.objects import Mode
+from hdbridge.enums import Scheme
 from hdbridge.errors import HdbridgeError
 
 K = CommandKind

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.machine import Machine, machine_file
+from hdbridge.enums import Scheme
 from hdbridge.errors import InputError
 from hdbridge.files.profile import bundled_folder, bundled_profile
 
@@ -170,8 +170,9 @@ def test_the_token_file_must_be_private(folder: Path) -> None:
     tcp = load(folder, text).api.tcp
     assert tcp is not None
     assert tcp.port == 8402
-    token.write_text("short", encoding="ascii")
-    assert "expected a token of 16 to 200" in refused(folder, text)
+    for content in ("", "short", "with spaces in the middle", "x" * 201, "line\nbreak-long-enough"):
+        token.write_text(content, encoding="ascii")
+        assert "expected a token of 16 to 200" in refused(folder, text)
 
 
 def test_a_machine_is_found_by_folder_file_or_name(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -209,7 +209,7 @@ async def test_a_fault_of_the_gateway_is_reported_once_with_its_cause_and_record
     await swing(bench)
     await bench.wait(0.6)
     status = bench.daemon.memory.status
-    pid = status.loop_pid
+    pid = status[Cell.LOOP_PID]
     status[Cell.LOOP_PID] = 0  # as the keeper does when the control process has died
     await faulted(bench, 0x6010)
     status[Cell.LOOP_PID] = pid
@@ -295,7 +295,12 @@ async def test_target_reached_means_that_the_load_rests_there(bench):
 
 @pytest.mark.parametrize(
     ("held_out", "arcsec"),
-    [({"after_arcsec": 4.0}, 3.24 + 12.32), ("too short", 3.24 + 2.83), (None, 3.24 + 300.0)],
+    [
+        ({"after_arcsec": 4.0}, 3.24 + 12.32),
+        ({"after_arcsec": None}, 3.24 + 2.83),
+        ("too short", 3.24 + 2.83),
+        (None, 3.24 + 300.0),
+    ],
 )
 def test_the_position_window_grows_with_the_residual_of_the_model(held_out, arcsec):
     axis = AxisConfig.load(PROFILE)

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.reader import Reader
 
-from hdbridge.commissioning.evaluation.stepping import Scheme, Stepped
+from hdbridge.commissioning.evaluation.stepping import Stepped
+from hdbridge.enums import Scheme
 from hdbridge.motion.procedures.stepping import Standing, SteppingOutcome
 from hdbridge.report.page import (
     Chart,

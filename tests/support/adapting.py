@@ -156,6 +156,11 @@ class Sampler:
         for angle in self._demand.tolist():
             self._tracker.advance(angle, Moment())
 
+    @property
+    def time_s(self) -> float:
+        """Time of the next sample, seconds."""
+        return self._cycle * self.axis.drive.cycle_s
+
     def samples(self, record: Record) -> SampleArray:
         """Returns all samples of a record, shape (n,); their time continues that of the previous record."""
         columns, ratio = record.columns, self.axis.gear.ratio
@@ -212,6 +217,11 @@ class Work:
     def time_s(self) -> float:
         """Time since the axis was switched on."""
         return self._drive.link.clock.now()
+
+    @property
+    def axis_time_s(self) -> float:
+        """Duration of the samples so far, the time in the history; less than `time_s` by the pauses."""
+        return self._sampler.time_s
 
     def step(self, count: int = 16, step_deg: float = 43.56) -> None:
         """Runs a stepping test at new angles, because repeated angles do not separate the orders."""

@@ -21,7 +21,6 @@ from can.interfaces.virtual import VirtualBus
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.clock import Clock
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.daemon.loop.axisloop import AxisLoop
 from hdbridge.daemon.loop.controller import Controller
@@ -34,6 +33,7 @@ from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.device.node import DriveNode
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import Link
+from hdbridge.enums import Scheme
 from hdbridge.sim.lockstep import SimulatedAxis, VirtualClock, simulated_benches
 from hdbridge.sim.truth import Truth
 from support.characters import FRIENDLY, Character
@@ -179,7 +179,7 @@ class SteppedDaemon:
 
     def drive(self, axis: int) -> Drive:
         """Returns the service's drive object of an axis."""
-        return self.commissioning(axis)._drive
+        return self.commissioning(axis).drive
 
     def verify(self, axis: int = 0) -> None:
         """Boots the drive by SDO over the relay, and reports it as verified."""

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from hdbridge.client import messages
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.memory import sample_dtype
 from hdbridge.daemon.service.lease import Lease
 from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.values import Object, Value
+from hdbridge.enums import Scheme
 from hdbridge.errors import InputError, RefusedError
 
 BEGAN = datetime(2025, 1, 31, 12, 0, tzinfo=UTC)
@@ -131,20 +131,17 @@ class FakeAxis:
         self._enabled()
         self._moved(holder, "jog", velocity_deg_s, timeout_s)
 
-    async def queue(self, holder: str, points: Sequence[messages.QueueItem]) -> int:
+    async def queue(self, holder: str, points: Sequence[messages.QueueItem]) -> None:
         self._bridge.lease.check(holder)
         self._enabled()
         for each in points:
             self._within(each.target_deg)
         self._moved(holder, "queue", len(points))
         self.queued += points
-        return len(self.queued)
 
-    async def clear_queue(self, holder: str) -> int:
+    async def clear_queue(self, holder: str) -> None:
         self._moved(holder, "clear queue")
-        forgotten = len(self.queued)
         self.queued.clear()
-        return forgotten
 
     async def stream(self, holder: str, timeout_s: float = 0.5) -> FakeStream:
         self._bridge.lease.check(holder)

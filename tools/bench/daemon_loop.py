@@ -23,10 +23,9 @@ from cycle import AnsweringBus, NeverSleeping
 from harness import PROFILE, Busy, block_us, in_turn, keep, medians, parser, undisturbed
 
 from hdbridge.axis import AxisConfig
-from hdbridge.axis.effects import Moment, Observer
+from hdbridge.axis.effects import Moment
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.clock import Clock
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.control.channelstate import ChannelState
@@ -40,6 +39,7 @@ from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
+from hdbridge.enums import Scheme
 from hdbridge.motion import SetPoint
 
 GOAL = 1.3
@@ -71,8 +71,7 @@ def bench_cycle(
     cycle = Cycle(Link(bus, clock), clock, image, Supervision(), axis.drive.cycle_s)
     compensation = compensation_for(axis, model.bound_to(axis))
     compensation.engage()
-    observer, sensed = Observer(), ChannelState(axis)
-    needs, at_rest = bool(compensation.needs), Moment()
+    sensed, needs, at_rest = ChannelState(axis), bool(compensation.needs), Moment()
     # Set-points of the same move as in the daemon's loop, so that both follow the same path.
     set_point = SetPoint(axis_view(axis).limits, axis.drive.cycle_s)
     goal = 300.0
@@ -82,11 +81,7 @@ def bench_cycle(
     target_deg = 0.0
 
     def answer(feedback: Feedback) -> int:
-        moment = at_rest
-        if needs:
-            moment = observer.moment(
-                50 * target_deg, feedback.time_s, measured=sensed.measured(feedback), load_deg=target_deg
-            )
+        moment = sensed.moment(feedback, target_deg, compensation) if needs else at_rest
         follow = compensation.command if feedback.fresh else compensation.hold
         return image.target_counts_for(follow(target_deg, moment))
 

@@ -32,7 +32,7 @@ from typing import Any
 from harness import PROFILE, keep, parser
 
 from hdbridge.client import Client
-from hdbridge.daemon.memory import Memory
+from hdbridge.daemon.memory import Cell, Memory
 from hdbridge.errors import DaemonError
 
 PATIENCE_S = 180.0
@@ -211,9 +211,9 @@ def clients(socket: Path) -> Iterator[Callable[[], dict[str, Any]]]:
 
 def turn_us(memory: Memory, pid: int, work: Callable[[], object]) -> float:
     """Returns the CPU time of the control process per cycle while ``work`` runs, us."""
-    before, turns = Cost.of(pid), memory.status.loop_count
+    before, turns = Cost.of(pid), memory.status[Cell.LOOP_COUNT]
     work()
-    return 1e6 * (Cost.of(pid).cpu_s - before.cpu_s) / (memory.status.loop_count - turns)
+    return 1e6 * (Cost.of(pid).cpu_s - before.cpu_s) / (memory.status[Cell.LOOP_COUNT] - turns)
 
 
 def run(minutes: float, every_s: float, idle_s: float) -> tuple[list[Growth], dict[str, Any]]:
@@ -244,9 +244,9 @@ def run(minutes: float, every_s: float, idle_s: float) -> tuple[list[Growth], di
         idle_us = turn_us(memory, pids[CONTROL], lambda: time.sleep(idle_s))
         accounts.take(*reader.read())
         seen = stack.enter_context(clients(daemon.socket))
-        first_turn, begin_s = memory.status.loop_count, time.monotonic()
+        first_turn, begin_s = memory.status[Cell.LOOP_COUNT], time.monotonic()
         busy_us = turn_us(memory, pids[CONTROL], watch)
-        turns, wall_s = memory.status.loop_count - first_turn, time.monotonic() - begin_s
+        turns, wall_s = memory.status[Cell.LOOP_COUNT] - first_turn, time.monotonic() - begin_s
         with Client(str(daemon.socket), timeout_s=60.0) as client:
             state = client.state()
         found = {

@@ -41,7 +41,6 @@ from harness import PROFILE, Waking, keep, parser
 from realtime_cycle import WARM_UP, Figures, table
 
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.control.realtime import prepare_realtime
 from hdbridge.daemon.loop.controller import Controller
@@ -49,6 +48,7 @@ from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind, Knot, Memory, RelayedFrame
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.link import Link
+from hdbridge.enums import Scheme
 
 VARIANTS = {"bench": (1, 1.0), "one": (1, 1.0), "six": (6, 4.0)}
 """Number of axes and cycle time, ms, of each variant."""

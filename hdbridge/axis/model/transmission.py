@@ -113,6 +113,15 @@ class TransmissionModel:
         """Writes the model file atomically."""
         write_atomically(path, self.dump())
 
+    @property
+    def held_out_arcsec(self) -> float | None:
+        """Rms residual on held-out data, from the provenance; None if it is not positive or unknown."""
+        held_out = self.provenance.get("held_out")
+        value = held_out.get("after_arcsec") if isinstance(held_out, dict) else None
+        if not isinstance(value, int | float) or not 0.0 < value < math.inf:
+            return None
+        return float(value)
+
     def with_provenance(self, **provenance: Any) -> Self:
         """Returns the model with these entries added to its provenance."""
         return replace(self, provenance={**self.provenance, **provenance})

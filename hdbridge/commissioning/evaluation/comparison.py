@@ -7,11 +7,12 @@ from typing import Any, Self
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.stepping import Scheme, Stepped, quantisation_floor_arcsec
+from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_floor_arcsec
 from hdbridge.control.bench import Run, compensation_for
 from hdbridge.control.faultcounts import fault_notes
 from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
+from hdbridge.enums import Scheme
 from hdbridge.motion.procedures.stepping import Stepping, SteppingOutcome
 from hdbridge.records.record import Record
 

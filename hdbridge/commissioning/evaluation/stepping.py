@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from enum import Enum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,37 +12,7 @@ import numpy as np
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 if TYPE_CHECKING:
-    from hdbridge.axis.model import TransmissionModel
     from hdbridge.motion.procedures.stepping import SteppingOutcome
-
-
-class Scheme(Enum):
-    """Parts of the model used by the compensation."""
-
-    NONE = "none"
-    SYNCHRONOUS = "synchronous"
-    HYSTERESIS = "hysteresis"
-    BOTH = "both"
-    EXTENDED = "extended"
-
-    def of(self, model: TransmissionModel) -> TransmissionModel:
-        """Returns the model with only this scheme's effects."""
-        match self:
-            case Scheme.NONE:
-                return model.only(())
-            case Scheme.SYNCHRONOUS | Scheme.HYSTERESIS:
-                return model.only((self.value,))
-            case Scheme.BOTH:
-                return model.only(("synchronous", "hysteresis"))
-            case Scheme.EXTENDED:
-                return model
-
-    @staticmethod
-    def offered_by(model: TransmissionModel) -> tuple[Scheme, ...]:
-        """Returns the article's four schemes, and `EXTENDED` if the model has more than their two parts."""
-        four = (Scheme.NONE, Scheme.SYNCHRONOUS, Scheme.HYSTERESIS, Scheme.BOTH)
-        more = any(each.name not in {"synchronous", "hysteresis"} for each in model.effects)
-        return (*four, Scheme.EXTENDED) if more else four
 
 
 @dataclass(frozen=True, slots=True)

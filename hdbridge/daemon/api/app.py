@@ -3,7 +3,7 @@
 from http import HTTPStatus
 from typing import Any, Final
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 
@@ -13,7 +13,7 @@ from hdbridge.daemon.api import problems
 from hdbridge.daemon.api.guard import Traffic
 from hdbridge.daemon.api.metrics import Metrics, exposition
 from hdbridge.daemon.api.routes import axis, machine, sockets
-from hdbridge.daemon.page import PAGE, POLICY, page_files
+from hdbridge.daemon.page import PAGE, PageFiles
 from hdbridge.daemon.service.bridge import ServiceBridge
 
 PREFIX: Final = "/api/v1"
@@ -49,8 +49,8 @@ def create_app(bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> Fas
         openapi_tags=[{"name": name, "description": about} for name, about in TAGS],
         generate_unique_id_function=lambda route: route.name,
         redirect_slashes=False,
+        exception_handlers=problems.HANDLERS,
     )
-    problems.register(app)
     app.state.bridge = bridge
     for each in (machine, axis, sockets):
         app.include_router(each.routes, prefix=PREFIX)
@@ -60,20 +60,18 @@ def create_app(bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> Fas
 
 
 def _add_pages(app: FastAPI, bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> None:
+    page = PageFiles()
+    app.mount("/page", page)
+
     @app.get(f"{PREFIX}/openapi.json", include_in_schema=False)
     async def get_description() -> JSONResponse:
         """Returns the description of the API, OpenAPI 3.1."""
         return JSONResponse(app.openapi())
 
     @app.get("/", include_in_schema=False)
-    async def get_page() -> Response:
+    async def get_page(request: Request) -> Response:
         """Returns the live page."""
-        return _static(PAGE)
-
-    @app.get("/page/{name}", include_in_schema=False)
-    async def get_page_file(name: str) -> Response:
-        """Returns a file of the live page."""
-        return _static(name)
+        return await page.get_response(PAGE, request.scope)
 
     @app.get("/metrics", include_in_schema=False)
     async def get_metrics() -> Response:
@@ -87,14 +85,6 @@ def _add_pages(app: FastAPI, bridge: ServiceBridge, metrics: Metrics, traffic: T
         status = HTTPStatus.OK if alive else HTTPStatus.SERVICE_UNAVAILABLE
         words = "ok\n" if alive else "the control loop completes no cycles\n"
         return Response(words, status, media_type="text/plain")
-
-
-def _static(name: str) -> Response:
-    found = page_files().get(name)
-    if found is None:
-        raise problems.UnknownError(f"the page has no file {name[:80]!a}")
-    content, kind = found
-    return Response(content, media_type=kind, headers={"Content-Security-Policy": POLICY})
 
 
 def _schema(app: FastAPI) -> dict[str, Any]:

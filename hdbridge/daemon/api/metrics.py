@@ -1,17 +1,17 @@
 """`/metrics` for Prometheus: loop timing, faults, axes and API requests.
 
-`Metrics` is a sink of the observer; its `take` costs a few microseconds per batch. Everything else is read
-on each scrape.
+`Metrics` is a sink of the observer. Everything else is read on each scrape.
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from prometheus_client import CollectorRegistry, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
+from prometheus_client import CollectorRegistry, Histogram, disable_created_metrics, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from hdbridge.client.messages import ControlState
@@ -20,51 +20,34 @@ from hdbridge.daemon.loop.faultlog import fault_of
 from hdbridge.daemon.memory import EventKind
 from hdbridge.daemon.service.bridge import ServiceBridge
 
-BOUNDS_US: Final = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 50_000, 100_000)
-"""Upper bounds of the histogram buckets in microseconds; the last bucket is unbounded."""
+BOUNDS_S: Final = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2, 5e-2, 1e-1)
+"""Upper bounds of the histogram buckets; the last bucket is unbounded."""
 _PREFIX: Final = "hdbridge_"
+disable_created_metrics()  # type: ignore[no-untyped-call]  # omits the start time of each histogram
 
 
 class Metrics:
     """Counts accumulated for the scrapes."""
 
     def __init__(self) -> None:
-        self.late = Histogram()
-        self.busy = Histogram()
+        self.late = _histogram("cycle_late_seconds", "Delay of the start of cycles.")
+        self.busy = _histogram("cycle_busy_seconds", "Duration of cycles.")
         self.faults: Counter[tuple[int, str]] = Counter()
         """Number of events by axis index and name of the fault."""
 
     def take(self, samples: NDArray[np.void], events: Iterable[Any], lost: int) -> None:
-        """Takes samples and events of the loop from the observer."""
-        if len(samples):
-            self.late.add(samples["late_us"])
-            self.busy.add(samples["busy_us"])
+        """Takes samples and events of the loop from the observer; ignores times that are not finite."""
+        for histogram, field in ((self.late, "late_us"), (self.busy, "busy_us")):
+            for value_us in samples[field].tolist():
+                if math.isfinite(value_us):
+                    histogram.observe(value_us / 1e6)
         for each in events:
             if each.kind == EventKind.FAULT and (fault := fault_of(each.code)) is not None:
                 self.faults[each.axis, fault.name] += 1
 
 
-class Histogram:
-    """Histogram of durations in microseconds."""
-
-    def __init__(self) -> None:
-        self._bounds = np.asarray(BOUNDS_US, dtype=float)
-        self._counts = np.zeros(len(BOUNDS_US) + 1, dtype=np.int64)
-        self._sum_us = 0.0
-
-    def add(self, values_us: NDArray[np.floating[Any]]) -> None:
-        """Counts values; ignores NaN and infinity."""
-        finite = values_us[np.isfinite(values_us)].astype(float)
-        places = np.searchsorted(self._bounds, finite)
-        self._counts += np.bincount(places, minlength=len(self._counts))
-        self._sum_us += float(finite.sum())
-
-    def family(self, name: str, about: str) -> Metric:
-        """Returns the histogram in seconds, in Prometheus' format."""
-        cumulative = np.cumsum(self._counts).tolist()
-        bounds = [*(f"{each / 1e6:g}" for each in BOUNDS_US), "+Inf"]
-        buckets = [(bound, float(count)) for bound, count in zip(bounds, cumulative, strict=True)]
-        return HistogramMetricFamily(_PREFIX + name, about, buckets, self._sum_us / 1e6)
+def _histogram(name: str, about: str) -> Histogram:
+    return Histogram(_PREFIX + name, about, registry=None, buckets=BOUNDS_S)
 
 
 def exposition(bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> bytes:
@@ -112,8 +95,8 @@ class _Scrape(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yields the metrics of loop, faults, axes and API."""
         state, metrics, traffic = self._state, self._metrics, self._traffic
-        yield metrics.late.family("cycle_late_seconds", "Delay of the start of cycles.")
-        yield metrics.busy.family("cycle_busy_seconds", "Duration of cycles.")
+        yield from metrics.late.collect()
+        yield from metrics.busy.collect()
         yield _gauge("info", "1.", [((state.name, state.version), 1)], ("machine", "version"))
         yield _gauge("loop_alive", "1 if the control loop is running.", [((), state.cycle.alive)])
         yield _gauge("cycle_period_seconds", "Period of the cycle.", [((), state.cycle.period_s)])

@@ -1,9 +1,11 @@
 """Errors of the API as ``application/problem+json`` (RFC 9457), never with a stack trace."""
 
 import logging
+from collections.abc import Callable, Coroutine
 from http import HTTPStatus
+from typing import Any, Final
 
-from fastapi import FastAPI, Request, Response
+from fastapi import Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 
@@ -31,25 +33,15 @@ def answer(problem: Problem) -> Response:
     return Response(content, problem.status, headers, CONTENT_TYPE)
 
 
-def register(app: FastAPI) -> None:
-    """Registers the error handlers of the application."""
-    app.add_exception_handler(HdbridgeError, _on_hdbridge_error)
-    app.add_exception_handler(RequestValidationError, _on_validation_error)
-    app.add_exception_handler(HTTPException, _on_http_exception)
-    app.add_exception_handler(Exception, _on_unexpected_error)
-
-
-async def _on_hdbridge_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HdbridgeError)
+async def _on_hdbridge_error(request: Request, error: HdbridgeError) -> Response:
     problem = Problem.of(error, request.path_params.get("axis"))
     if isinstance(error, UnknownError):
         problem = refusal(404, str(error), "InputError")
     return answer(problem)
 
 
-async def _on_validation_error(request: Request, error: Exception) -> Response:
+async def _on_validation_error(request: Request, error: RequestValidationError) -> Response:
     """Answers a request that violates the schema, with one complaint per key, without its value."""
-    assert isinstance(error, RequestValidationError)
     complaints = []
     for each in error.errors()[:COMPLAINTS_MAXIMUM]:
         where = ".".join(str(part) for part in each["loc"] if part != "body")
@@ -61,8 +53,7 @@ async def _on_validation_error(request: Request, error: Exception) -> Response:
     return answer(problem)
 
 
-async def _on_http_exception(_request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
+async def _on_http_exception(_request: Request, error: HTTPException) -> Response:
     kind = "InputError" if error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR else "HdbridgeError"
     response = answer(refusal(error.status_code, _printable(str(error.detail)), kind))
     response.headers.update(error.headers or {})
@@ -83,3 +74,12 @@ async def _on_unexpected_error(request: Request, error: Exception) -> Response:
 def _printable(text: str) -> str:
     """Escapes unpaired surrogates, which JSON may contain but UTF-8 may not."""
     return text.encode("utf-8", "backslashreplace").decode()[:400]
+
+
+HANDLERS: Final[dict[int | type[Exception], Callable[[Request, Any], Coroutine[Any, Any, Response]]]] = {
+    HdbridgeError: _on_hdbridge_error,
+    RequestValidationError: _on_validation_error,
+    HTTPException: _on_http_exception,
+    Exception: _on_unexpected_error,
+}
+"""Error handlers of the application."""

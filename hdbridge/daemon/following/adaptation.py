@@ -31,7 +31,8 @@ from hdbridge.daemon.following.estimator import (
 )
 from hdbridge.daemon.following.measuring import DriftModel, Observation, reversals, turns
 from hdbridge.daemon.following.zero import Rate
-from hdbridge.daemon.machinefile import AdaptationSettings, Mode
+from hdbridge.daemon.machinefile import AdaptationSettings
+from hdbridge.enums import AdaptationMode
 from hdbridge.errors import InputError
 from hdbridge.strictness import Strict
 
@@ -103,7 +104,7 @@ class Adaptation:
         name a parameter that the model lacks.
         """
         self.settings = settings
-        self.mode: Mode = settings.mode
+        self.mode: AdaptationMode = settings.mode
         self.committed = self.model = whole.model
         """Committed model, and the model that should be in use: the last one proposed for application."""
         self.freeze_reason: Freeze | None = None
@@ -156,7 +157,7 @@ class Adaptation:
                 self._close(window, rates)
         return self._proposal()
 
-    def set_mode(self, mode: Mode) -> None:
+    def set_mode(self, mode: AdaptationMode) -> None:
         """Changes the mode. ``on`` ends a freeze, whatever the load encoder reads."""
         if mode == "on" and self.freeze_reason is not None:
             estimator = self._estimator
@@ -181,7 +182,7 @@ class Adaptation:
         self._unfreeze("restarted")
         self._proposed = self._used = np.zeros(self._drift.zero)
         self.model = self.committed
-        self.mode = "observe"
+        self.mode = AdaptationMode.OBSERVE
         self._log_event("back", changes=_changes_json(changes))
         return Proposal(self.committed, changes, True, self._now_s)
 

@@ -21,10 +21,10 @@ from hdbridge.client import messages
 from hdbridge.daemon.following.adaptation import Adaptation, Proposal
 from hdbridge.daemon.following.health import (
     DRIVEN,
+    UNTESTED_ARCSEC,
     ZERO_UNKNOWN,
     EncoderHealth,
     EncoderStatus,
-    held_out_arcsec,
     in_states,
 )
 from hdbridge.daemon.following.judging import RaisedVerdict, Verdict, Watch
@@ -33,8 +33,9 @@ from hdbridge.daemon.following.servo import ServoWatch
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.following.zero import Zero
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.machinefile import AdaptationSettings, Mode
+from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import NO_FAULT, SampleArray, SampleFlag, joined_samples
+from hdbridge.enums import AdaptationMode
 from hdbridge.errors import InputError
 
 MIN_BATCH_SAMPLES: Final = 25
@@ -86,7 +87,7 @@ class Follower:
         motor_count = axis.motor_encoder.resolution_arcsec / axis.gear.ratio
         self._sigma_arcsec = math.hypot(motor_count, axis.load_encoder.resolution_arcsec) / UNIFORM
         """Standard deviation of an observation due to quantisation by the encoders' counts."""
-        noise = max(held_out_arcsec(model), motor_count / UNIFORM)
+        noise = max(model.held_out_arcsec or UNTESTED_ARCSEC, motor_count / UNIFORM)
         self.watch = Watch(self._drift, noise)
         self._zero = Zero(self._drift, self._sigma_arcsec)
         channels = tuple(BY_KEY[key] for key in axis.channels)
@@ -100,7 +101,7 @@ class Follower:
         self._now_s = 0.0
         self._refined_at: datetime | None = None
 
-    def adapt(self, mode: Mode, files: AdaptationFiles | None = None) -> None:
+    def adapt(self, mode: AdaptationMode, files: AdaptationFiles | None = None) -> None:
         """Changes the mode of the adaptation, or starts it, from the state in ``files`` if any.
 
         Raises InputError if the settings name a parameter that the model lacks, or the axis has no encoder at
@@ -195,7 +196,7 @@ class Follower:
         adaptation = self.adaptation
         assert adaptation is not None
         return messages.AdaptationState(
-            mode=messages.AdaptationMode(adaptation.mode),
+            mode=adaptation.mode,
             frozen=adaptation.waiting_reason(path_known=self._measuring.known),
             updated=self.updated,
             parameters=adaptation.estimated_changes(),

@@ -288,7 +288,7 @@ class EncoderHealth:
         self._period_s = axis.drive.cycle_s
         self._count_arcsec = axis.motor_encoder.resolution_arcsec / axis.gear.ratio
         self._load_count_arcsec = axis.load_encoder.resolution_arcsec
-        self._residual_arcsec = held_out_arcsec(model)
+        self._residual_arcsec = model.held_out_arcsec or UNTESTED_ARCSEC
         self._predicted = bool(model.effects)
         """False without a prediction, in which case the gear's own error may look like an encoder fault."""
         self._jitters: dict[bool, list[float]] = {True: [], False: []}
@@ -451,12 +451,3 @@ class EncoderHealth:
 
 def _standing(found: Residuals) -> BoolArray:
     return np.asarray(np.abs(found["velocity_deg_s"]) < STANDING_DEG_S)
-
-
-def held_out_arcsec(model: TransmissionModel) -> float:
-    """Returns the model's rms residual on held-out data from its file, arcsec; else `UNTESTED_ARCSEC`."""
-    held_out = model.provenance.get("held_out")
-    value = held_out.get("after_arcsec") if isinstance(held_out, dict) else None
-    if isinstance(value, int | float) and math.isfinite(value) and value > 0.0:
-        return float(value)
-    return UNTESTED_ARCSEC

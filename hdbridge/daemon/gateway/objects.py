@@ -91,8 +91,7 @@ def rest_deg(axis: AxisConfig, model: TransmissionModel | None) -> float:
     load_deg = abs(axis.load_encoder.degrees(1))
     if model is None or not model.effects:
         return motor_deg + axis.compensation.maximum_arcsec / ARCSEC_PER_DEG
-    held_out = model.provenance.get("held_out")
-    residual_arcsec = held_out.get("after_arcsec", 0.0) if isinstance(held_out, Mapping) else 0.0
+    residual_arcsec = model.held_out_arcsec or 0.0
     rounding_deg = math.hypot(motor_deg, load_deg) / math.sqrt(12.0)
     return motor_deg + 3.0 * math.hypot(rounding_deg, residual_arcsec / ARCSEC_PER_DEG)
 

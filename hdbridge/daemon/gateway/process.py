@@ -52,7 +52,7 @@ class SimulatedClock:
             self._turn_s = 1e-9 * int(samples[-1]["time_ns"])
             self._turned_s = time.monotonic()
         since_s = (time.monotonic() - self._turned_s) * self._speed
-        if self._status.loop_pid:
+        if self._status[Cell.LOOP_PID]:
             since_s = min(since_s, self._period_s)
         self._latest_s = max(self._latest_s, self._turn_s + since_s)
         return self._latest_s

@@ -18,7 +18,7 @@ from hdbridge.daemon.gateway.objects import BRIDGE, nameplate, write_eds
 from hdbridge.daemon.loop.faultlog import fault_of
 from hdbridge.daemon.loop.states import STOPPED as STOPPED_STATES
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import Memory, OuterCell, OuterKnot, OuterView, SampleArray, SampleFlag
+from hdbridge.daemon.memory import Cell, Memory, OuterCell, OuterKnot, OuterView, SampleArray, SampleFlag
 from hdbridge.device.behaviour import Behaviour, Controlword
 from hdbridge.device.emergency import ErrorCode
 from hdbridge.device.modes import InterpolatedPosition
@@ -98,7 +98,8 @@ class LoadAxis(PowerStage):
         self, axis: AxisConfig, settings: GatewaySettings, memory: Memory, index: int, clock: Clock
     ) -> None:
         self.torque_limit_permille = 0.0
-        self._node: DriveNode | None = None
+        self.node: DriveNode | None = None
+        """Node whose periods time-stamp the set-points."""
         self._clock, self._index = clock, index
         self._status, self._knots, self._cells = memory.status, memory.followed[index], memory.outer[index]
         self._counts_per_deg = settings.counts_per_turn / 360.0
@@ -166,7 +167,7 @@ class LoadAxis(PowerStage):
             if sample["state"] == AxisState.ENABLED:
                 return IN_USE_BY_OTHER
             # If this process was scheduled late, the set-points end before SYNC is overdue.
-            node = self._node
+            node = self.node
             outer = node is not None and node.firmware.follows_the_bus and node.sync_is_late(now_s)
             return ErrorCode.SYNC_LOST if outer else NOT_POWERED
         if not self.is_on and now_s - self._requested_s > POWER_S:
@@ -204,22 +205,18 @@ class LoadAxis(PowerStage):
 
     # ---------------------------------------------------------------- the plant
 
-    def use_times_of(self, node: DriveNode) -> None:
-        """Time-stamps set-points by the periods of this node."""
-        self._node = node
-
     def follow(self, start_counts: float, end_counts: float, substeps: int) -> None:
         """Writes a set-point: linear motion from start to end over this period."""
-        assert self._node is not None
-        begins_s = self._node.period_begins_s
+        assert self.node is not None
+        begins_s = self.node.period_begins_s
         if not self._begun:
             self._begun = True
             self._put(begins_s, start_counts)
         self._put(begins_s + substeps * self.dt_s, end_counts)
 
     def _put(self, time_s: float, counts: float) -> None:
-        assert self._node is not None
-        received_s = self._node.now_s
+        assert self.node is not None
+        received_s = self.node.now_s
         self._knots.add(OuterKnot(self._requested, time_s, counts / self._counts_per_deg, received_s))
 
     def coast(self, substeps: int, braked: bool) -> None:
@@ -309,7 +306,7 @@ class Gateway:
                 store_of(axis),
                 settings.bus.bitrate_bps,
             )
-            load.use_times_of(node)
+            load.node = node
             for sub, read in enumerate(load.values(), start=1):
                 node.dictionary[BRIDGE, sub].bind(read)
             self.axes[axis.name], self.nodes[axis.name] = load, node
@@ -353,11 +350,11 @@ class Gateway:
             return
         self._updated_s = now_s
         status = self._memory.status
-        turns = status.loop_count
+        turns = status[Cell.LOOP_COUNT]
         if turns != self._turns:
             self._turns, self._turned_s = turns, now_s
         samples, _ = self._reader.read()
         newest = samples[-1:] if len(samples) else None
-        alive = status.loop_pid != 0 and now_s - self._turned_s < DEAD_S
+        alive = status[Cell.LOOP_PID] != 0 and now_s - self._turned_s < DEAD_S
         for load in self.axes.values():
             load.update(newest, now_s, alive)

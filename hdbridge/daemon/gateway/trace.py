@@ -19,7 +19,7 @@ from hdbridge.cia301 import NmtCommand, NmtState, wrap_int32
 from hdbridge.drive.dictionary import find
 from hdbridge.drive.emergencies import gateway_error
 from hdbridge.drive.link import Frame
-from hdbridge.drive.states import State, decode
+from hdbridge.drive.states import Command, State, decode
 
 _MULTIPLEXER: Final = struct.Struct("<BHB")
 _NMT: Final = {int(each): each.name.lower().replace("_", " ").replace("pre ", "pre-") for each in NmtCommand}
@@ -420,22 +420,10 @@ class Trace:
 
 
 def _command(word: int) -> str:
-    if word & 0x80:
-        return "fault reset"
-    if not word & 0x02:
-        name = "disable voltage"
-    elif not word & 0x04:
-        name = "quick stop"
-    elif not word & 0x01:
-        name = "shutdown"
-    else:
-        name = "enable operation" if word & 0x08 else "switch on"
-    extra = [
-        text
-        for bit, text in ((0x10, "bit 4"), (0x20, "bit 5"), (0x40, "bit 6"), (0x100, "halt"))
-        if word & bit
-    ]
-    return ", ".join([name, *extra])
+    """Returns the command of a controlword and its other bits, in words."""
+    command = next(each for each in Command if word & each.mask == each.word)
+    others = {0x10: "bit 4", 0x20: "bit 5", 0x40: "bit 6", 0x100: "halt"} if command.word < 0x80 else {}
+    return ", ".join([command.label, *(text for bit, text in others.items() if word & bit)])
 
 
 def _defaults(od: ObjectDictionary) -> dict[tuple[int, int], int]:

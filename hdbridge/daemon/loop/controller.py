@@ -75,7 +75,7 @@ class Controller:
         self._ending = self._at_once = False
         self._ending_turns_left = 0
         self._released: set[int] = set()
-        self._turns = memory.status.loop_count
+        self._turns = memory.status[Cell.LOOP_COUNT]
         cycle.on_frame = self._relay_incoming
         cycle.outgoing = self._relay_outgoing
         # Waiting commands, frames and knots were meant for an earlier loop with the axes in other states.

@@ -9,9 +9,8 @@ import math
 from typing import Final
 
 from hdbridge.axis import AxisConfig
-from hdbridge.axis.effects import Moment, Observer
+from hdbridge.axis.effects import Moment
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.channelstate import ChannelState
 from hdbridge.control.loadloop import LoadLoop
@@ -20,6 +19,7 @@ from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
+from hdbridge.enums import Scheme
 from hdbridge.errors import InputError
 from hdbridge.motion import SetPoint
 from hdbridge.units import ARCSEC_PER_DEG
@@ -44,8 +44,6 @@ class Follower:
         """Correction by the load loop."""
         self.sensed = ChannelState(config)
         self._axis, self._image, self._ratio = config, image, view.ratio
-        self._has_channels = bool(image.channels)
-        self._observer = Observer()
         self._needs = bool(self.correction.needs)
         self._load_loop = _load_loop(config, load_loop) if load_loop is not None else None
         self._load_loop_on = True
@@ -92,18 +90,12 @@ class Follower:
         image = self._image
         image.check_target(feedback.motor_counts)
         motor_deg = image.motor_deg(feedback.motor_counts)
-        load_deg = self.target_deg = motor_deg / self._ratio
-        self.set_point.reset(load_deg)
+        self.target_deg = motor_deg / self._ratio
+        self.set_point.reset(self.target_deg)
         self._issued = image.target_counts
-        self._observer = Observer()
-        sensed, correction = self.sensed, self.correction
-        sensed.reset()
-        sensed.take(feedback)
-        correction.set_known_channels(sensed.known)
-        moment = Moment(time_s=feedback.time_s, measured=sensed.measured(feedback), load_deg=load_deg)
-        correction.reset(motor_deg, moment)
+        self.sensed.begin(feedback, motor_deg, self.correction)
         self.engage(self.compensating)
-        self._needs = bool(correction.needs)
+        self._needs = bool(self.correction.needs)
         if self._load_loop is not None:
             self._load_loop.reset()
         self.loop_arcsec = 0.0
@@ -117,18 +109,7 @@ class Follower:
         if self._load_loop is not None:
             target_deg = self._with_load_loop(self._load_loop, target_deg, feedback)
         correction = self.correction
-        if self._needs:
-            sensed = self.sensed
-            if self._has_channels and sensed.take(feedback):
-                correction.set_known_channels(sensed.known)
-            moment = self._observer.moment(
-                self._ratio * target_deg,
-                feedback.time_s,
-                measured=sensed.measured(feedback),
-                load_deg=target_deg,
-            )
-        else:
-            moment = _AT_REST
+        moment = self.sensed.moment(feedback, target_deg, correction) if self._needs else _AT_REST
         follow = correction.command if feedback.fresh else correction.hold
         counts = self._image.target_counts_for(follow(target_deg, moment))
         if not -self._max_step_counts <= counts - self._issued <= self._max_step_counts:
@@ -143,7 +124,7 @@ class Follower:
         """Starts or stops tracking the motion history after a change of compensation."""
         needs = bool(self.correction.needs)
         if needs and not self._needs:
-            self._observer = Observer()
+            self.sensed.restart()
         self._needs = needs
 
     @property

@@ -8,7 +8,7 @@ import zlib
 from enum import IntEnum
 from typing import Final, Self
 
-from hdbridge.daemon.memory.layout import LINE, OUTER_VIEW, STATUS_OFFSET, OuterCell, OuterView, Place
+from hdbridge.daemon.memory.layout import LINE, OUTER_VIEW, OuterCell, OuterView, Place
 from hdbridge.errors import InputError
 
 _STRIDE: Final = LINE // 8
@@ -60,11 +60,13 @@ class Region:
 
 
 class Cell(IntEnum):
-    """Status cells, each in its own cache line."""
+    """State of the daemon's processes."""
 
     LOOP_COUNT = 0
+    """Number of cycles of the loop, summed over all control processes so far."""
     SERVICE_TIME_NS = 1
     LOOP_PID = 2
+    """Process id of the control process; 0 if none runs."""
     SERVICE_PID = 3
     STOP_REQUESTED = 4
     GATEWAY_TIME_NS = 5
@@ -90,23 +92,6 @@ class Cells:
 
     def __setitem__(self, cell: IntEnum, value: int) -> None:
         self._cells[cell * _STRIDE] = value
-
-
-class Status(Cells):
-    """State of the daemon's processes, by `Cell`."""
-
-    def __init__(self, region: Region) -> None:
-        super().__init__(region, STATUS_OFFSET, Cell)
-
-    @property
-    def loop_count(self) -> int:
-        """Number of cycles of the loop, summed over all control processes so far."""
-        return self[Cell.LOOP_COUNT]
-
-    @property
-    def loop_pid(self) -> int:
-        """Process id of the control process; 0 if none runs."""
-        return self[Cell.LOOP_PID]
 
 
 class OuterCells(Cells):

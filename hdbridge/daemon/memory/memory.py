@@ -5,7 +5,7 @@ import platform
 import zlib
 from typing import Final, Self
 
-from hdbridge.daemon.memory.cells import OuterCells, Region, SettingSlot, Status
+from hdbridge.daemon.memory.cells import Cell, Cells, OuterCells, Region, SettingSlot
 from hdbridge.daemon.memory.channels import (
     COMMANDS,
     EVENTS,
@@ -24,6 +24,7 @@ from hdbridge.daemon.memory.layout import (
     HEADER,
     MAGIC,
     NO_OUTER,
+    STATUS_OFFSET,
     VERSION,
     Event,
     Layout,
@@ -60,7 +61,7 @@ class Memory:
         self.settings = tuple(SettingSlot(region, place) for place in layout.settings)
         self.followed = tuple(Queue(region, place, FOLLOWED) for place in layout.followed)
         self.outer = tuple(OuterCells(region, place) for place in layout.outer)
-        self.status = Status(region)
+        self.status = Cells(region, STATUS_OFFSET, Cell)
 
     @classmethod
     def create(cls, axes: int, period_s: float, *, checked: bool = not ORDERED) -> Self:

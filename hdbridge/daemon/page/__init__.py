@@ -4,9 +4,10 @@ It consists of static files; all data comes over the API. The charts use uPlot, 
 reports, and `POLICY` forbids the browser to load anything from elsewhere.
 """
 
-from functools import cache
-from importlib.resources import files
-from typing import Final
+from typing import Any, Final
+
+from starlette.responses import Response
+from starlette.staticfiles import StaticFiles
 
 PAGE: Final = "index.html"
 """File served at the root of the site."""
@@ -15,19 +16,15 @@ POLICY: Final = (
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 """Content-Security-Policy of the page. uPlot needs inline styles to place its canvases."""
-_TYPES: Final = {
-    ".html": "text/html; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".svg": "image/svg+xml",
-}
-_FROM_REPORTS: Final = {"uplot.js": "uPlot.iife.min.js", "uplot.css": "uPlot.min.css"}
 
 
-@cache
-def page_files() -> dict[str, tuple[bytes, str]]:
-    """Returns content and content type of each file of the page, by name."""
-    found = {each.name: each.read_bytes() for each in files(__name__).joinpath("assets").iterdir()}
-    reports = files("hdbridge.report").joinpath("assets")
-    found |= {name: reports.joinpath(source).read_bytes() for name, source in _FROM_REPORTS.items()}
-    return {name: (content, _TYPES[name[name.rindex(".") :]]) for name, content in sorted(found.items())}
+class PageFiles(StaticFiles):
+    """Files of the page and of the reports."""
+
+    def __init__(self) -> None:
+        super().__init__(packages=[(__name__, "assets"), ("hdbridge.report", "assets")])
+
+    def file_response(self, *args: Any, **kwargs: Any) -> Response:
+        response = super().file_response(*args, **kwargs)
+        response.headers["Content-Security-Policy"] = POLICY
+        return response

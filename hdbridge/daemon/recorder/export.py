@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleFlag
-from hdbridge.daemon.recorder.flightfile import About, AxisAbout
-from hdbridge.daemon.recorder.reading import Flight, ModelUsed
+from hdbridge.daemon.recorder.flightfile import About, AxisAbout, ModelUse
+from hdbridge.daemon.recorder.reading import Flight
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import GAP_CYCLES, PART_SAMPLES, Recording
@@ -94,7 +94,7 @@ def exported(
     )
 
 
-def last_model(flights: Sequence[Flight], axis: str) -> ModelUsed | None:
+def last_model(flights: Sequence[Flight], axis: str) -> ModelUse | None:
     """Returns the last model that the axis used; None if none was recorded."""
     used = [each for flight in flights for each in flight.models if each.axis == axis]
     return used[-1] if used else None

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 from mcap.writer import CompressionType, Writer
 
@@ -154,6 +154,14 @@ class About:
             raise InputError(f"{path}: its metadata are damaged: {problem}") from None
 
 
+class ModelUse(NamedTuple):
+    """Change of an axis's model."""
+
+    axis: str
+    version: str
+    text: str
+
+
 def axis_topic(name: str) -> str:
     """Returns the topic of an axis's samples."""
     return f"/axis/{name}/sample"
@@ -275,9 +283,9 @@ class FlightFile:
         }
         self._put(self._events, time_ns, content | facts)
 
-    def add_model(self, time_ns: int, axis: str, version: str, text: str) -> None:
+    def add_model(self, time_ns: int, use: ModelUse) -> None:
         """Adds the model that an axis uses from now on."""
-        self._put(self._models, time_ns, {"axis": axis, "version": version, "text": text})
+        self._put(self._models, time_ns, use._asdict())
 
     def flush(self) -> None:
         """Writes new messages and syncs them to the disk. After an OSError, they wait for a retry."""

@@ -27,7 +27,7 @@ from typing import Final, NamedTuple
 
 from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.memory import Event, EventKind, SampleArray
-from hdbridge.daemon.recorder.flightfile import KEPT, PART, About, FlightFile
+from hdbridge.daemon.recorder.flightfile import KEPT, PART, About, FlightFile, ModelUse
 from hdbridge.daemon.recorder.mend import mend_folder
 from hdbridge.daemon.recorder.reading import SUFFIX, overview
 from hdbridge.errors import InputError
@@ -49,14 +49,6 @@ class Batch(NamedTuple):
     samples: SampleArray
     events: tuple[Event, ...] = ()
     lost: int = 0
-
-
-class ModelUse(NamedTuple):
-    """Change of an axis's model."""
-
-    axis: str
-    version: str
-    text: str
 
 
 class Note(NamedTuple):
@@ -169,13 +161,13 @@ class FlightLog:
         self._file = file
         self._begun_ns = int(batches[0]["time_ns"][0]) if batches else self._newest_ns
         for each in self._models.values():
-            file.add_model(self._newest_ns, each.axis, each.version, each.text)
+            file.add_model(self._newest_ns, each)
         return file
 
     def _write(self, file: FlightFile, item: Item) -> None:
         match item:
             case ModelUse():
-                file.add_model(self._newest_ns, item.axis, item.version, item.text)
+                file.add_model(self._newest_ns, item)
             case Note():
                 file.note(self._newest_ns, item.kind, item.text)
             case Batch():

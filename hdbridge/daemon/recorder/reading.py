@@ -20,7 +20,16 @@ from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 from zstandard import ZstdError
 
-from hdbridge.daemon.recorder.flightfile import EVENTS, KEPT, MACHINE_TOPIC, MODEL, PART, About, axis_topic
+from hdbridge.daemon.recorder.flightfile import (
+    EVENTS,
+    KEPT,
+    MACHINE_TOPIC,
+    MODEL,
+    PART,
+    About,
+    ModelUse,
+    axis_topic,
+)
 from hdbridge.daemon.recorder.wire import AXIS, MACHINE
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import open_regular
@@ -46,15 +55,6 @@ class LoggedEvent(NamedTuple):
     text: str
 
 
-class ModelUsed(NamedTuple):
-    """Model used by an axis from a given time."""
-
-    time_ns: int
-    axis: str
-    version: str
-    text: str
-
-
 @dataclass(eq=False)
 class Flight:
     """Content of one file, or its summary."""
@@ -74,7 +74,8 @@ class Flight:
     axes: Mapping[str, Mapping[str, NDArray[Any]]] = field(default_factory=dict)
     """Requested sample fields as columns, by axis."""
     machine: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    models: tuple[ModelUsed, ...] = ()
+    models: tuple[ModelUse, ...] = ()
+    """Changes of model, oldest first."""
 
 
 def flight_files(paths: Sequence[Path]) -> list[Path]:
@@ -153,7 +154,7 @@ def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
     messages: dict[str, list[bytes]] = defaultdict(list)
     metadata: dict[str, Mapping[str, str]] = {}
     events: list[LoggedEvent] = []
-    models: list[ModelUsed] = []
+    models: list[ModelUse] = []
     times: list[int] = []
     finished = False
     wanted = None if axes is None else {MACHINE_TOPIC, *map(axis_topic, axes)}
@@ -166,7 +167,7 @@ def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
                 if topic == EVENTS:
                     events.append(_logged_event(record))
                 elif topic == MODEL:
-                    models.append(ModelUsed(record.log_time, **json.loads(record.data)))
+                    models.append(ModelUse(**json.loads(record.data)))
                 elif wanted is None or topic in wanted:
                     messages[topic].append(record.data)
                 times.append(record.log_time)

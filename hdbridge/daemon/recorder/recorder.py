@@ -14,8 +14,8 @@ from typing import Final
 from hdbridge.client import messages
 from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.memory import Event, SampleArray
-from hdbridge.daemon.recorder.flightfile import About
-from hdbridge.daemon.recorder.flightlog import MARK, Batch, FlightLog, ModelUse, Note, free_bytes
+from hdbridge.daemon.recorder.flightfile import About, ModelUse
+from hdbridge.daemon.recorder.flightlog import MARK, Batch, FlightLog, Note, free_bytes
 from hdbridge.daemon.setting import CompensationSetting
 
 FLUSH_S: Final = 1.0

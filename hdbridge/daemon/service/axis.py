@@ -14,9 +14,9 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Literal
 
 from hdbridge.client import messages
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, UNKNOWN, AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind
+from hdbridge.daemon.service import reports
 from hdbridge.daemon.service.axislink import AxisLink
 from hdbridge.daemon.service.commissioning import Commissioning
 from hdbridge.daemon.service.core import ANSWER_S
@@ -24,6 +24,7 @@ from hdbridge.daemon.service.models import AxisModels
 from hdbridge.daemon.service.moves import AxisMotion
 from hdbridge.drive.states import State
 from hdbridge.drive.values import Object, Value
+from hdbridge.enums import Scheme
 from hdbridge.errors import DriveError, HdbridgeError, InputError, RefusedError
 
 if TYPE_CHECKING:
@@ -45,9 +46,9 @@ class ServiceAxis:
     """One axis of the machine. Methods that change it require the lease; stopping and reading do not."""
 
     def __init__(
-        self, index: int, axis: Axis, core: Core, report: Callable[[ServiceAxis], messages.AxisState]
+        self, index: int, axis: Axis, core: Core, outer: Callable[[], messages.OuterState | None]
     ) -> None:
-        """``report`` returns the state of an axis."""
+        """``outer`` returns the state of the axis's node in a gateway."""
         self.axis = axis
         self.name = axis.name
         self.core = core
@@ -64,7 +65,7 @@ class ServiceAxis:
         event."""
         self.following: Following | None = None
         """Watch and adaptation; None without."""
-        self._report = report
+        self._outer = outer
         self._work = core.timing.work
         self._changing = asyncio.Lock()
         self._doing = ""
@@ -76,7 +77,7 @@ class ServiceAxis:
 
     def state(self) -> messages.AxisState:
         """Returns the state of the axis in the newest cycle."""
-        return self._report(self)
+        return reports.axis_state(self, self._outer())
 
     def on_event(self, event: Event) -> None:
         """Takes an event of the axis."""
@@ -125,7 +126,7 @@ class ServiceAxis:
                 return
             if link.state is AxisState.UNVERIFIED:
                 await self._verify()
-            self.models.check_drive(self.commissioning.identity)
+            self.models.check_drive(self.commissioning.drive.identity)
             if link.state is not AxisState.DISABLED:
                 await link.do(CommandKind.ENABLE)  # raises RefusedError with the reason
             if self.is_prepared:
@@ -144,7 +145,7 @@ class ServiceAxis:
         self.check_free()
         async with self._drive:
             if self.link.state is AxisState.DISABLED:
-                self.models.check_drive(self.commissioning.identity)
+                self.models.check_drive(self.commissioning.drive.identity)
                 await self._work(self.commissioning.prepare)
                 self.is_prepared = True
 
@@ -258,7 +259,7 @@ class ServiceAxis:
         ``pending`` commits it; ``active`` reads the profile's model again. Fades it in, also during motion.
         """
         self.check_may(holder)
-        identity = self.commissioning.identity
+        identity = self.commissioning.drive.identity
         async with self._changing:
             await self._use(await self._work(self.models.found, version, identity))
             date = datetime.now(UTC)
@@ -296,7 +297,8 @@ class ServiceAxis:
         await self.link.do(CommandKind.CHANGE, i=self.models.send(setting))
         self.models.chosen = setting
         await self.link.until(
-            lambda: any(each.kind is EventKind.CHANGED for each in log.of_axis(index, since)), CHANGE_S
+            lambda: any(each.kind is EventKind.CHANGED and each.axis == index for each in log.since(since)),
+            CHANGE_S,
         )
 
     # ---------------------------------------------------------------- objects of the drive
@@ -314,8 +316,3 @@ class ServiceAxis:
             )
         self.is_prepared = False
         return await self._work(self.commissioning.write, object_, value)
-
-    async def close(self) -> None:
-        """Ends queue and SDO access; the axis completes its current motion."""
-        await self.motion.close()
-        self.commissioning.close()

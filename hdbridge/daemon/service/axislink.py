@@ -150,7 +150,9 @@ class AxisLink:
         self.core.observer.poll()
         log = self.core.log
         newest = log.newest
-        for event in log.of_axis(self.index, activity.since):
+        for event in log.since(activity.since):
+            if event.axis not in {self.index, -1}:
+                continue
             if event.kind is EventKind.STOPPED:
                 activity.end("the supervision stopped it")
                 raise SafetyStop(f"{self.name}: {event.text}", stop_hint(event, self.name))

@@ -22,10 +22,11 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from hdbridge.client import messages
 from hdbridge.daemon.loop.states import UNKNOWN
@@ -43,9 +44,7 @@ from hdbridge.errors import HdbridgeError, InputError
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Machine
     from hdbridge.daemon.memory import Event, Memory, SampleArray
-    from hdbridge.daemon.memory.channels import SampleReader
     from hdbridge.daemon.recorder.recorder import FlightRecorder
-    from hdbridge.daemon.service.lease import Lease
 
 VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
 """Pauses before successive attempts to verify a drive that did not answer; the last pause repeats."""
@@ -75,9 +74,11 @@ class ServiceBridge:
             against = "its axes are simulated; a command has a simulated axis of its own with --simulate"
         self.lending = Lending(self.core, machine.bus, against)
         self.axes: dict[str, ServiceAxis] = {
-            axis.name: ServiceAxis(index, axis, self.core, self._axis_state)
+            axis.name: ServiceAxis(index, axis, self.core, partial(self._outer, index))
             for index, axis in enumerate(machine.axes)
         }
+        self.reader = memory.reader
+        """Returns a reader of samples from now on."""
         self.recorder: FlightRecorder | None = None
         self._names = tuple(self.axes)
         self._simulated = simulated
@@ -87,8 +88,9 @@ class ServiceBridge:
         self._latency = Latency(memory.axes)
         if machine.gateway is not None:
             self.core.observer.add(self._latency)
-        self._tasks: set[asyncio.Task[None]] = set()
-        self.core.lease.doing = self._doing
+        self.lease = self.core.lease
+        """Right to move."""
+        self.lease.doing = self._doing
 
     def _doing(self) -> str:
         """Describes the current motions for a client without the lease."""
@@ -97,11 +99,6 @@ class ServiceBridge:
             f"axis '{each.name}' is in motion ({each.mode})" for each in states if each.mode != "hold"
         )
 
-    @property
-    def lease(self) -> Lease:
-        """Lease, which is the right to move."""
-        return self.core.lease
-
     # ---------------------------------------------------------------- begin and end
 
     async def __aenter__(self) -> Self:
@@ -109,16 +106,20 @@ class ServiceBridge:
 
         Returns once the control process compensates each axis by its setting, or does not answer.
         """
-        self._start(self._watch())
+        self.core.start(self._watch())
         for axis in self.axes.values():
-            self._start(self._take_over(axis))
-            self._start(self._settle(axis))
-            self._start(self._verify(axis))
+            self.core.start(self._take_over(axis))
+            # The drive is booted and verified whenever necessary; the axis stays disabled.
+            for is_due, attempt, pauses_s, failure in (
+                (self._is_unsettled, axis.settle, SETTLE_AGAIN_S, "the compensation could not be put back"),
+                (self._is_unverified, axis.verify, VERIFY_AGAIN_S, "the drive could not be verified"),
+            ):
+                self.core.start(self._persist(axis, is_due, attempt, pauses_s, failure))
         if (gateway := self.machine.gateway) is not None:
             master = OuterMaster(self.core, gateway, self.mark)
-            self._start(master.keep())
+            self.core.start(master.keep())
             for name in gateway.nodes:
-                self._start(master.serve(self.axes[name]))
+                self.core.start(master.serve(self.axes[name]))
         # Let each take-over start, so that no other request precedes it.
         await asyncio.sleep(0)
         timing = self.core.timing
@@ -129,20 +130,21 @@ class ServiceBridge:
 
     async def __aexit__(self, *_: object) -> None:
         """Stops monitoring; the axes complete their current commands."""
-        for task in tuple(self._tasks):
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self.core.close()
         for axis in self.axes.values():
-            await axis.close()
+            axis.commissioning.close()
 
     async def _watch(self) -> None:
-        """Reads samples and events, checks the lease and notices a new control process, every `PERIOD_S`."""
+        """Reads samples and events, checks the lease and notices a new control process, every `PERIOD_S`.
+
+        If it fails, the keeper restarts the service.
+        """
         core, status = self.core, self.core.memory.status
-        known = status.loop_pid
+        known = status[Cell.LOOP_PID]
         while True:
             core.observer.poll()
             status[Cell.SERVICE_TIME_NS] = time.monotonic_ns()
-            if (pid := status.loop_pid) and pid != known:
+            if (pid := status[Cell.LOOP_PID]) and pid != known:
                 if known:
                     core.log.note("the control process was started again: every axis is disabled")
                     self._bus_up = True
@@ -162,23 +164,16 @@ class ServiceBridge:
             elif event.kind in (EventKind.BUS_DOWN, EventKind.BUS_UP):
                 self._bus_up = event.kind is EventKind.BUS_UP
 
-    async def _settle(self, axis: ServiceAxis) -> None:
-        """Sends the chosen compensation whenever the control process does not use it."""
-        what = "the compensation could not be put back"
-        await self._persist(axis, lambda: not axis.models.settled, axis.settle, SETTLE_AGAIN_S, what)
+    def _is_unsettled(self, axis: ServiceAxis) -> bool:
+        return not axis.models.settled
 
-    async def _verify(self, axis: ServiceAxis) -> None:
-        """Boots and verifies the drive whenever necessary. The axis stays disabled."""
-
-        def is_due() -> bool:
-            return axis.link.state in UNKNOWN and self._bus_up
-
-        await self._persist(axis, is_due, axis.verify, VERIFY_AGAIN_S, "the drive could not be verified")
+    def _is_unverified(self, axis: ServiceAxis) -> bool:
+        return axis.link.state in UNKNOWN and self._bus_up
 
     async def _persist(
         self,
         axis: ServiceAxis,
-        is_due: Callable[[], bool],
+        is_due: Callable[[ServiceAxis], bool],
         attempt: Callable[[], Awaitable[None]],
         pauses_s: Sequence[float],
         failure: str,
@@ -186,14 +181,14 @@ class ServiceBridge:
         """Repeats an attempt while it is due, until cancelled; notes each different error."""
         timing, attempts, noted = self.core.timing, 0, ""
         while True:
-            if not is_due():
+            if not is_due(axis):
                 attempts, noted = 0, ""
                 await timing.sleep(PERIOD_S)
                 continue
             await timing.sleep(pauses_s[min(attempts, len(pauses_s) - 1)])
             attempts += 1
             try:
-                if is_due():
+                if is_due(axis):
                     await attempt()
             except HdbridgeError as error:
                 if str(error) != noted:
@@ -221,7 +216,7 @@ class ServiceBridge:
             version=version("hdbridge"),
             started=self._started,
             simulated=self._simulated,
-            axes=[self._axis_state(axis) for axis in self.axes.values()],
+            axes=[axis.state() for axis in self.axes.values()],
             bus=messages.BusState(
                 interface=self.machine.bus.interface,
                 channel=str(self.machine.bus.channel),
@@ -234,7 +229,7 @@ class ServiceBridge:
                 period_s=core.memory.period_s,
                 cycle=core.observer.cycle,
                 alive=core.observer.alive,
-                pid=core.memory.status.loop_pid,
+                pid=core.memory.status[Cell.LOOP_PID],
                 skipped=int(head["skipped"]) if head is not None else 0,
                 late_us=float(head["late_us"]) if head is not None else None,
                 busy_us=float(head["busy_us"]) if head is not None else None,
@@ -244,18 +239,14 @@ class ServiceBridge:
             warnings=self._warnings(),
         )
 
-    def _axis_state(self, axis: ServiceAxis) -> messages.AxisState:
-        """Returns the state of one axis in the newest cycle."""
-        return reports.axis_state(axis, self._outer(axis))
-
-    def _outer(self, axis: ServiceAxis) -> messages.OuterState | None:
+    def _outer(self, index: int) -> messages.OuterState | None:
+        """Returns the state of an axis as seen by the outer master; None without one."""
         gateway, memory = self.machine.gateway, self.core.memory
-        node_id = gateway.nodes.get(axis.name) if gateway is not None else None
+        node_id = gateway.nodes.get(self._names[index]) if gateway is not None else None
         if node_id is None:
             return None
         alive_ns = memory.status[Cell.GATEWAY_TIME_NS]
-        place = axis.link.index
-        return reports.outer_state(memory.outer[place], node_id, alive_ns, self._latency.of(place))
+        return reports.outer_state(memory.outer[index], node_id, alive_ns, self._latency.of(index))
 
     def _warnings(self) -> list[str]:
         core = self.core
@@ -280,16 +271,12 @@ class ServiceBridge:
     def events(self, since: int = 0) -> messages.Events:
         """Returns at most the newest `EVENTS_RETURNED` events after number ``since``, oldest first."""
         events = self.core.log.public(since)[-EVENTS_RETURNED:]
-        newest = events[-1].number if events else self.core.log.newest_public
+        newest = events[-1].sequence if events else self.core.log.newest_public
         return messages.Events(
             events=[reports.event_message(each, self._names) for each in events],
             lost=max(newest - since - len(events), 0),
             newest=newest,
         )
-
-    def reader(self) -> SampleReader:
-        """Returns a reader of samples from now on."""
-        return self.core.memory.reader()
 
     # ---------------------------------------------------------------- requests
 
@@ -308,8 +295,6 @@ class ServiceBridge:
         self, holder: str, moves: Mapping[str, float], speed: float = 1.0, wait: bool = True
     ) -> None:
         """Moves several axes so that all begin and end together; ``speed`` is a fraction of the limits."""
-        if not moves:
-            raise InputError("a coordinated move without an axis; expected a target for at least one")
         for name in moves.keys() - self.axes.keys():
             raise InputError(f"there is no axis '{name}'; expected one of: {', '.join(self.axes)}")
         await run_together(holder, [self.axes[name] for name in moves], moves, speed, wait=wait)
@@ -319,14 +304,3 @@ class ServiceBridge:
         self.core.log.note(text, axis)
         if self.recorder is not None:
             self.recorder.mark(text)
-
-    def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.get_running_loop().create_task(coroutine)
-        self._tasks.add(task)
-        task.add_done_callback(self._log_error)
-
-    def _log_error(self, task: asyncio.Task[None]) -> None:
-        """Logs an unexpected error of a task. If `_watch` fails, the keeper restarts the service."""
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            _log.error("an error in hdbridge", exc_info=error)

@@ -16,12 +16,11 @@ from typing import Final
 
 import can
 
-from hdbridge.axis import AxisConfig, Identity
+from hdbridge.axis import AxisConfig
 from hdbridge.client import messages
 from hdbridge.daemon.memory import RelayedFrame
 from hdbridge.daemon.service.core import Arguments, Core
 from hdbridge.drive import objects
-from hdbridge.drive.bootup import BootReport
 from hdbridge.drive.drive import Drive, Positions
 from hdbridge.drive.states import State
 from hdbridge.drive.values import Object, Value, find_object
@@ -60,12 +59,8 @@ class RelayBus(can.BusABC):
         """Reason with which the current operation is to fail; empty if it is not to fail."""
 
     def interrupt(self, reason: str) -> None:
-        """Makes the current operation fail at its next wait, once, with ``reason``."""
+        """Makes the current operation fail at its next wait, once, with ``reason``; empty: not any more."""
         self._interruption = reason
-
-    def begin(self) -> None:
-        """Begins another operation, discarding an interruption of the last one."""
-        self._interruption = ""
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Sends a frame. Drops the master's heartbeat, which the control process sends."""
@@ -117,20 +112,10 @@ class Commissioning:
     """Drive of one axis, as seen by the service."""
 
     def __init__(self, axis: AxisConfig, core: Core) -> None:
-        self.bus = RelayBus(core, axis.nodes, f"{axis.bus.interface}:{axis.bus.channel}")
-        self._drive = Drive(self.bus, axis, core.timing.clock, force=True)
+        self._bus = RelayBus(core, axis.nodes, f"{axis.bus.interface}:{axis.bus.channel}")
+        self.drive = Drive(self._bus, axis, core.timing.clock, force=True)
         self._busy = threading.Lock()
         self._doing = ""
-
-    @property
-    def report(self) -> BootReport | None:
-        """Result of the verification; None before."""
-        return self._drive.report
-
-    @property
-    def identity(self) -> Identity:
-        """Identity that the drive reported, else the identity in the axis file."""
-        return self._drive.identity
 
     def verify(self, *, clear_fault: bool = False) -> Arguments:
         """Boots the drive and compares it with the axis file; power is off afterwards.
@@ -139,32 +124,32 @@ class Commissioning:
         like `Drive.boot`.
         """
         with self._request("it is being booted"):
-            self._drive.boot()
-            if clear_fault and self._drive.state() is State.FAULT:
-                self._drive.fault_reset()
-            return self._seeds(self._drive.read_positions())
+            self.drive.boot()
+            if clear_fault and self.drive.state() is State.FAULT:
+                self.drive.fault_reset()
+            return self._seeds(self.drive.read_positions())
 
     def take_over(self) -> None:
         """Compares a drive under control of the control process with the axis file, without writing."""
         with self._request("it is being compared with its axis file"):
-            self._drive.take_over()
+            self.drive.take_over()
 
     def abandon_homing(self) -> None:
         """Stops a drive that was lent to an earlier service, and switches its power off."""
         with self._request("it is being stopped"):
-            if self._drive.state() is State.OPERATION_ENABLED:
-                self._drive.quick_stop()
-            self._drive.disable()
+            if self.drive.state() is State.OPERATION_ENABLED:
+                self.drive.quick_stop()
+            self.drive.disable()
 
     def prepare(self) -> Arguments:
         """Prepares the drive for being enabled by the control process. Raises like `Drive.enable`."""
         with self._request("it is being prepared"):
-            return self._seeds(self._drive.prepare())
+            return self._seeds(self.drive.prepare())
 
     def rest(self) -> None:
         """Ends the drive's monitoring of the master; power is off already."""
         with self._request("it is being switched off"):
-            self._drive.disable()
+            self.drive.disable()
 
     def home(self, run: messages.Home) -> Arguments:
         """Homes a drive that the control process has lent; power is off afterwards.
@@ -173,50 +158,50 @@ class Commissioning:
         """
         with self._request("it is being homed"):
             try:
-                positions = self._drive.home(**run.model_dump())
+                positions = self.drive.home(**run.model_dump())
             finally:
-                self._drive.disable()
+                self.drive.disable()
             return self._seeds(positions)
 
     def interrupt(self, reason: str) -> None:
         """Interrupts the current request with this reason; a homing axis stops. Thread-safe."""
         if self._busy.locked():
-            self.bus.interrupt(reason)
+            self._bus.interrupt(reason)
 
     def read(self, object_: str) -> tuple[Object, Value]:
         """Reads an object by its number or its EDS name."""
-        wanted = find_object(object_, self._drive.sdo.od)
+        wanted = find_object(object_, self.drive.sdo.od)
         if not wanted.readable:
             raise InputError(f"{wanted}: is write-only in the EDS")
         with self._request(f"{object_} is being read"):
-            return wanted, wanted.decode(self._drive.sdo.read_bytes(wanted.index, wanted.sub))
+            return wanted, wanted.decode(self.drive.sdo.read_bytes(wanted.index, wanted.sub))
 
     def write(self, object_: str, text: str) -> Object:
         """Writes an object; the control process refuses this while the axis is enabled."""
-        wanted = find_object(object_, self._drive.sdo.od)
+        wanted = find_object(object_, self.drive.sdo.od)
         if not wanted.writable:
             raise InputError(f"{wanted}: is read-only in the EDS")
         data = wanted.encode(text)
         with self._request(f"{object_} is being written"):
-            self._drive.sdo.write_bytes(wanted.index, wanted.sub, data)
+            self.drive.sdo.write_bytes(wanted.index, wanted.sub, data)
         return wanted
 
     def close(self) -> None:
         """Closes the relay bus; the drive stays as it is."""
-        self.bus.shutdown()
+        self._bus.shutdown()
 
     def _seeds(self, positions: Positions) -> Arguments:
         """Returns counts and statusword, the arguments of VERIFIED, UNLEND and ENABLE."""
-        self._drive.state()
-        statusword = self._drive.image.statusword or 0
+        self.drive.state()
+        statusword = self.drive.image.statusword or 0
         return Arguments(i=positions.motor_counts, j=positions.load_counts, k=statusword)
 
     @contextmanager
     def _request(self, doing: str) -> Iterator[None]:
         if not self._busy.acquire(timeout=BUSY_S):
-            raise RefusedError(f"the drive of axis '{self._drive.axis.name}' is busy: {self._doing}")
+            raise RefusedError(f"the drive of axis '{self.drive.axis.name}' is busy: {self._doing}")
         self._doing = doing
-        self.bus.begin()
+        self._bus.interrupt("")
         try:
             yield
         finally:

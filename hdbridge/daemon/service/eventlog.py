@@ -1,8 +1,8 @@
 """Event log: the control process's events and the service's notes, in two bounded lists. Thread-safe.
 
-One list has every entry, for the service itself. Clients see the other list, which omits routine entries
-(`_routine`), because the thousands of motions of a calibration must not displace yesterday's stop. Each list
-has its own numbering. `EventLogger` writes the log lines of the control process, which itself writes none.
+One list has every event, for the service itself. Clients see the other list, which has the notes but omits
+routine events (`_routine`), because the thousands of motions of a calibration must not displace yesterday's
+stop. `EventLogger` writes the log lines of the control process, which itself writes none.
 """
 
 import logging
@@ -10,7 +10,8 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from typing import NamedTuple
+from itertools import takewhile
+from typing import NamedTuple, TypeVar
 
 from hdbridge.daemon.loop.faultlog import fault_of
 from hdbridge.daemon.loop.states import AxisState
@@ -20,16 +21,14 @@ from hdbridge.drive.supervision import Reaction
 from hdbridge.motion import MotionMode
 
 ENTRIES_KEPT = 4096
-ANSWERS_KEPT = 1024
-_ANSWERS = (EventKind.DONE, EventKind.REFUSED)
 _log = logging.getLogger(__name__)
 
 
 class Entry(NamedTuple):
-    """Entry of the event log."""
+    """Entry for clients."""
 
-    number: int
-    """Number within its list, from 1 at the start of the service."""
+    sequence: int
+    """Number of the entry, from 1 at the start of the service."""
     date: datetime
     axis: int
     """Index of the axis; -1 is the machine."""
@@ -38,65 +37,55 @@ class Entry(NamedTuple):
     text: str
 
 
+Numbered = TypeVar("Numbered", Event, Entry)
+
+
 class EventLog:
-    """Newest `ENTRIES_KEPT` entries, and the answers to the newest commands."""
+    """Newest `ENTRIES_KEPT` events of the control process, and as many entries for clients."""
 
     def __init__(self, reader: RingReader[Event]) -> None:
         self._reader = reader
         self._lock = threading.Lock()
-        self._entries: deque[Entry] = deque(maxlen=ENTRIES_KEPT)
+        self._events: deque[Event] = deque(maxlen=ENTRIES_KEPT)
         self._public: deque[Entry] = deque(maxlen=ENTRIES_KEPT)
-        self._answers: dict[int, Event] = {}
         self.newest = self.newest_public = 0
-        """Numbers of the newest entry, and of the newest for clients; 0 before the first."""
+        """Numbers of the newest event, and of the newest entry for clients; 0 before the first."""
 
-    def poll(self) -> None:
-        """Reads new events of the control process."""
+    def poll(self) -> list[Event]:
+        """Reads new events of the control process and returns them."""
         with self._lock:
             events, _ = self._reader.read()
             for event in events:
-                self._add(event.axis, event, event.text)
-                if event.id and event.kind in _ANSWERS:
-                    self._answers[event.id] = event
-            while len(self._answers) > ANSWERS_KEPT:
-                del self._answers[next(iter(self._answers))]
+                self._events.append(event)
+                self.newest = event.sequence
+                if not _routine(event):
+                    self._add(event.axis, event, event.text)
+        return events
 
     def note(self, text: str, axis: int = -1) -> None:
         """Adds a note of the service."""
         with self._lock:
             self._add(axis, None, text)
 
-    def answer(self, command_id: int) -> Event | None:
-        """Returns the DONE or REFUSED event of a command; None until it arrives."""
-        return self._answers.get(command_id)
-
-    def since(self, number: int) -> list[Entry]:
-        """Returns the retained entries after ``number``, oldest first."""
+    def since(self, sequence: int) -> list[Event]:
+        """Returns the retained events after number ``sequence``, oldest first."""
         with self._lock:
-            return _newest(self._entries, self.newest - number)
+            return _after(self._events, sequence)
 
-    def public(self, number: int) -> list[Entry]:
-        """Returns the entries for clients after ``number``, oldest first."""
+    def public(self, sequence: int) -> list[Entry]:
+        """Returns the entries for clients after number ``sequence``, oldest first."""
         with self._lock:
-            return _newest(self._public, self.newest_public - number)
-
-    def of_axis(self, axis: int, since: int) -> list[Event]:
-        """Returns the control process's events of one axis and of the machine after number ``since``."""
-        entries = self.since(since)
-        return [each.event for each in entries if each.event is not None and each.axis in {axis, -1}]
+            return _after(self._public, sequence)
 
     def _add(self, axis: int, event: Event | None, text: str) -> None:
-        date = datetime.now(UTC)
-        self.newest += 1
-        self._entries.append(Entry(self.newest, date, axis, event, text))
-        if event is None or not _routine(event):
-            self.newest_public += 1
-            self._public.append(Entry(self.newest_public, date, axis, event, text))
+        self.newest_public += 1
+        self._public.append(Entry(self.newest_public, datetime.now(UTC), axis, event, text))
 
 
-def _newest(entries: deque[Entry], count: int) -> list[Entry]:
-    new = min(max(count, 0), len(entries))
-    return [entries[place] for place in range(len(entries) - new, len(entries))]
+def _after(entries: deque[Numbered], sequence: int) -> list[Numbered]:
+    new = list(takewhile(lambda each: each.sequence > sequence, reversed(entries)))
+    new.reverse()
+    return new
 
 
 def _routine(event: Event) -> bool:

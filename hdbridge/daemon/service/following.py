@@ -23,6 +23,7 @@ from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
 from hdbridge.daemon.recorder.flightlog import Note
 from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.axis import ServiceAxis
+from hdbridge.enums import AdaptationMode
 from hdbridge.errors import HdbridgeError
 
 MAX_BATCHES: Final = 500
@@ -50,7 +51,7 @@ class Following:
         ``worker`` has one thread. Verdicts are noted in ``recorder``; those in `DIAGNOSED` start
         ``diagnosis``.
         """
-        self.state = messages.AdaptationState(mode=messages.AdaptationMode(settings.mode))
+        self.state = messages.AdaptationState(mode=settings.mode)
         """State of the adaptation."""
         self.advice: list[str] = []
         """Current verdict of the watch unless the model is valid; the reason if the axis is not watched."""
@@ -75,9 +76,9 @@ class Following:
             self._sent += 1
             self._do(self._process, samples)
 
-    async def set_mode(self, mode: messages.AdaptationMode) -> None:
+    async def set_mode(self, mode: AdaptationMode) -> None:
         """Changes the mode of the adaptation."""
-        self._settings = self._settings.model_copy(update={"mode": mode.value})
+        self._settings = self._settings.model_copy(update={"mode": mode})
         await asyncio.wrap_future(self._do(self._adapt))
 
     async def revert(self) -> None:
@@ -168,8 +169,7 @@ class Following:
         if follower is not None and follower.adaptation is not None:
             self.state = follower.state()
         else:
-            mode = messages.AdaptationMode(self._settings.mode)
-            self.state = messages.AdaptationState(mode=mode, frozen=self._problem or None)
+            self.state = messages.AdaptationState(mode=self._settings.mode, frozen=self._problem or None)
 
     def _report(self, outcome: Outcome, model: TransmissionModel) -> None:
         """Logs a proposal; notes, logs and diagnoses verdicts."""

@@ -14,14 +14,12 @@ from typing import TYPE_CHECKING, Final
 from hdbridge.daemon.memory import Cell, CommandKind
 from hdbridge.daemon.service.timing import POLL_S
 from hdbridge.drive.interfacelock import InterfaceLock, process_words
-from hdbridge.errors import DaemonError, RefusedError
+from hdbridge.errors import RefusedError
 
 if TYPE_CHECKING:
     from hdbridge.axis import BusConfig
     from hdbridge.daemon.service.core import Core
 
-LEND_S: Final = 40.0
-"""Maximum time until the axes are at rest without power and the control process has ended."""
 SIGNAL_AGAIN_S: Final = 1.0
 """Minimum interval between stop signals to the borrower, which ends at once on the third."""
 _STOPS: Final = frozenset({CommandKind.STOP, CommandKind.QUICK_STOP})
@@ -54,21 +52,18 @@ class Lending:
         return 1e-9 * (time.monotonic_ns() - since_ns) if since_ns else None
 
     async def lend(self) -> None:
-        """Stops the axes and releases the interface. Raises RefusedError if the bus cannot be lent.
+        """Stops the axes; returns once the keeper has released the interface.
 
-        Raises DaemonError if the interface is not released in time; the keeper then takes it back.
+        The keeper ends a control process whose axes do not come to rest. Raises RefusedError if the bus
+        cannot be lent.
         """
         self.refuse()
         if self._reason_against:
             raise RefusedError(f"the bus cannot be lent: {self._reason_against}")
-        timing = self._core.timing
-        deadline_s = timing.clock.now() + LEND_S
         self._status[Cell.BUS_REQUESTED] = 1
         try:
             while not self._status[Cell.BUS_LENT]:
-                if timing.clock.now() > deadline_s:
-                    raise DaemonError(f"the axes did not come to rest within {LEND_S:g} s: nothing was lent")
-                await timing.sleep(POLL_S)
+                await self._core.timing.sleep(POLL_S)
         finally:
             self._status[Cell.BUS_REQUESTED] = 0
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Literal
 
 from hdbridge.axis import Identity
 from hdbridge.axis.model import TransmissionModel, store
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.setting import CompensationSetting
+from hdbridge.enums import Scheme
 from hdbridge.errors import InputError
 
 if TYPE_CHECKING:

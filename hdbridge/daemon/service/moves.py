@@ -10,9 +10,9 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import deque
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack, suppress
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from hdbridge.client.messages import QueueItem
 from hdbridge.control.bench import axis_view
@@ -42,7 +42,6 @@ class AxisMotion:
         self._points: deque[QueueItem] = deque()
         self.commanding = asyncio.Lock()
         """Held while one motion replaces another."""
-        self._tasks: set[asyncio.Task[None]] = set()
 
     @property
     def queued(self) -> int:
@@ -105,11 +104,11 @@ class AxisMotion:
             self.replace(activity, "it was replaced by a stream")
         return stream
 
-    async def queue(self, holder: str, points: Sequence[QueueItem]) -> int:
+    async def queue(self, holder: str, points: Sequence[QueueItem]) -> None:
         """Appends all or none of these moves, each of which begins at the end of the one before.
 
-        Returns the number of waiting moves. Raises InputError for an invalid point, RefusedError if another
-        motion is in progress or the queue is full.
+        Raises InputError for an invalid point, RefusedError if another motion is in progress or the queue is
+        full.
         """
         self._check(holder)
         name = self._link.name
@@ -126,15 +125,12 @@ class AxisMotion:
             present.holder = holder
         elif points:
             before, self.activity = self.activity, Activity(Kind.QUEUE, holder)
-            self._start(self._run(self.activity, before))
-        return self.queued
+            self._link.core.start(self._run(self.activity, before))
 
-    async def clear_queue(self, holder: str) -> int:
-        """Discards the waiting moves and returns their number. The current move continues."""
+    async def clear_queue(self, holder: str) -> None:
+        """Discards the waiting moves. The current move continues."""
         self._check(holder)
-        forgotten = self.queued
         self._points.clear()
-        return forgotten
 
     async def end_without_lease(self) -> None:
         """Stops an activity that must end with its lease, if that lease has ended."""
@@ -156,12 +152,6 @@ class AxisMotion:
     def _without_lease(self) -> Activity | None:
         activity, lease = self.in_progress(*ENDS_WITH_LEASE), self._link.core.lease
         return None if activity is None or lease.holds(activity.holder) else activity
-
-    async def close(self) -> None:
-        """Ends the queue; the axis completes its current motion."""
-        for task in tuple(self._tasks):
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def _goto(
         self, activity: Activity, target_deg: float, velocity: float | None, acceleration: float | None
@@ -209,11 +199,6 @@ class AxisMotion:
                 f"{self._link.name}: a target of {target_deg!r} deg; the position limits are "
                 f"{limits.position_min_deg:g} and {limits.position_max_deg:g} deg; nothing was begun"
             )
-
-    def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.get_running_loop().create_task(coroutine)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
 
 
 async def run_together(

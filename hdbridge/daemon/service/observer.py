@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from hdbridge.clock import Clock
-from hdbridge.daemon.memory import Event, Memory, SampleArray
+from hdbridge.daemon.memory import Cell, Event, Memory, SampleArray
 from hdbridge.daemon.service.eventlog import EventLog
 
 PERIOD_S = 0.02
@@ -32,7 +32,6 @@ class Observer:
         self._turns = -1
         self._turned_s = clock.now()
         self._log = log
-        self._seen = log.newest
         self._sinks: list[Sink] = []
         self._failed_sinks: set[int] = set()
         self.newest: SampleArray | None = None
@@ -56,13 +55,10 @@ class Observer:
     def poll(self) -> None:
         """Reads the rings and calls the sinks. An error of a sink is logged once and affects no other."""
         samples, lost = self._reader.read()
-        self._log.poll()
-        turns = self._status.loop_count
+        events = self._log.poll()
+        turns = self._status[Cell.LOOP_COUNT]
         if turns != self._turns:
             self._turns, self._turned_s = turns, self._clock.now()
-        entries = self._log.since(self._seen)
-        self._seen = entries[-1].number if entries else self._seen
-        events = [each.event for each in entries if each.event is not None]
         self.lost += lost
         if len(samples):
             self.newest = samples[-1:].copy()

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import CommandKind, Event, OuterCell, OuterCells, SampleArray
+from hdbridge.daemon.memory import Cell, CommandKind, Event, OuterCell, OuterCells, SampleArray
 from hdbridge.daemon.service.timing import POLL_S
 from hdbridge.drive.emergencies import gateway_error
 from hdbridge.drive.states import State
@@ -99,7 +99,7 @@ class OuterMaster:
                 fault = gateway_error(error_code)
                 _log.error("gateway fault", {"axis": axis.name, "error": fault})
                 self._mark(f"gateway fault {fault}", axis.link.index)
-            if not self._core.memory.status.loop_pid:
+            if not self._core.memory.status[Cell.LOOP_PID]:
                 continue  # the requests below wait for the control process
             holds = self._core.lease.holds(self._token)
             granted_by = granted_by or self._token  # an earlier service may have granted it

@@ -61,7 +61,7 @@ def event_message(entry: Entry, names: Sequence[str]) -> messages.Event:
             case EventKind.STOPPED:
                 hint = stop_hint(event, axis or "AXIS")
     return messages.Event(
-        sequence=entry.number, kind=kind, date=entry.date, cycle=cycle, axis=axis, text=text, hint=hint
+        sequence=entry.sequence, kind=kind, date=entry.date, cycle=cycle, axis=axis, text=text, hint=hint
     )
 
 
@@ -140,7 +140,7 @@ def axis_state(axis: ServiceAxis, outer: messages.OuterState | None) -> messages
         node_id=config.drive.node_id,
         ratio=config.gear.ratio,
         state=STATES[link.state],
-        power=messages.PowerState(link.power.value),
+        power=link.power,
         mode=MODES[int(link.value("mode"))],
         load_target_deg=target,
         load_position_deg=load,
@@ -148,7 +148,7 @@ def axis_state(axis: ServiceAxis, outer: messages.OuterState | None) -> messages
         **{name: bool(flags & flag) for name, flag in _FLAGS.items()},
         error_arcsec=error,
         readings=readings,
-        scheme=messages.Scheme(in_use.scheme.value),
+        scheme=in_use.scheme,
         limits=messages.Limits.model_validate(config.limits, from_attributes=True),
         fault=_fault(axis),
         model=model_in_use(in_use),

@@ -1,6 +1,7 @@
 """Request of each route to the machine, and its answer."""
 
 import json
+import re
 
 import pytest
 
@@ -112,7 +113,8 @@ def test_an_unknown_axis_lists_the_known_ones(leased):
         (b'{"target_deg": 30, "\\ud800": 3}', 422, "unicode"),
         (b'{"target_deg": 30, "wait": 1}', 422, "wait"),
         (b'{"target_deg": 181}', 422, "180"),
-        (b"[" * 100 + b"]" * 100, 400, "nests"),
+        (b"[" * 100 + b"]" * 100, 422, "dictionary"),
+        (b"[" * 100_000 + b"]" * 100_000, 400, "parsing"),
         (b'{"target_deg": 1' + b"0" * 5000 + b"}", 400, ""),
         (b'{"target_deg": 30}' + b" " * (256 << 10), 413, "KiB"),
     ],
@@ -168,5 +170,13 @@ def test_the_live_page_is_served_with_its_own_policy(leased):
     page = leased.get("http://hdbridge/")
     assert page.headers["content-type"].startswith("text/html")
     assert "script-src 'self'" in page.headers["content-security-policy"]
-    assert leased.get("http://hdbridge/page/main.js").status_code == 200
+    main = leased.get("http://hdbridge/page/main.js")
+    named = re.findall(r'"/page/([^"]+)"', page.text) + re.findall(r'"\./([^"]+)"', main.text)
+    assert {"main.js", "uPlot.iife.min.js", "live.css", "icon.svg", "controls.js"} <= {*named}
+    for name in named:
+        answer = leased.get(f"http://hdbridge/page/{name}")
+        assert answer.status_code == 200
+        kind = {"js": "javascript", "css": "css", "svg": "svg"}[name.rpartition(".")[2]]
+        assert kind in answer.headers["content-type"]
+        assert answer.headers["content-security-policy"] == page.headers["content-security-policy"]
     assert leased.get("http://hdbridge/page/..%2f__init__.py").status_code == 404

@@ -7,11 +7,9 @@ import stat
 
 import httpx
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support.api import TOKEN
 
-from hdbridge.daemon.api.guard import DEPTH_MAXIMUM, Policy, too_deep
+from hdbridge.daemon.api.guard import Policy
 from hdbridge.daemon.api.sockets import unix_socket
 from hdbridge.errors import DaemonError, InputError
 
@@ -55,14 +53,6 @@ def test_an_unknown_group_is_refused_and_a_known_one_owns_the_socket(tmp_path):
     own = grp.getgrgid(os.getgid())
     with unix_socket(path, group=own.gr_name):
         assert path.stat().st_gid == own.gr_gid
-
-
-@pytest.mark.parametrize(
-    "token", ["", "short", "with spaces in the middle", "x" * 201, "line\nbreak-long-enough"]
-)
-def test_a_weak_or_unsendable_token_is_refused(token):
-    with pytest.raises(InputError, match="invalid API token"):
-        Policy(token=token)
 
 
 @pytest.mark.parametrize(
@@ -187,7 +177,18 @@ def test_peers_on_the_unix_socket_are_logged(api, caplog):
     assert about["status"] == 200
 
 
-@given(st.integers(min_value=1, max_value=60), st.sampled_from([b"[", b'{"a":', b'{"]":[', b'["[[[",']))
-def test_nesting_is_counted_outside_strings(depth, opening):
-    levels = depth * {b"[": 1, b'{"a":': 1, b'{"]":[': 2, b'["[[[",': 1}[opening]
-    assert too_deep(opening * depth) == (levels > DEPTH_MAXIMUM)
+@pytest.mark.parametrize("depth", [17, 900, 100_000])
+@pytest.mark.parametrize("opening", ["[", '{"a":'])
+def test_a_deeply_nested_body_is_refused(api, depth, opening):
+    lease = api.bridge.lease.take("nester")
+    with api.over_socket(**{"X-Lease": lease}) as client:
+        closing = {"[": "]", '{"a":': "}"}[opening]
+        for body in (opening * depth, opening * depth + "1" + closing * depth):
+            answer = client.post(
+                "/coordinated",
+                content=f'{{"targets_deg": {body}}}'[: 256 << 10],
+                headers={"Content-Type": "application/json"},
+            )
+            assert answer.status_code in {400, 413, 422}
+            assert answer.json()["type"] == "urn:hdbridge:problem:InputError"
+    assert api.bridge.moved == []

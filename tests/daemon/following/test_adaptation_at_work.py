@@ -39,7 +39,7 @@ def test_a_changing_gear_is_followed_within_the_floor(left_alone: list[float]) -
     assert work.encoder_faults == []
 
 
-@pytest.mark.parametrize(("fault", "at_s"), [("drift", 30.0), ("noise x 10", 45.0)])
+@pytest.mark.parametrize(("fault", "at_s"), [("drift", 30.0), ("jump", 30.0), ("noise x 10", 45.0)])
 def test_a_load_encoder_that_fails_freezes_the_adaptation(
     fault: str, at_s: float, left_alone: list[float]
 ) -> None:
@@ -47,13 +47,15 @@ def test_a_load_encoder_that_fails_freezes_the_adaptation(
     with at_work(CHANGING, QUICK) as work:
         work.until(at_s)
         work.faults.load_reading = FAULTS[fault](work)
-        begun_s, before = work.time_s, used_arcsec(work.adaptation)
+        begun_s, before = work.axis_time_s, used_arcsec(work.adaptation)
         work.until(FAULTY_UNTIL_S)
         frozen = [each for each in work.history if each["event"] == "frozen"]
         adapted = work.three_sigma_arcsec()
     assert work.adaptation.freeze_reason is not None
     assert len(frozen) == 1
     assert begun_s <= frozen[0]["axis_time_s"]
+    if fault == "jump":
+        assert f" at {begun_s:.2f} s," in frozen[0]["reason"], "the test and the history use one clock"
     assert not [each for each in work.history[work.history.index(frozen[0]) :] if each["event"] == "changed"]
     # Anything learnt from the fault before its detection is within the rate limit, and harmless.
     rate = QUICK.rate_arcsec_per_hour / 3600.0

@@ -7,11 +7,11 @@ import pytest
 from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
 
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import CommandKind, EventKind, Knot, SampleFlag
 from hdbridge.drive.states import State
+from hdbridge.enums import Scheme
 from hdbridge.motion import MotionMode
 
 S, K, E = AxisState, CommandKind, EventKind

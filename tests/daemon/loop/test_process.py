@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 from hdbridge.daemon.machine import Machine
-from hdbridge.daemon.memory import Memory
+from hdbridge.daemon.memory import Cell, Memory
 from hdbridge.daemon.start import Simulation, Start
 
 CONTROL = [sys.executable, "-m", "hdbridge.daemon.loop.process"]
@@ -20,7 +20,7 @@ def ended(machine: Machine, simulation: Simulation | None, **changes: object) ->
             [*CONTROL, str(fd)], pass_fds=[fd, memory.fd], stderr=subprocess.PIPE, text=True, check=False
         )
         os.close(fd)
-        return done.returncode, done.stderr, memory.status.loop_count
+        return done.returncode, done.stderr, memory.status[Cell.LOOP_COUNT]
 
 
 def test_a_missing_bus_is_reported_in_one_line() -> None:

@@ -125,9 +125,9 @@ def test_status_cells_are_shared(memory: Memory) -> None:
             memory.status[cell] = value
         status = other.status
         assert [
-            status.loop_count,
+            status[Cell.LOOP_COUNT],
             status[Cell.SERVICE_TIME_NS],
-            status.loop_pid,
+            status[Cell.LOOP_PID],
             status[Cell.SERVICE_PID],
         ] == [(1 << 40) + place for place in range(4)]
         assert status[Cell.STOP_REQUESTED]

@@ -11,7 +11,6 @@ from support.patience import until
 
 from hdbridge.client import messages
 from hdbridge.client.messages import Event, EventKind
-from hdbridge.daemon.page import page_files
 
 NOON = "2025-01-31T12:00:00Z"
 
@@ -237,13 +236,3 @@ def test_orders_are_shown_only_for_covered_turns(page):
     }})""")
     assert found["half"] is None
     assert found["whole"] == pytest.approx([0, 8, 0, 0, 3, 0], abs=0.02)
-
-
-def test_every_file_that_the_page_names_is_served():
-    named = {
-        name
-        for name in page_files()
-        if name.encode() in page_files()["index.html"][0] + page_files()["main.js"][0]
-    }
-    assert {"main.js", "uplot.js", "uplot.css", "live.css", "icon.svg", "controls.js"} <= named
-    assert "../__init__.py" not in page_files()

@@ -35,7 +35,7 @@ def main(kind: str, *arguments: str) -> int:
         say(f"{kind} {os.getpid()}")
         while not signals and not (kind == "control" and status[Cell.STOP_REQUESTED]):
             if kind == "control":
-                status[Cell.LOOP_COUNT] = status.loop_count + 1
+                status[Cell.LOOP_COUNT] = status[Cell.LOOP_COUNT] + 1
             else:
                 if wanted:
                     status[Cell.BUS_REQUESTED] = 1

@@ -12,7 +12,8 @@ from support.flight import START_NS, event, flight_log, samples
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.recorder.export import exported, last_model
-from hdbridge.daemon.recorder.flightlog import Batch, ModelUse
+from hdbridge.daemon.recorder.flightfile import ModelUse
+from hdbridge.daemon.recorder.flightlog import Batch
 from hdbridge.daemon.recorder.reading import flight_files, read
 from hdbridge.errors import InputError
 from hdbridge.records.recording import Recording

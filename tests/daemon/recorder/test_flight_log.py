@@ -7,7 +7,8 @@ import pytest
 from mcap.reader import make_reader
 from support.flight import START_NS, event, flight_log, samples
 
-from hdbridge.daemon.recorder.flightlog import MARK, Batch, ModelUse, Note
+from hdbridge.daemon.recorder.flightfile import ModelUse
+from hdbridge.daemon.recorder.flightlog import MARK, Batch, Note
 from hdbridge.daemon.recorder.reading import flight_files, overview, read
 
 SECOND = 250

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from support.flight import about, event, flight_log, samples
 
-from hdbridge.daemon.recorder.flightlog import Batch, ModelUse
+from hdbridge.daemon.recorder.flightfile import ModelUse
+from hdbridge.daemon.recorder.flightlog import Batch
 from hdbridge.daemon.recorder.mend import mend, mend_folder
 from hdbridge.daemon.recorder.reading import flight_files, read
 from hdbridge.daemon.recorder.recorder import FlightRecorder
@@ -19,7 +20,8 @@ import sys
 from pathlib import Path
 sys.path.insert(0, "tests")
 from support.flight import flight_log, event, samples
-from hdbridge.daemon.recorder.flightlog import Batch, ModelUse
+from hdbridge.daemon.recorder.flightfile import ModelUse
+from hdbridge.daemon.recorder.flightlog import Batch
 log, clock = flight_log(Path(sys.argv[1]))
 second = 0
 while True:

@@ -14,11 +14,11 @@ from support.service import AtOnce, Service, stepped_service, until
 
 from hdbridge.axis.effects import Hysteresis
 from hdbridge.client import messages
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import EventKind
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
+from hdbridge.enums import Scheme
 
 QUICK = AdaptationSettings(mode="on", interval_s=3.0, rate_arcsec_per_hour=7200.0, half_life_turns=10.0)
 

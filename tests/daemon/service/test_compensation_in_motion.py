@@ -9,11 +9,11 @@ from support.raised import measured_profile, ripple_arcsec
 from support.service import AtOnce, Service, play, stepped_service, until
 
 from hdbridge.client.messages import StreamPoint
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import axis_view
 from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
+from hdbridge.enums import Scheme
 from hdbridge.motion.procedures.moves import MoveTo
 from hdbridge.sim.truth import Truth
 

@@ -16,7 +16,7 @@ class EventReader:
 
     def read(self) -> tuple[list[Event], int]:
         events, self.events = self.events, []
-        return events, 0
+        return [each._replace(sequence=number) for number, each in enumerate(events, 1)], 0
 
 
 def event(kind: EventKind, code: int = 0, text: str = "") -> Event:
@@ -31,12 +31,16 @@ def test_routine_events_do_not_displace_stops() -> None:
     reader.events += leg * ENTRIES_KEPT
     reader.events.append(event(EventKind.MOTION_ENDED, MotionMode.GOTO))
     log.poll()
-    assert [(each.number, each.text) for each in log.public(0)] == [(1, "cycle 1: lost"), (2, "")]
+    assert [(each.sequence, each.text) for each in log.public(0)] == [(1, "cycle 1: lost"), (2, "")]
     assert log.newest_public == 2
-    assert log.public(1)[0].event == event(EventKind.MOTION_ENDED, MotionMode.GOTO)
+    ended = log.public(1)[0].event
+    assert ended is not None
+    assert (ended.kind, ended.code) == (EventKind.MOTION_ENDED, MotionMode.GOTO)
     assert log.public(2) == log.public(99) == []
-    assert log.newest == 2 * ENTRIES_KEPT + 2  # the service itself sees all
-    assert log.answer(7) is not None
+    # The service itself sees all.
+    assert log.newest == 2 * ENTRIES_KEPT + 2
+    assert len(log.since(0)) == ENTRIES_KEPT
+    assert [each.sequence for each in log.since(2 * ENTRIES_KEPT)] == [log.newest - 1, log.newest]
 
 
 async def test_the_newest_events_are_returned_and_the_others_counted(service: Service) -> None:

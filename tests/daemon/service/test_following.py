@@ -17,13 +17,13 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Hysteresis
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.client.messages import AdaptationMode
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import EventKind
 from hdbridge.daemon.recorder.flightlog import Note
 from hdbridge.daemon.serve import follow
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
+from hdbridge.enums import Scheme
 
 DEMO = Path("profiles/demo/axis.yaml")
 
@@ -37,8 +37,7 @@ def following(bridge: ServiceBridge, settings: AdaptationSettings, folder: Path)
 
 
 def changes(bridge: ServiceBridge) -> int:
-    entries = bridge.core.log.since(0)
-    return sum(each.event is not None and each.event.kind is EventKind.CHANGED for each in entries)
+    return sum(each.kind is EventKind.CHANGED for each in bridge.core.log.since(0))
 
 
 async def test_a_disabled_adaptation_learns_and_writes_nothing(service: Service, tmp_path: Path) -> None:

@@ -13,13 +13,13 @@ from support.service import Service, stepped_service, until
 
 from hdbridge.axis.effects import Hysteresis
 from hdbridge.axis.model import TransmissionModel, store
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.switchover import Correction
 from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import Cell
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.setting import CompensationSetting
+from hdbridge.enums import Scheme
 from hdbridge.errors import DaemonError, InputError, RefusedError
 
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
@@ -165,7 +165,7 @@ def begin_uncompensated(service: Service) -> None:
             compensation_for(axis.config, TransmissionModel(axis.config.gear.ratio))
         )
     status = service.daemon.memory.status
-    status[Cell.LOOP_PID] = status.loop_pid + 1
+    status[Cell.LOOP_PID] = status[Cell.LOOP_PID] + 1
 
 
 async def choose(bridge: ServiceBridge, token: str) -> None:

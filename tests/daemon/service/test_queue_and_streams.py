@@ -23,8 +23,10 @@ async def test_way_points_are_visited_in_order(service: Service) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
         reader = service.daemon.memory.reader()
-        assert await axis.motion.queue(token, [way_point(2.0, dwell_s=0.3), way_point(-1.0)]) == 2
-        assert await axis.motion.queue(token, [way_point(1.0)]) >= 2
+        await axis.motion.queue(token, [way_point(2.0, dwell_s=0.3), way_point(-1.0)])
+        assert axis.motion.queued == 2
+        await axis.motion.queue(token, [way_point(1.0)])
+        assert axis.motion.queued >= 2
         await until(bridge, lambda: axis.motion.activity.over != "")
         samples, lost = reader.read()
         assert lost == 0
@@ -74,7 +76,8 @@ async def test_a_cleared_queue_ends_after_the_present_move(service: Service) -> 
         axis = bridge.axes["axis1"]
         await axis.motion.queue(token, [way_point(4.0), way_point(-20.0), way_point(20.0)])
         await bridge.core.timing.sleep(0.1)
-        assert await axis.motion.clear_queue(token) == 2
+        assert axis.motion.queued == 2
+        await axis.motion.clear_queue(token)
         await until(bridge, lambda: axis.motion.activity.over != "")
         assert axis.state().load_target_deg == pytest.approx(4.0)
 

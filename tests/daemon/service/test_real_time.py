@@ -12,6 +12,7 @@ import pytest
 from support.service import Service, stepped_service
 
 from hdbridge.client.messages import QueueItem, StreamPoint
+from hdbridge.daemon.memory import Cell
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.timing import SimulatedClock, Timing
 from hdbridge.errors import RefusedError
@@ -49,7 +50,10 @@ def test_many_concurrent_requests(tmp_path: Path, slower: int) -> None:
     async def story(service: Service) -> None:
         memory = service.daemon.memory
         clock = SimulatedClock(
-            lambda: memory.status.loop_count, memory.period_s, lambda: slower * time.monotonic(), math.inf
+            lambda: memory.status[Cell.LOOP_COUNT],
+            memory.period_s,
+            lambda: slower * time.monotonic(),
+            math.inf,
         )
         timing = Timing(8, clock)
         async with ServiceBridge(service.machine, memory, timing) as bridge:

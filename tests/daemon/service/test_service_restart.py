@@ -3,9 +3,9 @@
 import pytest
 from support.service import Service, until
 
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import Cell, CommandKind
+from hdbridge.enums import Scheme
 from hdbridge.errors import LeaseError, RefusedError
 
 
@@ -19,7 +19,7 @@ async def test_a_new_service_finds_the_axis_where_it_is(service: Service) -> Non
     assert service.daemon.states == [AxisState.ENABLED]
     async with service.bridge() as bridge:
         axis = bridge.axes["axis1"]
-        await until(bridge, lambda: axis.commissioning.report is not None)
+        await until(bridge, lambda: axis.commissioning.drive.report is not None)
         state = axis.state()
         assert state.state == "enabled"
         assert state.load_target_deg == pytest.approx(30.0)
@@ -46,7 +46,7 @@ async def test_no_request_is_made_before_the_axis_state_is_known(service: Servic
         axis = bridge.axes["axis1"]
         token = bridge.lease.take("at once")
         await axis.reset(token)  # waits until the state is known
-        assert axis.commissioning.report is not None
+        assert axis.commissioning.drive.report is not None
         assert daemon.states == [AxisState.DISABLED]
         assert 0x000 not in sent  # no NMT command has been sent
 
@@ -56,7 +56,7 @@ async def test_without_a_control_process_nothing_is_sent(service: Service) -> No
     async with service.ready() as bridge:
         axis, token = bridge.axes["axis1"], bridge.lease.take("test")
         status = service.daemon.memory.status
-        pid = status.loop_pid
+        pid = status[Cell.LOOP_PID]
         status[Cell.LOOP_PID] = 0
         with pytest.raises(RefusedError, match="there is no control process"):
             await axis.enable(token)

@@ -3,7 +3,6 @@
 from fastapi import APIRouter
 
 from hdbridge.client import messages
-from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.api.routes.parts import (
     LOOKING,
     MOVING,
@@ -104,7 +103,7 @@ async def compensate(
     axis: FoundAxis, compensate: messages.Compensate, holder: Holder = ""
 ) -> messages.AxisState:
     """Select the part of the model that compensates; the change is ramped, also during motion."""
-    await axis.compensate(holder, Scheme(compensate.scheme.value))
+    await axis.compensate(holder, compensate.scheme)
     return axis.state()
 
 

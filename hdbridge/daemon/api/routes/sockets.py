@@ -15,7 +15,6 @@ from pydantic import BaseModel, ValidationError
 
 from hdbridge.client.messages import (
     AxisColumns,
-    ControlState,
     Event,
     LiveOptions,
     Problem,
@@ -27,6 +26,7 @@ from hdbridge.client.messages import (
 from hdbridge.daemon.api.guard import SUBPROTOCOL
 from hdbridge.daemon.api.routes.parts import Bridge, port
 from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.reports import STATES
 from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -48,11 +48,7 @@ _ABNORMAL_CLOSURE: Final = 1006
 
 
 routes = APIRouter()
-_STATES: Final = [each.value for each in ControlState]
-_COPIED_FIELDS: Final = (
-    "load_target_deg", "load_position_deg", "motor_position_deg", "motor_torque_nm", "velocity_deg_s",
-    "correction_arcsec", "predicted_arcsec", "loop_arcsec", "weight", "reading0", "reading1",
-)  # fmt: skip
+_COPIED_FIELDS: Final = AxisColumns.model_fields.keys() - {"state", "error_arcsec"}
 
 
 @routes.websocket("/live")
@@ -193,5 +189,7 @@ def _axis(rows: NDArray[Any]) -> AxisColumns:
     found: dict[str, Any] = {name: rows[name].tolist() for name in _COPIED_FIELDS}
     error_arcsec = ARCSEC_PER_DEG * (rows["load_position_deg"] - rows["load_target_deg"])
     return AxisColumns.model_construct(
-        state=[_STATES[each] for each in rows["state"].tolist()], error_arcsec=error_arcsec.tolist(), **found
+        state=[STATES[each].value for each in rows["state"].tolist()],
+        error_arcsec=error_arcsec.tolist(),
+        **found,
     )
