@@ -13,7 +13,9 @@ from typing import Any, TypeVar
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.machine import Axis, Machine
+from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.following import Following
 from hdbridge.files.profile import Profile
 from support.characters import FRIENDLY, Character
 from support.daemon import PROFILE, SteppedDaemon, stepped_daemon
@@ -78,6 +80,13 @@ class Service:
             for axis in bridge.axes.values():
                 await axis.enable(token)
             yield bridge, token
+
+    def follow(self, bridge: ServiceBridge, settings: AdaptationSettings) -> Following:
+        """Adds watch and adaptation of the first axis, as in the service process, but in the same thread."""
+        axis = bridge.axes["axis1"]
+        axis.following = Following(0, axis, settings, self.folder / "adaptation", AtOnce())
+        bridge.core.observer.add(axis.following)
+        return axis.following
 
 
 async def until(bridge: ServiceBridge, done: Callable[[], bool], timeout_s: float = 20.0) -> None:

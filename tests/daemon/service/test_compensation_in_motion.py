@@ -4,16 +4,14 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
-import yaml
 from support.raised import measured_profile, ripple_arcsec
-from support.service import AtOnce, Service, play, stepped_service, until
+from support.service import Service, play, stepped_service, until
 
 from hdbridge.client.messages import StreamPoint
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import axis_view
 from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.following import Following
 from hdbridge.motion.procedures.moves import MoveTo
 from hdbridge.sim.truth import Truth
 
@@ -84,9 +82,7 @@ def test_adaptation_removes_the_ripple_of_a_retuned_servo(profile: Path, tmp_pat
     async def story(service: Service) -> tuple[float, float]:
         async with service.enabled() as (bridge, token):
             axis = bridge.axes["axis1"]
-            settings = AdaptationSettings(mode="on", interval_s=1.0)
-            following = Following(0, axis, settings, tmp_path / "state", AtOnce())
-            bridge.core.observer.add(following)
+            following = service.follow(bridge, AdaptationSettings(mode="on", interval_s=1.0))
             await axis.motion.move(token, -FAR_DEG)
             before = await ripple(service, bridge, token, goto)
             for speed in (60.0, 45.0) * 2:
@@ -98,13 +94,9 @@ def test_adaptation_removes_the_ripple_of_a_retuned_servo(profile: Path, tmp_pat
             return before, await ripple(service, bridge, token, goto)
 
     truth = Truth.load(profile / "truth.yaml")
-    retuned = truth.servo.model_copy(update={"position_gain_per_s": 130.0})
-    path = tmp_path / "truth.yaml"
-    text = truth.model_copy(update={"servo": retuned}).model_dump(
-        mode="json", by_alias=True, exclude_none=True
-    )
-    path.write_text(yaml.safe_dump(text))
-    with stepped_service(tmp_path, profile=profile, truth=path) as service:
+    servo = truth.servo.model_copy(update={"position_gain_per_s": 130.0})
+    retuned = truth.model_copy(update={"servo": servo})
+    with stepped_service(tmp_path, profile=profile, truth=retuned) as service:
         before, after = play(story(service))
     assert before > 2.0
     # At 60 and 45 deg/s the rounding of the set-points to counts repeats with the orders.
