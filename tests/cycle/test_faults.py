@@ -165,11 +165,8 @@ def test_a_target_in_degrees_that_is_not_finite_stops_in_the_same_cycle(moving) 
 
 def test_a_full_transmit_queue_stops_without_a_retry(moving) -> None:
     moving.bus.full = True
-    sent = len(moving.bus.sent)
+    sent = len(moving.sent)
     moving.stopped_within(1, Fault.TRANSMIT_FULL)
-    assert len(moving.bus.sent) == sent
+    assert len(moving.sent) == sent
     moving.bus.full = False
     moving.stands_still()
-
-
-# ------------------------------------------------------------------ the latch, the stop
