@@ -5,7 +5,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from typing import Any
 import httpx
 
 from support import patience
+from support.command import started
 
 
 class Daemon:
@@ -27,14 +27,8 @@ class Daemon:
         """Events of all processes in the daemon's log."""
         self._manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._manager.bind(str(folder / "notify"))
-        environment = {
-            **os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder),
-            "NOTIFY_SOCKET": str(folder / "notify"),
-        }  # fmt: skip
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "hdbridge", "run", *map(str, arguments)],
-            env=environment, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
-        )  # fmt: skip
+        environment = {**folders_in(folder), "NOTIFY_SOCKET": str(folder / "notify")}
+        self.process = started(folder, "run", *arguments, env=environment, stdout=subprocess.DEVNULL)
         self.notifications: list[str] = []
         """Messages that the daemon has sent to the service manager."""
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -198,6 +192,11 @@ def running(folder: Path, *arguments: object, name: str) -> Iterator[Daemon]:
         yield daemon
     finally:
         daemon.close()
+
+
+def folders_in(folder: Path) -> dict[str, str]:
+    """Returns the environment variables of a daemon whose runtime folder and state are in ``folder``."""
+    return {"XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder)}
 
 
 def gone(pid: int) -> bool:
