@@ -50,7 +50,7 @@ def test_a_verified_axis_is_idle_at_its_position(daemon: SteppedDaemon) -> None:
     sent = rpdos(daemon)
     daemon.run(0.2)
     assert daemon.states == [S.DISABLED]
-    place = daemon.nodes[0].firmware.motion.machine.motor_counts
+    place = daemon.motor_counts()
     assert all(word == 0 and abs(target - place) <= 2 for word, target in sent)
     assert len(sent) == 50
 
