@@ -16,13 +16,6 @@ FREEZE, STOP, LATCH = Reaction.FREEZE, Reaction.QUICK_STOP, Reaction.LATCH
 # ------------------------------------------------------------------ TPDOs
 
 
-def test_alternately_lost_tpdos_stop_the_axis(moving) -> None:
-    moving.node.faults.drop_tpdos = 1
-    moving.move()
-    moving.node.faults.hold_tpdos = 1
-    moving.stopped_within(1, Fault.LOST_TPDO)
-
-
 def test_the_newest_frame_of_an_identifier_counts(moving) -> None:
     place = moving.move().motor_counts
     moving.node.faults.silent = True
