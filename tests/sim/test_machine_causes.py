@@ -60,22 +60,6 @@ def error_arcsec(machine: Machine, ratio: float = 50.0) -> float:
 # Spring, load, friction
 
 
-@pytest.mark.parametrize("torque_nm", [1.0, 4.0, 6.5, 9.0, 17.0, -6.5, -17.0])
-def test_a_hanging_load_winds_the_spring_up_through_its_stages(torque_nm: float) -> None:
-    size = abs(torque_nm)
-    wind_up = (
-        min(size, 4.0) / 16_000 + max(0.0, min(size, 9.0) - 4.0) / 20_000 + max(0.0, size - 9.0) / 28_000
-    )
-    down_deg = math.copysign(90.0, torque_nm)  # the full weight acts when the load angle is zero
-    truth = axis(load__gravity=mass(size, down_deg), gear__stiffening=STAGES)
-    machine, exercise = moved(truth, 30.0)
-    exercise.move(-30.0, 300.0, 1000.0)
-    exercise.hold(1.0)
-    expected = math.copysign(wind_up, torque_nm) * ARCSEC_PER_RAD
-    assert error_arcsec(machine) == pytest.approx(expected, rel=0.002)
-    assert machine.load_torque_nm == pytest.approx(torque_nm, rel=1e-3)
-
-
 def test_the_stages_of_the_spring_join() -> None:
     spring = Spring(16_000.0, TrueStiffening(**STAGES), 0.0)
     steps = np.linspace(-0.1, 0.1, 20_001)
@@ -153,20 +137,6 @@ def test_drag_only_takes_energy_away() -> None:
         peaks.append(swing)
     assert peaks == sorted(peaks, reverse=True)
     assert peaks[-1] < 0.1 * peaks[0]
-
-
-@pytest.mark.parametrize("speed_deg_s", [50.0, 200.0, 700.0])
-def test_viscous_drag_winds_up_by_its_thinned_torque(speed_deg_s: float) -> None:
-    thinning = {"speed_rad_s": 0.05, "exponent": 0.5}
-    truth = axis(load__viscous_nm_s_per_rad=8.0, load__thinning=thinning)
-    machine = Machine(truth, 1)
-    exercise = Exercise(machine)
-    exercise.move(speed_deg_s, speed_deg_s, 3000.0)
-    exercise.hold(0.3)
-    exercise.lead(lambda seconds: speed_deg_s * seconds, 1.0)
-    speed = math.radians(speed_deg_s / 50.0)
-    torque = 8.0 * speed / math.sqrt(1.0 + speed / 0.05)
-    assert error_arcsec(machine) == pytest.approx(-torque / 16_000 * ARCSEC_PER_RAD, rel=0.02)
 
 
 def test_friction_at_rest_holds_more_than_in_motion() -> None:
