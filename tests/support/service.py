@@ -14,6 +14,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.machine import Axis, Machine
 from hdbridge.daemon.machinefile import AdaptationSettings
+from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
 from hdbridge.files.profile import Profile
@@ -73,13 +74,18 @@ class Service:
             yield bridge
 
     @asynccontextmanager
-    async def enabled(self, **options: Any) -> AsyncIterator[tuple[ServiceBridge, str]]:
-        """Provides a bridge whose axes are enabled, and the token of the lease."""
+    async def leased(self, **options: Any) -> AsyncIterator[tuple[ServiceBridge, ServiceAxis, str]]:
+        """Provides a bridge whose axes are verified, its first axis, and the token of the lease."""
         async with self.ready(**options) as bridge:
-            token = bridge.lease.take("test")
+            yield bridge, bridge.axes["axis1"], bridge.lease.take("test")
+
+    @asynccontextmanager
+    async def enabled(self, **options: Any) -> AsyncIterator[tuple[ServiceBridge, ServiceAxis, str]]:
+        """Provides the same as `leased`, with every axis enabled."""
+        async with self.leased(**options) as (bridge, first, token):
             for axis in bridge.axes.values():
                 await axis.enable(token)
-            yield bridge, token
+            yield bridge, first, token
 
     def follow(self, bridge: ServiceBridge, settings: AdaptationSettings) -> Following:
         """Adds watch and adaptation of the first axis, as in the service process, but in the same thread."""

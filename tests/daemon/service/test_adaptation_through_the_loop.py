@@ -35,7 +35,7 @@ def service(tmp_path: Path):
 @asynccontextmanager
 async def adapting(service: Service) -> AsyncIterator[tuple[ServiceBridge, str, Following]]:
     """Adaptation assembled as in the service process."""
-    async with service.enabled() as (bridge, token):
+    async with service.enabled() as (bridge, _, token):
         made = service.follow(bridge, service.machine.axes[0].adaptation)
         task = asyncio.get_running_loop().create_task(follow(bridge, made))
         try:

@@ -67,7 +67,7 @@ async def ripple(
 @pytest.mark.parametrize("motion", [jog, stream, coordinated])
 def test_every_kind_of_motion_removes_the_ripple(motion, profile: Path, tmp_path: Path) -> None:
     async def story(service: Service) -> tuple[float, float]:
-        async with service.enabled() as (bridge, token):
+        async with service.enabled() as (bridge, _, token):
             left = await ripple(service, bridge, token, motion)
             await bridge.axes["axis1"].compensate(token, Scheme.NONE)
             await bridge.axes["axis1"].motion.move(token, 0.0)
@@ -80,8 +80,7 @@ def test_every_kind_of_motion_removes_the_ripple(motion, profile: Path, tmp_path
 
 def test_adaptation_removes_the_ripple_of_a_retuned_servo(profile: Path, tmp_path: Path) -> None:
     async def story(service: Service) -> tuple[float, float]:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
+        async with service.enabled() as (bridge, axis, token):
             following = service.follow(bridge, AdaptationSettings(mode="on", interval_s=1.0))
             await axis.motion.move(token, -FAR_DEG)
             before = await ripple(service, bridge, token, goto)

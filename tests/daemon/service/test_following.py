@@ -72,7 +72,7 @@ async def test_each_axis_is_watched_in_its_own_thread_that_ends(
     service: Service, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.ERROR):
-        async with service.enabled() as (bridge, token), AsyncExitStack() as stack:
+        async with service.enabled() as (bridge, _, token), AsyncExitStack() as stack:
             for each in follow(service.machine, bridge, None, stack):
                 bridge.core.observer.add(each)
             first, second = bridge.axes.values()

@@ -27,8 +27,7 @@ def at_work(blind: Path, folder: Path, **servo: float) -> tuple[messages.AxisSta
     """Moves in both directions with these servo parameters; returns the state and all notes."""
 
     async def story(service: Service) -> tuple[messages.AxisState, list[str]]:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
+        async with service.enabled() as (bridge, axis, token):
             service.follow(bridge, AdaptationSettings(mode="on"))
             for target in (FAR_DEG, -FAR_DEG, FAR_DEG):
                 bridge.lease.check(token)
