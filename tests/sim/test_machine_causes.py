@@ -1,13 +1,12 @@
 """The causes in the simulated axis, each by its physics; the sizes are tested in test_hidden."""
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support.bare_axis import truth as truth_of
 from support.hidden.elastic import remembering
-from support.keys import with_keys
 
 from hdbridge.sim.encoder import Late, Signals
 from hdbridge.sim.exercise import Exercise
@@ -19,17 +18,17 @@ from hdbridge.sim.truth import Dahl, RollingFriction, Truth
 from hdbridge.sim.truth.encoder import TrueSignals
 from hdbridge.sim.truth.gear import TrueStiffening
 
-ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
 ARCSEC_PER_RAD = math.degrees(1.0) * 3600.0
 
 
 def axis(**changes: Any) -> Truth:
     """Returns the article's axis with a perfect gear and fine encoders; ``load__gravity`` sets its key."""
-    data = Truth.load(ARTICLE).model_dump(by_alias=True)
-    data["gear"].update(motor_orders=[], hysteresis=None)
-    data["motor"]["encoder"].update(counts_per_turn=512_000, interpolation=1)
-    data["load"]["encoder"].update(counts_per_turn=28_800_000, coupling=None)
-    return Truth.model_validate(with_keys(data, changes))
+    plain = {
+        "gear__motor_orders": [], "gear__hysteresis": None, "load__encoder__coupling": None,
+        "motor__encoder__counts_per_turn": 512_000, "motor__encoder__interpolation": 1,
+        "load__encoder__counts_per_turn": 28_800_000,
+    }  # fmt: skip
+    return truth_of(**(plain | changes))
 
 
 def mass(torque_nm: float = 20.0, down_deg: float = 0.0) -> dict[str, float]:
@@ -177,7 +176,7 @@ def test_play_in_the_encoder_s_coupling_leaves_the_load_alone() -> None:
 
 
 def test_an_axis_with_nothing_on_its_load_moves_alike_in_both_plants() -> None:
-    truth = Truth.load(ARTICLE)
+    truth = truth_of()
     plants = (Plant(truth), LoadedPlant(truth))
     for step in range(3000):
         for plant in plants:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment, Motion, Start
@@ -31,6 +30,7 @@ from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.record import Record
 from hdbridge.sim.truth import Truth
 from hdbridge.units import ARCSEC_PER_DEG
+from support.bare_axis import truth
 from support.exercised import booted
 
 ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
@@ -46,14 +46,12 @@ SPAN_DEG = 60.0
 
 def truth_of(duration_s: float = 3600.0, growth: float = 0.2, second_order_arcsec: float = 3.0) -> Truth:
     """Returns the article's axis with a growing hysteresis loop and second motor order, and encoder noise."""
-    data = yaml.safe_load((ARTICLE / "truth.yaml").read_text())
-    data["gear"]["ageing"] = {
+    ageing = {
         "duration_s": duration_s,
         "hysteresis_growth": growth,
         "motor_orders": [{"order": 2, "amplitude_arcsec": second_order_arcsec, "phase_deg": 20.0}],
     }
-    data["load"]["encoder"]["noise_arcsec"] = NOISE_ARCSEC
-    return Truth.model_validate(data)
+    return truth(gear__ageing=ageing, load__encoder__noise_arcsec=NOISE_ARCSEC)
 
 
 def work(
