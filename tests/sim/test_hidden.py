@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from support.bare_axis import truth as truth_of
 from support.hidden import CAUSES, UNKNOWN, Run, hide
+from support.keys import changed
 
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.machine import Machine
@@ -176,9 +177,7 @@ def test_a_hidden_cause_has_its_stated_size(cause: str) -> None:
     assert hidden.size_arcsec == pytest.approx(wanted, rel=0.05)
     here = bare()
     if hidden.brings:  # side effects are not to be measured
-        less = known.model_dump(by_alias=True)
-        less["gear"]["torque_growth_per_nm"] = 0.0
-        here = Errors(Truth.model_validate(less))
+        here = Errors(changed(known, gear__torque_growth_per_nm=0.0))
     measure, least, most = EXPECTED[cause]
     measured = measure(Errors(known), here)
     assert least * hidden.size_arcsec < measured < most * hidden.size_arcsec, hidden.text

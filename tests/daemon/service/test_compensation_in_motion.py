@@ -4,6 +4,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
+from support.keys import changed
 from support.raised import measured_profile, ripple_arcsec
 from support.service import Service, play, stepped_service, until
 
@@ -92,9 +93,7 @@ def test_adaptation_removes_the_ripple_of_a_retuned_servo(profile: Path, tmp_pat
             await axis.motion.move(token, -FAR_DEG)
             return before, await ripple(service, bridge, token, goto)
 
-    truth = Truth.load(profile / "truth.yaml")
-    servo = truth.servo.model_copy(update={"position_gain_per_s": 130.0})
-    retuned = truth.model_copy(update={"servo": servo})
+    retuned = changed(Truth.load(profile / "truth.yaml"), servo__position_gain_per_s=130.0)
     with stepped_service(tmp_path, profile=profile, truth=retuned) as service:
         before, after = play(story(service))
     assert before > 2.0

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from support.keys import changed
 from support.raised import measured_profile, without_load_encoder
 from support.service import Service, play, stepped_service
 
@@ -35,8 +36,7 @@ def at_work(blind: Path, folder: Path, **servo: float) -> tuple[messages.AxisSta
             await axis.disable(token)
             return axis.state(), [each.text for each in bridge.events().events]
 
-    truth = Truth.load(blind / "truth.yaml")
-    truth = truth.model_copy(update={"servo": truth.servo.model_copy(update=servo)})
+    truth = changed(Truth.load(blind / "truth.yaml"), **{f"servo__{key}": servo[key] for key in servo})
     with stepped_service(folder, profile=blind, truth=truth) as service:
         return play(story(service))
 
