@@ -152,11 +152,12 @@ class BusCycle:
             )
         if (found := conflict([each.image.axis for each in (*self.axes, axis)])) is not None:
             raise InputError(found[1])
-        self._take_axes((*self.axes, axis))
-
-    def leave(self, axis: AxisCycle) -> None:
-        """Removes an axis; its frames are then treated as foreign. Must not be called within a cycle."""
-        self._take_axes(tuple(each for each in self.axes if each is not axis))
+        self.axes = (*self.axes, axis)
+        axis.changed = self._change
+        self._heartbeat_id = axis.image.heartbeat_id
+        self._heartbeat_period_s = min(self._heartbeat_period_s, axis.image.heartbeat_period_s)
+        self._bus_faults = bus_faults(self._heartbeat_id)
+        self._changed = True
 
     def restart(self) -> None:
         """Restarts at once with the next `exchange`, after a pause; the cycle numbers continue.
@@ -451,17 +452,6 @@ class BusCycle:
 
     # ---------------------------------------------------------------- axes on the bus
 
-    def _take_axes(self, axes: tuple[AxisCycle, ...]) -> None:
-        for axis in self.axes:
-            axis.changed = _nobody
-        self.axes = axes
-        for axis in axes:
-            axis.changed = self._change
-        self._heartbeat_id = axes[0].image.heartbeat_id if axes else 0
-        self._heartbeat_period_s = min((axis.image.heartbeat_period_s for axis in axes), default=math.inf)
-        self._bus_faults = bus_faults(self._heartbeat_id)
-        self._changed = True
-
     def _change(self) -> None:
         """Requests `_rebuild` in the next cycle."""
         self._changed = True
@@ -476,7 +466,3 @@ class BusCycle:
             if axis.flushing:
                 axis.start(now, self.count)
                 self._beginning.append(axis)
-
-
-def _nobody() -> None:
-    """Does nothing, because the axis is not on a bus."""

@@ -1,10 +1,8 @@
 """Fixtures: a calibrated axis, and the command line as a process."""
 
 import json
-import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -41,19 +39,6 @@ class Cell:
         text = path.read_text()
         assert old in text
         path.write_text(text.replace(old, new))
-
-    def start(self, *arguments: object) -> subprocess.Popen[str]:
-        return subprocess.Popen(
-            [sys.executable, "-m", "hdbridge", *map(str, arguments)],
-            cwd=self.folder,
-            env={
-                **os.environ,
-                "OPENBLAS_NUM_THREADS": "1",
-            },  # two threads slow down operations on such small matrices
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
 
     def run(self, *arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
         done = run_here(self.folder, *arguments)

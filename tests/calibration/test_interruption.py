@@ -3,6 +3,7 @@
 import signal
 
 import yaml
+from support.command import started
 from support.patience import until
 
 from hdbridge.records.recording import Recording
@@ -22,7 +23,9 @@ validation: {count: 4, cycles: 0}
 def begun(cell, *arguments):
     """Starts a calibration; returns its process once the third task, which is long, is running."""
     (cell.folder / "long.yaml").write_text(LONG)
-    process = cell.start("calibrate", "axis", "--simulate", "--plan", "long.yaml", "--out", "rec", *arguments)
+    process = started(
+        cell.folder, "calibrate", "axis", "--simulate", "--plan", "long.yaml", "--out", "rec", *arguments
+    )
     about = cell.folder / "rec" / "recording.yaml"
     until(lambda: process.poll() is not None or (about.exists() and "02-sines.csv.gz" in about.read_text()))
     return process

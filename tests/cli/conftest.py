@@ -2,13 +2,11 @@
 
 import os
 import shutil
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 
 import pytest
-from support.command import run_here
+from support.command import run_apart, run_here
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 
@@ -22,17 +20,7 @@ def hdbridge(tmp_path):
 @pytest.fixture
 def process(tmp_path):
     """Runs a command in a process of its own, for tests of its standard output."""
-
-    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "hdbridge", *map(str, arguments)],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-
-    return run
+    return partial(run_apart, tmp_path)
 
 
 @pytest.fixture
@@ -43,14 +31,7 @@ def unread(tmp_path):
         reader, writer = os.pipe()
         os.close(reader)
         with os.fdopen(writer, "w") as broken:
-            done = subprocess.run(
-                [sys.executable, "-m", "hdbridge", *map(str, arguments)],
-                cwd=tmp_path,
-                stdout=broken,
-                stderr=subprocess.PIPE,
-                text=True,
-                check=False,
-            )
+            done = run_apart(tmp_path, *arguments, stdout=broken)
         assert done.returncode == 0, done.stderr
         return done.stderr
 

@@ -5,10 +5,9 @@ import os
 import pwd
 import re
 import signal
-import subprocess
-import sys
 
 import pytest
+from support.command import started
 from support.patience import PATIENCE_S, until
 
 from hdbridge import Client
@@ -210,13 +209,9 @@ def test_tables_are_complete_at_any_width(ctl, process, machine, monkeypatch, li
 
 @pytest.mark.usefixtures("at_a_terminal")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_stops_the_moving_axis(machine, place, number):
+def test_a_signal_stops_the_moving_axis(machine, tmp_path, number):
     machine.axes["joint-1"].moving_s = 2 * PATIENCE_S
-    command = [sys.executable, "-m", "hdbridge", "ctl", "move", "joint-1", "30"]
-    environment = {**os.environ, "HDBRIDGE_SOCKET": str(place.socket)}
-    with subprocess.Popen(
-        command, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as moving:
+    with started(tmp_path, "ctl", "move", "joint-1", 30) as moving:
         until(lambda: machine.moved)
         moving.send_signal(number)
         _, said = moving.communicate()

@@ -9,18 +9,16 @@ import sys
 import time
 
 import pytest
+from support.command import run_apart, started
 
 from hdbridge.records.recording import Recording
 
 LONG = ("step", "article", "--simulate", "--count", 400, "--step-deg", 20)
 
 
-def started(folder, *arguments):
+def booted(folder, *arguments):
     """A command whose drive is booted."""
-    process = subprocess.Popen(
-        [sys.executable, "-u", "-m", "hdbridge", *map(str, arguments)],
-        cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    process = started(folder, *arguments)
     assert process.stderr is not None
     while "booted" not in (line := process.stderr.readline()):
         assert line, "it ended early"
@@ -30,7 +28,7 @@ def started(folder, *arguments):
 @pytest.mark.usefixtures("at_a_terminal")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_a_termination_signal_stops_in_order_and_keeps_the_measurement(tmp_path, number):
-    process = started(tmp_path, *LONG, "--record", "kept")
+    process = booted(tmp_path, *LONG, "--record", "kept")
     time.sleep(1.0)
     process.send_signal(number)
     _, errors = process.communicate()
@@ -44,7 +42,7 @@ def test_a_termination_signal_stops_in_order_and_keeps_the_measurement(tmp_path,
 
 def test_results_of_finished_schemes_are_printed_and_written(tmp_path):
     outputs = ("--record", "kept", "--json", "figures.json", "--html", "page.html")
-    process = started(tmp_path, "step", "article", "--simulate", "--count", 40, *outputs)
+    process = booted(tmp_path, "step", "article", "--simulate", "--count", 40, *outputs)
     first = tmp_path / "kept" / "stepping-none.csv.gz"
     while not first.exists():
         assert process.poll() is None
@@ -73,12 +71,10 @@ def test_signals_ignored_by_nohup_stay_ignored(tmp_path):
 
 
 def test_a_full_disk_during_motion_loses_no_figures(tmp_path):
-    done = subprocess.run(  # -B: bytecode cut off at 100 bytes would make every later process fail
-        [sys.executable, "-B", "-m", "hdbridge", "step", "article", "--simulate", "--count", "2",
-         "--scheme", "none", "--json", "out.json", "--html", "out.html", "--record", "kept"],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100)),
-    )  # fmt: skip
+    step = ("step", "article", "--simulate", "--count", 2, "--scheme", "none")
+    outputs = ("--json", "out.json", "--html", "out.html", "--record", "kept")
+    full = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))  # noqa: E731
+    done = run_apart(tmp_path, *step, *outputs, preexec_fn=full)
     assert done.returncode == 6, done.stderr
     assert "quantisation floor" in done.stdout
     assert done.stderr.count("cannot be written: File too large") == 3

@@ -1,28 +1,17 @@
 """Properties of all commands: writable results, complete tables, closed outputs."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+from support.command import started
 
 
-def command(*arguments, **more):
-    return subprocess.run(
-        [sys.executable, "-m", "hdbridge", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-        **more,
-    )
-
-
-def test_no_figure_is_cut_in_a_narrow_terminal(tmp_path, profile):
-    shown = command(
-        "model", "diff", profile.folder, "active", "active", env={**os.environ, "COLUMNS": "30"}, cwd=tmp_path
-    )
+def test_no_figure_is_cut_in_a_narrow_terminal(process, profile):
+    shown = process("model", "diff", profile.folder, "active", "active", env={"COLUMNS": "30"})
     assert shown.returncode == 0, shown.stderr
     assert "…" not in shown.stdout
     assert "orders[2].amplitude_arcsec" in shown.stdout
@@ -65,13 +54,7 @@ def test_a_closed_standard_output_is_not_an_error(tmp_path):
 def test_ctrl_c_during_start_up_prints_no_traceback(tmp_path, slow, arguments):
     """An import that never ends stands for a slow one."""
     (tmp_path / f"{slow}.py").write_text("import sys, time\nprint('loading', flush=True)\ntime.sleep(600)\n")
-    with subprocess.Popen(
-        [sys.executable, "-m", "hdbridge", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-    ) as process:
+    with started(Path.cwd(), *arguments, env={"PYTHONPATH": str(tmp_path)}) as process:
         assert process.stdout.readline() == "loading\n"
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate()
@@ -79,26 +62,16 @@ def test_ctrl_c_during_start_up_prints_no_traceback(tmp_path, slow, arguments):
     assert errors == ""
 
 
-def test_characters_unknown_to_the_terminal_are_replaced(tmp_path):
-    shown = command(
-        *("step", "article", "--simulate", "--count", 2, "--scheme", "none"),
-        env={**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"},
-        cwd=tmp_path,
-    )
+def test_characters_unknown_to_the_terminal_are_replaced(process):
+    step = ("step", "article", "--simulate", "--count", 2, "--scheme", "none")
+    shown = process(*step, env={"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"})
     assert shown.returncode == 0, shown.stderr
     assert "CW 3s" in shown.stdout
 
 
-def test_a_full_standard_output_ends_in_one_line(tmp_path):
+def test_a_full_standard_output_ends_in_one_line(process):
     with open("/dev/full", "w") as full:  # noqa: PTH123
-        done = subprocess.run(
-            [sys.executable, "-m", "hdbridge", "check", "article"],
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            check=False,
-            cwd=tmp_path,
-        )
+        done = process("check", "article", stdout=full)
     assert done.returncode == 6
     assert done.stderr.splitlines() == [
         "hdbridge: the standard output cannot be written: No space left on device"

@@ -4,8 +4,6 @@ import json
 import os
 import shutil
 import stat
-import subprocess
-import sys
 import threading
 import typing
 from pathlib import Path
@@ -150,12 +148,9 @@ def test_a_socket_is_refused_as_output(hdbridge, tmp_path, monkeypatch):
     assert "neither a file nor a pipe nor a character device" in done.stderr
 
 
-def test_a_file_already_open_in_the_shell_is_refused(tmp_path):
+def test_a_file_already_open_in_the_shell_is_refused(process, tmp_path):
     with (tmp_path / "out").open("w") as out:
-        done = subprocess.run(
-            [sys.executable, "-m", "hdbridge", "check", "article", "--json", "out"],
-            cwd=tmp_path, stdout=out, stderr=subprocess.PIPE, text=True, check=False,
-        )  # fmt: skip
+        done = process("check", "article", "--json", "out", stdout=out)
     assert done.returncode == 2
     assert "standard output already goes there" in done.stderr
 

@@ -8,15 +8,13 @@ import os
 import resource
 import shutil
 import socket
-import subprocess
-import sys
 import typing
 from dataclasses import dataclass
 from pathlib import Path
 
 import command_reference
 import pytest
-from support.command import run_here
+from support.command import run_apart, run_here
 from typer.models import ArgumentInfo
 
 from hdbridge.cli import PANELS, load
@@ -252,11 +250,8 @@ def test_check_knows_python_can_and_local_interfaces(place):
 
 @pytest.mark.parametrize("name", ["mine", "cells/left/mine"])
 def test_a_new_profile_on_a_full_disk_leaves_no_files(tmp_path, name):
-    done = subprocess.run(
-        [sys.executable, "-B", "-m", "hdbridge", "new", name],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100)),
-    )  # fmt: skip
+    full = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))  # noqa: E731
+    done = run_apart(tmp_path, "new", name, preexec_fn=full)
     assert done.returncode == 6, done.stderr
     assert "cannot be written: File too large" in done.stderr
     assert list(tmp_path.iterdir()) == []

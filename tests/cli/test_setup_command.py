@@ -7,13 +7,12 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.command import run_here
+from support.command import run_here, started
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
@@ -86,10 +85,7 @@ def test_a_changed_axis_file_is_checked_again(finished, tmp_path):
 def test_an_interrupted_calibration_is_resumed(tmp_path):
     (tmp_path / "short.yaml").write_text(PLAN)
     command = ("setup", "arm", "--simulate", "--yes", "--plan", "short.yaml")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "hdbridge", *command],
-        cwd=tmp_path, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    process = started(tmp_path, *command, stdin=subprocess.DEVNULL)
     recording = tmp_path / "arm" / "setup-calibration" / "recording.yaml"
     while not recording.exists() and process.poll() is None:
         time.sleep(0.005)
@@ -139,10 +135,7 @@ def test_missing_requirements_are_reported(arguments, status, said, tmp_path):
 def test_nothing_moves_without_consent(tmp_path):
     """On a terminal, the user answers no to the first question."""
     parent, child = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "hdbridge", "setup", "arm", "--simulate"],
-        cwd=tmp_path, stdin=child, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    process = started(tmp_path, "setup", "arm", "--simulate", stdin=child)
     os.write(parent, b"n\n")
     out, err = process.communicate()
     os.close(parent)

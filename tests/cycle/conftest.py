@@ -5,14 +5,14 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from uuid import uuid4
 
 import can
 import pytest
 from support.characters import FRIENDLY, Character
-from support.spoilt import LoggingBus
+from support.spoilt import SpoiltBus
 
 from hdbridge.axis import AxisConfig
 from hdbridge.control.cycle import Cycle, Feedback
@@ -51,7 +51,7 @@ class SyncAnswer:
 class Rig:
     """An axis in motion, and everything that a test may change."""
 
-    bus: LoggingBus
+    bus: SpoiltBus
     clock: VirtualClock
     node: DriveNode
     drive: Drive
@@ -60,6 +60,11 @@ class Rig:
     intruder: can.BusABC
     target: int = 0
     bad: float | None = None
+    sent: list[tuple[float, int, bytes]] = field(default_factory=list)
+    """Time, identifier and data of each frame of the master."""
+
+    def __post_init__(self) -> None:
+        self.bus.spy = lambda can_id, data: self.sent.append((self.clock.now(), can_id, data))
 
     def enable(self) -> None:
         self.drive.enable()
@@ -75,7 +80,7 @@ class Rig:
         """Enables the axis and moves it at constant speed."""
         self.enable()
         self.move(60)
-        self.bus.sent.clear()
+        self.sent.clear()
 
     @property
     def period_s(self) -> float:
@@ -148,7 +153,7 @@ class Rig:
                 cycle.tick()
 
     def frames(self, can_id: int) -> list[tuple[float, bytes]]:
-        return [(time_s, data) for time_s, sent, data in self.bus.sent if sent == can_id]
+        return [(time_s, data) for time_s, sent, data in self.sent if sent == can_id]
 
 
 @contextmanager
@@ -163,7 +168,7 @@ def rig(profile: Path = PROFILE, character: Character = FRIENDLY) -> Iterator[Ri
     ):
         intruder = can.Bus(interface="virtual", channel=channel, ignore_config=True)
         bus.shutdown()
-        with intruder, LoggingBus(channel, clock) as spoilt:
+        with intruder, SpoiltBus(channel, clock) as spoilt:
             drive = Drive(spoilt, axis, clock)
             drive.boot()
             supervision = Supervision()

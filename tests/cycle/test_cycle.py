@@ -15,12 +15,12 @@ def test_sync_comes_first_and_the_rpdo_after_the_feedback(moving) -> None:
     seen = []
 
     def command(feedback: Feedback) -> int:
-        seen.append([can_id for _, can_id, _ in moving.bus.sent])
+        seen.append([can_id for _, can_id, _ in moving.sent])
         return moving.target
 
     moving.cycle.tick(command)
     assert seen == [[0x080]]
-    assert [can_id for _, can_id, _ in moving.bus.sent][:2] == [0x080, 0x201]
+    assert [can_id for _, can_id, _ in moving.sent][:2] == [0x080, 0x201]
 
 
 def test_work_between_ticks_does_not_shift_the_deadlines(moving) -> None:
@@ -52,9 +52,9 @@ def test_the_first_cycle_after_a_rest_sends_the_heartbeat(idle) -> None:
     idle.cycle.tick()
     idle.clock.sleep_until(idle.clock.now() + 0.010)
     idle.cycle.restart()
-    idle.bus.sent.clear()
+    idle.sent.clear()
     idle.cycle.tick()
-    assert [can_id for _, can_id, _ in idle.bus.sent] == [0x201, 0x080, 0x201, 0x77F]
+    assert [can_id for _, can_id, _ in idle.sent] == [0x201, 0x080, 0x201, 0x77F]
 
 
 def test_an_overrun_skips_whole_periods_and_never_bursts(moving) -> None:

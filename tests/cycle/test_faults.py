@@ -16,13 +16,6 @@ FREEZE, STOP, LATCH = Reaction.FREEZE, Reaction.QUICK_STOP, Reaction.LATCH
 # ------------------------------------------------------------------ TPDOs
 
 
-def test_alternately_lost_tpdos_stop_the_axis(moving) -> None:
-    moving.node.faults.drop_tpdos = 1
-    moving.move()
-    moving.node.faults.hold_tpdos = 1
-    moving.stopped_within(1, Fault.LOST_TPDO)
-
-
 def test_the_newest_frame_of_an_identifier_counts(moving) -> None:
     place = moving.move().motor_counts
     moving.node.faults.silent = True
@@ -165,11 +158,8 @@ def test_a_target_in_degrees_that_is_not_finite_stops_in_the_same_cycle(moving) 
 
 def test_a_full_transmit_queue_stops_without_a_retry(moving) -> None:
     moving.bus.full = True
-    sent = len(moving.bus.sent)
+    sent = len(moving.sent)
     moving.stopped_within(1, Fault.TRANSMIT_FULL)
-    assert len(moving.bus.sent) == sent
+    assert len(moving.sent) == sent
     moving.bus.full = False
     moving.stands_still()
-
-
-# ------------------------------------------------------------------ the latch, the stop

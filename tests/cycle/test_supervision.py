@@ -110,6 +110,16 @@ def test_a_fault_while_answering_counts_in_the_same_cycle() -> None:
     assert [event.cycle for event in supervision.events] == [7, 7]
 
 
+def test_events_since_a_count_are_the_newer_ones() -> None:
+    supervision = Supervision()
+    run(supervision, [{Fault.LOST_TPDO}])
+    noted = supervision.noted
+    assert supervision.since(0) == list(supervision.events)
+    assert supervision.since(noted) == []
+    run(supervision, [{Fault.OWN_ID_ELSEWHERE}])
+    assert [event.fault for event in supervision.since(noted)] == [Fault.OWN_ID_ELSEWHERE]
+
+
 def test_a_bounded_number_of_events_is_kept_with_cycle_numbers() -> None:
     supervision = Supervision()
     run(supervision, [{Fault.DUPLICATE_TPDO}] * (EVENTS_KEPT + 5))

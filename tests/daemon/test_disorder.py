@@ -9,16 +9,18 @@ command answered once.
 import errno
 import math
 import struct
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from functools import update_wrapper
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
-from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
+from support.daemon import SteppedDaemon, article_axes, stepped_daemon
 from support.daemonlaws import Laws
 
-from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Knot, MailboxFullError, RelayedFrame
 from hdbridge.drive.objects import Mode
@@ -49,6 +51,19 @@ def machine_axes():
     return made
 
 
+def event(number: st.SearchStrategy[int] = turns, **drawn: st.SearchStrategy[Any]) -> Callable[..., Any]:
+    """Returns a rule whose action is followed by this number of cycles."""
+
+    def rule_of(act: Callable[..., None]) -> Any:
+        def happen(self: "Disorder", number: int, **values: Any) -> None:
+            act(self, **values)
+            self.go(number)
+
+        return rule(number=number, **drawn)(update_wrapper(happen, act))
+
+    return rule_of
+
+
 class Disorder(RuleBasedStateMachine):
     """Two axes, a service with random commands, and a bus with random events."""
 
@@ -74,10 +89,6 @@ class Disorder(RuleBasedStateMachine):
     def boot(self) -> None:
         for axis in range(2):
             self._boot(axis)
-
-    @staticmethod
-    def _model() -> TransmissionModel:
-        return TransmissionModel.load(PROFILE / "model.yaml")
 
     def teardown(self) -> None:
         Disorder.enabled += sum(laws.enabled for laws in self.laws.axes.values())
@@ -140,7 +151,8 @@ class Disorder(RuleBasedStateMachine):
             if self.daemon.states[axis] in (AxisState.LATCHED, AxisState.UNVERIFIED):
                 self._boot(axis)
             if self.daemon.states[axis] is AxisState.DISABLED:
-                self.enable(axis, 12)
+                self._enable(axis)
+                self.go(12)
 
     @precondition(stopped)
     @rule()
@@ -148,66 +160,43 @@ class Disorder(RuleBasedStateMachine):
         """Duplicates the rule `start`, so that a restart is drawn more often."""
         self.start()
 
-    @rule(axis=axes, number=turns)
-    def enable(self, axis: int, number: int) -> None:
+    def _enable(self, axis: int) -> None:
         image = self.daemon.axes[axis].image
         self.post(K.ENABLE, axis, i=image.motor_counts, j=image.load_counts, k=image.statusword or 0)
-        self.go(number)
 
-    @rule(axis=axes, number=st.integers(10, 30))
-    def enable_and_wait(self, axis: int, number: int) -> None:
-        self.enable(axis, number)
+    @event(axis=axes)
+    def enable(self, axis: int) -> None:
+        self._enable(axis)
 
-    @rule(
-        axis=st.integers(-1, 2),
-        kind=st.sampled_from(
-            [K.DISABLE, K.QUICK_STOP, K.STOP, K.LEND, K.RELEASE, K.STREAM_END, K.DRIVE_FAULT_RESET]
-        ),
-        number=turns,
-    )
-    def order(self, axis: int, kind: CommandKind, number: int) -> None:
+    @event(st.integers(10, 30), axis=axes)
+    def enable_and_wait(self, axis: int) -> None:
+        self._enable(axis)
+
+    @event(axis=st.integers(-1, 2), kind=st.sampled_from(
+        [K.DISABLE, K.QUICK_STOP, K.STOP, K.LEND, K.RELEASE, K.STREAM_END, K.DRIVE_FAULT_RESET]))  # fmt: skip
+    def order(self, axis: int, kind: CommandKind) -> None:
         self.post(kind, axis)
-        self.go(number)
 
-    @rule(axis=axes, verified=st.integers(0, 1), number=turns)
-    def reset(self, axis: int, verified: int, number: int) -> None:
+    @event(axis=axes, verified=st.integers(0, 1))
+    def reset(self, axis: int, verified: int) -> None:
         self.post(K.RESET, axis, i=verified)
-        self.go(number)
 
-    @rule(
-        axis=axes,
-        goal=angles,
-        velocity=speeds,
-        acceleration=st.sampled_from([math.nan, 50.0, 1e9, -1.0]),
-        number=turns,
-    )
-    def move(self, axis: int, goal: float, velocity: float, acceleration: float, number: int) -> None:
+    @event(axis=axes, goal=angles, velocity=speeds, acceleration=st.sampled_from([math.nan, 50.0, 1e9, -1.0]))
+    def move(self, axis: int, goal: float, velocity: float, acceleration: float) -> None:
         self.post(K.MOVE, axis, a=goal, b=velocity, c=acceleration)
-        self.go(number)
 
-    @rule(axis=axes, goal=st.floats(-TRAVEL_DEG, TRAVEL_DEG), number=st.integers(1, 40))
-    def move_far(self, axis: int, goal: float, number: int) -> None:
+    @event(st.integers(1, 40), axis=axes, goal=st.floats(-TRAVEL_DEG, TRAVEL_DEG))
+    def move_far(self, axis: int, goal: float) -> None:
         self.post(K.MOVE, axis, a=goal, b=math.nan, c=math.nan)
-        self.go(number)
 
-    @rule(
-        axis=axes,
-        velocity=speeds,
-        timeout=st.sampled_from([0.02, 0.2, 1.0, -1.0, math.nan, 1e9]),
-        number=turns,
-    )
-    def jog(self, axis: int, velocity: float, timeout: float, number: int) -> None:
+    @event(axis=axes, velocity=speeds, timeout=st.sampled_from([0.02, 0.2, 1.0, -1.0, math.nan, 1e9]))
+    def jog(self, axis: int, velocity: float, timeout: float) -> None:
         self.post(K.JOG, axis, a=velocity, b=timeout)
-        self.go(number)
 
-    @rule(
-        mask=st.integers(0, 4),
-        travel=st.floats(-2.0, 2.0),
-        knots=st.integers(1, 26),
-        before=st.booleans(),
-        number=turns,
+    @event(
+        mask=st.integers(0, 4), travel=st.floats(-2.0, 2.0), knots=st.integers(1, 26), before=st.booleans()
     )
-    def stream_smoothly(self, mask: int, travel: float, knots: int, before: bool, number: int) -> None:
+    def stream_smoothly(self, mask: int, travel: float, knots: int, before: bool) -> None:
         """Streams a path from the current positions, complete or cut short, with knots queued before or after
         the stream begins.
         """
@@ -226,123 +215,100 @@ class Disorder(RuleBasedStateMachine):
             self.daemon.memory.knots[axis.index].put(path)
         if before:
             self.post(K.STREAM_BEGIN, 1, a=0.1, i=mask, j=self.stream)
-        self.go(number)
 
-    @rule(axis=axes, which=st.integers(0, 5), number=turns)
-    def change_model(self, axis: int, which: int, number: int) -> None:
+    @event(axis=axes, which=st.integers(0, 5))
+    def change_model(self, axis: int, which: int) -> None:
         self.post(K.CHANGE, axis, i=self.daemon.memory.settings[axis].put(self.models[which]))
-        self.go(number)
 
     # ---------------------------------------------------------------- commands of a faulty service
 
-    @rule(
+    @event(
         kind=st.one_of(st.sampled_from(KINDS), st.integers(-5, 300)),
         axis=st.integers(-3, 5), a=angles, b=speeds, c=speeds, i=counts, j=counts,
-        k=st.one_of(counts, st.sampled_from([0x0250, 0x1237, 0x0008, 0x0007])), number=turns,
+        k=st.one_of(counts, st.sampled_from([0x0250, 0x1237, 0x0008, 0x0007])),
     )  # fmt: skip
-    def nonsense(self, kind, axis, a, b, c, i, j, k, number) -> None:
+    def nonsense(self, kind, axis, a, b, c, i, j, k) -> None:
         if kind in (K.VERIFIED, K.UNLEND, K.ENABLE):
             # Only the service can know how often the position has wrapped around 2**32 counts.
             i = max(min(i, (1 << 31) - 1), -(1 << 31))
         self.post(kind, axis, a=a, b=b, c=c, i=i, j=j, k=k)
-        self.go(number)
 
-    @rule(data=st.binary(max_size=50), number=turns)
-    def nonsense_model(self, data: bytes, number: int) -> None:
+    @event(data=st.binary(max_size=50))
+    def nonsense_model(self, data: bytes) -> None:
         self.post(K.CHANGE, 0, i=self.daemon.memory.settings[0].put(data))
-        self.go(number)
 
-    @rule(
-        axis=axes,
-        knots=st.lists(st.tuples(st.integers(-1, 3), angles, angles, speeds), max_size=20),
-        number=turns,
-    )
-    def nonsense_knots(self, axis: int, knots: list[tuple[int, float, float, float]], number: int) -> None:
+    @event(axis=axes, knots=st.lists(st.tuples(st.integers(-1, 3), angles, angles, speeds), max_size=20))
+    def nonsense_knots(self, axis: int, knots: list[tuple[int, float, float, float]]) -> None:
         self.daemon.memory.knots[axis].put([Knot(self.stream + s, t, p, v) for s, t, p, v in knots])
-        self.go(number)
 
-    @rule(number=st.integers(0, 300))
-    def flood(self, number: int) -> None:
-        for place in range(number):
+    @event(st.just(3), count=st.integers(0, 300))
+    def flood(self, count: int) -> None:
+        for place in range(count):
             self.post(K.MOVE if place % 2 else K.STOP, place % 2, a=float(place % 5), b=math.nan, c=math.nan)
-        self.go(3)
 
-    @rule(
+    @event(
         can_id=st.one_of(st.integers(0, 0x7FF), st.sampled_from([0, 0x601, 0x602])),
         data=st.binary(max_size=8),
-        number=turns,
     )
-    def outgoing(self, can_id: int, data: bytes, number: int) -> None:
+    def outgoing(self, can_id: int, data: bytes) -> None:
         # The invariants do not cover a node that the service has reconfigured; they cover restarts and reads.
         if 0x600 <= can_id < 0x680 and data and data[0] >> 5 not in (2, 3, 4):
             data = b"\x40" + data[1:]
         self.daemon.memory.outgoing.add(RelayedFrame(0, can_id, data))
-        self.go(number)
 
     # ---------------------------------------------------------------- events on the bus
 
-    @rule(axis=axes, what=st.sampled_from(["drop_tpdos", "shorten_tpdos", "duplicate_tpdos", "hold_tpdos"]),
-          how_many=st.integers(1, 4), number=turns)  # fmt: skip
-    def spoil_tpdos(self, axis: int, what: str, how_many: int, number: int) -> None:
+    @event(axis=axes, what=st.sampled_from(["drop_tpdos", "shorten_tpdos", "duplicate_tpdos", "hold_tpdos"]),
+           how_many=st.integers(1, 4))  # fmt: skip
+    def spoil_tpdos(self, axis: int, what: str, how_many: int) -> None:
         setattr(self.daemon.nodes[axis].faults, what, how_many)
-        self.go(number)
 
-    @rule(axis=axes, number=turns)
-    def restart_node(self, axis: int, number: int) -> None:
+    @event(axis=axes)
+    def restart_node(self, axis: int) -> None:
         self.booted[axis] = False
         self.daemon.nodes[axis].faults.boot_up()
-        self.go(number)
 
-    @rule(axis=axes, code=st.sampled_from([0x3210, 0x8611, 0x8130]), number=turns)
-    def drive_fault(self, axis: int, code: int, number: int) -> None:
+    @event(axis=axes, code=st.sampled_from([0x3210, 0x8611, 0x8130]))
+    def drive_fault(self, axis: int, code: int) -> None:
         self.daemon.nodes[axis].faults.raise_error(code)
-        self.go(number)
 
-    @rule(axis=axes, jump=st.integers(-200_000, 200_000), number=turns)
-    def jump(self, axis: int, jump: int, number: int) -> None:
+    @event(axis=axes, jump=st.integers(-200_000, 200_000))
+    def jump(self, axis: int, jump: int) -> None:
         self.daemon.nodes[axis].faults.load_jump_counts = jump
-        self.go(number)
 
-    @rule(axis=axes, what=st.sampled_from(["silent", "mute_heartbeat"]), on=st.booleans(), number=turns)
-    def unplug(self, axis: int, what: str, on: bool, number: int) -> None:
+    @event(axis=axes, what=st.sampled_from(["silent", "mute_heartbeat"]), on=st.booleans())
+    def unplug(self, axis: int, what: str, on: bool) -> None:
         setattr(self.daemon.nodes[axis].faults, what, on)
-        self.go(number)
 
-    @rule(can_id=st.one_of(
+    @event(can_id=st.one_of(
         st.integers(0x081, 0x7FF).filter(lambda n: not 0x201 <= n <= 0x202 and not 0x600 <= n <= 0x67F),
         st.sampled_from([0x080, 0x081, 0x701, 0x702, 0x77F])),
-        data=st.binary(max_size=8), number=turns)  # fmt: skip
-    def foreign(self, can_id: int, data: bytes, number: int) -> None:
+        data=st.binary(max_size=8))  # fmt: skip
+    def foreign(self, can_id: int, data: bytes) -> None:
         if can_id == 0x701 or can_id == 0x702:
             data = data[:1]
-        if 0x181 <= can_id <= 0x182 or 0x281 <= can_id <= 0x282:
-            return  # the drive reports a false position: see `lying_tpdo`
-        self.daemon.interfere(can_id, data)
-        self.go(number)
+        if not (0x181 <= can_id <= 0x182 or 0x281 <= can_id <= 0x282):  # a false position: see `lying_tpdo`
+            self.daemon.interfere(can_id, data)
 
-    @rule(node=st.integers(1, 2), length=st.integers(0, 7), number=turns)
-    def lying_tpdo(self, node: int, length: int, number: int) -> None:
+    @event(node=st.integers(1, 2), length=st.integers(0, 7))
+    def lying_tpdo(self, node: int, length: int) -> None:
         self.daemon.interfere(0x180 + node, struct.pack("<Hih", 0x1237, 999_999, 0)[:length])
-        self.go(number)
 
-    @rule(can_id=st.sampled_from([0x080, 0x201, 0x202, 0x77F, 0x601]), number=turns)
-    def no_room(self, can_id: int, number: int) -> None:
+    @event(can_id=st.sampled_from([0x080, 0x201, 0x202, 0x77F, 0x601]))
+    def no_room(self, can_id: int) -> None:
         self.daemon.bus.no_room_for = can_id
-        self.go(number)
 
-    @rule(down=st.booleans(), number=turns)
-    def interface(self, down: bool, number: int) -> None:
+    @event(down=st.booleans())
+    def interface(self, down: bool) -> None:
         self.daemon.bus.down = errno.ENETDOWN if down else None
-        self.go(number)
 
-    @rule(duration=st.sampled_from([0.001, 0.003, 0.006, 0.02, 0.3]), number=turns)
-    def hang(self, duration: float, number: int) -> None:
+    @event(duration=st.sampled_from([0.001, 0.003, 0.006, 0.02, 0.3]))
+    def hang(self, duration: float) -> None:
         self.daemon.hang(duration)
-        self.go(number)
 
-    @rule(number=st.integers(1, 60))
-    def pass_time(self, number: int) -> None:
-        self.go(number)
+    @event(st.integers(1, 60))
+    def pass_time(self) -> None:
+        """Lets only time pass."""
 
 
 SMALL = settings(

@@ -7,17 +7,16 @@ RPDOs, and the state comes back in the statusword of a TPDO.
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
-import can
 import pytest
 from support.ideal_motor import IdealMotor
+from support.slave_events import TimedStage
 
 from hdbridge.device.behaviour import Behaviour
-from hdbridge.device.powerstate import PowerStage
 from hdbridge.sim.lockstep import lockstep_bench
 
-EDS = Path(__file__).parents[2] / "eds" / "hdbridge-402.eds"
+from .conftest import EDS, RawMaster
+
 DISABLED, READY, ON, ENABLED, STOPPED, REACTION, FAULT = (
     "switch on disabled", "ready to switch on", "switched on", "operation enabled", "quick stop active",
     "fault reaction active", "fault",
@@ -88,45 +87,24 @@ def expected(state: str, word: int, before: int) -> str:
     return found.pop() if found else state
 
 
-class Slow(PowerStage):
-    """A power stage that takes time, and fails on demand."""
-
-    def __init__(self, takes: int = 0) -> None:
-        self.takes, self.left = takes, 0
-        self.wanted = False
-
-    def switch(self, on: bool) -> None:
-        self.wanted, self.left = on, self.takes
-
-    @property
-    def is_on(self) -> bool:  # read at the command, then once per period
-        self.left -= 1
-        return self.wanted and self.left < 0
-
-    def reset(self) -> None:
-        self.error_code = 0
-
-
-class Slave:
-    """Accesses the slave by raw CAN frames."""
+class Slave(RawMaster):
+    """Master of the slave: it sends the controlword in an RPDO, and the statusword comes in a TPDO."""
 
     def __init__(self, bus, clock, node, motor, stage) -> None:
-        self.bus, self.clock, self.node, self.motor, self.stage = bus, clock, node, motor, stage
-        self.word = 0
-        self.statusword = 0
+        super().__init__(bus, clock, node, motor)
+        self.stage, self.word, self._statusword = stage, 0, 0
 
-    def send(self, can_id: int, data: bytes) -> None:
-        self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
-        self.listen()
+    def take(self) -> list[tuple[int, bytes]]:
+        frames = super().take()
+        for can_id, data in frames:
+            if can_id == 0x181:
+                self._statusword = int.from_bytes(data[:2], "little")
+        return frames
 
-    def listen(self) -> None:
-        while (message := self.bus.recv(0)) is not None:
-            if message.arbitration_id == 0x181:
-                (self.statusword,) = struct.unpack("<H", message.data)
-
-    def put(self, index: int, sub: int, value: int, size: int) -> None:
-        raw = (value & (1 << 8 * size) - 1).to_bytes(size, "little").ljust(4, b"\0")
-        self.send(0x601, struct.pack("<BHB", 0x23 | (4 - size) << 2, index, sub) + raw)
+    @property
+    def state(self) -> str:
+        self.take()
+        return state_of(self._statusword)
 
     def configure(self) -> None:
         """Controlword and statusword, each in an event-driven PDO."""
@@ -140,19 +118,11 @@ class Slave:
             self.put(communication, 1, 1 | base, 4)
         self.put(0x605A, 0, 6, 2)
         self.put(0x6060, 0, 1, 1)
-        self.send(0, b"\x01\x01")
+        self.nmt(1)
 
     def control(self, word: int) -> None:
         self.word = word
         self.send(0x201, struct.pack("<H", word))
-
-    def wait(self, seconds: float = 0.012) -> None:
-        self.clock.sleep_until(self.clock.now() + seconds)
-        self.listen()
-
-    @property
-    def state(self) -> str:
-        return state_of(self.statusword)
 
     def bring(self, state: str) -> None:
         """Leads the drive from any state to this one, at rest."""
@@ -177,7 +147,6 @@ class Slave:
                 self.wait(0.06)
             self.node.faults.raise_error(0x2310)
             self.node.poll(self.clock.now())
-            self.listen()
             if state == FAULT:
                 self.wait(0.02)
         assert self.state == state, (self.state, state)
@@ -185,7 +154,7 @@ class Slave:
 
 @contextmanager
 def slave(behaviour: str, takes: int = 0) -> Iterator[Slave]:
-    motor, stage = IdealMotor(1000), Slow(takes)
+    motor, stage = IdealMotor(1000), TimedStage(takes)
     chosen = Behaviour.model_validate({"controlword": behaviour})
     with lockstep_bench(motor, EDS, behaviour=chosen, stage=stage) as (bus, clock, node):
         under_test = Slave(bus, clock, node, motor, stage)
@@ -279,9 +248,9 @@ EVENTS = {
     "lost master, 6007h = 1": lambda node: lose(node, 1),
     "lost master, 6007h = 2": lambda node: lose(node, 2),
     "lost master, 6007h = 3": lambda node: lose(node, 3),
-    "NMT stop": lambda node: node.send(0, b"\x02\x01"),
-    "reset communication": lambda node: node.send(0, b"\x82\x01"),
-    "reset node": lambda node: node.send(0, b"\x81\x01"),
+    "NMT stop": lambda node: node.nmt(2),
+    "reset communication": lambda node: node.nmt(130),
+    "reset node": lambda node: node.nmt(129),
 }
 
 
@@ -331,7 +300,7 @@ def test_every_event_in_every_state_and_then_every_command(state, event, behavio
                     node.configure()
                     before = node.word = 0 if event == "reset node" else before
                 else:
-                    node.send(0, b"\x01\x01")
+                    node.nmt(1)
                 node.wait(0.01)
             assert node.state in after(event, state), f"{event} in {state}"
             reached, place = node.state, node.motor.position

@@ -6,124 +6,112 @@ from typing import Any
 import can
 import pytest
 from canopen.objectdictionary import ObjectDictionary
+from support.ideal_motor import IdealMotor
 
 from hdbridge.axis import AxisConfig
+from hdbridge.canframe import DataFrame
+from hdbridge.device.node import DriveNode
 from hdbridge.drive import Drive, Mode, State
 from hdbridge.errors import DriveError, IdentityError, InputError, SdoError
 
+from .conftest import EDS, Later, Slave, holding
+
 
 @pytest.fixture
-def drive(bus: Any, clock: Any, tiny: Any, axis: AxisConfig) -> Drive:
-    return Drive(bus, axis, clock, tiny.od, sdo_timeout_s=0.1)
+def drive(bus: Any, clock: Any, slave: Any, axis: AxisConfig) -> Drive:
+    return Drive(bus, axis, clock, slave.od, sdo_timeout_s=0.1)
 
 
-def test_a_drive_comes_up_configured_operational_and_disabled(drive: Drive, tiny: Any) -> None:
+def test_a_drive_comes_up_configured_operational_and_disabled(drive: Drive, slave: Any) -> None:
     report = drive.boot()
     assert report.state is State.SWITCH_ON_DISABLED
     assert set(report.modes) == {Mode.PP, Mode.HM, Mode.IP, Mode.CSP}
     assert report.identity["vendor_id"] == 0x4844
     assert report.names["device"]
     assert report.notes == ()
-    assert tiny.nmt_state == 5
+    assert slave.nmt_state == 5
     for (index, sub), row in {(row.index, row.sub): row for row in report.held}.items():
-        assert int(tiny.values[index, sub]) & row.compared == row.value & row.compared
-    assert tiny.values[0x1A01, 1] == 0x60E40120
-    assert tiny.values[0x1400, 1] == 0x201
+        assert int(slave.values[index, sub]) & row.compared == row.value & row.compared
+    assert slave.values[0x1A01, 1] == 0x60E40120
+    assert slave.values[0x1400, 1] == 0x201
     for unused in (0x1401, 0x1402, 0x1403, 0x1802, 0x1803):
-        assert tiny.values[unused, 1] & 0x8000_0000
+        assert slave.values[unused, 1] & 0x8000_0000
     assert drive.monitor.nodes[1].boot_ups == 1
 
 
-def test_nothing_is_written_before_the_drive_is_known(drive: Drive, tiny: Any) -> None:
-    tiny.values[0x1018, 2] = 0x403
+def test_nothing_is_written_before_the_drive_is_known(drive: Drive, slave: Any) -> None:
+    slave.values[0x1018, 2] = 0x403
     with pytest.raises(IdentityError, match=r"1018h:02 .*is 403h.*drive\.identity\.product_code is 402h"):
         drive.boot()
-    assert tiny.sdo_order == []
+    assert slave.sdo_order == []
 
 
-def test_without_a_reset_no_boot_up_message_is_awaited(drive: Drive, tiny: Any, bus: Any) -> None:
+def test_without_a_reset_no_boot_up_message_is_awaited(drive: Drive, sent: Any) -> None:
     drive.boot(reset=False)
-    assert [bytes(message.data) for message in bus.sent if message.arbitration_id == 0] == [
-        b"\x80\x01",
-        b"\x01\x01",
-    ]
+    assert [data for can_id, data in sent if can_id == 0] == [b"\x80\x01", b"\x01\x01"]
 
 
 def test_an_absent_drive_is_named_within_a_bounded_time(
-    drive: Drive, tiny: Any, clock: Any, axis: AxisConfig
+    drive: Drive, slave: Any, clock: Any, axis: AxisConfig
 ) -> None:
-    tiny.silent = True
+    slave.node.faults.silent = True
     with pytest.raises(DriveError, match=r"node 1 on virtual:test-.*no other node.*drive\.node_id") as caught:
         drive.boot()
     assert "\n" not in str(caught.value)
     assert clock.now() < 3.0
 
 
-def booting(tiny: Any, boot_up_s: float | None, sdo_s: float) -> None:
+def booting(slave: Any, clock: Any, boot_up_s: float | None, sdo_s: float) -> None:
     """Delays boot-up message and SDO server by these times after a reset."""
-    nmt, sdo, clock = tiny.nmt, tiny.sdo, tiny.clock
-    reset_s = [0.0]
-    announced = [True]
+    reset_s = 0.0
 
-    def command(value: int) -> None:
-        if value == 0x82:
-            reset_s[0], announced[0] = clock.now(), boot_up_s is None
-        elif clock.now() >= reset_s[0] + sdo_s:
-            nmt(value)
+    def is_up() -> bool:
+        return bool(clock.now() >= reset_s + sdo_s)
 
-    def request(data: bytes) -> None:
-        if clock.now() >= reset_s[0] + sdo_s:
-            sdo(data)
+    def obeys(command: int) -> bool:
+        nonlocal reset_s
+        if command == 0x82:
+            reset_s = clock.now()
+            if boot_up_s is not None:
+                Later(clock, reset_s + boot_up_s, lambda: slave.say(0x700, b"\0"))
+        return command == 0x82 or is_up()
 
-    def call() -> None:
-        if not announced[0] and clock.now() >= reset_s[0] + (boot_up_s or 0.0):
-            announced[0] = True
-            tiny.send(0x700, b"\x00")
-
-    tiny.nmt, tiny.sdo = command, request
-    tiny.bus_peers.append(call)
+    slave.obeys = obeys
+    slave.sends = lambda message: boot_up_s is None or message.arbitration_id != 0x701 or message.data[0] != 0
+    slave.sdo = lambda request: slave.scripted(request) if is_up() else []
 
 
 @pytest.mark.parametrize(
     ("boot_up_s", "sdo_s"), [(0.1, 1.0), (0.1, 3.5), (1.9, 5.2), (2.8, 5.0), (3.4, 6.8), (None, 3.0)]
 )
 def test_a_drive_that_answers_seconds_after_its_boot_up_message(
-    tiny: Any, bus: Any, axis: AxisConfig, clock: Any, boot_up_s: float | None, sdo_s: float
+    slave: Any, bus: Any, axis: AxisConfig, clock: Any, boot_up_s: float | None, sdo_s: float
 ) -> None:
-    tiny.bus_peers = bus.peers
-    booting(tiny, boot_up_s, sdo_s)
-    assert Drive(bus, axis, clock, tiny.od).boot().state is State.SWITCH_ON_DISABLED
+    booting(slave, clock, boot_up_s, sdo_s)
+    assert Drive(bus, axis, clock, slave.od).boot().state is State.SWITCH_ON_DISABLED
 
 
 def test_a_drive_that_boots_but_never_answers_is_reported_as_heard(
-    drive: Drive, tiny: Any, bus: Any, clock: Any
+    drive: Drive, slave: Any, bus: Any, clock: Any
 ) -> None:
-    tiny.bus_peers = bus.peers
-    booting(tiny, 0.5, 1e9)
+    booting(slave, clock, 0.5, 1e9)
     with pytest.raises(DriveError, match=r"does not answer \(heard of it: its boot-up message\); ") as caught:
         drive.boot()
     assert "no other node" not in str(caught.value)
     assert 4.0 <= clock.now() <= 5.0
 
 
-def test_a_stopped_node_is_reported_as_heard(drive: Drive, tiny: Any) -> None:
-    tiny.values[0x1017, 0] = 100
-    tiny.nmt_state = 4
-    tiny.nmt = tiny.sdo = lambda _: None
+def test_a_stopped_node_is_reported_as_heard(drive: Drive, slave: Any, bus: Any) -> None:
+    slave.node.dictionary[0x1017, 0].put(100)
+    bus.send(DataFrame(0x000, b"\x02\x01"))
+    slave.obeys, slave.sdo = lambda _: False, lambda _: []
     with pytest.raises(DriveError, match=r"heard of it: a heartbeat \(04h\)"):
         drive.boot()
 
 
-def test_an_absent_drive_lists_the_present_nodes(
-    drive: Drive, tiny: Any, bus: Any, peer_bus: can.BusABC
-) -> None:
-    tiny.silent = True
-
-    def other() -> None:
-        peer_bus.send(can.Message(arbitration_id=0x705, data=b"\x7f", is_extended_id=False))
-        bus.peers.remove(other)
-
-    bus.peers.append(other)
+def test_an_absent_drive_lists_the_present_nodes(drive: Drive, slave: Any, clock: Any) -> None:
+    slave.node.faults.silent = True
+    Later(clock, 0.1, lambda: slave.say(0x704, b"\x7f"))  # of node 5
     with pytest.raises(DriveError, match="heard: node 5"):
         drive.boot()
 
@@ -145,41 +133,41 @@ def test_an_absent_drive_lists_the_present_nodes(
     ],
 )
 def test_another_drive_or_another_scale_is_refused(
-    drive: Drive, tiny: Any, key: tuple[int, int], value: int, text: str
+    drive: Drive, slave: Any, key: tuple[int, int], value: int, text: str
 ) -> None:
-    tiny.values[key] = value
+    slave.values[key] = value
     with pytest.raises(IdentityError, match=text) as caught:
         drive.boot()
     assert "\n" not in str(caught.value)
-    assert tiny.sdo_order == []
+    assert slave.sdo_order == []
 
 
-def test_a_feed_that_does_not_scale(bus: Any, tiny: Any, clock: Any, build_axis: Any) -> None:
+def test_a_feed_that_does_not_scale(bus: Any, slave: Any, clock: Any, build_axis: Any) -> None:
     """If 6092h does not scale, the error names the line that does; with it, the drive is accepted."""
-    tiny.values[0x6092, 1] = 360_000
+    slave.values[0x6092, 1] = 360_000
     with pytest.raises(IdentityError, match=r"'feed_scales: false' under axis.yaml: drive"):
-        Drive(bus, build_axis(), clock, tiny.od).boot()
-    Drive(bus, build_axis(drive__feed_scales=False), clock, tiny.od).boot()
-    tiny.values[0x6091, 1] = 50
-    Drive(bus, build_axis(drive__feed_scales=False), clock, tiny.od).boot()
-    tiny.values[0x608F, 1] = 360_000
+        Drive(bus, build_axis(), clock, slave.od).boot()
+    Drive(bus, build_axis(drive__feed_scales=False), clock, slave.od).boot()
+    slave.values[0x6091, 1] = 50
+    Drive(bus, build_axis(drive__feed_scales=False), clock, slave.od).boot()
+    slave.values[0x608F, 1] = 360_000
     with pytest.raises(IdentityError, match="608Fh"):
-        Drive(bus, build_axis(drive__feed_scales=False), clock, tiny.od).boot()
+        Drive(bus, build_axis(drive__feed_scales=False), clock, slave.od).boot()
 
 
 def test_missing_mandatory_objects_are_refused_before_anything_is_sent(
-    tiny: Any, bus: Any, axis: Any, clock: Any
+    slave: Any, bus: Any, axis: Any, clock: Any, sent: Any
 ) -> None:
     with pytest.raises(InputError, match=r"drive\.eds: none\.eds lacks 6040h:00 controlword, .* more"):
         Drive(bus, axis, clock, ObjectDictionary())
-    del tiny.od[0x6064]
+    del slave.od[0x6064]
     with pytest.raises(InputError, match=r"lacks 6064h:00 position actual value, which"):
-        Drive(bus, axis, clock, tiny.od)
-    assert bus.sent == []
+        Drive(bus, axis, clock, slave.od)
+    assert sent == []
 
 
-def test_a_different_rated_torque_is_only_noted(drive: Drive, tiny: Any) -> None:
-    tiny.values[0x6076, 0] = 640
+def test_a_different_rated_torque_is_only_noted(drive: Drive, slave: Any) -> None:
+    slave.values[0x6076, 0] = 640
     (note,) = drive.boot().notes
     assert "0.64 Nm" in note
 
@@ -210,22 +198,21 @@ STATED = {
 
 
 @pytest.fixture
-def stated(bus: Any, clock: Any, tiny: Any, build_axis: Callable[..., AxisConfig]) -> Drive:
+def stated(bus: Any, clock: Any, slave: Any, build_axis: Callable[..., AxisConfig]) -> Drive:
     """Provides a drive whose axis file states all options of `STATED`."""
     axis = build_axis(**{f"drive__{key}": value for key, value in STATED.items()})
-    return Drive(bus, axis, clock, tiny.od, sdo_timeout_s=0.1)
+    return Drive(bus, axis, clock, slave.od, sdo_timeout_s=0.1)
 
 
 @pytest.mark.parametrize(("key", "field"), WRITTEN)
 def test_a_value_that_is_not_kept_is_detected(
-    stated: Drive, tiny: Any, key: tuple[int, int], field: str
+    stated: Drive, slave: Any, key: tuple[int, int], field: str
 ) -> None:
-    tiny.stuck.add(key)
-    tiny.values[key] = 77
+    slave.scripts[key] = holding(77)
     with pytest.raises(DriveError, match=f"{key[0]:04X}h:{key[1]:02X} .*but reads back 77") as caught:
         stated.boot()
     assert field in str(caught.value)
-    assert tiny.nmt_state == 127
+    assert slave.nmt_state == 127
 
 
 def refusing(code: int, held: int = 0) -> Callable[[bytes], list[bytes]]:
@@ -242,9 +229,9 @@ def refusing(code: int, held: int = 0) -> Callable[[bytes], list[bytes]]:
 @pytest.mark.parametrize("key", [(0x605A, 0), (0x605D, 0), (0x605B, 0), (0x6007, 0), (0x1029, 1)])
 @pytest.mark.parametrize("code", [0x06090030, 0x06090031, 0x06010002, 0x08000000])
 def test_a_default_refused_by_the_drive_is_left_to_it(
-    drive: Drive, tiny: Any, key: tuple[int, int], code: int
+    drive: Drive, slave: Any, key: tuple[int, int], code: int
 ) -> None:
-    tiny.scripts[key] = refusing(code, held=5)
+    slave.scripts[key] = refusing(code, held=5)
     report = drive.boot()
     (note,) = report.notes
     assert note.startswith("left to the drive (")
@@ -253,28 +240,28 @@ def test_a_default_refused_by_the_drive_is_left_to_it(
     assert "drive." in note
     assert report.left == {key}
     assert key not in {(row.index, row.sub) for row in report.held}
-    assert tiny.nmt_state == 5
+    assert slave.nmt_state == 5
 
 
-def test_a_read_only_limit_is_left_to_the_drive_even_if_stated(stated: Drive, tiny: Any) -> None:
+def test_a_read_only_limit_is_left_to_the_drive_even_if_stated(stated: Drive, slave: Any) -> None:
     for key in ((0x6065, 0), (0x605A, 0)):
-        tiny.scripts[key] = refusing(0x06010002, held=2)
+        slave.scripts[key] = refusing(0x06010002, held=2)
     report = stated.boot()
     assert report.left == {(0x6065, 0), (0x605A, 0)}
 
 
-def test_a_drive_that_refuses_its_cycle_is_refused(drive: Drive, tiny: Any) -> None:
-    tiny.scripts[0x60C2, 1] = refusing(0x06010002, held=1)
+def test_a_drive_that_refuses_its_cycle_is_refused(drive: Drive, slave: Any) -> None:
+    slave.scripts[0x60C2, 1] = refusing(0x06010002, held=1)
     with pytest.raises(SdoError, match=r"60C2h:01 .*read-only.*drive\.cycle_ms decides it"):
         drive.boot()
 
 
-def test_a_write_only_object_is_written(drive: Drive, tiny: Any) -> None:
-    tiny.od[0x605A].access_type = "wo"
-    tiny.scripts[0x605A, 0] = lambda request: [b"\x60" + request[1:4] + bytes(4)]
+def test_a_write_only_object_is_written(drive: Drive, slave: Any) -> None:
+    slave.od[0x605A].access_type = "wo"
+    slave.scripts[0x605A, 0] = lambda request: [b"\x60" + request[1:4] + bytes(4)]
     assert 0x605A in {row.index for row in drive.boot().written}
-    tiny.od[0x605A].access_type = "rw"  # the EDS permits reading, the drive does not
-    tiny.scripts[0x605A, 0] = lambda request: [
+    slave.od[0x605A].access_type = "rw"  # the EDS permits reading, the drive does not
+    slave.scripts[0x605A, 0] = lambda request: [
         b"\x80" + request[1:4] + (0x06010001).to_bytes(4, "little")
         if request[0] >> 5 == 2
         else b"\x60" + request[1:4] + bytes(4)
@@ -282,75 +269,74 @@ def test_a_write_only_object_is_written(drive: Drive, tiny: Any) -> None:
     assert 0x605A in {row.index for row in drive.boot().written}
 
 
-def test_a_correct_mapping_is_not_written_again(drive: Drive, tiny: Any) -> None:
+def test_a_correct_mapping_is_not_written_again(drive: Drive, slave: Any) -> None:
     drive.boot()
-    tiny.values[0x1800, 2] = 255
-    tiny.sdo_order.clear()
-    drive.boot()
-    assert tiny.sdo_order == [(0x1800, 1, 0x8000_0181), (0x1800, 2, 1), (0x1800, 1, 0x181)]
+    slave.values[0x1800, 2] = 255
+    slave.sdo_order.clear()
+    drive.boot(reset=False)
+    assert slave.sdo_order == [(0x1800, 1, 0x8000_0181), (0x1800, 2, 1), (0x1800, 1, 0x181)]
 
 
 @pytest.mark.parametrize(("key", "field"), WRITTEN)
-def test_a_refused_write_names_the_field(stated: Drive, tiny: Any, key: tuple[int, int], field: str) -> None:
-    tiny.scripts[key] = refusing(0x06090030)
+def test_a_refused_write_names_the_field(stated: Drive, slave: Any, key: tuple[int, int], field: str) -> None:
+    slave.scripts[key] = refusing(0x06090030)
     with pytest.raises(SdoError, match=f"{key[0]:04X}h:{key[1]:02X} .*write refused.*06090030h") as caught:
         stated.boot()
     assert field in str(caught.value)
 
 
-def test_a_load_encoder_that_cannot_be_mapped(drive: Drive, tiny: Any) -> None:
-    tiny.scripts[0x1A01, 1] = lambda request: [b"\x80" + request[1:4] + (0x06040041).to_bytes(4, "little")]
+def test_a_load_encoder_that_cannot_be_mapped(drive: Drive, slave: Any) -> None:
+    slave.scripts[0x1A01, 1] = lambda request: [b"\x80" + request[1:4] + (0x06040041).to_bytes(4, "little")]
     with pytest.raises(SdoError, match=r"cannot map it.*another object.*load_encoder\.source"):
         drive.boot()
 
 
-def test_a_node_that_does_not_start(drive: Drive, tiny: Any) -> None:
-    original = tiny.nmt
-    tiny.nmt = lambda command: None if command == 1 else original(command)
+def test_a_node_that_does_not_start(drive: Drive, slave: Any) -> None:
+    slave.obeys = lambda command: command != 1
     with pytest.raises(DriveError, match=r"did not become OPERATIONAL \(it says 7Fh"):
         drive.boot()
 
 
-def test_a_powered_drive_is_switched_off_first(drive: Drive, tiny: Any) -> None:
-    tiny.state, tiny.controlword = 0x27, 0x0F
-    assert drive.boot().state is State.SWITCH_ON_DISABLED
-    assert tiny.sdo_order[0] == (0x6040, 0, 0)
+def test_a_powered_drive_is_switched_off_first(drive: Drive, slave: Any) -> None:
+    slave.enable()
+    assert drive.boot(reset=False).state is State.SWITCH_ON_DISABLED
+    assert slave.sdo_order[0] == (0x6040, 0, 0)
 
 
-def test_a_drive_that_stays_under_power_is_refused(drive: Drive, tiny: Any) -> None:
-    tiny.state = 0x27
-    tiny.control = lambda word: None
+def test_a_drive_that_stays_under_power_is_refused(drive: Drive, slave: Any) -> None:
+    slave.enable()
+    slave.scripts[0x6040, 0] = holding(0x0F)
     with pytest.raises(DriveError, match="stays in 'operation enabled'"):
-        drive.boot()
+        drive.boot(reset=False)
 
 
-def test_a_drive_in_fault_boots_and_reports_it(drive: Drive, tiny: Any) -> None:
-    tiny.fail()
+def test_a_drive_in_fault_boots_and_reports_it(drive: Drive, slave: Any) -> None:
+    slave.fail()
     assert drive.boot().state is State.FAULT
 
 
-def test_the_bit_that_forbids_rtr_is_left_to_the_drive(drive: Drive, tiny: Any) -> None:
-    tiny.values[0x1800, 1] = 0x4000_0181
-    drive.boot()
-    assert tiny.values[0x1800, 1] == 0x4000_0181
+def test_the_bit_that_forbids_rtr_is_left_to_the_drive(drive: Drive, slave: Any) -> None:
+    slave.values[0x1800, 1] = 0x4000_0181
+    drive.boot(reset=False)
+    assert slave.values[0x1800, 1] == 0x4000_0181
 
 
 def test_load_encoder_on_a_separate_node(
-    bus: Any, clock: Any, tiny: Any, channel: str, build_axis: Callable[..., AxisConfig]
+    bus: Any, clock: Any, slave: Any, channel: str, build_axis: Callable[..., AxisConfig]
 ) -> None:
     source = {"index": 0x60E4, "subindex": 1, "type": "int32", "node": 2}
     with can.Bus(interface="virtual", channel=channel, ignore_config=True) as other_bus:
-        encoder = type(tiny)(other_bus, clock, node_id=2)
-        encoder.position = 5000.0
-        bus.peers.append(encoder)
-        drive = Drive(bus, build_axis(load_encoder__source=source), clock, tiny.od)
+        motor = IdealMotor(5000)
+        encoder = Slave(DriveNode(other_bus, motor, EDS, 2, clock), motor)
+        clock.nodes.append(encoder.node)
+        drive = Drive(bus, build_axis(load_encoder__source=source), clock, slave.od)
         drive.boot()
         assert (encoder.values[0x1800, 1], encoder.values[0x1A00, 1]) == (0x182, 0x60E40120)
         assert (encoder.values[0x1800, 2], encoder.values[0x1017, 0]) == (1, 50)
-        assert (tiny.nmt_state, encoder.nmt_state) == (5, 5)
-        assert tiny.values[0x1A01, 0] == 1
+        assert (slave.nmt_state, encoder.nmt_state) == (5, 5)
+        assert slave.values[0x1A01, 0] == 1
         assert drive.read_positions().load_counts == 36_000
-        encoder.silent = True
+        encoder.node.faults.silent = True
         with pytest.raises(DriveError, match=r"node 2 .*load_encoder\.source\.node"):
             drive.boot()
-        assert tiny.nmt_state == 127
+        assert slave.nmt_state == 127

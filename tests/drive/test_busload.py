@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.twoaxes import axis_of
+from support.daemon import article_axis
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive.busload import MAXIMUM_LOAD, bus_load, check_bus_load, cycle_bits, frame_bits
@@ -11,7 +11,7 @@ from hdbridge.errors import InputError
 
 
 def axes(count: int, **drive: object) -> list[AxisConfig]:
-    return [axis_of(node_id, **drive) for node_id in range(1, count + 1)]
+    return [article_axis(node_id, **drive) for node_id in range(1, count + 1)]
 
 
 def with_bus(axis: AxisConfig, bitrate_bps: int) -> AxisConfig:
@@ -90,7 +90,7 @@ def test_too_many_axes_are_refused_with_a_feasible_alternative() -> None:
     with pytest.raises(InputError) as refused:
         check_bus_load(fast, 1_000_000)
     text = str(refused.value)
-    assert "axis 1 and axis 2" in text
+    assert "axis1 and axis2" in text
     assert "at most 80 % is allowed" in text
     assert "or 3 of the 6 axes" in text
     longer_ms = float(text.split("a cycle_ms of ")[1].split(maxsplit=1)[0])
@@ -104,6 +104,6 @@ def test_too_many_axes_are_refused_with_a_feasible_alternative() -> None:
 
 def test_axes_with_different_bus_settings_are_refused() -> None:
     with pytest.raises(InputError, match=r"drive\.cycle_ms gives 8.*gives 4"):
-        bus_load([axis_of(1), axis_of(2, cycle_ms=8.0)], 1_000_000)
+        bus_load([article_axis(1), article_axis(2, cycle_ms=8.0)], 1_000_000)
     with pytest.raises(InputError, match=r"bus\.bitrate_bps gives 500000.*gives 1e\+06"):
-        bus_load([with_bus(axis_of(1), 1_000_000), with_bus(axis_of(2), 500_000)])
+        bus_load([with_bus(article_axis(1), 1_000_000), with_bus(article_axis(2), 500_000)])

@@ -16,6 +16,8 @@ from hdbridge.drive.supervision import Fault
 from hdbridge.errors import SdoError
 from hdbridge.files.profile import bundled_folder
 
+from .conftest import holding
+
 TORQUE = {"source": {"index": 0x2101, "type": "int32"}, "newton_metres_per_count": 0.001, "maximum_nm": 50}
 TEMPERATURE = {"source": {"index": 0x2100, "type": "int16"}, "celsius_per_count": 0.1}
 Build = Callable[..., AxisConfig]
@@ -53,12 +55,11 @@ def test_the_plan_maps_channels_and_names_their_key(build_axis: Build) -> None:
     assert (rows[0x1802, 1].value, rows[0x1803, 1].value) == (0x381, 0x481)
 
 
-def test_a_drive_refusing_the_mapping_is_refused(bus: Any, clock: Any, tiny: Any, build_axis: Build) -> None:
-    tiny.scripts[0x1A02, 1] = lambda request: [b"\x80" + request[1:4] + (0x06040041).to_bytes(4, "little")]
+def test_a_drive_refusing_the_mapping_is_refused(bus: Any, clock: Any, slave: Any, build_axis: Build) -> None:
+    slave.scripts[0x1A02, 1] = lambda request: [b"\x80" + request[1:4] + (0x06040041).to_bytes(4, "little")]
     with pytest.raises(SdoError, match=r"cannot map it.*load_torque\.source decides it"):
         Drive(bus, build_axis(load_torque=TORQUE), clock, load_eds_with_2101()).boot()
-    tiny.scripts.clear()
-    tiny.stuck.add((0x1A02, 1))
+    slave.scripts[0x1A02, 1] = holding(0)
     with pytest.raises(Exception, match=r"1A02h:01 .*reads back 0; .*load_torque\.source decides it"):
         Drive(bus, build_axis(load_torque=TORQUE), clock, load_eds_with_2101()).boot()
 

@@ -7,32 +7,33 @@ here. Its notifier thread is replaced by a poll, so that the test is in lockstep
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import can
 import pytest
-from durand.scheduler import get_scheduler, set_scheduler
-from support.foreign_slaves import NODE_ID, DurandDrive
+from support.foreign_slaves import NODE_ID, DurandDrive, durand_drive
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import Drive, Mode, State, load_eds
 
 
 @pytest.fixture
-def peer(bus: Any, peer_bus: can.BusABC, clock: Any) -> Iterator[DurandDrive]:
-    before = get_scheduler()
-    peer = DurandDrive(peer_bus, clock)
-    bus.peers.append(peer.poll)
-    yield peer
-    set_scheduler(before)
+def peer() -> Iterator[DurandDrive]:
+    with durand_drive() as (bus, made):
+        made.master = bus
+        yield made
+
+
+@pytest.fixture
+def clock(peer: DurandDrive) -> Any:
+    return peer.clock
 
 
 @pytest.fixture
 def drive(
-    bus: Any, clock: Any, peer: DurandDrive, tmp_path: Any, build_axis: Callable[..., AxisConfig]
+    peer: DurandDrive, clock: Any, tmp_path: Any, build_axis: Callable[..., AxisConfig]
 ) -> Iterator[Drive]:
     eds = tmp_path / "durand.eds"
     eds.write_text(peer.node.eds.content)
     axis = build_axis(drive__node_id=NODE_ID)
-    with Drive(bus, axis, clock, load_eds(eds, NODE_ID)) as drive:
+    with Drive(peer.master, axis, clock, load_eds(eds, NODE_ID)) as drive:
         yield drive
 
 

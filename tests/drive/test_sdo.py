@@ -3,7 +3,6 @@
 import struct
 from typing import Any
 
-import can
 import pytest
 
 from hdbridge.drive import IntegerType, Link, NetworkMonitor, SdoAbortError, SdoClient
@@ -11,15 +10,15 @@ from hdbridge.errors import InputError, SdoError
 
 
 @pytest.fixture
-def client(bus: Any, clock: Any, tiny: Any) -> SdoClient:
-    return SdoClient(Link(bus, clock), NetworkMonitor(1), 1, tiny.od, timeout_s=0.1)
+def client(bus: Any, clock: Any, slave: Any) -> SdoClient:
+    return SdoClient(Link(bus, clock), NetworkMonitor(1), 1, slave.od, timeout_s=0.1)
 
 
 def expedited(request: bytes, value: bytes) -> bytes:
     return bytes((0x43 | (4 - len(value)) << 2,)) + request[1:4] + value.ljust(4, b"\0")
 
 
-def test_integers_of_every_sign_and_width_are_read_and_written(client: SdoClient, tiny: Any) -> None:
+def test_integers_of_every_sign_and_width_are_read_and_written(client: SdoClient, slave: Any) -> None:
     for index, sub, value in (
         (0x607A, 0, -123456),
         (0x605A, 0, 6),
@@ -27,60 +26,59 @@ def test_integers_of_every_sign_and_width_are_read_and_written(client: SdoClient
         (0x6065, 0, 0xFFFF_FFFF),
     ):
         client.write(index, sub, value)
-        assert tiny.values[index, sub] == value
+        assert slave.values[index, sub] == value
         assert client.read(index, sub) == value
 
 
-def test_strings_come_in_segments(client: SdoClient, tiny: Any) -> None:
-    tiny.values[0x1008, 0] = b"a name of more than two segments\0"
+def test_strings_come_in_segments(client: SdoClient, slave: Any) -> None:
+    slave.values[0x1008, 0] = b"a name of more than two segments\0"
     assert client.read_text(0x1008) == "a name of more than two segments"
-    tiny.values[0x1008, 0] = b"caf\xc3\xa9"
+    slave.values[0x1008, 0] = b"caf\xc3\xa9"
     assert client.read_text(0x1008) == "caf??"
 
 
-def test_a_long_value_is_written_in_segments(client: SdoClient, tiny: Any, bus: Any) -> None:
+def test_a_long_value_is_written_in_segments(client: SdoClient, slave: Any) -> None:
     received = bytearray()
 
     def initiate(request: bytes) -> list[bytes]:
         return [b"\x60" + request[1:4] + bytes(4)]
 
-    def segment(request: bytes) -> None:
-        if request[0] >> 5 == 0:
-            received.extend(request[1 : 8 - (request[0] >> 1 & 7)])
-            tiny.send(0x580, bytes((0x20 | request[0] & 0x10,)) + bytes(7))
-        else:
-            original(request)
+    def segment(request: bytes) -> list[bytes] | None:
+        if request[0] >> 5:
+            return slave.scripted(request)
+        received.extend(request[1 : 8 - (request[0] >> 1 & 7)])
+        return [bytes((0x20 | request[0] & 0x10,)) + bytes(7)]
 
-    original, tiny.sdo = tiny.sdo, segment
-    tiny.scripts[0x1008, 0] = initiate
+    slave.sdo = segment
+    slave.scripts[0x1008, 0] = initiate
     client.write_bytes(0x1008, 0, b"twelve bytes")
     assert bytes(received) == b"twelve bytes"
 
 
-def test_retries_are_bounded(client: SdoClient, tiny: Any, clock: Any, bus: Any) -> None:
-    tiny.silent = True
+def test_retries_are_bounded(client: SdoClient, slave: Any, clock: Any, sent: Any) -> None:
+    slave.node.faults.silent = True
     with pytest.raises(
         SdoError, match=r"node 1, object 6064h:00 'Position actual value': read failed after 3"
     ):
         client.read(0x6064)
     assert clock.now() == pytest.approx(0.3, abs=0.02)
-    assert [message.data[0] for message in bus.sent] == [0x40, 0x80] * 3
+    assert [data[0] for _, data in sent] == [0x40, 0x80] * 3
 
 
-def test_a_lost_answer_is_retried(client: SdoClient, tiny: Any) -> None:
+def test_a_lost_answer_is_retried(client: SdoClient, slave: Any) -> None:
     answers: list[list[bytes]] = [[], []]
 
     def forgetful(request: bytes) -> list[bytes]:
         return answers.pop() if answers else [expedited(request, struct.pack("<i", -7))]
 
-    tiny.scripts[0x6064, 0] = forgetful
+    slave.scripts[0x6064, 0] = forgetful
     assert client.read(0x6064) == -7
 
 
-def test_a_late_answer_is_not_used_for_another_object(client: SdoClient, tiny: Any) -> None:
+def test_a_late_answer_is_not_used_for_another_object(client: SdoClient, slave: Any) -> None:
     other = b"\x43\x64\x60\x00" + struct.pack("<i", 99)
-    tiny.scripts[0x607A, 0] = lambda request: [other, expedited(request, struct.pack("<i", 5))]
-    tiny.send(0x580, other)
+    slave.scripts[0x607A, 0] = lambda request: [other, expedited(request, struct.pack("<i", 5))]
+    slave.say(0x580, other)
     assert client.read(0x607A) == 5
     assert client.unsolicited_answers == 2
 
@@ -95,7 +93,7 @@ def test_a_late_answer_is_not_used_for_another_object(client: SdoClient, tiny: A
     ],
 )
 def test_an_abort_is_reported_with_a_remedy_and_not_retried(
-    client: SdoClient, tiny: Any, code: int, text: str
+    client: SdoClient, slave: Any, code: int, text: str
 ) -> None:
     calls = []
 
@@ -103,7 +101,7 @@ def test_an_abort_is_reported_with_a_remedy_and_not_retried(
         calls.append(request)
         return [b"\x80" + request[1:4] + code.to_bytes(4, "little")]
 
-    tiny.scripts[0x605A, 0] = refuse
+    slave.scripts[0x605A, 0] = refuse
     with pytest.raises(SdoAbortError, match=text) as caught:
         client.write(0x605A, 0, 6)
     assert caught.value.code == code
@@ -112,14 +110,14 @@ def test_an_abort_is_reported_with_a_remedy_and_not_retried(
 
 
 @pytest.mark.parametrize("length", [0, 1, 4, 7])
-def test_a_short_frame_is_an_error_not_a_crash(client: SdoClient, tiny: Any, length: int) -> None:
-    tiny.scripts[0x6064, 0] = lambda request: [expedited(request, b"\1\2\3\4")[:length]]
+def test_a_short_frame_is_an_error_not_a_crash(client: SdoClient, slave: Any, length: int) -> None:
+    slave.scripts[0x6064, 0] = lambda request: [expedited(request, b"\1\2\3\4")[:length]]
     with pytest.raises(SdoError, match=f"the answer has {length} bytes"):
         client.read(0x6064)
 
 
-def test_too_few_bytes_for_the_type(client: SdoClient, tiny: Any) -> None:
-    tiny.scripts[0x6064, 0] = lambda request: [expedited(request, b"\1\2")]
+def test_too_few_bytes_for_the_type(client: SdoClient, slave: Any) -> None:
+    slave.scripts[0x6064, 0] = lambda request: [expedited(request, b"\1\2")]
     with pytest.raises(SdoError, match="answered 2 bytes, but int32 has 4"):
         client.read(0x6064)
 
@@ -128,9 +126,9 @@ def test_too_few_bytes_for_the_type(client: SdoClient, tiny: Any) -> None:
     ("data", "value"), [(b"\xfe\xff\xff\xff", -2), (b"\x06\0\0\0", 6), (b"\x06\0\1\0", None)]
 )
 def test_four_bytes_for_a_shorter_object(
-    client: SdoClient, tiny: Any, data: bytes, value: int | None
+    client: SdoClient, slave: Any, data: bytes, value: int | None
 ) -> None:
-    tiny.scripts[0x605A, 0] = lambda request: [expedited(request, data)]
+    slave.scripts[0x605A, 0] = lambda request: [expedited(request, data)]
     if value is None:
         with pytest.raises(SdoError, match="answered 4 bytes"):
             client.read(0x605A)
@@ -138,78 +136,78 @@ def test_four_bytes_for_a_shorter_object(
         assert client.read(0x605A) == value
 
 
-def endless(tiny: Any, chunk: bytes) -> None:
+def endless(slave: Any, chunk: bytes) -> None:
     """Answers every segment without ever marking a last one."""
-    original = tiny.sdo
 
-    def serve(request: bytes) -> None:
-        if request[0] >> 5 == 3:
-            tiny.send(0x580, bytes((request[0] & 0x10 | (7 - len(chunk)) << 1,)) + chunk.ljust(7, b"\0"))
-        else:
-            original(request)
+    def serve(request: bytes) -> list[bytes] | None:
+        if request[0] >> 5 != 3:
+            return slave.scripted(request)
+        return [bytes((request[0] & 0x10 | (7 - len(chunk)) << 1,)) + chunk.ljust(7, b"\0")]
 
-    tiny.sdo = serve
-    tiny.scripts[0x1008, 0] = lambda request: [b"\x40" + request[1:4] + bytes(4)]
+    slave.sdo = serve
+    slave.scripts[0x1008, 0] = lambda request: [b"\x40" + request[1:4] + bytes(4)]
 
 
 @pytest.mark.parametrize(
     ("chunk", "text"), [(b"sevenby", "more than the 4096 bytes"), (b"", "empty segments without an end")]
 )
-def test_endless_segments_end(client: SdoClient, tiny: Any, chunk: bytes, text: str) -> None:
-    endless(tiny, chunk)
+def test_endless_segments_end(client: SdoClient, slave: Any, chunk: bytes, text: str) -> None:
+    endless(slave, chunk)
     with pytest.raises(SdoError, match=text):
         client.read_text(0x1008)
 
 
-def test_a_slow_drip_of_segments_ends_too(bus: Any, clock: Any, tiny: Any) -> None:
-    client = SdoClient(Link(bus, clock), NetworkMonitor(1), 1, tiny.od, timeout_s=0.1, attempts=1)
-    endless(tiny, b"x")
-    answer = tiny.sdo
+def test_a_slow_drip_of_segments_ends_too(bus: Any, clock: Any, slave: Any) -> None:
+    client = SdoClient(Link(bus, clock), NetworkMonitor(1), 1, slave.od, timeout_s=0.1, attempts=1)
+    endless(slave, b"x")
+    answer = slave.sdo
 
-    def slowly(request: bytes) -> None:
+    def slowly(request: bytes) -> list[bytes] | None:
         clock.sleep_until(clock.now() + 0.09)
-        answer(request)
+        return answer(request)
 
-    tiny.sdo = slowly
+    slave.sdo = slowly
     with pytest.raises(SdoError, match="no answer within"):
         client.read_text(0x1008)
     assert clock.now() < 2.5
 
 
-def test_wrong_announced_sizes_are_refused(client: SdoClient, tiny: Any) -> None:
-    tiny.scripts[0x1008, 0] = lambda request: [b"\x41" + request[1:4] + (10**6).to_bytes(4, "little")]
+def test_wrong_announced_sizes_are_refused(client: SdoClient, slave: Any) -> None:
+    slave.scripts[0x1008, 0] = lambda request: [b"\x41" + request[1:4] + (10**6).to_bytes(4, "little")]
     with pytest.raises(SdoError, match="more than the 4096 bytes"):
         client.read_text(0x1008)
-    tiny.rest = b"four"
-    tiny.scripts[0x1008, 0] = lambda request: [b"\x41" + request[1:4] + (9).to_bytes(4, "little")]
+    slave.scripts[0x1008, 0] = lambda request: [b"\x41" + request[1:4] + (9).to_bytes(4, "little")]
+    slave.sdo = lambda request: (
+        [bytes((request[0] & 0x10 | 7,)) + b"four\0\0\0"] if request[0] >> 5 == 3 else slave.scripted(request)
+    )
     with pytest.raises(SdoError, match="announced 9 bytes and sent"):
         client.read_text(0x1008)
 
 
-def test_frames_arriving_meanwhile_are_not_lost(bus: Any, clock: Any, tiny: Any) -> None:
+def test_frames_arriving_meanwhile_are_not_lost(bus: Any, clock: Any, slave: Any) -> None:
     monitor = NetworkMonitor(1)
-    client = SdoClient(Link(bus, clock), monitor, 1, tiny.od)
+    client = SdoClient(Link(bus, clock), monitor, 1, slave.od)
 
     def chatty(request: bytes) -> list[bytes]:
-        tiny.send(0x700, b"\x05")
-        tiny.send(0x080, b"\x11\x86\x21")
+        slave.say(0x700, b"\x05")
+        slave.say(0x080, b"\x11\x86\x21")
         return [expedited(request, b"\1\0\0\0")]
 
-    tiny.scripts[0x6064, 0] = chatty
-    tiny.send(0x700, b"\x00")
+    slave.scripts[0x6064, 0] = chatty
+    slave.say(0x700, b"\x00")
     assert client.read(0x6064) == 1
     status = monitor.nodes[1]
     assert (status.boot_ups, status.nmt_state, status.emergency_count) == (1, 5, 1)
 
 
-def test_a_value_that_does_not_fit_is_not_sent(client: SdoClient, bus: Any) -> None:
+def test_a_value_that_does_not_fit_is_not_sent(client: SdoClient, sent: Any) -> None:
     for value in (-1, 65536, 1.5, float("nan")):
         with pytest.raises(InputError, match="nothing was written"):
             client.write(0x6040, 0, value)  # type: ignore[arg-type]
-    assert bus.sent == []
+    assert sent == []
 
 
-def test_sub_indices_are_kept_apart(client: SdoClient, tiny: Any) -> None:
+def test_sub_indices_are_kept_apart(client: SdoClient, slave: Any) -> None:
     client.write(0x607D, 1, -5)
     client.write(0x607D, 2, 5)
     assert (client.read(0x607D, 1), client.read(0x607D, 2)) == (-5, 5)
@@ -219,7 +217,7 @@ def test_sub_indices_are_kept_apart(client: SdoClient, tiny: Any) -> None:
     assert not client.has(0x2222)
 
 
-def test_types_without_an_eds(bus: Any, clock: Any, tiny: Any) -> None:
+def test_types_without_an_eds(bus: Any, clock: Any, slave: Any) -> None:
     client = SdoClient(Link(bus, clock), NetworkMonitor(1), 1)
     client.write(0x607A, 0, -9)
     assert client.read(0x607A) == -9
@@ -233,12 +231,12 @@ def test_a_non_integer_object_is_refused(client: SdoClient) -> None:
         client.read(0x1008)
 
 
-def test_an_answer_of_the_wrong_kind_is_refused(client: SdoClient, tiny: Any, peer_bus: can.BusABC) -> None:
-    tiny.scripts[0x6064, 0] = lambda request: [b"\x60" + request[1:4] + bytes(4)]
+def test_an_answer_of_the_wrong_kind_is_refused(client: SdoClient, slave: Any) -> None:
+    slave.scripts[0x6064, 0] = lambda request: [b"\x60" + request[1:4] + bytes(4)]
     with pytest.raises(SdoError, match="Unexpected response 0x60"):
         client.read(0x6064)
 
 
-def test_an_old_answer_for_the_same_object_is_ignored(client: SdoClient, tiny: Any) -> None:
-    tiny.send(0x580, b"\x43\x64\x60\x00" + struct.pack("<i", 99))
+def test_an_old_answer_for_the_same_object_is_ignored(client: SdoClient, slave: Any) -> None:
+    slave.say(0x580, b"\x43\x64\x60\x00" + struct.pack("<i", 99))
     assert client.read(0x6064) == 1000

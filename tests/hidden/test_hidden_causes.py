@@ -29,6 +29,7 @@ from support.hidden_bench import (
     bare_truth,
     hidden_bench,
 )
+from support.keys import changed
 from typer.testing import CliRunner
 
 from hdbridge.axis.effects import CATALOGUE
@@ -79,9 +80,7 @@ AT_REST = replace(STEPPING, settle=Settle(minimum_s=1.0))
 
 def lagging() -> Truth:
     """Returns an axis whose gear temperature follows the temperature sensor with a lag of one minute."""
-    data = bare_truth().model_dump(by_alias=True)
-    data["temperature"]["zero_time_constant_s"] = 60.0
-    return Truth.model_validate(data)
+    return changed(bare_truth(), temperature__zero_time_constant_s=60.0)
 
 
 def greased() -> Truth:
@@ -90,9 +89,7 @@ def greased() -> Truth:
     Otherwise the integral term compensates it, every stop overshoots by three motor counts (2.4 arcsec), and
     the error at rest is 7.4 times the floor, whatever the model.
     """
-    data = bare_truth().model_dump(by_alias=True)
-    data["servo"]["viscous_feedforward_nm_s_per_rad"] = 0.004
-    return Truth.model_validate(data)
+    return changed(bare_truth(), servo__viscous_feedforward_nm_s_per_rad=0.004)
 
 
 def obeying(law: str, **shape: float) -> Truth:
@@ -292,7 +289,5 @@ def test_the_same_seed_gives_the_same_record_bit_for_bit(tmp_path: Path) -> None
 
 
 def test_a_drive_reports_the_nominal_ratio() -> None:
-    data = bare_truth().model_dump(by_alias=True)
-    data["gear"]["ratio"] = 49.99981
-    nameplate = nameplate_of(Truth.model_validate(data))
+    nameplate = nameplate_of(changed(bare_truth(), gear__ratio=49.99981))
     assert (nameplate.gear_motor_turns, nameplate.gear_load_turns) == (50, 1)

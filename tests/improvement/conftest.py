@@ -3,13 +3,13 @@
 import json
 import random
 import shutil
+from copy import copy
 from pathlib import Path
 
 import pytest
 from support.command import run_here
 from support.hidden import Run, hide
-
-from hdbridge.sim.truth import Truth
+from support.hidden_bench import bare_truth
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 MODEL = """\
@@ -53,10 +53,9 @@ with small counts, this biases a sweep only insignificantly.
 class Cell:
     """A folder for the improvement of an axis: `axis/` is the profile, `small.yaml` a plan."""
 
-    def __init__(self, folder, run):
+    def __init__(self, folder):
         self.folder = folder
         self.axis = folder / "axis"
-        self._run = run
         self.axis.mkdir(parents=True)
         text = (DEMO / "axis.yaml").read_text()
         for old, new in COARSE:
@@ -70,12 +69,7 @@ class Cell:
 
     def hide(self, cause=None, size_arcsec=5.0, seed=1):
         """Writes the truth file with a hidden cause."""
-        data = Truth.load(DEMO).model_dump(by_alias=True, mode="json")
-        data["substep_ms"] = 1.0
-        data["motor"]["encoder"].update(counts_per_turn=32768, interpolation=16)
-        data["gear"].update(stiffness_nm_per_rad=45_000.0, damping_nm_s_per_rad=40.0)
-        data["servo"]["load_feedforward"]["frequency_hz"] = 65.0
-        truth, hidden = Truth.model_validate(data), None
+        truth, hidden = bare_truth(), None
         if cause:
             truth, hidden = hide(truth, cause, random.Random(seed), size_arcsec, Run(duration_s=120.0))
         (self.axis / "truth.yaml").write_text(json.dumps(truth.model_dump(by_alias=True, mode="json")))
@@ -83,7 +77,9 @@ class Cell:
 
     def run(self, *arguments, status=0):
         """Runs `hdbridge ARGS...` in this folder; returns its standard output and standard error."""
-        return self._run(self.folder, arguments, status)
+        done = run_here(self.folder, *arguments)
+        assert done.returncode == status, done.stderr
+        return done.stdout, done.stderr
 
     def improve(self, *arguments, status=0):
         """Runs `hdbridge improve`; returns the JSON result and the printed output."""
@@ -101,27 +97,21 @@ class Cell:
 
     def copy(self, folder):
         shutil.copytree(self.folder, folder)
-        cell = object.__new__(Cell)
-        cell.folder, cell.axis, cell._run, cell.hidden = folder, folder / "axis", self._run, self.hidden
+        cell = copy(self)
+        cell.folder, cell.axis = folder, folder / "axis"
         return cell
-
-
-def run(folder, arguments, status):
-    done = run_here(folder, *arguments)
-    assert done.returncode == status, done.stderr
-    return done.stdout, done.stderr
 
 
 @pytest.fixture
 def cell(tmp_path):
     """A cell whose axis has nothing hidden in it yet."""
-    return Cell(tmp_path / "cell", run)
+    return Cell(tmp_path / "cell")
 
 
 @pytest.fixture(scope="session")
 def improved_once(tmp_path_factory):
     """An axis with a hidden motor order, improved once for all tests."""
-    cell = Cell(tmp_path_factory.mktemp("improved") / "cell", run)
+    cell = Cell(tmp_path_factory.mktemp("improved") / "cell")
     cell.hidden = cell.hide("motor_order")
     return cell, *cell.improve("--html", "page.html")
 

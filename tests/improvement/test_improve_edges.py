@@ -1,12 +1,10 @@
 """`hdbridge improve` at its edges: interrupted, refused, not better."""
 
-import os
 import signal
-import subprocess
-import sys
 
 import pytest
 import yaml
+from support.command import started
 from support.patience import until
 
 from hdbridge.commissioning.calibration.validation import Floor, Validation
@@ -29,14 +27,7 @@ def test_ctrl_c_keeps_the_record_and_resume_completes_it(cell):
     axis = cell.axis / "axis.yaml"
     axis.write_text(axis.read_text().replace("cycle_ms: 20", "cycle_ms: 10"))
     options = ("--simulate", "--plan", "narrow.yaml", "--out", "rec")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "hdbridge", "improve", "axis", *options],
-        cwd=cell.folder,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = started(cell.folder, "improve", "axis", *options)
     about = cell.folder / "rec" / "recording.yaml"
     until(lambda: process.poll() is not None or (about.exists() and "02-sweep" in about.read_text()))
     process.send_signal(signal.SIGINT)

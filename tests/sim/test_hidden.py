@@ -3,19 +3,18 @@
 import random
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.bare_axis import truth as truth_of
 from support.hidden import CAUSES, UNKNOWN, Run, hide
+from support.keys import changed
 
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
 
-ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
 SPEED_DEG_S = 14.0
 RUN = Run(
     duration_s=31.0,
@@ -26,16 +25,13 @@ RUN = Run(
 )
 
 
-def axis(changes: Callable[[dict[str, Any]], None] | None = None) -> Truth:
+def axis() -> Truth:
     """The article's axis with finer encoders and a stiffer spring, at the coarsest time step."""
-    data = Truth.load(ARTICLE).model_dump(by_alias=True)
-    data["substep_ms"] = 1.0
-    data["motor"]["encoder"].update(counts_per_turn=512_000, interpolation=1)
-    data["load"]["encoder"].update(counts_per_turn=28_800_000)
-    data["gear"].update(stiffness_nm_per_rad=32_000.0, damping_nm_s_per_rad=34.0)
-    if changes is not None:
-        changes(data)
-    return Truth.model_validate(data)
+    return truth_of(
+        substep_ms=1.0, motor__encoder__counts_per_turn=512_000, motor__encoder__interpolation=1,
+        load__encoder__counts_per_turn=28_800_000, gear__stiffness_nm_per_rad=32_000.0,
+        gear__damping_nm_s_per_rad=34.0,
+    )  # fmt: skip
 
 
 class Errors:
@@ -181,9 +177,7 @@ def test_a_hidden_cause_has_its_stated_size(cause: str) -> None:
     assert hidden.size_arcsec == pytest.approx(wanted, rel=0.05)
     here = bare()
     if hidden.brings:  # side effects are not to be measured
-        less = known.model_dump(by_alias=True)
-        less["gear"]["torque_growth_per_nm"] = 0.0
-        here = Errors(Truth.model_validate(less))
+        here = Errors(changed(known, gear__torque_growth_per_nm=0.0))
     measure, least, most = EXPECTED[cause]
     measured = measure(Errors(known), here)
     assert least * hidden.size_arcsec < measured < most * hidden.size_arcsec, hidden.text

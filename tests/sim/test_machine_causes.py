@@ -1,13 +1,12 @@
 """The causes in the simulated axis, each by its physics; the sizes are tested in test_hidden."""
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support.bare_axis import truth as truth_of
 from support.hidden.elastic import remembering
-from support.keys import with_keys
 
 from hdbridge.sim.encoder import Late, Signals
 from hdbridge.sim.exercise import Exercise
@@ -19,17 +18,17 @@ from hdbridge.sim.truth import Dahl, RollingFriction, Truth
 from hdbridge.sim.truth.encoder import TrueSignals
 from hdbridge.sim.truth.gear import TrueStiffening
 
-ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
 ARCSEC_PER_RAD = math.degrees(1.0) * 3600.0
 
 
 def axis(**changes: Any) -> Truth:
     """Returns the article's axis with a perfect gear and fine encoders; ``load__gravity`` sets its key."""
-    data = Truth.load(ARTICLE).model_dump(by_alias=True)
-    data["gear"].update(motor_orders=[], hysteresis=None)
-    data["motor"]["encoder"].update(counts_per_turn=512_000, interpolation=1)
-    data["load"]["encoder"].update(counts_per_turn=28_800_000, coupling=None)
-    return Truth.model_validate(with_keys(data, changes))
+    plain = {
+        "gear__motor_orders": [], "gear__hysteresis": None, "load__encoder__coupling": None,
+        "motor__encoder__counts_per_turn": 512_000, "motor__encoder__interpolation": 1,
+        "load__encoder__counts_per_turn": 28_800_000,
+    }  # fmt: skip
+    return truth_of(**(plain | changes))
 
 
 def mass(torque_nm: float = 20.0, down_deg: float = 0.0) -> dict[str, float]:
@@ -58,22 +57,6 @@ def error_arcsec(machine: Machine, ratio: float = 50.0) -> float:
 
 
 # Spring, load, friction
-
-
-@pytest.mark.parametrize("torque_nm", [1.0, 4.0, 6.5, 9.0, 17.0, -6.5, -17.0])
-def test_a_hanging_load_winds_the_spring_up_through_its_stages(torque_nm: float) -> None:
-    size = abs(torque_nm)
-    wind_up = (
-        min(size, 4.0) / 16_000 + max(0.0, min(size, 9.0) - 4.0) / 20_000 + max(0.0, size - 9.0) / 28_000
-    )
-    down_deg = math.copysign(90.0, torque_nm)  # the full weight acts when the load angle is zero
-    truth = axis(load__gravity=mass(size, down_deg), gear__stiffening=STAGES)
-    machine, exercise = moved(truth, 30.0)
-    exercise.move(-30.0, 300.0, 1000.0)
-    exercise.hold(1.0)
-    expected = math.copysign(wind_up, torque_nm) * ARCSEC_PER_RAD
-    assert error_arcsec(machine) == pytest.approx(expected, rel=0.002)
-    assert machine.load_torque_nm == pytest.approx(torque_nm, rel=1e-3)
 
 
 def test_the_stages_of_the_spring_join() -> None:
@@ -155,20 +138,6 @@ def test_drag_only_takes_energy_away() -> None:
     assert peaks[-1] < 0.1 * peaks[0]
 
 
-@pytest.mark.parametrize("speed_deg_s", [50.0, 200.0, 700.0])
-def test_viscous_drag_winds_up_by_its_thinned_torque(speed_deg_s: float) -> None:
-    thinning = {"speed_rad_s": 0.05, "exponent": 0.5}
-    truth = axis(load__viscous_nm_s_per_rad=8.0, load__thinning=thinning)
-    machine = Machine(truth, 1)
-    exercise = Exercise(machine)
-    exercise.move(speed_deg_s, speed_deg_s, 3000.0)
-    exercise.hold(0.3)
-    exercise.lead(lambda seconds: speed_deg_s * seconds, 1.0)
-    speed = math.radians(speed_deg_s / 50.0)
-    torque = 8.0 * speed / math.sqrt(1.0 + speed / 0.05)
-    assert error_arcsec(machine) == pytest.approx(-torque / 16_000 * ARCSEC_PER_RAD, rel=0.02)
-
-
 def test_friction_at_rest_holds_more_than_in_motion() -> None:
     held = {}
     for breakaway_nm in (0.5, 2.0):
@@ -207,7 +176,7 @@ def test_play_in_the_encoder_s_coupling_leaves_the_load_alone() -> None:
 
 
 def test_an_axis_with_nothing_on_its_load_moves_alike_in_both_plants() -> None:
-    truth = Truth.load(ARTICLE)
+    truth = truth_of()
     plants = (Plant(truth), LoadedPlant(truth))
     for step in range(3000):
         for plant in plants:

@@ -1,27 +1,20 @@
 """The mechanics of the simulated axis alone: spring, inertias, friction, coupling."""
 
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
+from support.bare_axis import truth as truth_of
 
 from hdbridge.sim.loaded_plant import LoadedPlant
 from hdbridge.sim.oscillator import exact_step
 from hdbridge.sim.plant import Plant
 from hdbridge.sim.truth import Truth
 
-ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
-
 
 def plain(**changes: Any) -> Truth:
     """The article's axis with a perfect gear, keys like ``motor__coulomb_nm`` changed."""
-    data = Truth.load(ARTICLE).model_dump(by_alias=True)
-    data["gear"].update(motor_orders=[], hysteresis=None)
-    for path, value in changes.items():
-        part, key = path.split("__")
-        data[part][key] = value
-    return Truth.model_validate(data)
+    return truth_of(**{"gear__motor_orders": [], "gear__hysteresis": None, **changes})
 
 
 def energy_j(plant: Plant, truth: Truth) -> float:

@@ -7,7 +7,6 @@ import atexit
 import re
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +17,7 @@ from pathlib import Path
 
 import can
 import pytest
+from support.command import started
 
 from hdbridge.axis import AxisConfig
 from hdbridge.clock import MonotonicClock
@@ -97,14 +97,10 @@ def may_configure(interface: str) -> Callable[..., None]:
 
 
 @contextmanager
-def drive_process(channel: str) -> Iterator[subprocess.Popen[bytes]]:
+def drive_process(channel: str) -> Iterator[subprocess.Popen[str]]:
     """``hdbridge simulate`` on the interface, ended on exit."""
-    command = [sys.executable, "-m", "hdbridge", "simulate", str(unhurried_profile())]
-    process = subprocess.Popen(
-        [*command, "--interface", "socketcan", "--channel", channel],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+    command = ("simulate", unhurried_profile(), "--interface", "socketcan", "--channel", channel)
+    process = started(Path.cwd(), *command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         yield process
     finally:
@@ -188,9 +184,9 @@ class Drives:
 
     def __init__(self) -> None:
         self._stack = ExitStack()
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: subprocess.Popen[str] | None = None
 
-    def running(self, channel: str) -> subprocess.Popen[bytes]:
+    def running(self, channel: str) -> subprocess.Popen[str]:
         if self._process is None or self._process.poll() is not None:
             self.end()
             self._process = self._stack.enter_context(drive_process(channel))
@@ -211,14 +207,14 @@ def drives() -> Iterator[Drives]:
 @pytest.fixture
 def simulated(
     interface: str, drives: Drives, request: pytest.FixtureRequest
-) -> Iterator[subprocess.Popen[bytes]]:
+) -> Iterator[subprocess.Popen[str]]:
     yield drives.running(interface)
     if "may_configure" in request.fixturenames:  # the interface has been taken away from it
         drives.end()
 
 
 @pytest.fixture
-def master(interface: str, simulated: subprocess.Popen[bytes]) -> Iterator[Master]:
+def master(interface: str, simulated: subprocess.Popen[str]) -> Iterator[Master]:
     """Provides a booted master on the interface; the simulated drive is at the other end."""
     with master_on(interface) as made:
         made.boot()

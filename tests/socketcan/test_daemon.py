@@ -3,15 +3,15 @@
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+from support.command import run_apart
 from support.daemon_bench import OURS, THEIRS, Cable, DaemonBench, DaemonRow, Witness, try_out
 from support.daemon_faults import DAEMON_ROWS
-from support.running import running
+from support.running import folders_in, running
 
 from hdbridge.axis import AxisConfig
 from tests.socketcan.conftest import unhurried_profile
@@ -85,11 +85,8 @@ def benches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Benches]:
 def test_a_borrowed_step_completes_and_the_axis_moves_again_when_enabled(benches: Benches) -> None:
     daemon = benches.bench().daemon
     command = ("step", unhurried_profile(), "--interface", "socketcan", "--channel", OURS, "--count", 3)
-    done = subprocess.run(
-        [sys.executable, "-m", "hdbridge", *map(str, command), "--scheme", "both", "--borrow", "--json", "-"],
-        env={**os.environ, "XDG_RUNTIME_DIR": str(daemon.folder), "XDG_STATE_HOME": str(daemon.folder)},
-        cwd=daemon.folder, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    options = ("--scheme", "both", "--borrow", "--json", "-")
+    done = run_apart(daemon.folder, *command, *options, env=folders_in(daemon.folder))
     assert done.returncode == 0, done.stderr
     assert len(json.loads(done.stdout)["both"]["steps"]["cw"]["error_arcsec"]) == 3
     daemon.until(

@@ -7,18 +7,20 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import yaml
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment, Motion, Start
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scatter, quantisation_floor_arcsec
 from hdbridge.control.bench import Bench
-from hdbridge.daemon.following.adaptation import Adaptation, Entry, Learned
+from hdbridge.daemon.following.adaptation import Adaptation, Entry, Learned, Proposal
 from hdbridge.daemon.following.follower import Follower
+from hdbridge.daemon.following.health import EncoderFault, EncoderStatus
 from hdbridge.daemon.following.measuring import DriftModel
+from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SampleArray, SampleFlag, sample_dtype
@@ -28,6 +30,7 @@ from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.record import Record
 from hdbridge.sim.truth import Truth
 from hdbridge.units import ARCSEC_PER_DEG
+from support.bare_axis import truth
 from support.exercised import booted
 
 ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
@@ -43,14 +46,12 @@ SPAN_DEG = 60.0
 
 def truth_of(duration_s: float = 3600.0, growth: float = 0.2, second_order_arcsec: float = 3.0) -> Truth:
     """Returns the article's axis with a growing hysteresis loop and second motor order, and encoder noise."""
-    data = yaml.safe_load((ARTICLE / "truth.yaml").read_text())
-    data["gear"]["ageing"] = {
+    ageing = {
         "duration_s": duration_s,
         "hysteresis_growth": growth,
         "motor_orders": [{"order": 2, "amplitude_arcsec": second_order_arcsec, "phase_deg": 20.0}],
     }
-    data["load"]["encoder"]["noise_arcsec"] = NOISE_ARCSEC
-    return Truth.model_validate(data)
+    return truth(gear__ageing=ageing, load__encoder__noise_arcsec=NOISE_ARCSEC)
 
 
 def work(
@@ -139,6 +140,47 @@ class History:
     def write(self, entries: Sequence[Entry], learned: Learned) -> None:
         self.entries += entries
         self.learned = learned
+
+
+QUICK = AdaptationSettings(mode="on", interval_s=2.0, rate_arcsec_per_hour=3600.0, half_life_turns=10.0)
+
+
+class WorkingAxis:
+    """A follower that adapts quickly, and the synthetic work that it has seen."""
+
+    def __init__(
+        self, files: History | AdaptationFiles, model: TransmissionModel = MODEL, **changes: Any
+    ) -> None:
+        self.settings = QUICK.model_copy(update=changes)
+        self.follower = Follower(AXIS, model, settings=self.settings)
+        self.follower.adapt(self.settings.mode, files)  # type: ignore[arg-type]
+        assert self.follower.adaptation is not None
+        self.adaptation = self.follower.adaptation
+        self.time_s = 0.0
+        self.proposals: list[Proposal] = []
+        self.used: list[tuple[float, np.ndarray]] = []
+        self.path = [0.0]
+
+    def works(
+        self, truth: TransmissionModel = MODEL, stands: int = 60, seed: int = 0, fault: str = "", **more: Any
+    ) -> None:
+        self.takes(*self.measures(truth, wandering(stands, seed), seed=seed, **more), fault)
+
+    def measures(
+        self, truth: TransmissionModel, targets: list[float], **more: Any
+    ) -> tuple[np.ndarray, np.ndarray]:
+        found = work(truth, targets, begun_s=self.time_s, before_deg=self.path[-8:], **more)
+        self.path += targets
+        return found
+
+    def takes(self, times: np.ndarray, samples: np.ndarray, fault: str = "") -> None:
+        status = EncoderStatus(EncoderFault.NOISY, fault) if fault else EncoderStatus()
+        for part in np.array_split(np.arange(len(times)), max(len(times) // 50, 1)):
+            proposal = self.follower.advance(packed(times[part], samples[part]), status).proposal
+            self.used.append((float(times[part][-1]), used_arcsec(self.adaptation)))
+            if proposal is not None:
+                self.proposals.append(proposal)
+        self.time_s = float(times[-1]) + PERIOD_S
 
 
 class Sampler:

@@ -8,7 +8,7 @@ import ruckig
 
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
-from support.keys import with_keys
+from support.keys import changed
 
 PROFILES = Path(__file__).parents[2] / "profiles"
 CYCLE_S = 0.004
@@ -18,8 +18,7 @@ STEP_COUNTS = 968
 
 def truth(profile: str = "article", **changes: Any) -> Truth:
     """Returns the truth of a profile's axis with changed values; keys are like ``gear__ratio``."""
-    data = Truth.load(PROFILES / profile).model_dump(by_alias=True)
-    return Truth.model_validate(with_keys(data, changes))
+    return changed(Truth.load(PROFILES / profile), **changes)
 
 
 def trajectory(distance_counts: int) -> list[int]:

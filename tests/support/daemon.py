@@ -131,6 +131,16 @@ class SteppedDaemon:
     def states(self) -> list[AxisState]:
         return [axis.state for axis in self.axes]
 
+    def motor_counts(self, axis: int = 0) -> int:
+        """Returns the true motor position."""
+        return self.nodes[axis].firmware.motion.machine.motor_counts
+
+    def sent(self) -> list[tuple[float, int, bytes]]:
+        """Returns a list of time, identifier and data of all frames that the loop sends from now on."""
+        frames: list[tuple[float, int, bytes]] = []
+        self.bus.spy = lambda can_id, data: frames.append((self.clock.now(), can_id, data))
+        return frames
+
     def reported(self, kind: EventKind, axis: int | None = None) -> list[Event]:
         return [each for each in self.events if each.kind is kind and axis in (None, each.axis)]
 
@@ -227,15 +237,16 @@ class SteppedDaemon:
         self.clock.sleep_until(self.clock.now() + duration_s)
 
 
+def article_axis(node_id: int, **drive: object) -> AxisConfig:
+    """Returns the article's axis with another node id, named ``axis1``, ...; ``drive`` has other changes."""
+    axis = AxisConfig.load(PROFILE)
+    changed = axis.drive.model_copy(update={"node_id": node_id, **drive})
+    return axis.model_copy(update={"drive": changed, "name": f"axis{node_id}"})
+
+
 def article_axes(count: int = 1) -> list[AxisConfig]:
     """Returns ``count`` axes of one kind on one bus: nodes 1, 2, ..."""
-    first = AxisConfig.load(PROFILE)
-    return [
-        first.model_copy(
-            update={"name": f"axis{node}", "drive": first.drive.model_copy(update={"node_id": node})}
-        )
-        for node in range(1, count + 1)
-    ]
+    return [article_axis(node_id) for node_id in range(1, count + 1)]
 
 
 def compensated(axis: AxisLoop, model: TransmissionModel) -> None:

@@ -3,7 +3,6 @@
 import shutil
 import struct
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ import can
 import pytest
 
 from hdbridge.drive.states import State, decode
+from support.command import started
 from support.reliability import DAEMON_VCAN, Seen, record
 from support.running import Daemon
 
@@ -43,11 +43,8 @@ class Cable:
             pytest.skip(f"no vxcan pair: {made.stderr.strip()}")
         for end in (THEIRS, OURS):
             self.up(end)
-        self._drive = subprocess.Popen(
-            [sys.executable, "-m", "hdbridge", "simulate", str(self._profile),
-             "--interface", "socketcan", "--channel", THEIRS],
-            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+        bus = ("--interface", "socketcan", "--channel", THEIRS)
+        self._drive = started(Path.cwd(), "simulate", self._profile, *bus, stdout=subprocess.DEVNULL)
         assert self._drive.stderr is not None
         assert "simulated drive: node" in self._drive.stderr.readline()
 

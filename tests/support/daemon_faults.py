@@ -3,8 +3,6 @@
 import os
 import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -13,8 +11,9 @@ from typing import Final
 import pytest
 
 from hdbridge.drive.supervision import Fault
+from support.command import run_apart
 from support.daemon_bench import EMERGENCY, OURS, SLOW_DEG_S, THEIRS, DaemonBench, DaemonRow
-from support.running import gone
+from support.running import folders_in, gone
 
 CAN_ERR_BUSOFF: Final = 0x40
 """Bus-off bit of an error frame's identifier (linux/can/error.h)."""
@@ -187,11 +186,7 @@ def _second_daemon(bench: DaemonBench) -> tuple[str, int, int]:
     daemon = bench.daemon
     other = daemon.folder / "other"
     other.mkdir(exist_ok=True)
-    done = subprocess.run(
-        [sys.executable, "-m", "hdbridge", "run", *map(str, daemon.arguments)],
-        env={**os.environ, "XDG_RUNTIME_DIR": str(other), "XDG_STATE_HOME": str(other)},
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = run_apart(daemon.folder, "run", *daemon.arguments, env=folders_in(other))
     assert done.returncode == 3, done.stderr
     assert "another hdbridge on this machine masters it" in done.stderr
     bench.goes_on(20)

@@ -67,11 +67,15 @@ class FakeAxis:
         self._bridge.lease.check(holder)
         self._bridge.moved.append((self.name, what, *given))
 
-    def _enabled(self) -> None:
+    def check(self, holder: str, *targets_deg: float) -> None:
+        """Refuses motion without the lease or power, or to targets outside the limits."""
+        self._bridge.lease.check(holder)
         if self.at is not messages.ControlState.ENABLED:
             raise RefusedError(f"axis '{self.name}' is {self.at.value}; enable it first")
+        for each in targets_deg:
+            self.check_within(each)
 
-    def _within(self, target_deg: float) -> None:
+    def check_within(self, target_deg: float) -> None:
         if not -180 <= target_deg <= 180:
             raise InputError(f"found {target_deg:g} deg; expected from -180 to 180 deg")
 
@@ -118,24 +122,18 @@ class FakeAxis:
         acceleration_deg_s2: float | None = None,
         wait: bool = True,
     ) -> None:
-        self._bridge.lease.check(holder)
-        self._enabled()
-        self._within(target_deg)
+        self.check(holder, target_deg)
         self._moved(holder, "move", target_deg, velocity_deg_s)
         if wait:
             await asyncio.sleep(self.moving_s)
         self.target_deg = target_deg
 
     async def jog(self, holder: str, velocity_deg_s: float, timeout_s: float = 0.5) -> None:
-        self._bridge.lease.check(holder)
-        self._enabled()
+        self.check(holder)
         self._moved(holder, "jog", velocity_deg_s, timeout_s)
 
     async def queue(self, holder: str, points: Sequence[messages.QueueItem]) -> None:
-        self._bridge.lease.check(holder)
-        self._enabled()
-        for each in points:
-            self._within(each.target_deg)
+        self.check(holder, *(each.target_deg for each in points))
         self._moved(holder, "queue", len(points))
         self.queued += points
 
@@ -144,8 +142,7 @@ class FakeAxis:
         self.queued.clear()
 
     async def stream(self, holder: str, timeout_s: float = 0.5) -> FakeStream:
-        self._bridge.lease.check(holder)
-        self._enabled()
+        self.check(holder)
         self._moved(holder, "stream", timeout_s)
         return FakeStream(self)
 
@@ -186,7 +183,7 @@ class FakeStream:
 
     async def put(self, points: Sequence[messages.StreamPoint]) -> None:
         for each in points:
-            self._axis._within(each.position_deg)
+            self._axis.check_within(each.position_deg)
             self.points.append(each)
 
     async def end(self) -> None:
@@ -250,10 +247,8 @@ class FakeBridge:
     async def coordinated(
         self, holder: str, moves: Mapping[str, float], speed: float = 1.0, wait: bool = True
     ) -> None:
-        self.lease.check(holder)
         for name, target_deg in moves.items():
-            self.axes[name]._enabled()
-            self.axes[name]._within(target_deg)
+            self.axes[name].check(holder, target_deg)
         for name, target_deg in moves.items():
             await self.axes[name].move(holder, target_deg, wait=wait)
 

@@ -58,7 +58,7 @@ class Plc:
         self.heartbeats: list[int] = []
         self.seen: list[tuple[float, int, int, int]] = []
         """Time of SYNC, statusword, position, and target sent before that SYNC, for each cycle."""
-        self._answers: list[bytes] = []
+        self.answers: list[bytes] = []
 
     # ---------------------------------------------------------------- a node of the virtual clock
 
@@ -79,7 +79,7 @@ class Plc:
             elif message.arbitration_id == 0x080 + self.node:
                 self.emergencies.append(struct.unpack_from("<H", data)[0])
             elif message.arbitration_id == 0x580 + self.node:
-                self._answers.append(data)
+                self.answers.append(data)
             elif message.arbitration_id == 0x700 + self.node:
                 self.heartbeats.append(data[0])
 
@@ -102,9 +102,6 @@ class Plc:
     def begin(self) -> None:
         self._next_s = self._clock.now() + self.period_s
         self.cycling = True
-
-    def take_answer(self) -> bytes | None:
-        return self._answers.pop(0) if self._answers else None
 
 
 class GatewayProcess:
@@ -166,18 +163,15 @@ class GatewayBench:
     async def sdo(self, request: bytes) -> bytes:
         plc = self.plc
         plc.listen()
-        plc._answers.clear()
+        plc.answers.clear()
         plc.send(0x600 + plc.node, request)
-        found: list[bytes] = []
 
         def answered() -> bool:
             plc.listen()
-            if (answer := plc.take_answer()) is not None:
-                found.append(answer)
-            return bool(found)
+            return bool(plc.answers)
 
         await self.until(answered, 1.0)
-        return found[0]
+        return plc.answers[0]
 
     async def write(self, index: int, sub: int, value: int, size: int) -> None:
         data = value.to_bytes(size, "little", signed=value < 0)

@@ -28,6 +28,7 @@ from hdbridge.motion.procedures.rehearsal import legs_of
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
+from support.bare_axis import truth
 from support.exercised import booted
 from support.hidden import Hidden, Run, hide_all
 
@@ -90,12 +91,11 @@ def axis_config(folder: Path, cycle_ms: int) -> AxisConfig:
 
 def bare_truth() -> Truth:
     """Returns the truth of the axis without hidden causes."""
-    data = Truth.load(DEMO).model_dump(by_alias=True)
-    data["substep_ms"] = 1.0
-    data["motor"]["encoder"].update(counts_per_turn=MOTOR_COUNTS, interpolation=16)
-    data["gear"].update(stiffness_nm_per_rad=45_000.0, damping_nm_s_per_rad=40.0)
-    data["servo"]["load_feedforward"]["frequency_hz"] = 65.0
-    return Truth.model_validate(data)
+    return truth(
+        "demo", substep_ms=1.0, motor__encoder__counts_per_turn=MOTOR_COUNTS,
+        motor__encoder__interpolation=16, gear__stiffness_nm_per_rad=45_000.0,
+        gear__damping_nm_s_per_rad=40.0, servo__load_feedforward__frequency_hz=65.0,
+    )  # fmt: skip
 
 
 def model_text(truth: Truth, rng: random.Random) -> str:

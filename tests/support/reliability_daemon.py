@@ -98,34 +98,29 @@ class DaemonBench:
     def states(self) -> list[AxisState]:
         return self.daemon.states
 
-    def motor_counts(self, axis: int = 0) -> int:
-        """Returns the true motor position."""
-        return self.daemon.nodes[axis].firmware.motion.machine.motor_counts
-
     def moves_on(self, axis: int) -> bool:
         """Returns True if an axis is still enabled and in motion."""
-        before = self.motor_counts(axis)
+        before = self.daemon.motor_counts(axis)
         self.daemon.run(0.1)
-        return self.states[axis] is AxisState.ENABLED and abs(self.motor_counts(axis) - before) > 500
+        return self.states[axis] is AxisState.ENABLED and abs(self.daemon.motor_counts(axis) - before) > 500
 
     def stay_stopped(self, *axes: int) -> None:
         """Checks that axes come to rest, then stay at rest without power, whatever the commands."""
         daemon, states = self.daemon, [*self.states]
-        sent: dict[int, list[int]] = {RPDO + 1 + axis: [] for axis in range(2)}
-        daemon.bus.spy = lambda can_id, data: sent[can_id].append(data[0]) if can_id in sent else None
+        sent = daemon.sent()
         daemon.run(SETTLED_S)
-        places = [self.motor_counts(axis) for axis in range(2)]
+        places = [self.daemon.motor_counts(axis) for axis in range(2)]
         for axis in axes:
             for kind in (CommandKind.MOVE, CommandKind.JOG, CommandKind.ENABLE, CommandKind.VERIFIED):
                 assert daemon.order(kind, axis).kind is EventKind.REFUSED
         daemon.run(0.3)
-        for axis in axes:
-            assert abs(self.motor_counts(axis) - places[axis]) <= 2
-            assert daemon.states[axis] is states[axis]
-            assert ENABLE_OPERATION not in sent[RPDO + 1 + axis]
-            if states[axis] is AxisState.LATCHED:
-                assert sent[RPDO + 1 + axis] == []
         daemon.bus.spy = None
+        for axis in axes:
+            words = [data[0] for _, can_id, data in sent if can_id == RPDO + 1 + axis]
+            assert abs(daemon.motor_counts(axis) - places[axis]) <= 2
+            assert daemon.states[axis] is states[axis]
+            assert ENABLE_OPERATION not in words
+            assert words == [] or states[axis] is not AxisState.LATCHED
 
     def mend(self) -> None:
         """Removes the faults."""
@@ -139,7 +134,7 @@ class DaemonBench:
     def leads_back(self) -> None:
         """Checks that each stopped axis is disabled after a reset, without motion, and moves once enabled."""
         stopped = [axis for axis, state in enumerate(self.states) if state is not AxisState.ENABLED]
-        places = [self.motor_counts(axis) for axis in range(2)]
+        places = [self.daemon.motor_counts(axis) for axis in range(2)]
 
         async def story() -> None:
             async with self.service.bridge() as bridge:
@@ -153,7 +148,7 @@ class DaemonBench:
                     await bridge.core.timing.sleep(0.2)
                     assert axis.state().state == "disabled"
                     await axis.enable(token)
-                    assert abs(self.motor_counts(place) - places[place]) <= 2
+                    assert abs(self.daemon.motor_counts(place) - places[place]) <= 2
                     await axis.motion.move(token, axis.state().load_target_deg + 1.0)
 
         play(story())

@@ -5,7 +5,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,39 +14,25 @@ from typing import Any
 import httpx
 
 from support import patience
+from support.command import started
 
 
-class Daemon:
-    """Running ``hdbridge run ...``, with its processes, its API and its log."""
+class Keeper:
+    """Keeper in a process of its own, with its log and its messages to the service manager."""
 
-    def __init__(self, folder: Path, arguments: Sequence[object], name: str) -> None:
-        """``folder`` contains the daemon's runtime folder and output; ``name`` is the machine's name."""
-        self.folder, self.arguments, self.name = folder, arguments, name
+    def __init__(self, folder: Path, start: Callable[[dict[str, str]], subprocess.Popen[str]]) -> None:
+        """``start`` starts the process with additions to its environment."""
         self.events: list[dict[str, Any]] = []
         """Events of all processes in the daemon's log."""
+        self.notifications: list[str] = []
+        """Messages that the keeper has sent to the service manager."""
         self._manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._manager.bind(str(folder / "notify"))
-        environment = {
-            **os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder),
-            "NOTIFY_SOCKET": str(folder / "notify"),
-        }  # fmt: skip
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "hdbridge", "run", *map(str, arguments)],
-            env=environment, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
-        )  # fmt: skip
-        self.notifications: list[str] = []
-        """Messages that the daemon has sent to the service manager."""
+        self.process = start({"NOTIFY_SOCKET": str(folder / "notify")})
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
-        self.socket = folder / "hdbridge" / f"{name}.sock"
-        self.client = httpx.Client(
-            transport=httpx.HTTPTransport(uds=str(self.socket), verify=False),  # loads no certificates
-            base_url="http://hdbridge/api/v1",
-            timeout=None,
-        )
-        self._lease: str | None = None
 
     def _listen(self) -> None:
         """Reads messages to the service manager immediately, because the kernel queues only ten."""
@@ -62,29 +47,71 @@ class Daemon:
             except ValueError:
                 self.events.append({"event": line.strip()})
 
-    # ------------------------------------------------------------------ output
+    def until(self, met: Callable[[], Any], what: str) -> Any:
+        """Polls ``met`` until it returns a true value, and returns that value."""
+        return patience.until(met, lambda: f"{what}: {self._last_words()}")
+
+    def _last_words(self) -> str:
+        shown = [each for each in self.events if each["event"] != "request"][-20:]
+        return "\n".join(json.dumps(each) for each in shown)
 
     def until_notified(self, line: str) -> None:
         """Waits until the service manager has received this message."""
         self.until(lambda: line in self.notifications, line)
 
+    def names(self) -> list[str]:
+        """Returns the names of the events in the daemon's log."""
+        return [str(event["event"]) for event in self.events]
+
+    def ended(self) -> int:
+        """Waits for the end of the keeper; returns its exit status."""
+        status = self.process.wait()
+        self._reader.join()
+        return status
+
+    def close(self) -> None:
+        """Ends the keeper if it still runs, and closes its log."""
+        self.process.kill()
+        self.ended()
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as own:
+            own.sendto(b"", self._manager.getsockname())
+        self._listener.join()
+        for each in (self._manager, self.process.stdout, self.process.stderr):
+            if each is not None:
+                each.close()
+
+
+class Daemon(Keeper):
+    """Running ``hdbridge run ...``, with its processes, its API and its log."""
+
+    def __init__(self, folder: Path, arguments: Sequence[object], name: str) -> None:
+        """``folder`` contains the daemon's runtime folder and output; ``name`` is the machine's name."""
+        self.folder, self.arguments, self.name = folder, arguments, name
+        super().__init__(folder, lambda environment: started(
+            folder, "run", *arguments, env={**folders_in(folder), **environment}, stdout=subprocess.DEVNULL,
+        ))  # fmt: skip
+        self.socket = folder / "hdbridge" / f"{name}.sock"
+        self.client = httpx.Client(
+            transport=httpx.HTTPTransport(uds=str(self.socket), verify=False),  # loads no certificates
+            base_url="http://hdbridge/api/v1",
+            timeout=None,
+        )
+        self._lease: str | None = None
+
+    # ------------------------------------------------------------------ output
+
     def until(self, met: Callable[[], Any], what: str) -> Any:
-        """Polls ``met`` until it returns a true value, and returns that value."""
+        """Polls ``met`` until it returns a true value, and returns that value; fails if the daemon ends."""
 
         def still() -> Any:
             if not (found := met()):
                 assert self.process.poll() is None, f"{what}: it ended: {self._last_words()}"
             return found
 
-        return patience.until(still, lambda: f"{what}: {self._last_words()}")
+        return super().until(still, what)
 
     def _last_words(self) -> str:
-        shown = [each for each in self.events if each["event"] != "request"][-20:]
-        return "\n".join(json.dumps(each) for each in (*shown, self.axis()))
-
-    def names(self) -> list[str]:
-        """Returns the names of the events in the daemon's log."""
-        return [str(event["event"]) for event in self.events]
+        return f"{super()._last_words()}\n{self.axis()}"
 
     def pids(self, which: str) -> list[int]:
         """Returns the process ids of the ``control`` or ``service`` processes, oldest first."""
@@ -160,12 +187,6 @@ class Daemon:
 
     # ------------------------------------------------------------------ end
 
-    def ended(self) -> int:
-        """Waits for the end of the keeper; returns its exit status."""
-        status = self.process.wait()
-        self._reader.join()
-        return status
-
     def close(self) -> None:
         """Ends the daemon and all its processes that still run."""
         if self.process.poll() is None:
@@ -174,18 +195,11 @@ class Daemon:
                 self.process.wait(patience.PATIENCE_S)
             except subprocess.TimeoutExpired:
                 self.process.kill()
-                self.process.wait()
         for pid in (*self.pids("control"), *self.pids("service")):
             for number in (signal.SIGCONT, signal.SIGKILL):
                 if _is_ours(pid):
                     os.kill(pid, number)
-        self._reader.join()
-        assert self.process.stderr is not None
-        self.process.stderr.close()
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as own:
-            own.sendto(b"", self._manager.getsockname())
-        self._listener.join()
-        self._manager.close()
+        super().close()
         self.client.close()
 
 
@@ -198,6 +212,11 @@ def running(folder: Path, *arguments: object, name: str) -> Iterator[Daemon]:
         yield daemon
     finally:
         daemon.close()
+
+
+def folders_in(folder: Path) -> dict[str, str]:
+    """Returns the environment variables of a daemon whose runtime folder and state are in ``folder``."""
+    return {"XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder)}
 
 
 def gone(pid: int) -> bool:

@@ -13,7 +13,10 @@ from typing import Any, TypeVar
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.machine import Axis, Machine
+from hdbridge.daemon.machinefile import AdaptationSettings
+from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.following import Following
 from hdbridge.files.profile import Profile
 from support.characters import FRIENDLY, Character
 from support.daemon import PROFILE, SteppedDaemon, stepped_daemon
@@ -71,13 +74,25 @@ class Service:
             yield bridge
 
     @asynccontextmanager
-    async def enabled(self, **options: Any) -> AsyncIterator[tuple[ServiceBridge, str]]:
-        """Provides a bridge whose axes are enabled, and the token of the lease."""
+    async def leased(self, **options: Any) -> AsyncIterator[tuple[ServiceBridge, ServiceAxis, str]]:
+        """Provides a bridge whose axes are verified, its first axis, and the token of the lease."""
         async with self.ready(**options) as bridge:
-            token = bridge.lease.take("test")
+            yield bridge, bridge.axes["axis1"], bridge.lease.take("test")
+
+    @asynccontextmanager
+    async def enabled(self, **options: Any) -> AsyncIterator[tuple[ServiceBridge, ServiceAxis, str]]:
+        """Provides the same as `leased`, with every axis enabled."""
+        async with self.leased(**options) as (bridge, first, token):
             for axis in bridge.axes.values():
                 await axis.enable(token)
-            yield bridge, token
+            yield bridge, first, token
+
+    def follow(self, bridge: ServiceBridge, settings: AdaptationSettings) -> Following:
+        """Adds watch and adaptation of the first axis, as in the service process, but in the same thread."""
+        axis = bridge.axes["axis1"]
+        axis.following = Following(0, axis, settings, self.folder / "adaptation", AtOnce())
+        bridge.core.observer.add(axis.following)
+        return axis.following
 
 
 async def until(bridge: ServiceBridge, done: Callable[[], bool], timeout_s: float = 20.0) -> None:

@@ -28,16 +28,16 @@ MODES = (0, 1, 1, 6, 7, 8, 8, 8, 3)
 
 
 class TimedStage(PowerStage):
-    """Power stage that takes some time to switch on and may fail."""
+    """Power stage that takes some periods to switch on and may fail."""
 
-    def __init__(self) -> None:
-        self.takes, self.left, self.wanted = 0, 0, False
+    def __init__(self, takes: int = 0) -> None:
+        self.takes, self.left, self.wanted = takes, 0, False
 
     def switch(self, on: bool) -> None:
         self.wanted, self.left = on, self.takes
 
     @property
-    def is_on(self) -> bool:
+    def is_on(self) -> bool:  # read at the command, then once per period
         self.left -= 1
         return self.wanted and self.left < 0
 

@@ -49,12 +49,3 @@ class SpoiltBus(Spoilt, LockstepBus):
     def __init__(self, channel: str, clock: VirtualClock) -> None:
         super().__init__(channel, clock)
         self.clock = clock
-
-
-class LoggingBus(SpoiltBus):
-    """Master's interface of a simulated bus, which logs the frames sent: time, identifier, data."""
-
-    def __init__(self, channel: str, clock: VirtualClock) -> None:
-        super().__init__(channel, clock)
-        self.sent: list[tuple[float, int, bytes]] = []
-        self.spy = lambda can_id, data: self.sent.append((clock.now(), can_id, data))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
+from support.bare_axis import truth
 from support.demo import TRUTH
 from support.exercised import record_of
 
@@ -47,13 +47,6 @@ def steps_and_a_sweep(bench: Exercise) -> None:
     bench.hold(0.5)
 
 
-def changed(**parts: dict[str, Any]) -> Truth:
-    data = TRUTH.model_dump(by_alias=True)
-    for name, values in parts.items():
-        data[name] |= values
-    return Truth.model_validate(data)
-
-
 def legs_of(record: Record) -> tuple[Segment, ...]:
     end = float(record.time_s[-1])
     return (
@@ -67,8 +60,8 @@ def measured() -> Record:
     return record_of(TRUTH, steps_and_a_sweep)
 
 
-def against(measured: Record, truth: Truth) -> Comparison:
-    return compare(measured, record_of(truth, steps_and_a_sweep, seed=1), legs_of(measured), N)
+def against(measured: Record, known: Truth) -> Comparison:
+    return compare(measured, record_of(known, steps_and_a_sweep, seed=1), legs_of(measured), N)
 
 
 def test_the_same_axis_differs_by_its_noise(measured: Record) -> None:
@@ -89,7 +82,7 @@ def test_the_same_axis_differs_by_its_noise(measured: Record) -> None:
 
 
 def test_more_friction_shows_in_the_torque(measured: Record) -> None:
-    comparison = against(measured, changed(motor={"coulomb_nm": 0.068}))
+    comparison = against(measured, truth("demo", motor__coulomb_nm=0.068))
     row = row_of(comparison, "motor_torque")
     # 0.034 Nm in motion, and the torque of the integral at rest.
     assert 0.015 < row.difference < 0.045
@@ -111,7 +104,7 @@ def test_temperature_is_compared_if_its_resolution_allows(measured: Record) -> N
 
 def test_a_softer_spring_settles_later_and_beyond(measured: Record) -> None:
     comparison = against(
-        measured, changed(gear={"stiffness_nm_per_rad": 7000.0, "damping_nm_s_per_rad": 6.0})
+        measured, truth("demo", gear__stiffness_nm_per_rad=7000.0, gear__damping_nm_s_per_rad=6.0)
     )
     for name in ("settling_time", "overshoot"):
         row = row_of(comparison, name)

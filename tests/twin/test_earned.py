@@ -11,6 +11,7 @@ import pytest
 from support.demo import AXIS as DEMO
 from support.demo import TRUTH
 from support.exercised import booted
+from support.keys import changed
 
 from hdbridge.control.bench import Bench
 from hdbridge.motion.procedures.stepping import Stepping
@@ -68,15 +69,13 @@ def with_coupling(hz: float | None) -> Truth:
 
 def with_growth(per_k: float) -> Truth:
     """Returns the demo axis with a friction that changes with the temperature."""
-    heat = {"reference_c": 22.0, "friction_growth_per_k": per_k}
-    return TRUTH.model_copy(update={"temperature": TRUTH.temperature.model_copy(update=heat)})
+    return changed(TRUTH, temperature__reference_c=22.0, temperature__friction_growth_per_k=per_k)
 
 
 def warm_and_cold(truth: Truth) -> Recording:
     parts = []
     for warm_c in (22.0, 37.0):
-        heat = truth.temperature.model_copy(update={"start_c": warm_c})
-        part = recorded(truth.model_copy(update={"temperature": heat}))
+        part = recorded(changed(truth, temperature__start_c=warm_c))
         reported_c = np.full(len(part.record), warm_c)
         parts.append(replace(part, record=Record({**part.record.columns, "temperature_c": reported_c})))
     return Recording.joined(parts)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from support.command import run_here
+from support.keys import changed
 
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.axis.model import store
@@ -31,10 +32,8 @@ def profile(tmp_path: Path) -> Path:
 
 
 def twin_of(profile: Path, coulomb_nm: float = 0.05) -> TwinFile:
-    truth = Truth.load(profile)
-    motor = truth.motor.model_copy(update={"coulomb_nm": coulomb_nm})
     intervals = {"motor.coulomb_nm": (0.9 * coulomb_nm, 1.1 * coulomb_nm)}
-    return TwinFile(truth.model_copy(update={"motor": motor, "intervals": intervals}))
+    return TwinFile(changed(Truth.load(profile), motor__coulomb_nm=coulomb_nm, intervals=intervals))
 
 
 def test_a_twin_is_pending_until_it_is_committed_and_activations_are_undone(profile: Path) -> None:
@@ -85,9 +84,8 @@ def test_a_twin_of_another_drive_or_gear_is_refused(profile: Path) -> None:
 
 
 def test_the_simulated_drive_uses_an_existing_twin(profile: Path) -> None:
-    data = Truth.load(profile).model_dump(by_alias=True)
-    data["motor"]["encoder"]["counts_per_turn"] = 4000
-    (profile / "twin.yaml").write_text(TwinFile(Truth.model_validate(data)).dump())
+    coarse = changed(Truth.load(profile), motor__encoder__counts_per_turn=4000)
+    (profile / "twin.yaml").write_text(TwinFile(coarse).dump())
     axis = AxisConfig.load(profile)
     with simulated(axis) as drive, pytest.raises(Exception, match="4000"):
         drive.boot()

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.demo import AXIS, DEMO, TRUTH
 from support.exercised import booted, moved, record_of
+from support.keys import changed
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import ChannelSource, Temperature
@@ -78,8 +79,7 @@ def test_the_replay_on_the_true_axis_is_its_recording_over_frames(
 def test_a_replay_begins_where_the_recording_does_and_shows_what_the_drive_is() -> None:
     axis, truth = demo()
     recording = benched(axis, truth, Stepping(2, start_deg=3.0))
-    slower = truth.servo.model_copy(update={"dead_time_ms": 2.0})
-    late = replay(recording, axis, truth.model_copy(update={"servo": slower}))
+    late = replay(recording, axis, changed(truth, servo__dead_time_ms=2.0))
     same = replay(recording, axis, truth)
     record = recording.record
     assert np.array_equal(same.motor_position_deg[0], record.motor_position_deg[0])
@@ -116,11 +116,8 @@ def test_a_part_begins_as_warm_as_it_was_recorded() -> None:
     """The axis is 20 K warmer at the second part, and its friction falls by a hundredth per kelvin."""
     axis, truth = demo()
     axis = axis.model_copy(update={"temperature": Temperature(source=SENSOR, celsius_per_count=0.1)})
-    heat = truth.temperature.model_copy(update={"friction_growth_per_k": -0.01, "reference_c": 22.0})
-    plants = [
-        truth.model_copy(update={"temperature": heat.model_copy(update={"start_c": warm_c})})
-        for warm_c in (22.0, 42.0)
-    ]
+    heat = {"temperature__friction_growth_per_k": -0.01, "temperature__reference_c": 22.0}
+    plants = [changed(truth, temperature__start_c=warm_c, **heat) for warm_c in (22.0, 42.0)]
     joined = Recording.joined([benched(axis, each, Stepping(2, start_deg=0.0)) for each in plants])
     again = replay(joined, axis, plants[0])
     apart = {
@@ -151,8 +148,7 @@ def test_a_dead_time_delays_torque_and_motion_alike() -> None:
     axis, truth = demo()
     seen = {}
     for dead_ms in (0.0, 2.0):
-        servo = truth.servo.model_copy(update={"dead_time_ms": dead_ms})
-        machine = Machine(truth.model_copy(update={"servo": servo}), 0)
+        machine = Machine(changed(truth, servo__dead_time_ms=dead_ms), 0)
         path = MoveTo(5.0).path(0.0, axis_view(axis).limits)
         demand, rows = 0.0, []
         for number in range(600):
@@ -323,10 +319,9 @@ def test_a_resting_motor_reports_torque_repeatedly(creeps_deg: float, count: int
 def test_a_standing_motor_is_held_by_its_recorded_torque_in_the_replay_that_judges_a_twin() -> None:
     """Soft loops that have not settled would wind up, and begin the next motion with a different torque."""
     rests = record_of(TRUTH, moved((40.0, 300.0, 3000.0, 1.0), (9.0, 90.0, 900.0, 0.0)))
-    servo = TRUTH.servo.model_copy(
-        update={"position_gain_per_s": 8.0, "integral_of": "position", "integral_time_ms": 45.0}
+    soft = changed(
+        TRUTH, servo__position_gain_per_s=8.0, servo__integral_of="position", servo__integral_time_ms=45.0
     )
-    soft = TRUTH.model_copy(update={"servo": servo})
     again = replay(Recording(rests, axis="demo", ratio=50.0), AXIS, soft)
     *_, held = standing(rests, COUNT_DEG)
     off_nm = (again.columns["motor_torque_nm"] - rests.columns["motor_torque_nm"])[held]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.demo import AXIS, TRUTH
+from support.keys import changed
 
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
@@ -116,8 +117,7 @@ def test_without_temperature_the_truth_is_unchanged() -> None:
 
 def test_warmth_dependent_terms_keep_their_reference() -> None:
     """The reference remains the former ambient temperature if a new one is fitted."""
-    grows = TRUTH.temperature.model_copy(update={"friction_growth_per_k": -0.01})
-    start = TRUTH.model_copy(update={"temperature": grows})
+    start = changed(TRUTH, temperature__friction_growth_per_k=-0.01)
     heat = HEATS[0].model_copy(update={"friction_growth_per_k": -0.01, "reference_c": 22.0})
     recording = warmed(heat, 3, 8.0)
     after, _ = with_warmth(recording, AXIS, fitted(recording), start)

@@ -14,6 +14,7 @@ from support.demo import AXIS as DEMO
 from support.demo import TRUTH
 from support.effect_examples import EXAMPLES
 from support.exercised import moved, record_of
+from support.keys import changed
 
 from hdbridge.axis import AxisConfig, effects
 from hdbridge.axis.model import TransmissionModel
@@ -81,14 +82,12 @@ def warming(truth: Truth) -> Truth:
     warmer.
     """
     heat = {"ambient_k_per_hour": 3600.0, "time_constant_s": 0.5, "start_c": 25.0}
-    return truth.model_copy(update={"temperature": truth.temperature.model_copy(update=heat)})
+    return changed(truth, **{f"temperature__{key}": value for key, value in heat.items()})
 
 
 def hanging(truth: Truth) -> Truth:
     """Returns a truth with a mass that causes up to 5.9 Nm on the axis."""
-    data = truth.model_dump(by_alias=True)
-    data["load"]["gravity"] = {"mass_kg": 3.0, "arm_m": 0.2, "down_deg": -60.0}
-    return Truth.model_validate(data)
+    return changed(truth, load__gravity={"mass_kg": 3.0, "arm_m": 0.2, "down_deg": -60.0})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -288,8 +288,6 @@ def test_an_axis_is_learned_and_a_later_change_of_it_is_named(profile: Path) -> 
     run_here(profile, "model", "commit", profile, "--twin")
     same = run_here(profile, "twin", profile, recording, "--check")
     assert same.stdout.startswith("Nothing has changed since the twin was made")
-    stiffer = TRUTH.model_dump(by_alias=True)
-    stiffer["motor"]["coulomb_nm"] = 0.068
-    later = trips(Truth.model_validate(stiffer), profile / "later")
+    later = trips(with_values(TRUTH, {"Coulomb friction": 0.068}), profile / "later")
     changed = run_here(profile, "twin", profile, later, "--check")
     assert "friction" in changed.stdout

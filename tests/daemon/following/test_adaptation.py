@@ -6,49 +6,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.adapting import AXIS, MODEL, PERIOD_S, History, packed, used_arcsec, wandering, work, worn
+from support.adapting import AXIS, MODEL, PERIOD_S, History, WorkingAxis, used_arcsec, wandering, work, worn
 
-from hdbridge.daemon.following.follower import Follower
-from hdbridge.daemon.following.health import EncoderFault, EncoderStatus
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import SampleFlag
 
-QUICK = AdaptationSettings(mode="on", interval_s=2.0, rate_arcsec_per_hour=3600.0, half_life_turns=10.0)
 OFFSET, SECOND = 12, 2
 """Indices of the offset and the second order's cosine among the followed parameters."""
 
 
-class Axis:
+class Axis(WorkingAxis):
     """An adaptation and the work that it has seen."""
 
     def __init__(self, files: History | None = None, **changes: Any) -> None:
         self.files = files or History()
-        self.settings = QUICK.model_copy(update=changes)
-        self.follower = Follower(AXIS, MODEL, settings=self.settings)
-        self.follower.adapt(self.settings.mode, self.files)
-        self.adaptation = self.follower.adaptation
-        self.time_s = 0.0
-        self.proposals: list[Any] = []
-        self.used: list[tuple[float, np.ndarray]] = []
-        self.path = [0.0]
-
-    def works(self, truth=MODEL, stands: int = 60, seed: int = 0, fault: str = "", **more: Any) -> None:
-        self.takes(*self.measures(truth, wandering(stands, seed), seed=seed, **more), fault)
-
-    def measures(self, truth, targets: list[float], **more: Any) -> tuple[np.ndarray, np.ndarray]:
-        found = work(truth, targets, begun_s=self.time_s, before_deg=self.path[-8:], **more)
-        self.path += targets
-        return found
-
-    def takes(self, times: np.ndarray, samples: np.ndarray, fault: str = "") -> None:
-        status = EncoderStatus(EncoderFault.NOISY, fault) if fault else EncoderStatus()
-        for part in np.array_split(np.arange(len(times)), max(len(times) // 50, 1)):
-            proposal = self.follower.advance(packed(times[part], samples[part]), status).proposal
-            self.used.append((float(times[part][-1]), used_arcsec(self.adaptation)))
-            if proposal is not None:
-                self.proposals.append(proposal)
-        self.time_s = float(times[-1]) + PERIOD_S
+        super().__init__(self.files, **changes)
 
     @property
     def frozen(self) -> str:

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.daemon import stepped_daemon
+from support.keys import changed
 from support.raised import measured_response, raised_profile
 
 from hdbridge import AxisConfig, TransmissionModel
@@ -44,8 +45,7 @@ def seen(profile: Path, mode: Mode = "on", stuck: bool = False, **servo: float) 
     """Returns verdicts and proposals over moves in both directions, with these servo parameters."""
     axis = AxisConfig.load(profile)
     model = replace(TransmissionModel.load(profile / "model.yaml"), response=measured_response(profile))
-    truth = Truth.load(profile / "truth.yaml")
-    truth = truth.model_copy(update={"servo": truth.servo.model_copy(update=servo)})
+    truth = changed(Truth.load(profile / "truth.yaml"), **{f"servo__{key}": servo[key] for key in servo})
     verdicts: list[Verdict] = []
     proposals: list[Proposal] = []
     with stepped_daemon([axis], model=model, truth=truth) as daemon:

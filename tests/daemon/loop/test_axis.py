@@ -27,12 +27,9 @@ def record(daemon: SteppedDaemon, axis: int = 0) -> np.ndarray:
 def rpdos(daemon: SteppedDaemon, node: int = 1) -> list[tuple[int, int]]:
     """Controlwords and targets that are sent from now on."""
     found: list[tuple[int, int]] = []
-
-    def spy(can_id: int, data: bytes) -> None:
-        if can_id == 0x200 + node:
-            found.append(struct.unpack("<Hi", data))
-
-    daemon.bus.spy = spy
+    daemon.bus.spy = lambda can_id, data: (
+        found.append(struct.unpack("<Hi", data)) if can_id == 0x200 + node else None
+    )
     return found
 
 
@@ -53,7 +50,7 @@ def test_a_verified_axis_is_idle_at_its_position(daemon: SteppedDaemon) -> None:
     sent = rpdos(daemon)
     daemon.run(0.2)
     assert daemon.states == [S.DISABLED]
-    place = daemon.nodes[0].firmware.motion.machine.motor_counts
+    place = daemon.motor_counts()
     assert all(word == 0 and abs(target - place) <= 2 for word, target in sent)
     assert len(sent) == 50
 
@@ -272,19 +269,13 @@ def test_the_compensation_may_begin_switched_off() -> None:
 
 
 def test_a_new_loop_ignores_earlier_commands(enabled: SteppedDaemon) -> None:
-    from hdbridge.daemon.loop.controller import Controller
-
     enabled.post(K.ENABLE)
     enabled.memory.knots[0].put([Knot(1, 0.0, 0.0, 0.0)])
-    cycle = enabled.controller.cycle
-    for axis in cycle.axes:
-        cycle.leave(axis)
-    again = Controller(cycle, [(axis.config, None) for axis in enabled.axes], enabled.memory)
+    enabled.begin_again()
     assert len(enabled.memory.commands) == 0
     assert len(enabled.memory.knots[0]) == 0
-    for _ in range(50):
-        again.turn()
-    assert [axis.state for axis in again.axes] == [S.UNVERIFIED]
+    enabled.run(0.2)
+    assert enabled.states == [S.UNVERIFIED]
 
 
 def test_the_load_loop_removes_the_remaining_error_and_fades_out() -> None:

@@ -1,7 +1,7 @@
 """The first SYNC of a new loop, or after the bus was down, activates no buffered set-point."""
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
@@ -35,51 +35,45 @@ def moving(character: Character) -> Iterator[tuple[SteppedDaemon, list[PowerCoun
         yield daemon, [PowerCount(node) for node in daemon.nodes]
 
 
-def places(daemon: SteppedDaemon) -> list[int]:
-    return [node.firmware.motion.machine.motor_counts for node in daemon.nodes]
+def started_again(daemon: SteppedDaemon, away_s: float) -> None:
+    daemon.hang(away_s)
+    daemon.begin_again()
 
 
-def stays_without_power(daemon: SteppedDaemon, counts: list[PowerCount]) -> None:
-    daemon.run(0.8)
-    before = places(daemon)
-    daemon.run(0.4)
-    assert [each.times for each in counts] == [0, 0], "power without a request"
-    assert all(abs(now - then) <= 2 for now, then in zip(places(daemon), before, strict=True))
+def bus_down(daemon: SteppedDaemon, away_s: float) -> None:
+    daemon.bus.down = errno.ENETDOWN
+    daemon.run(0.004 + away_s)
+    daemon.bus.down = None
+
+
+def hung(daemon: SteppedDaemon, away_s: float) -> None:
+    daemon.hang(0.012 + away_s)
 
 
 @every_drive
+@pytest.mark.parametrize(
+    ("happens", "states"),
+    [
+        (started_again, {AxisState.UNVERIFIED}),
+        (bus_down, {AxisState.LATCHED}),
+        (hung, {*AxisState} - {AxisState.ENABLED, AxisState.ENABLING}),
+    ],
+)
 @settings(max_examples=3)
 @given(RUNNING_S, AWAY_S)
-def test_after_another_start_of_the_control_process(
-    character: Character, running_s: float, away_s: float
+def test_no_drive_gets_power_without_a_request(
+    character: Character,
+    happens: Callable[[SteppedDaemon, float], None],
+    states: set[AxisState],
+    running_s: float,
+    away_s: float,
 ) -> None:
     with moving(character) as (daemon, counts):
         daemon.run(running_s)
-        daemon.hang(away_s)
-        daemon.begin_again()
-        stays_without_power(daemon, counts)
-        assert daemon.states == [AxisState.UNVERIFIED] * 2
-
-
-@every_drive
-@settings(max_examples=3)
-@given(RUNNING_S, AWAY_S)
-def test_after_the_bus_was_down(character: Character, running_s: float, away_s: float) -> None:
-    with moving(character) as (daemon, counts):
-        daemon.run(running_s)
-        daemon.bus.down = errno.ENETDOWN
-        daemon.run(0.004 + away_s)
-        daemon.bus.down = None
-        stays_without_power(daemon, counts)
-        assert daemon.states == [AxisState.LATCHED] * 2
-
-
-@every_drive
-@settings(max_examples=3)
-@given(RUNNING_S, st.floats(0.012, 1.0))
-def test_after_the_control_process_hung(character: Character, running_s: float, away_s: float) -> None:
-    with moving(character) as (daemon, counts):
-        daemon.run(running_s)
-        daemon.hang(away_s)
-        stays_without_power(daemon, counts)
-        assert not {AxisState.ENABLED, AxisState.ENABLING} & set(daemon.states)
+        happens(daemon, away_s)
+        daemon.run(0.8)
+        before = [daemon.motor_counts(axis) for axis in range(2)]
+        daemon.run(0.4)
+        assert [each.times for each in counts] == [0, 0], "power without a request"
+        assert all(abs(daemon.motor_counts(axis) - before[axis]) <= 2 for axis in range(2))
+        assert {*daemon.states} <= states

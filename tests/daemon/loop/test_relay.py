@@ -5,7 +5,6 @@ from support.daemon import SteppedDaemon
 
 from hdbridge.daemon.loop.relay import incoming_ids, refusal_reason
 from hdbridge.daemon.loop.states import MAY_MOVE, AxisState
-from hdbridge.daemon.memory import RelayedFrame
 
 UPLOAD, DOWNLOAD = bytes([0x40, 0x64, 0x60, 0, 0, 0, 0, 0]), bytes([0x2B, 0x40, 0x60, 0, 0x0F, 0, 0, 0])
 READS = [UPLOAD, bytes([0x60, *bytes(7)]), bytes([0x80, *bytes(7)]), bytes([0xA0, *bytes(7)])]
@@ -67,13 +66,3 @@ def test_objects_can_be_read_in_motion_and_cost_no_cycle(enabled: SteppedDaemon)
     assert len(samples) > 1
     assert (samples["axes"]["flags"] & 1).all()
     assert not enabled.ended(id_)
-
-
-def test_at_most_one_frame_per_turn(daemon: SteppedDaemon) -> None:
-    sent: list[int] = []
-    daemon.bus.spy = lambda can_id, _: sent.append(can_id)
-    for _ in range(10):
-        daemon.memory.outgoing.add(RelayedFrame(0, 0x601, UPLOAD))
-    for count in range(1, 11):
-        daemon.turn()
-        assert sent.count(0x601) == count

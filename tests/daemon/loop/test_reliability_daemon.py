@@ -100,8 +100,7 @@ def test_a_motor_that_does_not_follow(bench: DaemonBench) -> None:
 
 def test_a_different_drive_gets_no_set_points(bench: DaemonBench) -> None:
     daemon = bench.daemon
-    sent: list[int] = []
-    daemon.bus.spy = lambda can_id, data: sent.append(can_id) if can_id == RPDO + 1 else None
+    sent = daemon.sent()
     dictionary = bench.node.dictionary
     others = (((0x1018, 1), 1), ((0x1018, 2), 0x403), ((0x608F, 1), 8001), ((0x6091, 1), 100))
     for (index, sub), wrong in others:
@@ -114,7 +113,7 @@ def test_a_different_drive_gets_no_set_points(bench: DaemonBench) -> None:
         assert "verified first" in refused.text
     daemon.run(0.2)
     assert daemon.states == [S.UNVERIFIED] * 2
-    assert sent == []
+    assert RPDO + 1 not in {can_id for _, can_id, _ in sent}
     further("another drive identity, encoder or gear").show(0)
 
 
@@ -141,17 +140,16 @@ def test_the_service_verifies_drives_when_the_bus_returns(bench: DaemonBench) ->
 
 def test_a_step_beyond_the_limits_is_not_sent(moving: DaemonBench) -> None:
     axis = moving.daemon.axes[0]
-    sent: list[int] = []
-    moving.daemon.bus.spy = lambda can_id, data: (
-        sent.append(struct.unpack_from("<i", data, 2)[0]) if can_id == RPDO + 1 else None
-    )
+    sent = moving.daemon.sent()
     wrong = axis.image.target_counts + 20_000
     moving.bad_target(wrong)
     turns = turns_until(moving, S.QUICK_STOPPED)
     assert axis.supervision.stop is not None
     assert axis.supervision.stop.fault is Fault.BAD_TARGET
+    targets = [struct.unpack("<Hi", data)[1] for _, can_id, data in sent if can_id == RPDO + 1]
+    assert targets
+    assert all(abs(each - wrong) > 5_000 for each in targets)
     moving.stay_stopped(0)
-    assert all(abs(each - wrong) > 5_000 for each in sent)
     assert moving.moves_on(1)
     further("a model asks for a step beyond the limits of speed and slew").show(turns)
     moving.leads_back()
@@ -211,14 +209,13 @@ def test_a_mailbox_full_of_nonsense_is_refused(moving: DaemonBench) -> None:
 def test_the_service_cannot_write_restart_or_command_a_moving_drive(moving: DaemonBench) -> None:
     daemon = moving.daemon
     frames = [(0x601, b"\x2b\x40\x60\x00\x06\x00\0\0"), (0x000, b"\x81\x01"), (0x201, bytes(6)), (0x080, b"")]
-    sent: list[tuple[int, bytes]] = []
-    daemon.bus.spy = lambda can_id, data: sent.append((can_id, data))
+    sent = daemon.sent()
     for can_id, data in frames:
         daemon.memory.outgoing.add(RelayedFrame(0, can_id, data))
     daemon.run(0.1)
-    passed = set(frames[:3]) & set(sent)
+    passed = set(frames[:3]) & {frame[1:] for frame in sent}
     assert not passed
-    assert sum(1 for can_id, _ in sent if can_id == 0x080) == 25  # exactly one SYNC per cycle
+    assert sum(1 for _, can_id, _ in sent if can_id == 0x080) == 25  # exactly one SYNC per cycle
     assert daemon.reported(E.REFUSED)
     assert moving.moves_on(0)
     further("an SDO write, an NMT reset, a set-point from the service in motion").show(len(passed))
@@ -228,18 +225,16 @@ def test_a_stale_position_at_enable_moves_nothing(bench: DaemonBench) -> None:
     daemon = bench.daemon
     daemon.verify()
     seeds = daemon.prepare()
-    before = bench.motor_counts()
-    targets: list[tuple[int, int]] = []
-    daemon.bus.spy = lambda can_id, data: (
-        targets.append(struct.unpack("<Hi", data)) if can_id == RPDO + 1 else None
-    )
+    before = bench.daemon.motor_counts()
+    sent = daemon.sent()
     daemon.done(K.ENABLE, 0, **{**seeds, "i": seeds["i"] + 3_000})
     daemon.run(0.5)
-    enabled = [target for word, target in targets if word & 0x0F == ENABLE_OPERATION]
+    rpdos = [struct.unpack("<Hi", data) for _, can_id, data in sent if can_id == RPDO + 1]
+    enabled = [target for word, target in rpdos if word & 0x0F == ENABLE_OPERATION]
     assert enabled
     assert abs(enabled[0] - before) <= 1
     # Any remaining motion is due to the compensation, which is faded in.
-    assert abs(bench.motor_counts() - before) < 20
+    assert abs(bench.daemon.motor_counts() - before) < 20
     further("the position in the enable command is stale").show(0)
 
 
@@ -255,20 +250,19 @@ def test_drives_stop_when_the_control_process_is_killed(bench: DaemonBench) -> N
         daemon.hang(daemon.period_s)
         cycles += 1
     daemon.hang(1.0)
-    places = [bench.motor_counts(axis) for axis in range(2)]
-    sent: list[int] = []
-    daemon.bus.spy = lambda can_id, data: sent.append(can_id) if can_id in (RPDO + 1, RPDO + 2) else None
+    places = [bench.daemon.motor_counts(axis) for axis in range(2)]
+    sent = daemon.sent()
     daemon.begin_again()
     daemon.turn()
     assert daemon.states == [S.UNVERIFIED] * 2
     further("the control process restarts").show(1)
     daemon.run(0.5)
-    assert sent == []
+    assert not {RPDO + 1, RPDO + 2} & {can_id for _, can_id, _ in sent}
     for axis in range(2):
         daemon.verify(axis)
     daemon.run(0.5)
     assert daemon.states == [S.DISABLED] * 2
-    assert [bench.motor_counts(axis) for axis in range(2)] == pytest.approx(places, abs=2)
+    assert [bench.daemon.motor_counts(axis) for axis in range(2)] == pytest.approx(places, abs=2)
     further("the control process is killed in motion").show(cycles)
 
 

@@ -4,14 +4,13 @@ import os
 import signal
 import stat
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import httpx
 import pytest
-from support.command import run_here
-from support.running import gone, running
+from support.command import run_apart, run_here
+from support.running import folders_in, gone, running
 
 TRUTH = Path(__file__).parents[3] / "profiles" / "article" / "truth.yaml"
 
@@ -27,7 +26,7 @@ def test_a_whole_daemon_session(tmp_path: Path) -> None:
         assert state["simulated"]
         assert stat.S_IMODE(daemon.socket.stat().st_mode) == 0o660
         assert stat.S_IMODE(daemon.socket.parent.stat().st_mode) == 0o700
-        second = run_to_its_end(tmp_path, "article", "--simulate")
+        second = run_to_its_end(tmp_path, "run", "article", "--simulate")
         assert second.returncode == 7
         keeper = daemon.process.pid
         assert f"another daemon listens there (process {keeper} of " in second.stderr
@@ -51,7 +50,7 @@ def test_a_whole_daemon_session(tmp_path: Path) -> None:
         (control,), (service,) = daemon.pids("control"), daemon.pids("service")
 
         os.kill(service, signal.SIGSTOP)
-        stop = run_to_its_end(tmp_path, "stop", command="ctl")
+        stop = run_to_its_end(tmp_path, "ctl", "stop")
         os.kill(service, signal.SIGCONT)
         assert stop.returncode == 7
         assert f"the daemon is process {daemon.process.pid} of " in stop.stderr
@@ -129,15 +128,11 @@ def test_invalid_arguments_are_refused(
             monkeypatch.setenv(each, str(tmp_path))
         done = run_here(tmp_path, "run", *arguments)
     else:
-        done = run_to_its_end(tmp_path, *arguments)
+        done = run_to_its_end(tmp_path, "run", *arguments)
     assert done.returncode == status, done.stderr
     assert said in done.stderr
     assert not list(tmp_path.glob("hdbridge/*.sock"))
 
 
-def run_to_its_end(folder: Path, *arguments: str, command: str = "run") -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "hdbridge", command, *arguments],
-        env={**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder)}, cwd=folder,
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+def run_to_its_end(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return run_apart(folder, *arguments, env=folders_in(folder))

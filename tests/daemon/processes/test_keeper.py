@@ -1,63 +1,39 @@
 """The keeper with stand-ins for its children: dead, hanging and ending processes."""
 
-import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from support.patience import until
-from support.running import gone
+from support.running import Keeper, gone
 
 PROGRAM = Path(__file__).with_name("standin_keeper.py")
 
 
-class Kept:
-    """Keeper in a process of its own, with its output and that of its children."""
+class Kept(Keeper):
+    """Keeper with stand-ins for its children, and their output."""
 
     def __init__(self, folder: Path, **environment: str) -> None:
-        self.manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.manager.bind(str(folder / "notify"))
-        passed = {
-            "NOTIFY_SOCKET": str(folder / "notify"), "WATCHDOG_USEC": "1000000",
-            "HDBRIDGE_TEST_LOCKS": str(folder), **environment,
-        }  # fmt: skip
-        self.process = subprocess.Popen(
-            [sys.executable, str(PROGRAM)], env={**os.environ, **passed},
+        passed = {"WATCHDOG_USEC": "1000000", "HDBRIDGE_TEST_LOCKS": str(folder), **environment}
+        super().__init__(folder, lambda notify: subprocess.Popen(
+            [sys.executable, str(PROGRAM)], env={**os.environ, **passed, **notify},
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+        ))  # fmt: skip
         self.said: list[str] = []
-        self.events: list[dict[str, object]] = []
-        self.notifications: list[str] = []
-        self._readers = [
-            threading.Thread(target=self._read_notifications, daemon=True),
-            threading.Thread(target=self._read_said, daemon=True),
-            threading.Thread(target=self._read_events, daemon=True),
-        ]
-        for each in self._readers:
-            each.start()
-
-    def _read_notifications(self) -> None:
-        """Reads messages at once, because the kernel queues only ten."""
-        while line := self.manager.recv(4096).decode():
-            self.notifications.append(line)
+        self._said_reader = threading.Thread(target=self._read_said, daemon=True)
+        self._said_reader.start()
 
     def _read_said(self) -> None:
         assert self.process.stdout is not None
         self.said.extend(line.strip() for line in self.process.stdout)
 
-    def _read_events(self) -> None:
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
-            self.events.append(json.loads(line))
-
-    def until(self, met: Callable[[], bool], what: str) -> None:
-        until(met, lambda: f"{what}: {self.said} {self.events}")
+    def _last_words(self) -> str:
+        return f"{self.said}\n{super()._last_words()}"
 
     def pids(self, kind: str) -> list[int]:
         """Returns all processes of a kind that have started, oldest first."""
@@ -68,39 +44,21 @@ class Kept:
         self.until(lambda: len(self.pids(kind)) == times, f"{kind} begins {times} times")
         return self.pids(kind)[-1]
 
-    def until_notified(self, line: str) -> None:
-        """Waits until the service manager has received this message."""
-        self.until(lambda: line in self.notifications, line)
-
-    def until_ended(self) -> int:
-        status = self.process.wait()
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as own:
-            own.sendto(b"", self.manager.getsockname())
-        for each in self._readers:
-            each.join()
-        return status
-
-    def names(self) -> list[object]:
-        return [event["event"] for event in self.events]
+    def ended(self) -> int:
+        self._said_reader.join()
+        return super().ended()
 
 
 @pytest.fixture
 def keeper(tmp_path: Path) -> Iterator[Callable[..., Kept]]:
-    made: list[Kept] = []
+    with ExitStack() as stack:
 
-    def make(**environment: str) -> Kept:
-        made.append(Kept(tmp_path, **environment))
-        return made[-1]
+        def make(**environment: str) -> Kept:
+            kept = Kept(tmp_path, **environment)
+            stack.callback(kept.close)
+            return kept
 
-    yield make
-    for each in made:
-        each.process.kill()
-        each.until_ended()
-        each.manager.close()
-        assert each.process.stdout is not None
-        assert each.process.stderr is not None
-        each.process.stdout.close()
-        each.process.stderr.close()
+        yield make
 
 
 def test_reports_readiness_and_ends_in_order(keeper: Callable[..., Kept]) -> None:
@@ -108,7 +66,7 @@ def test_reports_readiness_and_ends_in_order(keeper: Callable[..., Kept]) -> Non
     kept.until_notified("READY=1")
     kept.process.send_signal(signal.SIGTERM)
     kept.until_notified("STOPPING=1")
-    assert kept.until_ended() == 0
+    assert kept.ended() == 0
     assert kept.said[-2:] == ["control ends", "service ends"]
     assert [name for name in kept.names() if name in {"ready", "stopping"}] == ["ready", "stopping"]
 
@@ -164,7 +122,7 @@ def test_a_lent_bus_returns_however_its_borrower_ends(keeper: Callable[..., Kept
     kept.until_begun("control", times=2)
     assert kept.names().count("control process died") == 0
     kept.process.send_signal(signal.SIGTERM)
-    assert kept.until_ended() == 0
+    assert kept.ended() == 0
 
 
 def test_an_unused_lent_bus_returns_and_the_daemon_may_end_meanwhile(keeper: Callable[..., Kept]) -> None:
@@ -179,7 +137,7 @@ def test_an_unused_lent_bus_returns_and_the_daemon_may_end_meanwhile(keeper: Cal
     os.kill(kept.until_begun("service"), signal.SIGUSR1)
     kept.until(lambda: kept.said.count("bus is lent") == 2, "the bus is lent again")
     kept.process.send_signal(signal.SIGTERM)
-    assert kept.until_ended() == 0
+    assert kept.ended() == 0
 
 
 def test_a_dead_or_hanging_gateway_is_replaced(keeper: Callable[..., Kept]) -> None:
@@ -190,7 +148,7 @@ def test_a_dead_or_hanging_gateway_is_replaced(keeper: Callable[..., Kept]) -> N
     kept.until_begun("gateway", times=3)
     assert len(kept.pids("control")) == len(kept.pids("service")) == 1
     kept.process.send_signal(signal.SIGTERM)
-    assert kept.until_ended() == 0
+    assert kept.ended() == 0
     assert kept.said[-3] == "control ends"
     assert {*kept.said[-2:]} == {"service ends", "gateway ends"}
 
@@ -206,7 +164,7 @@ def test_a_repeatedly_dying_control_process_ends_the_daemon(
     kept.until_notified("READY=1")
     for times in range(1, 5):
         os.kill(kept.until_begun("control", times), number)
-    assert kept.until_ended() == 1
+    assert kept.ended() == 1
     assert len(kept.pids("control")) == 4
     assert len(kept.pids("service")) == 1
     assert kept.names().count("control process died") == 4
@@ -219,5 +177,5 @@ def test_a_child_that_cannot_start_ends_the_daemon(
     keeper: Callable[..., Kept], kind: str, status: int
 ) -> None:
     kept = keeper(**{f"HDBRIDGE_TEST_{kind}": str(status)})
-    assert kept.until_ended() == status
+    assert kept.ended() == status
     assert "ready" not in kept.names()

@@ -1,11 +1,9 @@
 """A bus that the daemon lends to a command, on a drive in another process."""
 
 import json
-import os
 import random
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -15,8 +13,9 @@ from typing import Any
 import httpx
 import pytest
 import yaml
+from support.command import started
 from support.patience import until
-from support.running import Daemon, running
+from support.running import Daemon, folders_in, running
 
 from hdbridge.axis.model import TransmissionModel, store
 from hdbridge.drive.interfacelock import InterfaceLock
@@ -27,13 +26,9 @@ LISTENING = ("scan", "--listen", 600, "--borrow")
 
 
 @contextmanager
-def started(folder: Path, *arguments: object) -> Iterator[subprocess.Popen[str]]:
+def next_to_it(folder: Path, *arguments: object) -> Iterator[subprocess.Popen[str]]:
     """Runs ``hdbridge`` next to the daemon, with the daemon's runtime folder."""
-    environment = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder)}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "hdbridge", *map(str, arguments)],
-        env=environment, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    process = started(folder, *arguments, env=folders_in(folder))
     try:
         yield process
     finally:
@@ -58,7 +53,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
     }  # a multicast port receives the frames of all groups
     axis["bus"] = {"interface": "udp_multicast", "channel": channel, "options": options}
     path.write_text(yaml.safe_dump(axis))
-    with started(tmp_path, "simulate", tmp_path), running(tmp_path, tmp_path, name="article") as daemon:
+    with next_to_it(tmp_path, "simulate", tmp_path), running(tmp_path, tmp_path, name="article") as daemon:
         daemon.until_notified("READY=1")
         until_off(daemon)
         yield daemon
@@ -91,11 +86,11 @@ def until_borrowed(daemon: Daemon, pid: int) -> None:
 
 def test_a_command_borrows_the_bus_and_the_axis_returns_disabled(daemon: Daemon) -> None:
     folder, loops = daemon.folder, len(daemon.pids("control"))
-    with started(folder, "sdo", "get", folder, "1000h", "--json", "-") as refused:
+    with next_to_it(folder, "sdo", "get", folder, "1000h", "--json", "-") as refused:
         _, error = refused.communicate()
         assert refused.returncode == 3
         assert "--borrow" in error
-    with started(folder, "sdo", "get", folder, "1000h", "--borrow", "--json", "-") as command:
+    with next_to_it(folder, "sdo", "get", folder, "1000h", "--borrow", "--json", "-") as command:
         output, error = command.communicate()
         assert command.returncode == 0, error
         assert json.loads(output)["value"] == 0x20192
@@ -106,7 +101,7 @@ def test_a_command_borrows_the_bus_and_the_axis_returns_disabled(daemon: Daemon)
 
 def test_clients_see_the_borrower_and_can_stop_it(daemon: Daemon) -> None:
     folder, loops = daemon.folder, len(daemon.pids("control"))
-    with started(folder, *LISTENING, folder) as borrower:
+    with next_to_it(folder, *LISTENING, folder) as borrower:
         until_borrowed(daemon, borrower.pid)
         state = daemon.state() or {}
         assert f"process {borrower.pid} of " in state["bus"]["lent_to"]
@@ -135,7 +130,7 @@ def test_the_daemon_commits_the_model_that_a_borrower_proposed(daemon: Daemon) -
         daemon.client.delete("/lease", headers=held)
         return done
 
-    with started(folder, *LISTENING, folder) as borrower:
+    with next_to_it(folder, *LISTENING, folder) as borrower:
         until_borrowed(daemon, borrower.pid)
         model = TransmissionModel.load(folder / "model.yaml")
         pending = store.propose(folder, model, "calibration", datetime(2026, 3, 1, tzinfo=UTC))
@@ -154,7 +149,7 @@ def test_the_daemon_commits_the_model_that_a_borrower_proposed(daemon: Daemon) -
 
 def test_a_killed_borrower_leaves_a_disabled_axis(daemon: Daemon) -> None:
     folder, loops = daemon.folder, len(daemon.pids("control"))
-    with started(folder, *LISTENING, folder) as borrower:
+    with next_to_it(folder, *LISTENING, folder) as borrower:
         until_borrowed(daemon, borrower.pid)
         borrower.send_signal(signal.SIGKILL)
         borrower.wait()

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from support.adapting import truth_of
-from support.service import AtOnce, Service, stepped_service, until
+from support.service import Service, stepped_service, until
 
 from hdbridge.axis.effects import Hysteresis
 from hdbridge.client import messages
@@ -26,10 +25,8 @@ QUICK = AdaptationSettings(mode="on", interval_s=3.0, rate_arcsec_per_hour=7200.
 @pytest.fixture
 def service(tmp_path: Path):
     """Axis whose loop is a tenth higher than that of its model."""
-    truth = tmp_path / "truth.yaml"
     grown = truth_of(1e-3, growth=0.1, second_order_arcsec=0.0)
-    truth.write_text(yaml.safe_dump(grown.model_dump(mode="json", by_alias=True, exclude_none=True)))
-    with stepped_service(tmp_path, truth=truth) as made:
+    with stepped_service(tmp_path, truth=grown) as made:
         axes = tuple(replace(each, adaptation=QUICK) for each in made.machine.axes)
         made.machine = replace(made.machine, axes=axes)
         yield made
@@ -38,8 +35,8 @@ def service(tmp_path: Path):
 @asynccontextmanager
 async def adapting(service: Service) -> AsyncIterator[tuple[ServiceBridge, str, Following]]:
     """Adaptation assembled as in the service process."""
-    async with service.enabled() as (bridge, token):
-        made = begin(service, bridge)
+    async with service.enabled() as (bridge, _, token):
+        made = service.follow(bridge, service.machine.axes[0].adaptation)
         task = asyncio.get_running_loop().create_task(follow(bridge, made))
         try:
             yield bridge, token, made
@@ -48,14 +45,6 @@ async def adapting(service: Service) -> AsyncIterator[tuple[ServiceBridge, str, 
             with suppress(asyncio.CancelledError):
                 await task
             made.close()
-
-
-def begin(service: Service, bridge: ServiceBridge) -> Following:
-    axis = service.machine.axes[0]
-    made = Following(0, bridge.axes["axis1"], axis.adaptation, axis.profile.folder / "adaptation", AtOnce())
-    bridge.axes["axis1"].following = made
-    bridge.core.observer.add(made)
-    return made
 
 
 async def follow(bridge: ServiceBridge, made: Following) -> None:

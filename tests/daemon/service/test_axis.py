@@ -8,8 +8,7 @@ from hdbridge.errors import InputError, LeaseError, RefusedError
 
 
 async def test_nothing_moves_without_the_lease(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         before = axis.state().load_target_deg
         for attempt in (axis.enable, axis.disable, axis.reset):
             with pytest.raises(LeaseError):
@@ -28,9 +27,7 @@ async def test_nothing_moves_without_the_lease(service: Service) -> None:
 
 
 async def test_impossible_requests_are_refused_with_the_loops_text(service: Service) -> None:
-    async with service.ready() as bridge:
-        axis = bridge.axes["axis1"]
-        token = bridge.lease.take("test")
+    async with service.leased() as (_, axis, token):
         with pytest.raises(RefusedError, match="enable it first"):
             await axis.motion.move(token, 5.0)
         await axis.enable(token)
@@ -48,9 +45,7 @@ async def test_impossible_requests_are_refused_with_the_loops_text(service: Serv
 
 
 async def test_a_prepared_drive_is_prepared_again_after_a_write(service: Service) -> None:
-    async with service.ready() as bridge:
-        axis = bridge.axes["axis1"]
-        token = bridge.lease.take("test")
+    async with service.leased() as (_, axis, token):
         await axis.prepare()
         _, cyclic = await axis.sdo_read("6060h")
         await axis.sdo_write(token, "6060h", "1")

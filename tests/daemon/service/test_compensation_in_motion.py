@@ -4,15 +4,14 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
-import yaml
+from support.keys import changed
 from support.raised import measured_profile, ripple_arcsec
-from support.service import AtOnce, Service, play, stepped_service, until
+from support.service import Service, play, stepped_service, until
 
 from hdbridge.client.messages import StreamPoint
 from hdbridge.control.bench import axis_view
 from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.following import Following
 from hdbridge.enums import Scheme
 from hdbridge.motion.procedures.moves import MoveTo
 from hdbridge.sim.truth import Truth
@@ -69,7 +68,7 @@ async def ripple(
 @pytest.mark.parametrize("motion", [jog, stream, coordinated])
 def test_every_kind_of_motion_removes_the_ripple(motion, profile: Path, tmp_path: Path) -> None:
     async def story(service: Service) -> tuple[float, float]:
-        async with service.enabled() as (bridge, token):
+        async with service.enabled() as (bridge, _, token):
             left = await ripple(service, bridge, token, motion)
             await bridge.axes["axis1"].compensate(token, Scheme.NONE)
             await bridge.axes["axis1"].motion.move(token, 0.0)
@@ -82,11 +81,8 @@ def test_every_kind_of_motion_removes_the_ripple(motion, profile: Path, tmp_path
 
 def test_adaptation_removes_the_ripple_of_a_retuned_servo(profile: Path, tmp_path: Path) -> None:
     async def story(service: Service) -> tuple[float, float]:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            settings = AdaptationSettings(mode="on", interval_s=1.0)
-            following = Following(0, axis, settings, tmp_path / "state", AtOnce())
-            bridge.core.observer.add(following)
+        async with service.enabled() as (bridge, axis, token):
+            following = service.follow(bridge, AdaptationSettings(mode="on", interval_s=1.0))
             await axis.motion.move(token, -FAR_DEG)
             before = await ripple(service, bridge, token, goto)
             for speed in (60.0, 45.0) * 2:
@@ -97,14 +93,8 @@ def test_adaptation_removes_the_ripple_of_a_retuned_servo(profile: Path, tmp_pat
             await axis.motion.move(token, -FAR_DEG)
             return before, await ripple(service, bridge, token, goto)
 
-    truth = Truth.load(profile / "truth.yaml")
-    retuned = truth.servo.model_copy(update={"position_gain_per_s": 130.0})
-    path = tmp_path / "truth.yaml"
-    text = truth.model_copy(update={"servo": retuned}).model_dump(
-        mode="json", by_alias=True, exclude_none=True
-    )
-    path.write_text(yaml.safe_dump(text))
-    with stepped_service(tmp_path, profile=profile, truth=path) as service:
+    retuned = changed(Truth.load(profile / "truth.yaml"), servo__position_gain_per_s=130.0)
+    with stepped_service(tmp_path, profile=profile, truth=retuned) as service:
         before, after = play(story(service))
     assert before > 2.0
     # At 60 and 45 deg/s the rounding of the set-points to counts repeats with the orders.

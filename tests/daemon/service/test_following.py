@@ -28,14 +28,6 @@ from hdbridge.enums import Scheme
 DEMO = Path("profiles/demo/axis.yaml")
 
 
-def following(bridge: ServiceBridge, settings: AdaptationSettings, folder: Path) -> Following:
-    (axis,) = bridge.axes.values()
-    made = Following(0, axis, settings, folder, ThreadPoolExecutor(1))
-    bridge.core.observer.add(made)
-    axis.following = made
-    return made
-
-
 def changes(bridge: ServiceBridge) -> int:
     return sum(each.kind is EventKind.CHANGED for each in bridge.core.log.since(0))
 
@@ -43,7 +35,7 @@ def changes(bridge: ServiceBridge) -> int:
 async def test_a_disabled_adaptation_learns_and_writes_nothing(service: Service, tmp_path: Path) -> None:
     folder = tmp_path / "adaptation"
     async with service.ready() as bridge:
-        made = following(bridge, AdaptationSettings(), folder)
+        made = service.follow(bridge, AdaptationSettings())
         before = changes(bridge)
         await until(bridge, lambda: bridge.core.observer.cycle > 100)
         await made.apply()
@@ -56,10 +48,10 @@ async def test_a_disabled_adaptation_learns_and_writes_nothing(service: Service,
         made.close()
 
 
-async def test_without_a_model_a_calibration_is_requested(service: Service, tmp_path: Path) -> None:
+async def test_without_a_model_a_calibration_is_requested(service: Service) -> None:
     service.machine.axes[0].profile.model.unlink()
     async with service.ready() as bridge:
-        made = following(bridge, AdaptationSettings(mode="on"), tmp_path / "adaptation")
+        made = service.follow(bridge, AdaptationSettings(mode="on"))
         await until(bridge, lambda: made.state.frozen is not None)
         assert made.state.frozen == "there is no model to follow: calibrate first"
         await made.apply()
@@ -69,7 +61,7 @@ async def test_an_unwritable_folder_is_reported_and_the_axis_works(service: Serv
     folder = tmp_path / "adaptation"
     folder.write_text("not a folder")
     async with service.ready() as bridge:
-        made = following(bridge, AdaptationSettings(mode="on"), folder)
+        made = service.follow(bridge, AdaptationSettings(mode="on"))
         await until(bridge, lambda: made.state.frozen is not None)
         assert str(folder) in (made.state.frozen or "")
 
@@ -79,7 +71,7 @@ async def test_each_axis_is_watched_in_its_own_thread_that_ends(
     service: Service, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.ERROR):
-        async with service.enabled() as (bridge, token), AsyncExitStack() as stack:
+        async with service.enabled() as (bridge, _, token), AsyncExitStack() as stack:
             for each in follow(service.machine, bridge, None, stack):
                 bridge.core.observer.add(each)
             first, second = bridge.axes.values()

@@ -48,8 +48,7 @@ def steps(samples: np.ndarray) -> np.ndarray:
 
 
 async def test_schemes_are_cross_faded_in_motion(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         assert axis.state().scheme == "extended"
         await axis.motion.move(token, 2.0)
         await axis.motion.move(token, 200.0, velocity_deg_s=0.5, wait=False)
@@ -70,8 +69,7 @@ async def test_schemes_are_cross_faded_in_motion(service: Service) -> None:
 
 
 async def test_a_new_model_is_committed_and_used_in_motion(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         first = axis.state().model
         commit(service, wider(axis.models.in_use.model))
         await axis.motion.move(token, 200.0, velocity_deg_s=0.5, wait=False)
@@ -93,8 +91,7 @@ async def test_a_new_model_is_committed_and_used_in_motion(service: Service) -> 
 
 
 async def test_a_missing_or_foreign_model_changes_nothing(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (_, axis, token):
         before = axis.state().model
         with pytest.raises(InputError, match="no model '7'"):
             await axis.activate_model(token, 7)
@@ -112,8 +109,7 @@ async def test_a_missing_or_foreign_model_changes_nothing(service: Service) -> N
 @pytest.mark.parametrize("service", [{"model": TransmissionModel(50.0)}], indirect=True)
 async def test_an_axis_without_a_model_runs_uncompensated(service: Service) -> None:
     service.machine.axes[0].profile.model.unlink()
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (_, axis, token):
         assert axis.state().model is None
         await axis.motion.move(token, 5.0)
         with pytest.raises(InputError, match="calibrate"):
@@ -174,7 +170,7 @@ async def choose(bridge: ServiceBridge, token: str) -> None:
 
 
 async def test_each_axis_keeps_its_compensation_over_restarts_of_the_control_process(pair: Service) -> None:
-    async with pair.enabled() as (bridge, token):
+    async with pair.enabled() as (bridge, _, token):
         await choose(bridge, token)
         for _ in range(7):
             begin_uncompensated(pair)
@@ -189,8 +185,7 @@ async def test_each_axis_keeps_its_compensation_over_restarts_of_the_control_pro
 
 
 async def test_an_axis_is_enabled_with_its_chosen_compensation_only(pair: Service) -> None:
-    async with pair.ready() as bridge:
-        token = bridge.lease.take("test")
+    async with pair.leased() as (bridge, _, token):
         await choose(bridge, token)
         begin_uncompensated(pair)
         await bridge.axes["axis2"].enable(token)
@@ -199,8 +194,7 @@ async def test_an_axis_is_enabled_with_its_chosen_compensation_only(pair: Servic
 
 @pytest.mark.parametrize("lost", range(1, 4))
 async def test_lost_settings_are_sent_again(pair: Service, lost: int) -> None:
-    async with pair.ready() as bridge:
-        token = bridge.lease.take("test")
+    async with pair.leased() as (bridge, _, token):
         await choose(bridge, token)
         begin_uncompensated(pair)
         for _ in range(lost):  # each time the new control process dies before it has read a command
@@ -212,7 +206,7 @@ async def test_lost_settings_are_sent_again(pair: Service, lost: int) -> None:
 
 
 async def test_a_new_service_reads_the_settings_in_use(pair: Service) -> None:
-    async with pair.enabled() as (bridge, token):
+    async with pair.enabled() as (bridge, _, token):
         await choose(bridge, token)
         await bridge.axes["axis2"].switch_load_loop(token, on=False)
         chosen = [axis.models.chosen for axis in bridge.axes.values()]
@@ -232,7 +226,7 @@ async def test_a_new_service_reads_the_settings_in_use(pair: Service) -> None:
 
 
 async def test_a_half_written_setting_falls_back_to_the_machine_file(pair: Service) -> None:
-    async with pair.enabled() as (bridge, token):
+    async with pair.enabled() as (bridge, _, token):
         await choose(bridge, token)
     slot = pair.daemon.memory.settings[0]
     slot._sent[0] = -slot.number - 1
@@ -243,9 +237,8 @@ async def test_a_half_written_setting_falls_back_to_the_machine_file(pair: Servi
 
 
 async def test_refused_settings_are_never_reported_or_repeated(pair: Service) -> None:
-    async with pair.enabled() as (bridge, token):
+    async with pair.enabled() as (bridge, axis, token):
         await choose(bridge, token)
-        axis = bridge.axes["axis1"]
         other = replace(axis.models.chosen, model=replace(axis.models.chosen.model, ratio=50.1))
         with pytest.raises(RefusedError, match="ratio"):
             await axis._use(other)
@@ -257,11 +250,10 @@ async def test_refused_settings_are_never_reported_or_repeated(pair: Service) ->
 
 
 async def test_late_answers_change_no_report(pair: Service) -> None:
-    async with pair.enabled() as (bridge, token):
+    async with pair.enabled() as (bridge, axis, token):
         await choose(bridge, token)
         daemon = pair.daemon
         turn, daemon.controller.turn = daemon.controller.turn, lambda: daemon.hang(daemon.period_s)
-        axis = bridge.axes["axis1"]
         with pytest.raises(DaemonError, match="did not answer"):
             await axis.compensate(token, Scheme.EXTENDED)
         assert axis.state().scheme == "synchronous"
@@ -294,8 +286,8 @@ LOAD_LOOP = LoadLoopSettings(gain_1_s=0.5, maximum_arcsec=20.0)
 @pytest.mark.parametrize("service", [{"load_loop": LOAD_LOOP}], indirect=True, ids=["loop"])
 async def test_an_inactive_load_loop_reports_its_reason(service: Service) -> None:
     service.machine = replace(service.machine, axes=(replace(service.machine.axes[0], load_loop=LOAD_LOOP),))
-    async with service.enabled() as (bridge, token):
-        axis, encoder = bridge.axes["axis1"], service.daemon.nodes[0].faults
+    async with service.enabled() as (bridge, axis, token):
+        encoder = service.daemon.nodes[0].faults
         await bridge.core.timing.sleep(3.0)
         assert axis.state().load_loop.doubt is None
         for _ in range(2):

@@ -20,8 +20,7 @@ def point(time_s: float, position_deg: float, velocity_deg_s: float | None = Non
 
 
 async def test_way_points_are_visited_in_order(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         reader = service.daemon.memory.reader()
         await axis.motion.queue(token, [way_point(2.0, dwell_s=0.3), way_point(-1.0)])
         assert axis.motion.queued == 2
@@ -38,8 +37,7 @@ async def test_way_points_are_visited_in_order(service: Service) -> None:
 
 
 async def test_a_move_replaces_the_queue(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         await axis.motion.queue(token, [way_point(20.0), way_point(-20.0)])
         await bridge.core.timing.sleep(0.2)
         await axis.motion.move(token, 1.0)
@@ -49,8 +47,7 @@ async def test_a_move_replaces_the_queue(service: Service) -> None:
 
 
 async def test_an_invalid_way_point_rejects_all(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         with pytest.raises(InputError, match="position limits"):
             await axis.motion.queue(token, [way_point(2.0), way_point(1e6)])
         await bridge.core.timing.sleep(0.5)
@@ -59,8 +56,7 @@ async def test_an_invalid_way_point_rejects_all(service: Service) -> None:
 
 @pytest.mark.parametrize("steps", range(3))
 async def test_a_queue_may_be_cleared_while_its_move_starts(service: Service, steps: int) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         await axis.motion.queue(token, [way_point(4.0)])
         for _ in range(steps):
             await asyncio.sleep(0)
@@ -72,8 +68,7 @@ async def test_a_queue_may_be_cleared_while_its_move_starts(service: Service, st
 
 
 async def test_a_cleared_queue_ends_after_the_present_move(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         await axis.motion.queue(token, [way_point(4.0), way_point(-20.0), way_point(20.0)])
         await bridge.core.timing.sleep(0.1)
         assert axis.motion.queued == 2
@@ -84,8 +79,8 @@ async def test_a_cleared_queue_ends_after_the_present_move(service: Service) -> 
 
 @pytest.mark.parametrize("service", [{"lease_s": 1.0}], indirect=True)
 async def test_the_end_of_a_lease_stops_a_queue_and_not_a_move(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
-        axis, timing = bridge.axes["axis1"], bridge.core.timing
+    async with service.enabled() as (bridge, axis, token):
+        timing = bridge.core.timing
         await axis.motion.move(token, 60.0, velocity_deg_s=15.0, wait=False)
         await until(bridge, lambda: bridge.lease.holder is None)
         assert not axis.state().at_rest
@@ -106,8 +101,7 @@ async def test_the_end_of_a_lease_stops_a_queue_and_not_a_move(service: Service)
 
 
 async def test_a_lease_taken_by_force_stops_the_jog_of_the_other(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         await axis.motion.jog(token, 10.0, timeout_s=5.0)
         await bridge.core.timing.sleep(0.2)
         bridge.lease.take("other", force=True)
@@ -126,8 +120,7 @@ def sine(count: int, period_s: float = 0.05, amplitude_deg: float = 3.0) -> list
 
 
 async def test_a_stream_follows_its_set_points(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (_, axis, token):
         await axis.motion.move(token, 0.0)
         reader = service.daemon.memory.reader()
         points = sine(41)
@@ -148,8 +141,7 @@ async def test_a_stream_follows_its_set_points(service: Service) -> None:
 
 
 async def test_a_starved_stream_brakes_and_reports_it(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         await axis.motion.move(token, 0.0)
         stream = await axis.motion.stream(token)
         await stream.put([point(0.1 * number, 0.05 * number * number) for number in range(6)])
@@ -170,8 +162,7 @@ async def test_a_starved_stream_brakes_and_reports_it(service: Service) -> None:
 async def test_bad_set_points_are_refused_before_anything_moves(
     service: Service, points: list[StreamPoint], words: str
 ) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         await axis.motion.move(token, 0.0)
         stream = await axis.motion.stream(token)
         with pytest.raises(InputError, match=words):
@@ -181,8 +172,7 @@ async def test_bad_set_points_are_refused_before_anything_moves(
 
 
 async def test_set_points_beyond_the_limits_end_the_stream_braking(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         await axis.motion.move(token, 0.0)
         stream = await axis.motion.stream(token)
         await stream.put([point(0.2, 0.5), point(0.4, 1.0), point(0.41, 300.0)])
@@ -195,7 +185,7 @@ async def test_set_points_beyond_the_limits_end_the_stream_braking(service: Serv
 
 @pytest.mark.parametrize("service", [{"axes": 2}], indirect=True)
 async def test_coordinated_axes_arrive_together(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
+    async with service.enabled() as (bridge, _, token):
         reader = service.daemon.memory.reader()
         before = [each.state().load_target_deg for each in bridge.axes.values()]
         await bridge.coordinated(token, {"axis1": 20.0, "axis2": -5.0})

@@ -10,8 +10,7 @@ from hdbridge.errors import LeaseError, RefusedError
 
 
 async def test_a_new_service_finds_the_axis_where_it_is(service: Service) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         await axis.compensate(token, Scheme.SYNCHRONOUS)
         await axis.motion.move(token, 30.0, wait=False)
         await bridge.core.timing.sleep(0.3)
@@ -53,8 +52,7 @@ async def test_no_request_is_made_before_the_axis_state_is_known(service: Servic
 
 async def test_without_a_control_process_nothing_is_sent(service: Service) -> None:
     """A request between two control processes is refused, and the next process does not receive it."""
-    async with service.ready() as bridge:
-        axis, token = bridge.axes["axis1"], bridge.lease.take("test")
+    async with service.leased() as (_, axis, token):
         status = service.daemon.memory.status
         pid = status[Cell.LOOP_PID]
         status[Cell.LOOP_PID] = 0

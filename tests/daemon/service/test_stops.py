@@ -36,8 +36,7 @@ LATCHED = [
 async def test_a_quick_stop_is_latched_until_a_reset(
     service: Service, spoil: Callable[[SteppedDaemon], None], fault: Fault
 ) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         await axis.motion.move(token, 100.0, wait=False)
         await bridge.core.timing.sleep(1.0)
         spoil(service.daemon)
@@ -73,8 +72,7 @@ async def test_a_quick_stop_is_latched_until_a_reset(
 async def test_a_drive_that_restarts_is_verified_again_and_stays_disabled(
     service: Service, spoil: Callable[[SteppedDaemon], None]
 ) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         await axis.motion.move(token, 100.0, wait=False)
         await bridge.core.timing.sleep(1.0)
         spoil(service.daemon)
@@ -102,23 +100,18 @@ async def test_an_absent_drive_is_awaited(service: Service) -> None:
 
 
 async def test_an_expired_jog_does_not_affect_the_next_client(service: Service) -> None:
-    async with service.ready() as bridge:
-        axis = bridge.axes["axis1"]
-        token = bridge.lease.take("first")
+    async with service.leased() as (bridge, axis, token):
         await axis.enable(token)
         await axis.motion.jog(token, 5.0, 0.2)
         await bridge.core.timing.sleep(1.0)
-        token = bridge.lease.take("second", force=True)
-        await axis.motion.move(token, 8.0)
+        await axis.motion.move(bridge.lease.take("second", force=True), 8.0)
         assert axis.state().load_target_deg == 8.0
         notes = [each.text for each in bridge.events(0).events if each.kind == "note"]
         assert not [each for each in notes if "lease of its client has ended" in each]
 
 
 async def test_homes_and_stays_disabled(service: Service) -> None:
-    async with service.ready() as bridge:
-        axis = bridge.axes["axis1"]
-        token = bridge.lease.take("test")
+    async with service.leased() as (bridge, axis, token):
         await axis.enable(token)
         await axis.motion.move(token, 5.0)
         await axis.disable(token)
@@ -133,9 +126,7 @@ async def test_homes_and_stays_disabled(service: Service) -> None:
 
 
 async def test_a_homing_that_fails_leaves_the_axis_disabled(service: Service) -> None:
-    async with service.ready() as bridge:
-        axis = bridge.axes["axis1"]
-        token = bridge.lease.take("test")
+    async with service.leased() as (bridge, axis, token):
         with pytest.raises(HdbridgeError):
             await axis.home(token, messages.Home(method=1))
         await until(bridge, lambda: axis.state().state == "disabled")
@@ -146,8 +137,7 @@ async def test_a_homing_that_fails_leaves_the_axis_disabled(service: Service) ->
 
 @pytest.mark.parametrize("obeys", [True, False])
 async def test_a_quick_stop_by_a_client_says_once_how_to_release_it(service: Service, obeys: bool) -> None:
-    async with service.enabled() as (bridge, token):
-        axis = bridge.axes["axis1"]
+    async with service.enabled() as (bridge, axis, token):
         await axis.motion.move(token, 100.0, wait=False)
         await bridge.core.timing.sleep(1.0)
         if not obeys:

@@ -3,15 +3,14 @@
 from pathlib import Path
 
 import pytest
-import yaml
+from support.keys import changed
 from support.raised import measured_profile, without_load_encoder
-from support.service import AtOnce, Service, play, stepped_service
+from support.service import Service, play, stepped_service
 
 from hdbridge.client import messages
 from hdbridge.daemon.following.follower import NO_LOAD_ENCODER
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.machinefile import AdaptationSettings
-from hdbridge.daemon.service.following import Following
 from hdbridge.errors import InputError
 from hdbridge.sim.truth import Truth
 
@@ -29,22 +28,16 @@ def at_work(blind: Path, folder: Path, **servo: float) -> tuple[messages.AxisSta
     """Moves in both directions with these servo parameters; returns the state and all notes."""
 
     async def story(service: Service) -> tuple[messages.AxisState, list[str]]:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            made = Following(0, axis, AdaptationSettings(mode="on"), folder / "state", AtOnce())
-            bridge.axes["axis1"].following = made
-            bridge.core.observer.add(made)
+        async with service.enabled() as (bridge, axis, token):
+            service.follow(bridge, AdaptationSettings(mode="on"))
             for target in (FAR_DEG, -FAR_DEG, FAR_DEG):
                 bridge.lease.check(token)
                 await axis.motion.move(token, target, SPEED_DEG_S)
             await axis.disable(token)
             return axis.state(), [each.text for each in bridge.events().events]
 
-    truth = Truth.load(blind / "truth.yaml")
-    truth = truth.model_copy(update={"servo": truth.servo.model_copy(update=servo)})
-    path = folder / "truth.yaml"
-    path.write_text(yaml.safe_dump(truth.model_dump(mode="json", by_alias=True, exclude_none=True)))
-    with stepped_service(folder, profile=blind, truth=path) as service:
+    truth = changed(Truth.load(blind / "truth.yaml"), **{f"servo__{key}": servo[key] for key in servo})
+    with stepped_service(folder, profile=blind, truth=truth) as service:
         return play(story(service))
 
 
