@@ -151,6 +151,7 @@ def test_a_step_beyond_the_limits_is_not_sent(moving: DaemonBench) -> None:
     assert axis.supervision.stop is not None
     assert axis.supervision.stop.fault is Fault.BAD_TARGET
     moving.stay_stopped(0)
+    assert sent
     assert all(abs(each - wrong) > 5_000 for each in sent)
     assert moving.moves_on(1)
     further("a model asks for a step beyond the limits of speed and slew").show(turns)
