@@ -33,6 +33,9 @@ LEAST_NEAR = 20
 MOST_JITTER_DEG = 0.1
 """Largest plausible standard deviation of a motor reading: rounding at 1,000 counts per turn. Larger third
 differences are due to fast motion."""
+LEAST_BENT_SHARE = 0.1
+"""Minimum number of changes of speed, and of acceleration, relative to the changes in motion. Rounding bends
+the path at most samples, whereas an exact ramp or trapezoid is bent only at its corners."""
 _THIRD = np.sqrt(20.0)
 """Amplification of white noise by third differences: the square root of 1 + 9 + 9 + 1."""
 _MAD = 1.4826
@@ -133,14 +136,21 @@ def quantum_deg(angle_deg: FloatArray) -> float:
 
     The changes between readings, and the differences of these changes, are multiples of the count. The
     smallest difference is the count if nearly all changes are multiples of it, within the last digit of a
-    rounded file.
+    rounded file, and if the changes are irregular as after rounding. The equal changes of an exact ramp have
+    a common divisor as well, but it is not a count.
     """
     exact = _exact(angle_deg)
     digit = last_digit(angle_deg)
-    if exact > 1.5 * digit or not digit:
-        return exact
-    # The exact steps are those of the file's last digit, or no exact step was found.
-    return _through_rounding(angle_deg, digit)
+    # Exact steps may also be those of the file's last digit.
+    count = exact if exact > 1.5 * digit or not digit else _through_rounding(angle_deg, digit)
+    return count if count and _is_rounded(angle_deg, count) else 0.0
+
+
+def _is_rounded(angle_deg: FloatArray, count_deg: float) -> bool:
+    """Returns True if the path varies by whole counts in speed and acceleration, as after rounding."""
+    counts = np.round(np.diff(angle_deg) / count_deg)
+    least = LEAST_BENT_SHARE * np.count_nonzero(counts)
+    return all(np.count_nonzero(np.diff(counts, order)) > least for order in (1, 2))
 
 
 def last_digit(angle_deg: FloatArray) -> float:

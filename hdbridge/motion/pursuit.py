@@ -41,15 +41,17 @@ class Pursuit:
         position, velocity, _ = self.state
         wanted = (goal_deg - position) / period_s
         speed, room_deg = (wanted, upper - position) if wanted > 0.0 else (-wanted, position - lower)
+        rate, allowed = (goal_deg - before_deg) / period_s, acceleration * (period_s + spacing_s)
         if (
             speed <= self._fastest
-            and abs(wanted - velocity) <= acceleration * (period_s + spacing_s)
-            and speed * (speed + acceleration * period_s) <= 2.0 * acceleration * room_deg  # as in `_speed`
+            and abs(wanted - velocity) <= allowed
+            and abs(wanted - rate) <= allowed  # else it would pass a goal that it catches up with
+            and speed <= self._speed(room_deg)
         ):
             position = goal_deg
         else:
             away, change = goal_deg - position, acceleration * period_s
-            wanted = (goal_deg - before_deg) / period_s + math.copysign(self._speed(abs(away)), away)
+            wanted = rate + math.copysign(self._speed(abs(away)), away)
             # The speed is limited such that the axis can brake before its bounds, wherever the goal moves.
             least = max(-self._fastest, velocity - change, -self._speed(position - lower))
             most = min(self._fastest, velocity + change, self._speed(upper - position))
@@ -59,8 +61,13 @@ class Pursuit:
         return state
 
     def _speed(self, distance_deg: float) -> float:
-        """Returns the highest speed in the next period from which the axis can brake within this distance."""
+        """Returns the highest speed in the next period from which the axis can brake within this distance.
+
+        The speed is constant in each period, and decreases by at most the acceleration limit per period.
+        """
         if distance_deg <= 0.0:
             return 0.0
         change = self._acceleration * self._period_s
-        return change * (math.sqrt(0.25 + 2.0 * distance_deg / (change * self._period_s)) - 0.5)
+        distance = distance_deg / (change * self._period_s)
+        whole = math.floor(math.sqrt(0.25 + 2.0 * distance) - 0.5)  # the speed in units of ``change``
+        return change * (distance / (whole + 1.0) + 0.5 * whole)

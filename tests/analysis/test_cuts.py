@@ -148,6 +148,7 @@ def test_a_model_without_hysteresis_must_be_fitted_first() -> None:
         assert "fit a model first (hdbridge fit)" in said
         assert float(said.split("one of ")[1].split(" arcsec")[0]) == pytest.approx(30.0, rel=0.1)
         unknown = [each for each in found.findings if each.cause == "unexplained"]
+        assert unknown
         assert all("fit a model first" in each.experiment for each in unknown)
 
 

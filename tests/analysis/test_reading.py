@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -57,8 +60,74 @@ def test_reversal_count_is_independent_of_digits_counts_and_home(
 def test_encoder_count_is_found_despite_rounded_digits(counts: int, digits: int) -> None:
     count = 360.0 / counts
     read = kept(np.round(bench(np.random.default_rng(2)) / count) * count + 4321.0, digits)
-    if count > 6.0 * 10.0 ** (5 - digits):
-        assert reading_of(read).count_deg == pytest.approx(count, rel=1e-4)
+    assert reading_of(read).count_deg == pytest.approx(count, rel=1e-4)
+
+
+RAMPS = st.lists(st.integers(-40, 40), min_size=3, max_size=12)
+"""Speeds of successive ramps, in a common unit."""
+
+
+def ramps(speeds: list[int], step_deg: float, samples: int) -> np.ndarray:
+    return np.concatenate([[0.0], np.cumsum(np.repeat(speeds, samples) * step_deg)])
+
+
+def trapezoids(speeds: list[int], step_deg: float, samples: int) -> np.ndarray:
+    """Moves with constant acceleration between the speeds, from rest to rest."""
+    changes = [np.linspace(a, b, samples) for a, b in pairwise([0, *speeds, 0])]
+    return np.concatenate([[0.0], np.cumsum(np.concatenate(changes)) * step_deg])
+
+
+@settings(deadline=None)
+@given(
+    speeds=RAMPS,
+    step_deg=st.sampled_from([0.08, 7.2, 1 / 3]),
+    samples=st.integers(40, 300),
+    path=st.sampled_from([ramps, trapezoids]),
+    digits=st.integers(8, 17),
+)
+def test_an_exact_path_has_no_count(
+    speeds: list[int], step_deg: float, samples: int, path: Callable[..., np.ndarray], digits: int
+) -> None:
+    count = reading_of(kept(path(speeds, step_deg, samples), digits)).count_deg
+    assert count < 2e-3  # at most the digits of the file
+
+
+@settings(deadline=None)
+@given(amplitude_deg=st.floats(1.0, 1000.0), period=st.integers(40, 2000), phase=st.floats(0.0, 6.0))
+def test_an_exact_sine_has_no_count(amplitude_deg: float, period: int, phase: float) -> None:
+    sine = amplitude_deg * np.sin(2.0 * np.pi * np.arange(4000) / period + phase)
+    assert reading_of(sine).count_deg == 0.0
+
+
+@settings(deadline=None)
+@given(
+    speeds=RAMPS,
+    offset=st.floats(0.1, 0.9),
+    samples=st.integers(40, 300),
+    path=st.sampled_from([ramps, trapezoids]),
+    counts=st.sampled_from(COUNTS[:3]),
+)
+def test_a_rounded_path_has_its_count(
+    speeds: list[int], offset: float, samples: int, path: Callable[..., np.ndarray], counts: int
+) -> None:
+    """The speeds are not whole counts per sample, which would not show the size of a count."""
+    count = 360.0 / counts
+    true = path([speed + offset for speed in speeds], count, samples)
+    assert reading_of(np.round(true / count) * count).count_deg == pytest.approx(count, rel=1e-6)
+
+
+@settings(deadline=None)
+@given(
+    amplitude=st.floats(3.0, 3000.0),
+    period=st.integers(40, 2000),
+    phase=st.floats(0.0, 6.0),
+    counts=st.sampled_from(COUNTS[:3]),
+)
+def test_a_rounded_sine_has_its_count(amplitude: float, period: int, phase: float, counts: int) -> None:
+    """Its period is not a whole number of samples, after which the same few changes would be repeated."""
+    count = 360.0 / counts
+    sine = amplitude * np.sin(2.0 * np.pi * np.arange(4000) / (period + 0.3719) + phase)
+    assert reading_of(np.round(sine) * count).count_deg == pytest.approx(count, rel=1e-6)
 
 
 @pytest.mark.parametrize("noise_deg", [0.0, 0.002, 0.05])

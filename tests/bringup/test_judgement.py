@@ -137,7 +137,9 @@ def test_most_likely_key_is_reported_first(
 @given(factor=st.floats(0.05, 20.0))
 def test_each_suspected_key_explains_the_factor(factor: float) -> None:
     one, tolerance = file(50, 8000, 2_880_000), 0.007
-    for each in suspect_entries(one, factor, tolerance):
+    suspects = suspect_entries(one, factor, tolerance)
+    assert len({each.key for each in suspects}) == 3
+    for each in suspects:
         ratio = each.expected / each.found
         explained = ratio if each.key == LOAD_COUNTS else 1.0 / ratio
         assert abs(explained / factor - 1.0) <= 2.0 * tolerance

@@ -39,8 +39,8 @@ class Logged:
     """Frames of the bus, and the master's own values."""
 
     messages: list[can.Message] = field(default_factory=list)
-    rows: list[tuple[float, int, int, int]] = field(default_factory=list)
-    """Time of SYNC in s, motor, load and demand of the drive in counts."""
+    rows: list[tuple[float, int, int, int, int]] = field(default_factory=list)
+    """Time of SYNC in s; motor, load and demand of the drive in counts; its torque in per mille."""
 
     def write(self, path: Path, *, skip: Callable[[can.Message], bool] = lambda _: False) -> Path:
         """Writes the frames with the python-can writer that matches the file's extension."""
@@ -116,10 +116,10 @@ class Master:
         self.send(0x080)
         frames = self.take()
         load, _ = struct.unpack("<iH", frames[0x1A1])
-        _, motor = struct.unpack("<hi", frames[0x2C1])
+        torque, motor = struct.unpack("<hi", frames[0x2C1])
         demand = struct.unpack("<i", frames[0x381])[0] if 0x381 in frames else 0
         if word == 0x0F and target is not None:
-            self.log.rows.append((now_s, motor, load, demand))
+            self.log.rows.append((now_s, motor, load, demand, torque))
         self.send(0x231, struct.pack("<iH", motor if target is None else target, word))
         self.clock.sleep_until(now_s + PERIOD_S)
         return motor, load
@@ -178,6 +178,9 @@ def check_angles(recording: Recording, logged: Logged, *, time_s: float = 1e-6) 
     first = next(each for each in shifts if np.array_equal(motor[each : each + len(rows)], rows[:, 1]))
     known = slice(first, first + len(rows))
     np.testing.assert_array_equal(load[known], rows[:, 2])
+    torque = 1000.0 * record.columns["motor_torque_nm"] / AXIS.drive.rated_torque_nm
+    np.testing.assert_allclose(torque[known], rows[:, 4], atol=1e-6)
+    assert np.ptp(rows[:, 4]) > 100
     assert len(record) <= len(rows) + 6
     np.testing.assert_allclose(np.diff(record.time_s), PERIOD_S, atol=2 * time_s)
     return known

@@ -97,7 +97,9 @@ def test_shortened_tasks_are_reported():
 
 def test_every_task_starts_from_the_same_pose_and_direction():
     axis = AxisView(50.0, WIDE)
-    for task in Plan.load("quick").tasks(axis).tasks:
+    tasks = Plan.load("quick").tasks(axis).tasks
+    assert tasks
+    for task in tasks:
         moves = task.procedure.moves(axis)
         first = next(moves)
         second = moves.send(())

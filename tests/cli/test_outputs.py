@@ -208,6 +208,7 @@ def test_aliases_of_a_future_file_are_recognised(tmp_path_factory, names):
 
 def test_every_output_option_is_guarded():
     """`--json` and `--html` are outputs everywhere; other outputs begin their help with "Write"."""
+    outputs = set()
     for name in (name for panel in PANELS.values() for name in panel):
         loaded = load(name)
         groups = [each.typer_instance for each in loaded.registered_groups]
@@ -222,3 +223,5 @@ def test_every_output_option_is_guarded():
                 writes = names_a_place and says.startswith("Write")
                 guarded = any(isinstance(each, Kind) for each in getattr(hint, "__metadata__", ()))
                 assert writes == guarded, (name, parameter, says)
+                outputs |= {parameter} if writes else set()
+    assert len(outputs) > 3, outputs

@@ -219,6 +219,24 @@ def test_the_slew_limit_holds_through_a_reversal():
     assert compensation.limited > 0
 
 
+@pytest.mark.parametrize(
+    "limits", [CompensationLimits(slew_arcsec_s=500.0), CompensationLimits(maximum_arcsec=8.0, ramp_s=0.0)]
+)
+def test_the_motor_target_contains_the_limited_correction(limits):
+    compensation = Compensation(model(), limits, PERIOD)
+    compensation.reset(0.0)
+    compensation.engage()
+    before = 0.0
+    there = travel(2.0)
+    for load in there + there[::-1]:
+        correction = 3600.0 * (load - compensation.command(load) / 50.0)
+        assert correction == pytest.approx(compensation.correction_arcsec, abs=1e-6)
+        assert abs(correction) <= limits.maximum_arcsec + 1e-6
+        assert abs(correction - before) <= limits.slew_arcsec_s * PERIOD + 1e-6
+        before = correction
+    assert compensation.limited > 0
+
+
 def test_reset_begins_without_a_correction_wherever_the_motor_stands():
     compensation = Compensation(model(), CompensationLimits(), PERIOD)
     compensation.reset(1234.5)

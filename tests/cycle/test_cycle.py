@@ -57,6 +57,19 @@ def test_the_first_cycle_after_a_rest_sends_the_heartbeat(idle) -> None:
     assert [can_id for _, can_id, _ in idle.sent] == [0x201, 0x080, 0x201, 0x77F]
 
 
+def test_heartbeats_missed_in_a_stall_are_not_sent_later(idle) -> None:
+    idle.node.faults.ignore_lost_heartbeat = True
+    for pause_s in (0.0, 0.3):
+        idle.clock.sleep_until(idle.clock.now() + pause_s)
+        for _ in range(50):
+            idle.cycle.tick()
+    times = [time_s for time_s, _ in idle.frames(0x77F)]
+    gaps = [b - a for a, b in pairwise(times)]
+    period_s = idle.drive.image.heartbeat_period_s
+    assert max(gaps) >= 0.3
+    assert min(gaps) >= period_s - idle.cycle.period_s - 1e-9
+
+
 def test_an_overrun_skips_whole_periods_and_never_bursts(moving) -> None:
     before = moving.move()
     moving.clock.sleep_until(moving.clock.now() + 0.007)

@@ -39,6 +39,53 @@ def test_frames_become_values(axis: AxisConfig) -> None:
     assert image.power.state is State.OPERATION_ENABLED
 
 
+def test_heartbeats_are_awaited_for_two_periods_and_sent_twice_in_the_drives_time_out(
+    build_axis: Callable[..., AxisConfig],
+) -> None:
+    image = ProcessImage(build_axis(drive__heartbeat_ms=80))
+    assert image.heartbeat_timeout_s == pytest.approx(0.16)
+    assert image.heartbeat_period_s == pytest.approx(0.04)
+
+
+def test_targets_at_the_limits_are_packed_and_no_further_ones(axis: AxisConfig) -> None:
+    image = ProcessImage(axis)
+    least, greatest = image.limits_counts
+    for target, beyond in ((least, least - 1), (greatest, greatest + 1)):
+        assert sent(image.pack_rpdo(target))[1] == target
+        with pytest.raises(InputError, match="the target was not sent"):
+            image.pack_rpdo(beyond)
+
+
+def test_a_quick_stop_is_sent_with_the_actual_position(axis: AxisConfig) -> None:
+    image = ProcessImage(axis)
+    image.accept(0x181, tpdo1(0x0027, 500))
+    image.pack_rpdo(1000)
+    assert sent(image.pack_rpdo_stop()) == (0x02, 500)
+
+
+END = 2**31
+"""First count beyond the range of 32 bits."""
+
+
+def test_positions_continue_beyond_their_32_bits_from_the_reading_at_boot_up(axis: AxisConfig) -> None:
+    image = ProcessImage(axis)
+    image.seed(END - 10, END - 20, 0x0040)
+    image.accept(0x181, tpdo1(0x0027, -END + 5))
+    image.accept(0x281, struct.pack("<ii", -END + 3, -END + 7))
+    assert (image.motor_counts, image.load_counts, image.demand_counts) == (END + 5, END + 3, END + 7)
+
+
+def test_without_6062h_the_earlier_target_continues_beyond_its_32_bits(
+    other: Callable[[str], ProcessImage],
+) -> None:
+    image = other(without(OWN, 0x6062))
+    image.seed(END - 10, 0, 0x0040)
+    image.accept(0x181, tpdo1(0x0027, -END + 5))
+    for target in (-END + 7, -END + 9):
+        image.follow_target(target)
+    assert image.demand_counts == END + 7
+
+
 @given(length=st.integers(0, 64).filter(lambda length: length != 8))
 def test_a_frame_of_the_wrong_length_changes_nothing(
     length: int, build_axis: Callable[..., AxisConfig]

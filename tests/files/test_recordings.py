@@ -1,12 +1,15 @@
 """Recording folders: round trip and refusals."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from hdbridge.axis import Identity
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record
-from hdbridge.records.recording import Recording, Segment, versions_here
+from hdbridge.records.recording import Recording, Segment, agreed_ratio, versions_here
 
 
 def record(start_s: float = 0.0, samples: int = 10) -> Record:
@@ -99,9 +102,22 @@ def test_bare_csv_files_and_folders_make_one_recording_in_the_order_given(tmp_pa
     assert both.record.starts == (0, 5)
     assert both.record.time_s[5] == pytest.approx(0.5)
     assert [each.start_s for each in both.segments] == pytest.approx([0.5, 0.8])
+    assert [each.end_s for each in both.segments] == pytest.approx([0.75, 1.4])
+    _, step = both.pieces()
+    assert step[1].time_s.tolist() == pytest.approx([0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4])
     assert (both.axis, both.ratio, both.notes) == (None, None, {})
     same = Recording.load(tmp_path / "one", tmp_path / "one")
     assert (same.axis, same.ratio, same.drive) == ("article", 50.0, FULL.drive)
+
+
+@pytest.mark.parametrize("other", [50.001, 49.0, 100.0])
+def test_recordings_of_another_ratio_are_refused_together(other):
+    several = {Path("one"): FULL, Path("two"): replace(FULL, ratio=other)}
+    with pytest.raises(InputError, match=f"two has a ratio of {other:g}, but one says 50; expected one gear"):
+        agreed_ratio(several, [])
+    assert agreed_ratio({Path("one"): FULL}, [("--ratio", 50.0), ("the model", None)]) == 50.0
+    with pytest.raises(InputError, match="the ratio of the gear is unknown"):
+        agreed_ratio({Path("bare"): Recording(record())}, [])
 
 
 def test_the_versions_name_hdbridge_itself():

@@ -208,6 +208,8 @@ def test_concatenated_records_keep_their_starts():
     assert [len(each) for each in both.parts()] == [11, 5, 5]
     assert [len(each) for each in concatenate([both, second]).parts()] == [11, 5, 5, 5]
     assert (np.diff(concatenate([both, both]).time_s) > 0).all()
+    assert both.rows(11, 21).starts == (0, 5)
+    assert both.rows(10, 16).starts == (0, 1)
 
 
 def test_a_span_of_time_includes_both_ends():

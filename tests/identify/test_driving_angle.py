@@ -142,7 +142,9 @@ def test_a_flickering_reading_at_rest_is_averaged(flicker, rate_hz, seed):
     measured = np.round(motor / count + flicker * rng.standard_normal(len(motor))) * count
     path = driving_angle(command, measured, 1.0 / rate_hz)
     rests = np.flatnonzero(np.diff(motor) == 0.0)
-    for rest in np.split(rests, np.flatnonzero(np.diff(rests) > 1) + 1)[1:]:
+    _, *between = np.split(rests, np.flatnonzero(np.diff(rests) > 1) + 1)
+    assert len(between) == 12
+    for rest in between:
         settled = path[rest[len(rest) // 4] : rest[-len(rest) // 8]]
         assert np.ptp(settled) < 0.1 * count
         assert abs(settled[0] - motor[rest[-1]]) < 1.1 * count

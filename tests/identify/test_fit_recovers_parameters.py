@@ -38,6 +38,7 @@ def test_intervals_are_narrow_enough_to_be_useful(standard):
 def test_the_residual_is_the_noise_and_no_more(standard):
     assert standard.noise.residual_arcsec == pytest.approx(0.5, rel=0.05)
     assert standard.noise.standing_arcsec == pytest.approx(0.5, rel=0.1)
+    assert standard.residual_tests
     assert all(each.passed for each in standard.residual_tests), standard.residual_tests
 
 

@@ -43,6 +43,28 @@ def test_limits_hold_for_any_target(goals):
     assert point.at_rest
 
 
+@given(begin=st.floats(30.0, 39.9), goal=st.sampled_from([40.0, 1e3]), way=st.sampled_from([1.0, -1.0]))
+def test_it_brakes_before_a_position_limit_without_exceeding_the_acceleration(begin, goal, way):
+    point = following(way * begin)
+    before, velocity = way * begin, 0.0
+    for _ in range(1000):
+        point.aim(way * goal)
+        place = point.step()
+        speed = (place - before) / PERIOD_S
+        assert abs(speed - velocity) <= 200.0 * PERIOD_S + 1e-6
+        before, velocity = place, speed
+    assert before == way * 40.0
+
+
+@given(goal=st.floats(0.1, 30.0))
+def test_a_goal_at_rest_is_reached_without_overshoot(goal):
+    point = following()
+    while not point.at_rest or point.position_deg == 0.0:
+        point.aim(goal)
+        assert point.step() <= goal + 1e-12
+    assert point.position_deg == goal
+
+
 @given(
     goals=st.lists(st.tuples(st.floats(-30, 30), st.integers(1, 40)), min_size=1, max_size=8),
     spacing_s=st.sampled_from([0.0, 0.02]),

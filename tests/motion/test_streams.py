@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hdbridge.errors import InputError
 from hdbridge.motion import MotionMode, SetPoint, coordinated
 from hdbridge.motion.procedures.moves import MotionLimits
-from hdbridge.motion.stream import MOST_KNOTS
+from hdbridge.motion.stream import MOST_KNOTS, Cubic
 
 LIMITS = MotionLimits(-90.0, 120.0, 60.0, 200.0, 4000.0)
 PERIOD_S = 0.004
@@ -137,6 +137,7 @@ def test_a_later_first_knot_delays_the_start():
         ((0.1, 1.0, 0.0), r"600 deg/s2; the axis file allows 200 \(limits.acceleration_deg_s2\)"),
         ((100.0, 121.0, 0.0), "position limits are -90 and 120 deg"),
         ((20.0, 119.0, 30.0), "could not brake"),
+        ((20.0, 119.0, 25.0), "could not brake"),
         ((100.0, 120.0, 5.0), "could not brake"),
         ((100.0, 120.0, -5.0), "leads through"),
     ],
@@ -150,6 +151,48 @@ def test_a_knot_beyond_the_limits_is_refused_and_the_stream_continues(knot, mess
     for _ in range(102):
         set_point.step()
     assert set_point.position_deg == 1.0
+
+
+@given(
+    begin=st.floats(-50.0, 50.0),
+    end=st.floats(-50.0, 50.0),
+    speeds=st.tuples(st.floats(-80.0, 80.0), st.floats(-80.0, 80.0)),
+    duration_s=st.floats(0.05, 5.0),
+)
+def test_extremes_of_a_cubic_are_those_of_its_path(begin, end, speeds, duration_s):
+    cubic = Cubic.between(1.0, begin, speeds[0], 1.0 + duration_s, end, speeds[1])
+    states = [cubic.state(1.0 + duration_s * number / 4000) for number in range(4001)]
+    places, velocities, accelerations = np.array(states).T
+    lowest, highest = cubic.extremes_deg()
+    fastest, hardest = cubic.fastest_deg_s(), cubic.hardest_deg_s2()
+    near = hardest * (duration_s / 400) ** 2
+    assert places.min() - near - 1e-9 <= lowest <= places.min() + 1e-9
+    assert places.max() - 1e-9 <= highest <= places.max() + near + 1e-9
+    assert hardest == pytest.approx(np.abs(accelerations).max(), abs=1e-6)
+    assert fastest == pytest.approx(np.abs(velocities).max(), rel=1e-6, abs=hardest * duration_s / 400)
+
+
+def accelerating(acceleration: float, speed: float) -> SetPoint:
+    """Streams a constant acceleration, and stops at a speed close to the axis's limit."""
+    set_point = streaming(begin=0.0)
+    end_s = 60.0 / abs(acceleration)
+    for number in range(int(end_s / PERIOD_S) + 1):
+        time_s = number * PERIOD_S
+        set_point.knot(time_s, 0.5 * acceleration * time_s**2, acceleration * time_s)
+    while abs(set_point.velocity_deg_s) < speed:
+        set_point.step()
+    return set_point
+
+
+def test_a_move_requested_in_hard_acceleration_does_not_exceed_the_speed_limit():
+    """The acceleration decreases at the jerk limit, during which the axis gains another 5 deg/s."""
+    set_point = accelerating(200.0, 58.0)
+    with pytest.raises(InputError, match="no trajectory"):
+        set_point.goto(110.0)
+    set_point.stop()
+    while not set_point.at_rest:
+        set_point.step()
+        assert abs(set_point.velocity_deg_s) <= LIMITS.velocity_deg_s * (1.0 + 2e-6)
 
 
 def test_a_stream_starts_at_rest_at_the_present_position():

@@ -17,6 +17,7 @@ from hdbridge.analysis.prepared import gather
 from hdbridge.cli import app
 from hdbridge.errors import InputError
 from hdbridge.files import csvfile
+from hdbridge.records.columns import Unit
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 from hdbridge.records.wraps import find_wraps
@@ -355,6 +356,35 @@ def test_a_single_jump_is_not_a_counter_wrap(jump_deg: float) -> None:
     assert find_wraps(slipped, slow / RATIO) is None
 
 
+@pytest.mark.parametrize("samples", [1, 2])
+def test_a_reading_that_is_a_turn_off_for_one_or_two_samples_is_not_a_counter_wrap(samples: int) -> None:
+    slow = np.round(MOTOR / 10.0, 8)
+    for first in (50, 120):
+        wrong = slow.copy()
+        wrong[first : first + samples] += 360.0
+        assert find_wraps(wrong, slow / RATIO) is None
+    wrong[80:120] += 360.0
+    assert find_wraps(wrong, slow / RATIO) is not None
+
+
+def test_a_single_wrap_of_a_binary_range_of_counts_is_found() -> None:
+    """The column is in degrees; the range of the 12-bit counter is 204.8 deg."""
+    angle = np.round(MOTOR / 8.0 / 0.05) * 0.05
+    wrapped = np.where(angle > 100.0, angle - 204.8, angle)
+    found = find_wraps(wrapped, angle / RATIO)
+    assert found is not None
+    assert found.period_deg == pytest.approx(204.8, abs=0.1)
+    slipped = np.where(angle > 100.0, angle - 190.0, angle)
+    assert find_wraps(slipped, angle / RATIO) is None
+
+
+def test_times_since_1970_keep_their_precision(tmp_path: Path) -> None:
+    path = tmp_path / "bench.csv"
+    path.write_text(text(time=1.7e15 + TIME * 1e6))
+    record = Record.read_csv(path, units="time=us")
+    np.testing.assert_allclose(record.time_s, TIME, atol=1e-10)
+
+
 @pytest.mark.parametrize("scatter_deg", [0.3, 0.6])
 def test_steps_that_differ_by_jitter_are_not_a_counter(scatter_deg: float) -> None:
     """Fast motion at 10 Hz: the two angles are sampled at different times, and two of the slips are equal."""
@@ -434,6 +464,39 @@ def test_a_wrapping_clock_is_reported_with_its_period(tmp_path: Path) -> None:
         Record.read_csv(path, units="time=ms")
     record = Record.read_csv(path, units="time=ms", unwrap="time=65536")
     np.testing.assert_allclose(np.diff(record.time_s), 0.01)
+
+
+def test_a_clock_that_repeats_a_time_and_wraps_is_unwrapped_only_where_it_wraps(tmp_path: Path) -> None:
+    path = tmp_path / "bench.csv"
+    ticks = np.repeat(np.arange(100) * 20.0, 2)  # coarser than the sampling period
+    path.write_text(text(time=(ticks + 65_000.0) % 65_536.0))
+    record = Record.read_csv(path, units="time=ms", unwrap="time=65536")
+    np.testing.assert_allclose(record.time_s - record.time_s[0], ticks / 1000.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("channel", "unit", "value", "expected"),
+    [
+        ("temperature", "degC", 20.0, 20.0),
+        ("temperature", "K", 300.0, 26.85),
+        ("temperature", "degF", 212.0, 100.0),
+        ("temperature", "degF", 32.0, 0.0),
+        ("temperature", "0.1degC", 235.0, 23.5),
+        ("motor_torque", "Nm", 0.3, 0.3),
+        ("motor_torque", "mNm", 300.0, 0.3),
+        ("motor_torque", "kNm", 0.3, 300.0),
+        ("motor_torque", "percent:2.5", 50.0, 1.25),
+        ("motor_torque", "-permille:2.5", 100.0, -0.25),
+        ("load_torque", "percent:40", -10.0, -4.0),
+        ("target", "counts:8000", 2000.0, 90.0),
+        ("target", "mrad", 1000.0, math.degrees(1.0)),
+        ("time", "min", 2.0, 120.0),
+        ("time", "ns", 5e8, 0.5),
+    ],
+)
+def test_every_unit_has_its_factor_and_zero(channel: str, unit: str, value: float, expected: float) -> None:
+    converted = Unit.parse(unit, channel).convert(np.array([value]))
+    assert converted.tolist() == pytest.approx([expected])
 
 
 def test_columns_of_any_name_and_unit_are_the_same_record(folder: Path) -> None:

@@ -42,6 +42,7 @@ def charts_in(text):
 def test_a_page_has_no_external_references():
     chart = Chart("c", "x", "y", [Series("s", [0, 1], [1, 2], mark) for mark in Mark])
     reader = Reader(render(page_of(chart, Table(["a"], [["b"], [1.5]]), Facts([("k", "v")]))))
+    assert {"table", "script"} <= {tag for tag, _ in reader.tags}
     for tag, attributes in reader.tags:
         assert tag not in {"link", "img", "iframe", "object"}
         assert not {"src", "href", "srcset"} & set(attributes), (tag, attributes)

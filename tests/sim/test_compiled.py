@@ -270,6 +270,7 @@ def test_every_state_of_the_simulation_is_known_to_the_compiler() -> None:
         (method,) = [
             name for name in vars(protocol) if not name.startswith("_") and callable(getattr(protocol, name))
         ]
+        assert kinds.classes
         assert all(hasattr(cls, method) for cls in kinds.classes)
     assert known <= set(compiled.STATES)
 

@@ -51,7 +51,7 @@ class Benches:
         daemon.until_notified("READY=1")
         self._bench = DaemonBench(
             daemon, cable, disk, axis.drive.cycle_s, 2e-3 * axis.drive.heartbeat_ms,
-            Witness(THEIRS, axis.drive.cycle_s),
+            Witness.on(THEIRS, axis.drive.cycle_s),
         )  # fmt: skip
         return self._bench
 

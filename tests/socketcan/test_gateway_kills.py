@@ -119,7 +119,7 @@ def under_way(folder: Path) -> Iterator[tuple[Daemon, Plc, Witness]]:
             daemon.until_axis("disabled")
             with master(folder, Machine.load(path)) as plc:
                 enable(daemon, plc)
-                witness = Witness(THEIRS, PERIOD_S)
+                witness = Witness.on(THEIRS, PERIOD_S)
                 try:
                     yield daemon, plc, witness
                 finally:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import can
 import pytest
@@ -23,6 +23,12 @@ OURS, THEIRS = "hdvx0", "hdvx1"
 NODE: Final = 1
 STATE_TPDO: Final = 0x180 + NODE
 EMERGENCY: Final = 0x080 + NODE
+NMT: Final = 0x000
+SDO_REQUEST, SDO_ANSWER = 0x600 + NODE, 0x580 + NODE
+MASTER_LOST: Final = frozenset({0x8130, 0x8250, 0x8700})
+"""EMCY codes of a lost master: heartbeat, RPDO, SYNC."""
+ANSWERED: Final = 10
+"""Maximum cycles until the drive answers an SDO request."""
 FAR_DEG: Final = 60.0
 SLOW_DEG_S: Final = 2.0
 STANDS: Final = 3
@@ -85,20 +91,27 @@ def _run(*command: str) -> subprocess.CompletedProcess[str]:
 class Witness:
     """Node that listens on the bus, and measures time in cycles of the master."""
 
-    def __init__(self, channel: str, period_s: float) -> None:
-        self._bus = can.Bus(interface="socketcan", channel=channel, ignore_config=True)
+    def __init__(self, bus: can.BusABC, period_s: float, now: Callable[[], float] = time.time) -> None:
+        """``now`` is the clock of the bus's time stamps, s."""
+        self._bus = bus
         self._period_s = period_s
-        self._begun_s = time.time()
+        self._now = now
+        self._begun_s = now()
+
+    @classmethod
+    def on(cls, channel: str, period_s: float) -> Self:
+        """Opens a SocketCAN interface."""
+        return cls(can.Bus(interface="socketcan", channel=channel, ignore_config=True), period_s)
 
     def begin(self) -> None:
         """Discards the received frames and starts to count cycles."""
         while self._bus.recv(0) is not None:
             pass
-        self._begun_s = time.time()
+        self._begun_s = self._now()
 
     def cycles_until(self, met: Callable[[can.Message], bool], most: int) -> int:
         """Returns the number of cycles until a frame meets the condition; AssertionError after ``most``."""
-        while (waited_s := time.time() - self._begun_s) < (most + 1) * self._period_s:
+        while (waited_s := self._now() - self._begun_s) < (most + 1) * self._period_s:
             message = self._bus.recv((most + 1) * self._period_s - waited_s)
             if message is not None and met(message):
                 return 1 + int((message.timestamp - self._begun_s) / self._period_s)
@@ -129,6 +142,36 @@ class Witness:
         cycles = self.cycles_until(disabled, most)
         assert len(places) < 3 or max(places[-3:]) - min(places[-3:]) <= 2, f"power off in motion: {places}"
         return cycles
+
+    def cycles_until_own_stop(self, most: int) -> int:
+        """Returns the number of cycles until the drive has stopped by its own supervision.
+
+        The drive must report a lost master without an NMT command before it, and must then be out of
+        *operation enabled*. AssertionError otherwise.
+        """
+
+        def reports(message: can.Message) -> bool:
+            assert message.arbitration_id != NMT, "a master commands the drive"
+            code = int.from_bytes(message.data[:2], "little")
+            return message.arbitration_id == EMERGENCY and code in MASTER_LOST
+
+        cycles = self.cycles_until(reports, most)
+        state = decode(self._read_statusword(most + ANSWERED))
+        assert state is not State.OPERATION_ENABLED, "the drive reports a lost master but does not stop"
+        return cycles
+
+    def _read_statusword(self, most: int) -> int:
+        """Reads 6041h by SDO; AssertionError if no answer arrives in ``most`` cycles."""
+        answers: list[int] = []
+
+        def answer(message: can.Message) -> bool:
+            if message.arbitration_id == SDO_ANSWER and message.data[1:4] == b"\x41\x60\x00":
+                answers.append(int.from_bytes(message.data[4:6], "little"))
+            return bool(answers)
+
+        self.send(SDO_REQUEST, b"\x40\x41\x60\x00\0\0\0\0")
+        self.cycles_until(answer, most)
+        return answers[0]
 
     def send(self, can_id: int, data: bytes = b"", *, is_error_frame: bool = False) -> None:
         """Sends a frame as another node."""
@@ -166,7 +209,7 @@ class DaemonBench:
     def look_again(self) -> None:
         """Replaces the listening node after the far end of the cable was replaced."""
         self.witness.close()
-        self.witness = Witness(THEIRS, self.period_s)
+        self.witness = Witness.on(THEIRS, self.period_s)
 
     def under_way(self) -> None:
         """Starts a long slow motion of the axis, from any state."""

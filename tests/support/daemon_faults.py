@@ -12,7 +12,7 @@ import pytest
 
 from hdbridge.drive.supervision import Fault
 from support.command import run_apart
-from support.daemon_bench import EMERGENCY, OURS, SLOW_DEG_S, THEIRS, DaemonBench, DaemonRow
+from support.daemon_bench import OURS, SLOW_DEG_S, THEIRS, DaemonBench, DaemonRow
 from support.running import folders_in, gone
 
 CAN_ERR_BUSOFF: Final = 0x40
@@ -197,13 +197,13 @@ def _second_daemon(bench: DaemonBench) -> tuple[str, int, int]:
 
 
 def _drive_stops_by_itself(bench: DaemonBench, number: signal.Signals) -> tuple[int, int]:
-    """Sends a signal to the control process; returns the number of cycles until the drive reports the loss of
-    its master, and the number allowed.
+    """Sends a signal to the control process; returns the number of cycles until the drive has stopped by its
+    own supervision, and the number allowed.
     """
     allowed = int(bench.heartbeat_timeout_s / bench.period_s) + 2
     bench.witness.begin()
     os.kill(bench.daemon.pids("control")[-1], number)
-    return bench.witness.cycles_until(lambda each: each.arbitration_id == EMERGENCY, allowed), allowed
+    return bench.witness.cycles_until_own_stop(allowed), allowed
 
 
 def _control_goes(bench: DaemonBench, number: signal.Signals) -> tuple[str, int, int]:

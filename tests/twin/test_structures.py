@@ -96,7 +96,9 @@ def shares(other: Recording, axis: AxisConfig, truth: Truth) -> dict[str, float]
 @pytest.mark.parametrize("dead_time_ms", [0.5, 15.0])
 def test_a_start_uses_the_measured_lag_and_a_feasible_dead_time(cycle_ms: float, dead_time_ms: float) -> None:
     late = with_values(default_truth(AXIS), {"servo dead time": dead_time_ms, "command filter": 2.0})
-    for truth, parameters in starts(late, cycle_ms):
+    found = list(starts(late, cycle_ms))
+    assert found
+    for truth, parameters in found:
         servo = truth.servo
         assert servo.dead_time_ms <= MOST_DEAD_CYCLES * cycle_ms
         lag_ms = servo.dead_time_ms + 2.0 * servo.command_filter_ms + 0.5 * servo.moving_average_ms

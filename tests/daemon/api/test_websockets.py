@@ -83,6 +83,13 @@ def test_a_slow_client_loses_only_its_own_samples(api):
     those that were dropped.
     """
     api.bridge.rows = 40
+
+    def next_of(connection, last: int) -> messages.Samples:
+        samples = batch(connection)
+        assert samples.cycle == list(range(samples.cycle[0], samples.cycle[-1] + 1))
+        assert samples.cycle[0] == last + 1 + samples.lost
+        return samples
+
     with socket.socket(socket.AF_UNIX) as raw:
         raw.connect(str(api.socket))
         # Small buffers, so that little data is in transit.
@@ -92,17 +99,20 @@ def test_a_slow_client_loses_only_its_own_samples(api):
             live(api) as reader,
         ):
             begun = last = batch(reader).cycle[-1]
-            lost_by_reader = 0
+            read = lost_by_reader = 0
             while last < begun + 20_000:
-                samples = batch(reader)
+                samples = next_of(reader, last)
+                read += len(samples.cycle)
                 lost_by_reader += samples.lost
-                assert samples.cycle[0] == last + 1 + samples.lost or samples.lost
                 last = samples.cycle[-1]
+            asleep = batch(sleeper).cycle[-1]
             seen = lost = 0
             while lost <= seen:
-                samples = batch(sleeper)
+                samples = next_of(sleeper, asleep)
                 seen += len(samples.cycle)
                 lost += samples.lost
+                asleep = samples.cycle[-1]
+    assert read + lost_by_reader == last - begun >= 20_000
     assert lost_by_reader < lost
 
 

@@ -138,7 +138,9 @@ def test_gain_and_phase_changes_are_detected_but_a_pure_delay_is_not(
         return ratio * (speed * time_s + size * sum(waves) / 360.0)
 
     issued, motor = angle(at_s, 1.0, 0.0), angle(at_s - lag_s, gain, phase_deg)
-    for place, found in answers(stored, speed, lag_s, speed * at_s, issued, motor, orders, ratio):
+    given = list(answers(stored, speed, lag_s, speed * at_s, issued, motor, orders, ratio))
+    assert [place for place, _ in given] == [0, 1]
+    for place, found in given:
         hertz = orders[place] * abs(speed) * ratio / 360.0
         assert found.frequency_hz == pytest.approx(hertz)
         assert found.response == pytest.approx(gain * np.exp(1j * math.radians(phase_deg)), rel=1e-3)

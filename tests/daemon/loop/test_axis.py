@@ -1,10 +1,13 @@
 """An axis from unknown to moving and back, by commands through the memory and frames on the bus."""
 
 import struct
+from functools import partial
 
 import numpy as np
 import pytest
+from support.bare_axis import truth
 from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
+from support.torque import check_torque, directed
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.loop.states import AxisState
@@ -13,6 +16,7 @@ from hdbridge.daemon.memory import CommandKind, EventKind, Knot, SampleFlag
 from hdbridge.drive.states import State
 from hdbridge.enums import Scheme
 from hdbridge.motion import MotionMode
+from hdbridge.records.record import Record
 
 S, K, E = AxisState, CommandKind, EventKind
 
@@ -226,6 +230,22 @@ def test_axes_stream_together_or_not_at_all(pair: SteppedDaemon) -> None:
     both = samples["axes"]["load_target_deg"]
     moving = (samples["axes"]["mode"] == MotionMode.STREAM).all(axis=1)
     assert np.allclose(2 * (both[moving, 0] - begins[0]), both[moving, 1] - begins[1], atol=1e-9)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_samples_have_the_torque_that_accelerates_the_motor(direction: int) -> None:
+    known = truth(motor__encoder__direction=direction)
+    with stepped_daemon([directed(article_axes()[0], direction)], truth=known) as daemon:
+        daemon.verify()
+        daemon.enable()
+        record(daemon)
+        for target_deg in (20.0, -20.0):
+            moved = daemon.move(target_deg)
+            daemon.until(partial(daemon.ended, moved))
+        samples = record(daemon)
+    names = ("motor_position_deg", "load_position_deg", "motor_torque_nm")
+    columns = {name: samples[name] for name in names}
+    check_torque(known, Record({"time_s": daemon.period_s * np.arange(len(samples)), **columns}))
 
 
 def test_a_fault_stops_coordinated_axes_in_order(pair: SteppedDaemon) -> None:

@@ -241,14 +241,23 @@ def test_a_stale_position_at_enable_moves_nothing(bench: DaemonBench) -> None:
 # ---------------------------------------------------------------- processes
 
 
+def cycles_until_own_stop(bench: DaemonBench, most: float) -> int:
+    """Stalls the control process until every drive has left *operation enabled*; returns the cycles taken."""
+    nodes = bench.daemon.nodes
+    assert all(powered(each) for each in nodes)
+    cycles = 0
+    while any(powered(each) for each in nodes):
+        assert cycles < most, f"still powered after {most:g} cycles"
+        bench.daemon.hang(bench.period_s)
+        cycles += 1
+    return cycles
+
+
 def test_drives_stop_when_the_control_process_is_killed(bench: DaemonBench) -> None:
     bench.set_off()
     daemon = bench.daemon
-    cycles = 0
-    assert all(powered(each) for each in daemon.nodes)
-    while any(powered(each) for each in daemon.nodes):
-        daemon.hang(daemon.period_s)
-        cycles += 1
+    row = further("the control process is killed in motion")
+    row.show(cycles_until_own_stop(bench, row.allowed))
     daemon.hang(1.0)
     places = [bench.daemon.motor_counts(axis) for axis in range(2)]
     sent = daemon.sent()
@@ -263,7 +272,18 @@ def test_drives_stop_when_the_control_process_is_killed(bench: DaemonBench) -> N
     daemon.run(0.5)
     assert daemon.states == [S.DISABLED] * 2
     assert [bench.daemon.motor_counts(axis) for axis in range(2)] == pytest.approx(places, abs=2)
-    further("the control process is killed in motion").show(cycles)
+
+
+@pytest.mark.parametrize("ignores", ["lost masters", "missing heartbeats and set-points"])
+def test_drives_that_ignore_a_killed_control_process_fail_the_row(bench: DaemonBench, ignores: str) -> None:
+    bench.set_off()
+    for node in bench.daemon.nodes:
+        if ignores == "lost masters":
+            node.dictionary[0x6007, 0].value = 0
+        node.faults.ignore_lost_heartbeat = ignores != "lost masters"
+        node.faults.ignore_missing_set_points = ignores != "lost masters"
+    with pytest.raises(AssertionError, match="still powered after 25 cycles"):
+        cycles_until_own_stop(bench, 25)
 
 
 def test_a_jog_runs_out_when_the_service_dies(moving: DaemonBench) -> None:
