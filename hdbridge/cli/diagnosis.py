@@ -317,19 +317,11 @@ def improve(
         note(f"no measurement first; {trial}")
     else:
         work.announce(trial)
-    with work.booted() as (drive, progress, interrupted):
+    with work.booted() as (drive, callbacks):
         journal = None if recordings else work.begun(drive)
-        result = improve(
-            drive,
-            Source(work.plan, work.folder, journal, recordings, independent_zeros),
-            session.files.folder,
-            active,
-            work.date,
-            rounds=rounds if auto else 0,
-            progress=progress,
-            interrupted=interrupted,
-            notify=note,
-        )
+        source = Source(work.plan, work.folder, journal, recordings, independent_zeros)
+        rounds = rounds if auto else 0
+        result = improve(drive, source, session.files.folder, active, work.date, callbacks, rounds=rounds)
     _conclude(result, work.folder, session, json_file, html_file)
 
 

@@ -391,6 +391,7 @@ def motion(
     """
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.axis.model.store import propose as keep
+    from hdbridge.commissioning.calibration import Callbacks
     from hdbridge.commissioning.calibration.motion import motion_test, motion_test_s
 
     files, axis = session.files, session.axis
@@ -401,7 +402,7 @@ def motion(
     used.check_bound_to(axis)
     note(f"motion test: {motion_test_s(axis) / 60.0:.1f} min at most")
     with session.booted() as (drive, interrupted), phases() as progress:
-        result = motion_test(drive, used, measure=measure, progress=progress, interrupted=interrupted)
+        result = motion_test(drive, used, Callbacks(progress, interrupted), measure=measure)
         identity = drive.identity
     write_json(json_file, result.as_dict())
     if html_file is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects.elastic_loop import ElasticLoop
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration.identification import resting
-from hdbridge.commissioning.calibration.measure import Pace
+from hdbridge.commissioning.calibration.measure import SILENT, Callbacks, Pace
 from hdbridge.commissioning.calibration.path import SETTLED_ARCSEC
 from hdbridge.commissioning.evaluation.accuracy import AxisAccuracy, axis_accuracy
 from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_floor_arcsec
@@ -170,9 +170,7 @@ def validate(
     after: TransmissionModel,
     floor: Floor,
     folder: Path,
-    *,
-    progress: Callable[[str, float, float], None] = lambda *_: None,
-    interrupted: Callable[[], bool] = lambda: False,
+    callbacks: Callbacks = SILENT,
 ) -> tuple[Validation, TransmissionModel]:
     """Runs the stepping and positioning tests with ``before`` (None: no compensation), then with ``after``.
 
@@ -182,7 +180,7 @@ def validate(
     axis = drive.axis
     stepping = plan.stepping(axis_view(axis))
     positioning = plan.positioning(axis_view(axis))
-    pace = Pace(validation_s(plan, axis), axis.drive.cycle_s, progress, interrupted)
+    pace = Pace(validation_s(plan, axis), axis.drive.cycle_s, callbacks)
     results: list[Stepped] = []
     accuracies: list[AxisAccuracy] = []
     notes: list[str] = []
