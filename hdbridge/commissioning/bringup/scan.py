@@ -4,7 +4,8 @@ Only SDO read requests are sent (and an SDO abort after an unanswered request). 
 another SDO client is skipped, because a second client on the same channel would disrupt its transfer.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Final
@@ -13,6 +14,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.cia301 import NmtState
 from hdbridge.commissioning.bringup import ASK_TIMEOUT_S, LISTEN_S
 from hdbridge.drive import objects
+from hdbridge.drive.bootup import read_names
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.masterdetection import MasterDetector, listening_s
 from hdbridge.drive.monitor import NetworkMonitor
@@ -39,7 +41,6 @@ MODES: Final[dict[int, str]] = {
     0: "PP", 1: "VL", 2: "PV", 3: "TQ", 5: "HM", 6: "IP", 7: "CSP", 8: "CSV", 9: "CST",
 }  # fmt: skip
 """Modes of operation by their bit in 6502h."""
-_NAMES: Final = ((0x1008, "device"), (0x1009, "hardware"), (0x100A, "software"))
 _SCALING: Final = (
     objects.ENCODER_INCREMENTS,
     objects.ENCODER_REVOLUTIONS,
@@ -225,39 +226,31 @@ def _ask(observer: _BusObserver, node_id: int, timeout_s: float) -> Node:
         return node
     node.answers = True
     sdo = SdoClient(observer.link, observer.monitor, node_id, None, DETAIL_TIMEOUT_S, attempts=2)
-    for address, name in IDENTITY:
-        value = _fetch(sdo, address)
-        if value is not None:
-            node.identity[name] = value
-    for index, name in _NAMES:
-        try:
-            node.names[name] = sdo.read_text(index)
-        except SdoError:
-            continue
+    found = _fetched(sdo, dict(IDENTITY))
+    node.identity = {name: found[address] for address, name in IDENTITY if address in found}
+    node.names = read_names(sdo)
     wanted: tuple[Address, ...] = ()
     if node.profile == objects.DEVICE_PROFILE_402:
-        node.modes = _fetch(sdo, objects.SUPPORTED_MODES)
+        node.modes = _fetched(sdo, (objects.SUPPORTED_MODES,)).get(objects.SUPPORTED_MODES)
         wanted = _SCALING
     elif node.profile == 406:
         wanted = (ENCODER_UNITS_PER_TURN,)
-    for address in wanted:
-        value = _fetch(sdo, address)
-        if value is not None:
-            node.values[address] = value
+    node.values = _fetched(sdo, wanted)
     return node
 
 
-def _fetch(sdo: SdoClient, address: Address) -> int | None:
-    try:
-        return sdo.read(address.index, address.sub, address.type)
-    except SdoError:
-        return None  # optional object
+def _fetched(sdo: SdoClient, addresses: Iterable[Address]) -> dict[Address, int]:
+    """Reads optional objects; omits those that the node lacks."""
+    found = {}
+    for address in addresses:
+        with suppress(SdoError):
+            found[address] = sdo.read(address.index, address.sub, address.type)
+    return found
 
 
 def identity_matches(axis: AxisConfig, node: Node) -> bool:
     """Returns True if the node's identity is that of the axis file."""
-    wanted = axis.drive.identity.model_dump(exclude_none=True)
-    return all(node.identity.get(name) == value for name, value in wanted.items())
+    return not _identity_lines(axis, node)
 
 
 def compare(axis: AxisConfig, scan: Scan) -> tuple[bool, list[str]]:

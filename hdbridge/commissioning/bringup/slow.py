@@ -414,6 +414,14 @@ class BringUpContext(ExitStack):
             self.drive.fault_reset()
         return self.drive
 
+    @contextmanager
+    def moving(self) -> Iterator[SlowAxis]:
+        """Yields the axis for slow motion, freshly booted and under power until the end of the block."""
+        with self.interruptible() as interrupted:
+            slow = self.slow(interrupted)
+            with slow.enabled():
+                yield slow
+
     def slow(self, interrupted: Callable[[], bool]) -> SlowAxis:
         """Returns the axis for slow motion, freshly booted and still switched off."""
         return SlowAxis(self.boot(), self.torque_percent, interrupted)
