@@ -311,7 +311,10 @@ def scan(
     write_json(json_file, result)
     _print_scan(link.name, found)
     if axis is not None:
-        _print_match(axis, matches, lines)
+        if matches:
+            say(f"\nnode {axis.drive.node_id} is the drive of {axis.path}")
+        for line in lines:
+            say(line)
     _judge_scan(link.name, found, axis, matches)
 
 
@@ -344,13 +347,6 @@ def _facts_of_node(node: Node) -> dict[str, str]:
     if node.modes is not None:
         facts["modes"] = ", ".join(node.mode_names) or "none"
     return facts
-
-
-def _print_match(axis: AxisConfig, matches: bool, lines: list[str]) -> None:
-    if matches:
-        say(f"\nnode {axis.drive.node_id} is the drive of {axis.path}")
-    for line in lines:
-        say(line)
 
 
 def _judge_scan(name: str, found: Scan, axis: AxisConfig | None, matches: bool) -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from datetime import datetime
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -80,7 +81,7 @@ def move(
             hold_s = 0.0  # a simulated axis need not hold its position
         hold = Hold(math.inf if hold_s is None else hold_s, released=interrupted)
         stands_deg = drive.read_positions().motor_deg / axis.gear.ratio
-        targets_deg = _absolute(angles_deg, stands_deg) if relative else angles_deg
+        targets_deg = [*accumulate(angles_deg, initial=stands_deg)][1:] if relative else angles_deg
         way = WayPoints(tuple(targets_deg), hold, velocity_deg_s)
         bench = Bench(drive, compensation, interrupted=lambda: interrupted() and not hold.begun)
         with progress_bar() as bar:
@@ -125,14 +126,6 @@ def _compensating(
         note(f"not compensated: {files.model} does not exist")
         return TransmissionModel(ratio)
     return TransmissionModel.load(given or files.model)
-
-
-def _absolute(steps_deg: list[float], start_deg: float) -> list[float]:
-    targets = []
-    for step_deg in steps_deg:
-        start_deg += step_deg
-        targets.append(start_deg)
-    return targets
 
 
 def _move_document(axis: str, model: TransmissionModel, stands: tuple[Standing, ...]) -> dict[str, Any]:
@@ -236,7 +229,7 @@ def run_comparison(
 
     ``notify`` receives the result. For an interrupted test, this is the result of the completed schemes.
     """
-    from hdbridge.commissioning.evaluation.comparison import compare_schemes
+    from hdbridge.commissioning.evaluation.comparison import Comparison, compare_schemes
     from hdbridge.control.bench import compensation_for
     from hdbridge.control.caps import cap_remark
 
@@ -255,12 +248,6 @@ def run_comparison(
 
     done: dict[Scheme, Run[SteppingOutcome]] = {}
 
-    def keep(scheme: Scheme, run: Run[SteppingOutcome]) -> None:
-        done[scheme] = run
-        if record is not None:
-            with writing():
-                run.record.write_csv(record / f"stepping-{scheme.value}.csv.gz")
-
     def stopped(scheme: Scheme, measured: Record) -> None:
         path = None if record is None else record / f"stepping-{scheme.value}-stopped.csv.gz"
         if path is not None:
@@ -270,49 +257,29 @@ def run_comparison(
         seconds = float(measured.time_s[-1] - measured.time_s[0])
         note(f"stopped in '{scheme.value}' after {seconds:.1f} s, {kept}")
 
-    with (
-        _reported_when_stopped(axis, done, notify),
-        session.booted() as (drive, interrupted),
-        progress_bar() as bar,
-    ):
-        bars = {each: bar.add_task(f"{each.value:>12}", total=1.0, visible=False) for each in wanted}
-
-        begun: set[Scheme] = set()
-
-        def show(scheme: Scheme, share: float) -> None:
-            if scheme not in begun:
-                begun.add(scheme)
-                bar.reset(bars[scheme])  # the bar's elapsed time starts here
-                for each in bars.values():  # no progress bar for a refused test
-                    bar.update(each, visible=True)
-            bar.update(bars[scheme], completed=share)
-
-        comparison = compare_schemes(
-            drive,
-            model,
-            wanted,
-            stepping,
-            progress=show,
-            interrupted=interrupted,
-            finished=keep,
-            stopped=stopped,
-        )
-    notify(comparison)
-
-
-@contextmanager
-def _reported_when_stopped(
-    axis: AxisConfig, done: dict[Scheme, Run[SteppingOutcome]], notify: Callable[[Comparison], None]
-) -> Iterator[None]:
-    """Reports the results of the completed schemes if a test is interrupted."""
-    from hdbridge.commissioning.evaluation.comparison import Comparison
-
     try:
-        yield
-    except BaseException:
+        with session.booted() as (drive, interrupted), progress_bar() as bar:
+            bars = {each: bar.add_task(f"{each.value:>12}", total=1.0, visible=False) for each in wanted}
+            begun: set[Scheme] = set()
+
+            def show(scheme: Scheme, share: float) -> None:
+                if scheme not in begun:
+                    begun.add(scheme)
+                    bar.reset(bars[scheme])  # the bar's elapsed time starts here
+                    for each in bars.values():  # no progress bar for a refused test
+                        bar.update(each, visible=True)
+                bar.update(bars[scheme], completed=share)
+
+            for scheme, run in compare_schemes(
+                drive, model, wanted, stepping, progress=show, interrupted=interrupted, stopped=stopped
+            ):
+                done[scheme] = run
+                if record is not None:
+                    with writing():
+                        run.record.write_csv(record / f"stepping-{scheme.value}.csv.gz")
+    finally:
         if done:
             notify(Comparison.of(axis, done))
-        raise
 
 
 def _print_stepping(axis: AxisConfig, comparison: Comparison) -> None:
