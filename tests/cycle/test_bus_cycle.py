@@ -11,7 +11,7 @@ from support.twoaxes import TwoAxes, axis_of, two_axes
 
 from hdbridge.axis.encoders import Source
 from hdbridge.control.axiscycle import AxisCycle
-from hdbridge.drive.busload import bus_load, frame_bits
+from hdbridge.drive.busload import FRAME_BITS, bus_load
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
@@ -192,9 +192,9 @@ def test_bus_load_of_a_turn_matches_its_frames(pair: TwoAxes) -> None:
         pair.turn()
         seen = 0
         while (message := pair.intruder.recv(0)) is not None:
-            seen += frame_bits(len(message.data))
+            seen += FRAME_BITS[len(message.data)]
         # A heartbeat that arrives after the end of a cycle counts in the next one.
-        assert cycle.bus_load * 4000 == pytest.approx(seen, abs=2 * frame_bits(1))
+        assert cycle.bus_load * 4000 == pytest.approx(seen, abs=2 * FRAME_BITS[1])
     configs = [axis.image.axis for axis in pair.axes]
     most = bus_load(configs, 1_000_000)
     assert most is not None
