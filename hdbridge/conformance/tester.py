@@ -18,6 +18,7 @@ from hdbridge.cia301 import NmtCommand
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.states import State, decode
 from hdbridge.errors import DriveError, HdbridgeError
+from hdbridge.files.edsfile import variables
 
 STATES: Final = {0x00: "boot-up", 0x04: "STOPPED", 0x05: "OPERATIONAL", 0x7F: "PRE-OPERATIONAL"}
 """NMT states by the byte of a heartbeat."""
@@ -509,8 +510,7 @@ class NodeTester:
 
     def variables(self) -> Iterator[ODVariable]:
         """Yields the entries of the EDS, if any."""
-        for item in (self.od or {}).values():
-            yield from [item] if isinstance(item, ODVariable) else item.subindices.values()
+        return iter(()) if self.od is None else variables(self.od)
 
     def scratch(self) -> tuple[int, int, int]:
         """Returns (index, sub-index, bits) of a writable, mappable object without side effects."""

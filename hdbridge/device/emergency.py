@@ -11,6 +11,8 @@ from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError, only
 HISTORY_DEPTH: Final = 8
 _FRAME: Final = struct.Struct("<HB5s")
 _DISABLED: Final = 1 << 31
+_REGISTER_BITS: Final = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x8: 0x10, 0xF: 0x80}
+"""Bits of 1001h by the leading digit of an error code."""
 
 
 class ErrorCode(IntEnum):
@@ -81,25 +83,10 @@ class Emergency:
         """Returns object 1001h: bit 0 for any error, bits 1 to 7 by the class of the code."""
         register = 0
         for code in self.active:
-            register |= 1 | _register_bit(code)
+            register |= 1 | (0x20 if code >> 8 == 0x86 else _REGISTER_BITS.get(code >> 12, 0))
         return register
 
     @staticmethod
     def _check_can_id(value: int) -> None:
         if not 0x81 <= value & 0x7FF <= 0xFF or value & 0x7FFFF800:
             raise SdoAbortError(Abort.RANGE)
-
-
-def _register_bit(code: int) -> int:
-    for high_byte, bit in (
-        (0x86, 0x20),
-        (0x20, 0x02),
-        (0x30, 0x04),
-        (0x40, 0x08),
-        (0x80, 0x10),
-        (0xF0, 0x80),
-    ):
-        mask = 0xFF00 if high_byte == 0x86 else 0xF000
-        if code & mask == high_byte << 8:
-            return bit
-    return 0

@@ -122,13 +122,10 @@ class Pdo:
         return entry
 
     def _check_can_id(self, value: int) -> None:
-        if self.valid and not value & INVALID and (value & ~INVALID) != self._communication_id():
+        if self.valid and not value & INVALID and (value & ~INVALID) != self._parameter(1) & ~INVALID:
             raise SdoAbortError(Abort.STATE)  # CiA 301: bits 0 to 29 are fixed while the PDO exists
         if value & EXTENDED or not (value & INVALID or 0x181 <= value & 0x7FF <= 0x57F):
             raise SdoAbortError(Abort.RANGE)
-
-    def _communication_id(self) -> int:
-        return self._dictionary.value(self._communication, 1) & ~INVALID
 
     def _check_fixed(self, sub: int, value: int) -> None:
         """Refuses a different value while the PDO exists; the current value is accepted, because some masters

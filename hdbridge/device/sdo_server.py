@@ -128,12 +128,7 @@ class SdoServer:
             size = 4 - (command >> 2 & 3) if sized else own_size
             entry.write(data[:size])
         else:
-            self._expected_size = struct.unpack("<I", data)[0] if sized else None
-            if self._expected_size is not None:
-                entry.check_length(self._expected_size)
-            elif not entry.writable:
-                raise SdoAbortError(Abort.READ_ONLY)
-            self._begin(entry, uploading=False)
+            self._begin_download(entry, struct.unpack("<I", data)[0] if sized else None)
         return _HEAD.pack(0x60, *self._object) + bytes(4)
 
     def _download_segment(self, command: int, request: bytes) -> bytes:
@@ -158,12 +153,7 @@ class SdoServer:
         if command & 1:
             raise SdoAbortError(Abort.COMMAND)
         entry = self._open(request)
-        self._expected_size = struct.unpack_from("<I", request, 4)[0] if command & 2 else None
-        if self._expected_size is not None:
-            entry.check_length(self._expected_size)
-        elif not entry.writable:
-            raise SdoAbortError(Abort.READ_ONLY)
-        self._begin(entry, uploading=False)
+        self._begin_download(entry, struct.unpack_from("<I", request, 4)[0] if command & 2 else None)
         self._checks_crc = bool(command & 4)
         self._sequence, self._block = 0, _Block.SEGMENTS_IN
         return _HEAD.pack(0xA4, *self._object) + bytes((_MOST_SEGMENTS, 0, 0, 0))
@@ -249,6 +239,14 @@ class SdoServer:
         self._block = _Block.END_OUT
         empty = self._sent - len(data)
         return [struct.pack("<BH5x", 0xC1 | empty << 2, crc_hqx(data, 0))]
+
+    def _begin_download(self, entry: Entry, size: int | None) -> None:
+        self._expected_size = size
+        if size is not None:
+            entry.check_length(size)
+        elif not entry.writable:
+            raise SdoAbortError(Abort.READ_ONLY)
+        self._begin(entry, uploading=False)
 
     def _begin(self, entry: Entry, *, uploading: bool) -> None:
         self._entry, self._uploading, self._buffer, self._toggle = entry, uploading, b"", 0

@@ -30,7 +30,7 @@ from hdbridge.drive.nameplate import (
     scaling_complaints,
     torque_notes,
 )
-from hdbridge.drive.objects import Address, Mode
+from hdbridge.drive.objects import Mode
 from hdbridge.drive.sdo import SdoAbortError, SdoClient
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.writes import PlannedWrite
@@ -231,7 +231,7 @@ class BootUp:
         while state not in off:
             if self._link.now() >= deadline_s:
                 raise DriveError(
-                    f"{self._name(objects.STATUSWORD)}: the drive stays in '{state.value}' after 'disable "
+                    f"{self._sdo.describe(0x6041, 0)}: the drive stays in '{state.value}' after 'disable "
                     "voltage'; switch it off by its enable input and look at its error display"
                 )
             self._pause(_POLL_S)
@@ -331,9 +331,6 @@ class BootUp:
 
     def _decides(self, row: PlannedWrite) -> str:
         return f"; {self._axis.where(row.field)} decides it" if row.field else ""
-
-    def _name(self, address: Address) -> str:
-        return self._sdo.describe(address.index, address.sub)
 
 
 def read_identity(axis: AxisConfig, sdo: SdoClient) -> dict[str, int]:

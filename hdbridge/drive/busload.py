@@ -82,11 +82,10 @@ def check_bus_load(axes: Sequence[AxisConfig], bitrate_bps: int | None = None) -
 
 def _load_at(axes: Sequence[AxisConfig], rate: int, cycle_s: float) -> float:
     """Returns the bus load of the axes at a given bit rate and cycle time."""
-    return cycle_bits([_with_cycle(axis, 1e3 * cycle_s) for axis in axes]) / (rate * cycle_s)
-
-
-def _with_cycle(axis: AxisConfig, cycle_ms: float) -> AxisConfig:
-    return axis.model_copy(update={"drive": axis.drive.model_copy(update={"cycle_ms": cycle_ms})})
+    given = {"cycle_ms": 1e3 * cycle_s}
+    drives = [axis.drive.model_copy(update=given) for axis in axes]
+    changed = [axis.model_copy(update={"drive": each}) for axis, each in zip(axes, drives, strict=True)]
+    return cycle_bits(changed) / (rate * cycle_s)
 
 
 def _common_cycle_s(axes: Sequence[AxisConfig]) -> float:

@@ -213,12 +213,9 @@ class ProcessImage:
         return [
             layout.can_id
             for layout in self.channel_tpdos
-            if layout.every == 1 and not all(each.lost for each in self._followers_in(layout))
+            if layout.every == 1
+            and any(not each.lost for key, each in self._followers.items() if key in layout.codec.positions)
         ]
-
-    def _followers_in(self, layout: Layout) -> list[ChannelFollower]:
-        keys = [(entry.index, entry.sub) for entry in layout.codec.entries]
-        return [self._followers[key] for key in keys if key in self._followers]
 
     def step_channels(self) -> list[tuple[Fault, str]]:
         """Ends a cycle for the channels: updates ``readings`` and returns the channels' faults."""

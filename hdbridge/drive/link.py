@@ -249,12 +249,6 @@ def absent_interface(settings: BusConfig) -> str | None:
     return f"this computer has no network interface {channel!r}{hint}"
 
 
-def _lacking(interface: str) -> str | None:
-    """Returns the package required by a python-can interface; None if installed or unknown."""
-    module, package = _PACKAGES.get(interface, ("", ""))
-    return package if module and find_spec(module) is None else None
-
-
 @contextmanager
 def open_bus(settings: BusConfig, *, shared: bool = False) -> Iterator[can.BusABC]:
     """Opens the bus of an axis file; raises a one-line `BusError` on failure.
@@ -281,7 +275,8 @@ def _opened(settings: BusConfig) -> Iterator[can.BusABC]:
     try:
         bus = can.Bus(interface=settings.interface, channel=settings.channel, ignore_config=True, **options)
     except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as error:
-        if (package := _lacking(settings.interface)) is not None:
+        module, package = _PACKAGES.get(settings.interface, ("", ""))
+        if module and find_spec(module) is None:
             what = f"python-can needs the package {package} for it: python -m pip install {package}"
         else:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -9,13 +9,14 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from decimal import Decimal
+from functools import partial
 from typing import Final
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
-from hdbridge.drive.dictionary import find, held, integer_type
+from hdbridge.drive.dictionary import find, held, integer_type, permitted
 from hdbridge.drive.image import position_limits_counts
 from hdbridge.drive.layout import PDOS_PER_KIND, Layout, Layouts
 from hdbridge.drive.objects import PDO_INVALID, Address, IntegerType
@@ -215,19 +216,11 @@ def _pdo(layout: Layout, communication: int, mapping: int, fields: list[str]) ->
     communication += number - 1
     mapping += number - 1
 
-    def row(
-        index: int, sub: int, value: int, why: str, key: str, type_: IntegerType, **more: int
-    ) -> PlannedWrite:
-        compared, kept = more.get("compared", _EVERYTHING), more.get("kept", 0)
-        passing = bool(more.get("passing"))
-        return PlannedWrite(
-            node_id, index, sub, value, why, key, type_, compared, kept, pdo=communication, passing=passing
-        )
-
+    row = partial(PlannedWrite, node_id, pdo=communication)
     byte, word = IntegerType.UINT8, IntegerType.UINT32
     count = len(codec.entries)
     yield _invalid(node_id, communication, f"{name} is off while it is changed", field, pdo=communication)
-    yield row(mapping, 0, 0, f"{name} maps nothing while it is changed", "", byte, passing=1)
+    yield row(mapping, 0, 0, f"{name} maps nothing while it is changed", "", byte, passing=True)
     for place, (entry, chosen) in enumerate(zip(codec.entries, fields, strict=True), start=1):
         yield row(mapping, place, entry.mapping, f"{name} carries {entry}", chosen, word)
     yield row(mapping, 0, count, f"{name} maps {count} objects", field, byte)
@@ -281,13 +274,6 @@ def _period(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[int, int]:
         f"{axis.where('drive.cycle_ms')}: {axis.drive.eds} does not permit {axis.drive.cycle_ms:g} ms in "
         f"object 60C2h: {said or 'it is out of its limits'}; expected a cycle that the drive can have"
     )
-
-
-def permitted(variable: ODVariable, kind: IntegerType) -> tuple[int, int]:
-    """Returns the least and the greatest value of an object, by its type and its limits in the EDS."""
-    low = kind.minimum if variable.min is None else max(kind.minimum, variable.min)
-    high = kind.maximum if variable.max is None else min(kind.maximum, variable.max)
-    return low, high
 
 
 def _takes(variable: ODVariable, value: int) -> bool:

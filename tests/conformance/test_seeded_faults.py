@@ -244,8 +244,8 @@ NETWORK = (
 def at_once(watch: Method, node: DriveNode) -> Method:
     def more() -> None:
         if node._watched_s:
-            node._watch_due_s = node._now_s + node._watched_s
-            node._due_s = node._now_s
+            node._watch_due_s = node.now_s + node._watched_s
+            node._due_s = node.now_s
 
     return then(watch, more)
 
