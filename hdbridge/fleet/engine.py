@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import islice
 from multiprocessing.resource_tracker import ensure_running
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -193,7 +194,7 @@ class _Run:
         """Function that returns the cluster's client; its first call starts the cluster."""
         self._dataset = dataset
         self._stored = dataset.stored()
-        self._notify = progress
+        self._progress = progress
         self._interrupted = interrupted
         self._retried = retried
         self._renewed: dict[tuple[str, str], Row] = {}
@@ -232,8 +233,7 @@ class _Run:
             self._write()
             self._dataset.renew(self._renewed)
             self._dataset.compact(self._present)
-        self._report()
-        return self._state()
+        return self._report()
 
     def _unchanged(self, source: Source) -> Mapping[str, Any] | None:
         """Returns the stored row of an unchanged recording, reusable if its model is the same; or None."""
@@ -319,31 +319,21 @@ class _Run:
             return
         client = self._clients()
         numbered = enumerate(tasks)
-        numbers: dict[Any, int] = {}
+        numbers: dict[str, int] = {}
+        """Numbers of the submitted tasks by the key of their future."""
         done = as_completed([], loop=client.loop)
-        more, waiting = True, 0
-
-        def submit() -> None:
-            nonlocal more, waiting
-            while more and waiting < AHEAD:
-                found = next(numbered, None)
-                if found is None:
-                    more = False
-                    return
-                number, (work, arguments) = found
+        seen_s = time.monotonic()
+        while True:
+            for number, (work, arguments) in islice(numbered, AHEAD - len(numbers)):
                 future = client.submit(work, *arguments, pure=False)
                 numbers[future.key] = number
                 done.add(future)
-                waiting += 1
-
-        submit()
-        seen_s = time.monotonic()
-        while waiting or more:
+            if not numbers:
+                break
             if self._interrupted():
                 raise KeyboardInterrupt
-            batch = done.next_batch(block=False) if waiting else []
+            batch = done.next_batch(block=False)
             for future in batch:
-                waiting -= 1
                 number = numbers.pop(future.key)
                 try:
                     result = future.result()
@@ -351,7 +341,6 @@ class _Run:
                     result = None
                 future.release()
                 yield number, result
-            submit()
             if time.monotonic() - seen_s > 5.0:
                 seen_s = time.monotonic()
                 self._measure(client)
@@ -384,8 +373,7 @@ class _Run:
         self._rows.clear()
         self._written_s = time.monotonic()
 
-    def _state(self) -> Progress:
-        return Progress(len(self._present), self._total, self._failed, self._known, self._memory)
-
-    def _report(self) -> None:
-        self._notify(self._state())
+    def _report(self) -> Progress:
+        state = Progress(len(self._present), self._total, self._failed, self._known, self._memory)
+        self._progress(state)
+        return state
