@@ -196,7 +196,8 @@ def _verdict(results: Mapping[Scheme, Stepped], floor_arcsec: float) -> str:
     text = (
         f"With {NAMES[best]}, the load's error at rest is {pooled.three_sigma_arcsec:.2f} arcsec ({SIGMA}) "
         f"about a mean of {with_decimals(pooled.mean_arcsec)}: "
-        f"{pooled.three_sigma_arcsec / floor_arcsec:.2f} times the {floor_arcsec:.2f} that one motor count allows"
+        f"{pooled.three_sigma_arcsec / floor_arcsec:.2f} times the {floor_arcsec:.2f} that one motor count "
+        "allows"
     )
     if Scheme.NONE in results and best is not Scheme.NONE:
         before = results[Scheme.NONE].pooled.three_sigma_arcsec
