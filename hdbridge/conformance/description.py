@@ -151,16 +151,16 @@ _limit("lower", "min", -1)
 _limit("upper", "max", 1)
 
 
-def _is_communication(each: ODVariable) -> bool:
-    return each.index <= 0x1FFF and each.index not in _COMMANDS and each.access_type in ("rw", "const")
-
-
 @_check(
     "defaults", "After a reset the communication parameters have the defaults of the EDS",
     "the defaults of the EDS (parameters that were saved differ)",
 )  # fmt: skip
 def _(t: NodeTester) -> Iterator[str]:
-    entries = [each for each in _entries(t) if _is_communication(each)]
+    entries = [
+        each
+        for each in _entries(t)
+        if each.index <= 0x1FFF and each.index not in _COMMANDS and each.access_type in ("rw", "const")
+    ]
     t.reset(NmtCommand.RESET_NODE)
     for each in entries:
         if _has_default(each) and t.has(each.index, each.subindex):

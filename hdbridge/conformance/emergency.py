@@ -47,28 +47,24 @@ def _(t: NodeTester) -> None:
     t.equal(f"{t.read(0x1014) & 0x7FF:03X}h", f"{0x80 + t.node_id:03X}h", "identifier")
 
 
-@check("emcy.frame", "An EMCY message has eight bytes", _EMCY)
+@check("emcy.frame", "An EMCY message has eight bytes", _EMCY, first=lose_heartbeat)
 def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
     t.equal({len(frame.data) for frame in t.heard(0x80 + t.node_id)}, {8}, "length")
 
 
-@check("emcy.frame.register", "Byte 2 of an EMCY message is 1001h", _EMCY)
+@check("emcy.frame.register", "Byte 2 of an EMCY message is 1001h", _EMCY, first=lose_heartbeat)
 def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
     t.equal(t.heard(0x80 + t.node_id)[-1].data[2], t.read(0x1001), "error register")
 
 
-@check("emcy.once", "An error is reported once", _EMCY)
+@check("emcy.once", "An error is reported once", _EMCY, first=lose_heartbeat)
 def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
     t.wait(0.5)
     t.equal(t.emergencies().count(0x8130), 1, "number of EMCY messages")
 
 
-@check("emcy.disabled", "1014h with bit 31 set sends no EMCY", _EMCY, 0x1014)
+@check("emcy.disabled", "1014h with bit 31 set sends no EMCY", _EMCY, 0x1014, first=lose_heartbeat)
 def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
     t.send(0x77E, b"\x05")
     t.wait(0.02)
     t.write(0x1014, 0, t.read(0x1014) | PDO_INVALID, 4)
@@ -86,9 +82,8 @@ def _(t: NodeTester) -> None:
     t.true(heard, "no EMCY with the new identifier", "EMCY 8130h")
 
 
-@check("emcy.history", "An error is the first entry of 1003h", _HISTORY, 0x1003)
+@check("emcy.history", "An error is the first entry of 1003h", _HISTORY, 0x1003, first=lose_heartbeat)
 def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
     t.equal(f"{t.read(0x1003, 1) & 0xFFFF:04X}h", "8130h", "1003h:01")
 
 

@@ -28,12 +28,6 @@ def _ask(t: NodeTester, command: int, *values: int, number: int | None = None) -
     return t.reply(_ANSWER, lambda: t.send(_REQUEST, (bytes((command,)) + data).ljust(8, b"\0")))
 
 
-def _identity(t: NodeTester) -> list[int]:
-    for sub in range(1, 5):
-        t.require(0x1018, sub)
-    return [t.read(0x1018, sub) for sub in range(1, 5)]
-
-
 def _select(t: NodeTester, identity: list[int]) -> bytes | None:
     for part in range(3):
         t.send(_REQUEST, struct.pack("<BI3x", 0x40 + part, identity[part]))
@@ -54,7 +48,9 @@ def _check(name: str, text: str, *, stores: bool = False) -> Callable[[_Function
     def add(function: _Function) -> None:
         @CHECKS.check(f"lss.{name}", text, "CiA 305", stores=stores)
         def _(t: NodeTester) -> None:
-            identity = _identity(t)
+            for sub in range(1, 5):
+                t.require(0x1018, sub)
+            identity = [t.read(0x1018, sub) for sub in range(1, 5)]
             t.need(_select(t, identity), "no answer to LSS switch state selective: the node has no LSS")
             try:
                 function(t, identity)

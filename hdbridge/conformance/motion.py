@@ -10,6 +10,7 @@ from hdbridge.cia301 import NmtCommand
 from hdbridge.conformance.drive import MODES
 from hdbridge.conformance.tester import (
     ENABLING,
+    Decorator,
     NodeTester,
     NotApplicableError,
     Table,
@@ -184,22 +185,23 @@ _unmoved("fault.enable", _FAULT, 0x0F, "Enable operation")
 _unmoved("fault.quick-stop", _FAULT, 0x02, "Quick stop")
 
 
-@check("402.fault.reset.again", "A second fault is reset by another rising edge of bit 7", _STATES)
+def _in_fault(name: str, text: str, clause: str = _STATES, *needs: int) -> Decorator:
+    """Decorates a check that begins with a fault."""
+    return check(f"402.fault.{name}", text, clause, *needs, first=lambda t: _bring(t, _FAULT))
+
+
+@_in_fault("reset.again", "A second fault is reset by another rising edge of bit 7")
 def _(t: NodeTester) -> None:
-    _bring(t, _FAULT)
     _reset_fault(t)
     _enable_and_beat(t)
     _lose_master(t)
     _reset_fault(t, 0x8F)
 
 
-@check(
-    "402.fault.reset.edge",
-    "Bit 7 that is held does not reset a fault: only a rising edge of bit 7 resets a fault",
-    _STATES,
+@_in_fault(
+    "reset.edge", "Bit 7 that is held does not reset a fault: only a rising edge of bit 7 resets a fault"
 )
 def _(t: NodeTester) -> None:
-    _bring(t, _FAULT)
     t.control(0x00)
     _reset_fault(t)
     # The last controlword before the second fault already sets bit 7, so no rising edge follows the fault.
@@ -215,46 +217,36 @@ def _(t: NodeTester) -> None:
     t.stays(_FAULT, 0.1)
 
 
-@check(
-    "402.fault.reset.enables-nothing",
-    "A fault reset with the bits of enable operation does not enable",
-    _STATES,
-)
+@_in_fault("reset.enables-nothing", "A fault reset with the bits of enable operation does not enable")
 def _(t: NodeTester) -> None:
-    _bring(t, _FAULT)
     _reset_fault(t, 0x8F)
     t.control(0x0F)
     t.stays(_DISABLED, 0.1)
 
 
-@check("402.fault.code", "603Fh is the code of the fault", "CiA 402-2, object 603Fh", 0x603F)
+@_in_fault("code", "603Fh is the code of the fault", "CiA 402-2, object 603Fh", 0x603F)
 def _(t: NodeTester) -> None:
-    _bring(t, _FAULT)
     t.equal(f"{t.read(0x603F):04X}h", "8130h", "603Fh")
 
 
-@check("402.fault.code.reset", "603Fh is 0 after the fault reset", "CiA 402-2, object 603Fh", 0x603F)
+@_in_fault("code.reset", "603Fh is 0 after the fault reset", "CiA 402-2, object 603Fh", 0x603F)
 def _(t: NodeTester) -> None:
-    _bring(t, _FAULT)
     _reset_fault(t)
     t.equal(t.read(0x603F), 0, "603Fh")
 
 
-@check("402.fault.emergency", "A fault is reported by EMCY with its code", _STATES)
+@_in_fault("emergency", "A fault is reported by EMCY with its code")
 def _(t: NodeTester) -> None:
-    _bring(t, _FAULT)
     t.true(0x8130 in t.emergencies(), f"EMCY codes {t.emergencies()}", "8130h")
 
 
-@check("402.fault.emergency.reset", "The fault reset is reported by EMCY 0000h", _STATES)
+@_in_fault("emergency.reset", "The fault reset is reported by EMCY 0000h")
 def _(t: NodeTester) -> None:
-    _bring(t, _FAULT)
     t.equal(t.emergencies_after(0.05, lambda: _reset_fault(t))[-1:], [0], "last EMCY code")
 
 
-@check("402.fault.register", "1001h is not 0 during a fault, and 0 after its reset", _STATES)
+@_in_fault("register", "1001h is not 0 during a fault, and 0 after its reset")
 def _(t: NodeTester) -> None:
-    _bring(t, _FAULT)
     t.true(t.read(0x1001), "1001h = 0 during the fault", "bit 0")
     _reset_fault(t)
     t.wait(0.05)
@@ -358,6 +350,11 @@ def _enable_slowly(t: NodeTester) -> None:
     t.walk()
 
 
+def _pp(name: str, text: str) -> Decorator:
+    """Decorates a check that begins with the drive enabled in profile position mode."""
+    return check(f"402.pp.{name}", text, _PP, first=_enable_slowly)
+
+
 def _direction(t: NodeTester, distances: int) -> int:
     """Returns 1 or -1, the direction in which the software limits leave room for this many test distances."""
     if not t.has(0x607D, 1):
@@ -434,48 +431,42 @@ def _(t: NodeTester) -> None:
     _moved_at_most(t, before, 0.5 * t.travel)
 
 
-@check("402.pp.move", "A new set-point is reached", _PP)
+@_pp("move", "A new set-point is reached")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     _arrives(t, _begin_move(t, 2))
 
 
-@check("402.pp.acknowledge", "Bit 12 acknowledges a new set-point", _PP)
+@_pp("acknowledge", "Bit 12 acknowledges a new set-point")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     t.equal(t.read(0x6041) & _BIT_12, 0, "bit 12 before the set-point")
     _begin_move(t, 2)
     t.equal(t.read(0x6041) & _BIT_12, _BIT_12, "bit 12 while bit 4 of the controlword is 1")
 
 
-@check("402.pp.acknowledge.end", "Bit 12 falls when bit 4 of the controlword falls", _PP)
+@_pp("acknowledge.end", "Bit 12 falls when bit 4 of the controlword falls")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     _begin_move(t, 2)
     t.control(0x0F)
     t.wait(0.05)
     t.equal(t.read(0x6041) & _BIT_12, 0, "bit 12")
 
 
-@check("402.pp.reached", "Target reached is 0 during a move and 1 after it", _PP)
+@_pp("reached", "Target reached is 0 during a move and 1 after it")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     target = _begin_move(t, 3)
     t.equal(t.read(0x6041) & _REACHED, 0, "bit 10 in motion")
     _arrives(t, target)
 
 
-@check("402.pp.target-alone", "A target without a new set-point moves nothing", _PP)
+@_pp("target-alone", "A target without a new set-point moves nothing")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     t.put(0x607A, 0, _ahead(t, 3), 4)
     t.control(0x0F)
     _stands(t, 0.3)
 
 
-@check("402.pp.held", "Bit 4 that is held does not start a second move", _PP)
+@_pp("held", "Bit 4 that is held does not start a second move")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     target = _begin_move(t, 2)
     _arrives(t, target)
     t.put(0x607A, 0, 2 * _position(t) - target + _direction(t, 2) * t.travel, 4)
@@ -491,9 +482,8 @@ def _(t: NodeTester) -> None:
     _stands(t, 0.3)
 
 
-@check("402.pp.relative", "A relative set-point counts from the one before", _PP)
+@_pp("relative", "A relative set-point counts from the one before")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     first = _begin_move(t, 1)
     _arrives(t, first)
     distance = _direction(t, 2) * t.travel
@@ -502,9 +492,8 @@ def _(t: NodeTester) -> None:
     _arrives(t, first + distance)
 
 
-@check("402.pp.again", "A set-point where the axis is already is acknowledged and reached", _PP)
+@_pp("again", "A set-point where the axis is already is acknowledged and reached")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     target = _begin_move(t, 1)
     _arrives(t, target)
     _set_point(t, target)
@@ -544,9 +533,8 @@ def _(t: NodeTester) -> None:
     t.true(farthest < 0.9 * first, f"the axis turned back at {farthest}", f"clearly before {first}")
 
 
-@check("402.pp.velocity", "A move is not faster than the profile velocity", _PP)
+@_pp("velocity", "A move is not faster than the profile velocity")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     speed = t.read(0x6081)
     start, begun_s = _position(t), t.now
     target = _ahead(t, 4)
@@ -557,9 +545,8 @@ def _(t: NodeTester) -> None:
     t.true(duration_s > 0.9 * shortest_s, f"{duration_s:.3f} s", f"at least {shortest_s:.3f} s")
 
 
-@check("402.pp.halt", "Halt stops a move, and bit 10 is 1 at rest", _PP)
+@_pp("halt", "Halt stops a move, and bit 10 is 1 at rest")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     target = _begin_move(t, 4)
     t.control(0x11F)
     t.wait(_STOP_S)
@@ -569,9 +556,8 @@ def _(t: NodeTester) -> None:
     t.stays(_ENABLED)
 
 
-@check("402.pp.halt.end", "When halt ends the move is continued", _PP)
+@_pp("halt.end", "When halt ends the move is continued")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     target = _begin_move(t, 4)
     t.control(0x11F)
     t.wait(_STOP_S)

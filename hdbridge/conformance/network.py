@@ -6,7 +6,7 @@ from statistics import median
 from typing import Final
 
 from hdbridge.cia301 import NmtCommand
-from hdbridge.conformance.tester import ENTERED, NodeTester, Table, upload_request
+from hdbridge.conformance.tester import ENTERED, Decorator, NodeTester, Table, upload_request
 
 CHECKS: Final = Table()
 check: Final = CHECKS.check
@@ -42,12 +42,9 @@ def _boots(command: int) -> None:
         t.nmt(command)
         boot = t.boot_up(since)
         before = t.log[since : t.log.index(boot)]
-        own = [f"{frame.can_id:03X}h" for frame in before if _is_own(t, frame.can_id)]
+        ids = {kind + t.node_id for kind in (0x180, 0x280, 0x380, 0x480, 0x580)}
+        own = [f"{frame.can_id:03X}h" for frame in before if frame.can_id in ids]
         t.true(not own, f"before the boot-up message: {', '.join(own)}", "nothing")
-
-
-def _is_own(t: NodeTester, can_id: int) -> bool:
-    return can_id & 0x7F == t.node_id and can_id & 0x780 in (0x180, 0x280, 0x380, 0x480, 0x580)
 
 
 _boots(NmtCommand.RESET_NODE)
@@ -338,18 +335,14 @@ _behaviour(2, _STOP)
 # ---------------------------------------------------------------- node guarding
 
 
-def _guarding(name: str, text: str, *, timed: bool = False) -> Callable[[Callable[[NodeTester], None]], None]:
-    """Decorates the function of a check of node guarding; ``timed`` sets a node life time of 200 ms."""
+def _guarding(name: str, text: str, first: Callable[[NodeTester], None] | None = None) -> Decorator:
+    return check(f"guarding.{name}", text, _GUARDING, 0x100C, 0x100D, first=first)
 
-    def add(function: Callable[[NodeTester], None]) -> None:
-        @check(f"guarding.{name}", text, _GUARDING, 0x100C, 0x100D)
-        def _(t: NodeTester) -> None:
-            if timed:
-                t.write(0x100C, 0, 100, 2)
-                t.write(0x100D, 0, 2, 1)
-            function(t)
 
-    return add
+def _limit_life(t: NodeTester) -> None:
+    """Sets a node life time of 200 ms."""
+    t.write(0x100C, 0, 100, 2)
+    t.write(0x100D, 0, 2, 1)
 
 
 def _guard(t: NodeTester) -> bytes:
@@ -382,12 +375,12 @@ def _(t: NodeTester) -> None:
     t.equal(_guard(t)[0] >> 7, 0, "toggle bit")
 
 
-@_guarding("idle", "Life guarding waits for the first remote frame", timed=True)
+@_guarding("idle", "Life guarding waits for the first remote frame", _limit_life)
 def _(t: NodeTester) -> None:
     t.equal(t.emergencies_after(0.5), [], "EMCY codes")
 
 
-@_guarding("regular", "Remote frames in time cause no error", timed=True)
+@_guarding("regular", "Remote frames in time cause no error", _limit_life)
 def _(t: NodeTester) -> None:
     for _ in range(6):
         _guard(t)
@@ -395,7 +388,7 @@ def _(t: NodeTester) -> None:
     t.equal(t.emergencies(), [], "EMCY codes")
 
 
-@_guarding("loss", "No remote frame for the node life time is EMCY 8130h", timed=True)
+@_guarding("loss", "No remote frame for the node life time is EMCY 8130h", _limit_life)
 def _(t: NodeTester) -> None:
     begun_s = t.now
     _guard(t)

@@ -174,7 +174,12 @@ def _mapping(first: int) -> None:
         @of_mapping(suffix, f"{name}: {text}")
         def _(t: NodeTester, mapped: _Object) -> None:
             t.write(mapping, 0, 0, 1)
-            _refuses_entry(t, mapping, _word(*(entry or _wrong_length(*mapped))), codes)
+            index, sub, bits = mapped
+            word = _word(*(entry or (index, sub, bits - 8 if bits > 8 else 16)))
+            if code := abort_code(t.answer(expedited(mapping, 1, word))):
+                t.true(code in codes, f"abort {code:08X}h", abort_codes(codes))
+            else:  # the node may refuse the entry when sub-index 0 activates it
+                t.aborts(expedited(mapping, 0, b"\x01"), codes, "activation of the entry")
 
     refused("missing", "an object that does not exist cannot be mapped", (0x1F7F, 0, 8))
     refused("not-mappable", "an object without PDO mapping cannot be mapped", (0x1018, 1, 32))
@@ -195,18 +200,6 @@ def _mapping(first: int) -> None:
     @of_mapping("too-many-objects", f"{name}: sub-index 0 beyond its entries is refused")
     def _(t: NodeTester, _: _Object) -> None:
         t.aborts(expedited(mapping, 0, b"\x41"), _TOO_LONG, "65 mapped objects")
-
-
-def _wrong_length(index: int, sub: int, bits: int) -> _Object:
-    return index, sub, bits - 8 if bits > 8 else 16
-
-
-def _refuses_entry(t: NodeTester, mapping: int, word: bytes, codes: tuple[int, ...]) -> None:
-    """Fails unless the node refuses a mapping entry, either at once or when sub-index 0 activates it."""
-    if code := abort_code(t.answer(expedited(mapping, 1, word))):
-        t.true(code in codes, f"abort {code:08X}h", abort_codes(codes))
-        return
-    t.aborts(expedited(mapping, 0, b"\x01"), codes, "activation of the entry")
 
 
 _mapping(_TPDO)

@@ -171,9 +171,8 @@ def _(t: NodeTester) -> None:
     t.aborts(b"\x70" + bytes(7), _TOGGLE, "segment with the wrong toggle bit")
 
 
-@check("sdo.upload.after-abort", "After an abort the transfer has ended", _SDO)
+@check("sdo.upload.after-abort", "After an abort the transfer has ended", _SDO, first=_open_upload)
 def _(t: NodeTester) -> None:
-    _open_upload(t)
     _segment(t, 0x70)
     t.aborts(b"\x60" + bytes(7), COMMAND, "segment after the abort")
 
@@ -300,29 +299,38 @@ def _(t: NodeTester) -> None:
 # ---------------------------------------------------------------- download
 
 
-def _downloads(t: NodeTester, request: Callable[[int, int, bytes], list[bytes]]) -> None:
-    """Writes a different value with the requests that ``request`` builds, and reads it back; restores the old
-    value.
+def _downloads(name: str, text: str, request: Callable[[int, int, bytes], list[bytes]]) -> None:
+    """Adds a check that writes a different value with the requests that ``request`` builds, and reads it
+    back; restores the old value.
     """
-    index, sub, size = _number(t)
-    before = t.upload(index, sub)
-    value = ((int.from_bytes(before, "little") + 100) & 0x7FFF).to_bytes(size, "little")
-    for place, each in enumerate(request(index, sub, value)):
-        answer = t.answer(each)
-        t.true(answer[0] != 0x80, f"request {place + 1}: {answer.hex(' ')}", "the download is carried out")
-    found = t.upload(index, sub)
-    t.download(index, sub, before)
-    t.equal(found, value, f"{index:04X}h")
+
+    @check(f"sdo.download.{name}", text, _SDO)
+    def _(t: NodeTester) -> None:
+        index, sub, size = _number(t)
+        before = t.upload(index, sub)
+        value = ((int.from_bytes(before, "little") + 100) & 0x7FFF).to_bytes(size, "little")
+        for place, each in enumerate(request(index, sub, value)):
+            answer = t.answer(each)
+            t.true(
+                answer[0] != 0x80, f"request {place + 1}: {answer.hex(' ')}", "the download is carried out"
+            )
+        found = t.upload(index, sub)
+        t.download(index, sub, before)
+        t.equal(found, value, f"{index:04X}h")
 
 
-@check("sdo.download.expedited", "An expedited download with its size is carried out", _SDO)
-def _(t: NodeTester) -> None:
-    _downloads(t, lambda index, sub, data: [expedited(index, sub, data)])
+def _last_segment(data: bytes) -> bytes:
+    return bytes(((7 - len(data)) << 1 | 1,)) + data.ljust(7, b"\0")
 
 
-@check("sdo.download.expedited.no-size", "An expedited download without a size is carried out", _SDO)
-def _(t: NodeTester) -> None:
-    _downloads(t, lambda index, sub, data: [b"\x22" + _mux(index, sub) + data.ljust(4, b"\0")])
+_downloads(
+    "expedited", "An expedited download with its size is carried out",
+    lambda index, sub, data: [expedited(index, sub, data)],
+)  # fmt: skip
+_downloads(
+    "expedited.no-size", "An expedited download without a size is carried out",
+    lambda index, sub, data: [b"\x22" + _mux(index, sub) + data.ljust(4, b"\0")],
+)  # fmt: skip
 
 
 @check("sdo.download.response", "The response to a download is 60h with the multiplexer and zeros", _SDO)
@@ -332,21 +340,14 @@ def _(t: NodeTester) -> None:
     t.equal(answer, b"\x60" + _mux(index, sub) + bytes(4), "response")
 
 
-@check("sdo.download.segmented", "A number may come in a segment", _SDO)
-def _(t: NodeTester) -> None:
-    _downloads(t, _segmented)
-
-
-def _segmented(index: int, sub: int, data: bytes) -> list[bytes]:
-    last = bytes(((7 - len(data)) << 1 | 1,)) + data.ljust(7, b"\0")
-    return [segmented(index, sub, len(data)), last]
-
-
-@check("sdo.download.segmented.no-size", "A segmented download without a size is carried out", _SDO)
-def _(t: NodeTester) -> None:
-    _downloads(
-        t, lambda index, sub, data: [b"\x20" + _mux(index, sub) + bytes(4), _segmented(index, sub, data)[1]]
-    )
+_downloads(
+    "segmented", "A number may come in a segment",
+    lambda index, sub, data: [segmented(index, sub, len(data)), _last_segment(data)],
+)  # fmt: skip
+_downloads(
+    "segmented.no-size", "A segmented download without a size is carried out",
+    lambda index, sub, data: [b"\x20" + _mux(index, sub) + bytes(4), _last_segment(data)],
+)  # fmt: skip
 
 
 @check("sdo.download.segmented.size", "Segments that do not have the announced size are refused", _SDO)

@@ -108,6 +108,9 @@ class Result:
     duration_s: float
 
 
+Decorator = Callable[[Callable[["NodeTester"], None]], Callable[["NodeTester"], None]]
+
+
 class Table(list[Check]):
     """Checks of one subject; `check` adds a function."""
 
@@ -117,9 +120,18 @@ class Table(list[Check]):
         self._drives, self._moves = drives, moves
 
     def check(
-        self, name: str, text: str, clause: str, *needs: int | tuple[int, int], stores: bool = False
-    ) -> Callable[[Callable[[NodeTester], None]], Callable[[NodeTester], None]]:
-        """Decorates the function of a check, which applies only to a node with the objects ``needs``."""
+        self,
+        name: str,
+        text: str,
+        clause: str,
+        *needs: int | tuple[int, int],
+        first: Callable[[NodeTester], object] | None = None,
+        stores: bool = False,
+    ) -> Decorator:
+        """Decorates the function of a check, which applies only to a node with the objects ``needs``.
+
+        ``first`` brings the node into the state in which the function begins.
+        """
 
         def add(function: Callable[[NodeTester], None]) -> Callable[[NodeTester], None]:
             def run(t: NodeTester) -> None:
@@ -127,6 +139,8 @@ class Table(list[Check]):
                     t.need_402()
                 for each in needs:
                     t.require(*((each,) if isinstance(each, int) else each))
+                if first is not None:
+                    first(t)
                 function(t)
 
             self.append(Check(name, text, clause, run, self._moves, stores))
