@@ -74,14 +74,19 @@ class SdoAbortError(Exception):
         self.code = code
 
 
-def only(*allowed: int) -> Callable[[int], None]:
-    """Returns a guard that refuses all values except ``allowed``."""
+def refusing(wrong: Callable[[int], object], code: Abort = Abort.RANGE) -> Callable[[int], None]:
+    """Returns a guard that refuses the values for which ``wrong`` is true."""
 
     def check(value: int) -> None:
-        if value not in allowed:
-            raise SdoAbortError(Abort.RANGE)
+        if wrong(value):
+            raise SdoAbortError(code)
 
     return check
+
+
+def only(*allowed: int) -> Callable[[int], None]:
+    """Returns a guard that refuses all values except ``allowed``."""
+    return refusing(lambda value: value not in allowed)
 
 
 class Entry:

@@ -6,7 +6,7 @@ from enum import IntEnum
 from functools import partial
 from typing import Final
 
-from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError, only
+from hdbridge.device.dictionary import Dictionary, only, refusing
 
 HISTORY_DEPTH: Final = 8
 _FRAME: Final = struct.Struct("<HB5s")
@@ -37,7 +37,9 @@ class Emergency:
         self.active: list[int] = []
         """Codes of the errors that are still active, oldest first."""
         dictionary[0x1001, 0].bind(self._register)
-        dictionary[0x1014, 0].guard = self._check_can_id
+        dictionary[0x1014, 0].guard = refusing(
+            lambda value: not 0x81 <= value & 0x7FF <= 0xFF or value & 0x7FFFF800
+        )
         dictionary[0x1003, 0].guard = only(0)
         dictionary[0x1003, 0].bind(lambda: len(self._history))
         dictionary[0x1003, 0].follower = lambda _: self._history.clear()
@@ -85,8 +87,3 @@ class Emergency:
         for code in self.active:
             register |= 1 | (0x20 if code >> 8 == 0x86 else _REGISTER_BITS.get(code >> 12, 0))
         return register
-
-    @staticmethod
-    def _check_can_id(value: int) -> None:
-        if not 0x81 <= value & 0x7FF <= 0xFF or value & 0x7FFFF800:
-            raise SdoAbortError(Abort.RANGE)

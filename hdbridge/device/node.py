@@ -18,7 +18,7 @@ from hdbridge.canframe import DataFrame
 from hdbridge.cia301 import NmtCommand, NmtState
 from hdbridge.clock import Clock
 from hdbridge.device.behaviour import Behaviour, HeartbeatConsumer
-from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError, only
+from hdbridge.device.dictionary import Dictionary, only, refusing
 from hdbridge.device.emergency import Emergency, ErrorCode
 from hdbridge.device.faults import Faults, Outgoing
 from hdbridge.device.firmware import Firmware
@@ -107,10 +107,11 @@ class DriveNode:
         holds, receiving = self.behaviour.holds_rpdo, self._pdos(0x1400)
         self._rpdos = [ReceivePdo(self.dictionary, number, self._route, holds=holds) for number in receiving]
         entry = self.dictionary
-        entry[0x1005, 0].guard = _check_sync_id
+        # Bit 30 would make the node a SYNC producer.
+        entry[0x1005, 0].guard = refusing(lambda value: value & ~0x7FF or not value & 0x7FF)
         entry[0x1005, 0].follower = lambda _: self._route()
         entry[0x1019, 0].guard = only(0, *range(2, 241))
-        entry[0x1016, 1].guard = _check_consumer
+        entry[0x1016, 1].guard = refusing(lambda value: value >> 23)
         entry[0x1016, 1].follower = lambda _: self._change_watch()
         entry[0x1017, 0].follower = lambda _: self._start_heartbeat()
         for index in (0x100C, 0x100D):
@@ -531,13 +532,3 @@ class DriveNode:
         if self.firmware.follows_the_bus and watches:
             self.emergency.occur(ErrorCode.RPDO_TIMEOUT)
             self.firmware.connection_lost(ErrorCode.RPDO_TIMEOUT)
-
-
-def _check_sync_id(value: int) -> None:
-    if value & ~0x7FF or not value & 0x7FF:  # bit 30 would make the node a SYNC producer
-        raise SdoAbortError(Abort.RANGE)
-
-
-def _check_consumer(value: int) -> None:
-    if value >> 23:
-        raise SdoAbortError(Abort.RANGE)

@@ -11,7 +11,7 @@ from typing import Final
 
 from canopen.objectdictionary import ODVariable
 
-from hdbridge.device.dictionary import Abort, Dictionary, Entry, SdoAbortError
+from hdbridge.device.dictionary import Abort, Dictionary, Entry, SdoAbortError, refusing
 
 INVALID: Final = 1 << 31
 EXTENDED: Final = 1 << 29
@@ -52,7 +52,7 @@ class Pdo:
     def _install(self) -> None:
         guards: dict[int, Callable[[int], None] | None] = {
             1: self._check_can_id,
-            2: _check_type,
+            2: refusing(lambda value: value > SYNC_LAST and value not in EVENT_DRIVEN),
             3: partial(self._check_fixed, 3),
             5: None,
             6: partial(self._check_fixed, 6),
@@ -278,8 +278,3 @@ def _packer(codec: struct.Struct, readers: Sequence[Callable[[], int]]) -> Calla
         f"lambda: pack({', '.join(f'{name}()' for name in called)})", {"pack": codec.pack, **called}
     )
     return pack
-
-
-def _check_type(value: int) -> None:
-    if value > SYNC_LAST and value not in EVENT_DRIVEN:
-        raise SdoAbortError(Abort.RANGE)
