@@ -389,22 +389,15 @@ def print_worse(test: str, ways: Iterable[str]) -> None:
 
 
 def _print_accuracy(checked: Validation) -> None:
+    from hdbridge.report.stepping import ISO_FIGURES
+
     found = ((checked.before.model, checked.accuracy_before), (checked.after.model, checked.accuracy_after))
     rows = [(model, each) for model, each in found if each is not None]
     if not rows:
         return
-    figures = [
-        (
-            model,
-            *(
-                f"{value:z.2f}"
-                for value in (each.accuracy, each.repeatability, each.reversal, each.systematic, each.range)
-            ),
-        )
-        for model, each in rows
-    ]
+    figures = [(model, *(f"{getattr(each, name):z.2f}" for name, _ in ISO_FIGURES)) for model, each in rows]
     print_table(
-        ("with", "accuracy\nA", "repeatability\nR", "reversal\nB", "systematic\nE", "range\nM"),
+        ("with", *(words.replace(" ", "\n") for _, words in ISO_FIGURES)),
         figures,
         f"Positioning test (ISO 230-2), arcsec: {rows[0][1].targets} targets, {rows[0][1].runs} "
         "approaches from each side",

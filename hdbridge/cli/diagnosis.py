@@ -21,7 +21,7 @@ from hdbridge.files.profile import Profile
 from hdbridge.units import figure
 
 if TYPE_CHECKING:
-    from hdbridge.analysis.findings import Diagnosis, Finding, Parameter
+    from hdbridge.analysis.findings import Diagnosis, Finding
     from hdbridge.analysis.probability import Prior
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.commissioning.improvement import Improvement
@@ -200,7 +200,10 @@ def print_diagnosis(result: Diagnosis) -> None:
 
 def _details(finding: Finding) -> Iterator[str]:
     """Yields the details of a finding that its table row does not show."""
-    said = [f"{name} {_number(each)}" for name, each in finding.parameters.items()]
+    said = []
+    for name, each in finding.parameters.items():
+        value, low, high = map(figure, (each.value, each.low, each.high))
+        said.append(f"{name} {value} ({low} to {high}) {each.unit}".rstrip())
     if finding.aliases:
         said.insert(0, f"it may also be: {', '.join(finding.aliases)}")
     if finding.lives_in:
@@ -214,11 +217,6 @@ def _details(finding: Finding) -> Iterator[str]:
     if said:
         yield f"{finding.cause}:"
         yield from (f"  {each}" for each in said)
-
-
-def _number(parameter: Parameter) -> str:
-    value, low, high = map(figure, (parameter.value, parameter.low, parameter.high))
-    return f"{value} ({low} to {high}) {parameter.unit}".rstrip()
 
 
 def _print_figures(result: Diagnosis) -> None:

@@ -238,15 +238,13 @@ def _facts(
     import numpy as np
 
     plant = truth or files.simulated
-    rows = [("recording", str(each)) for each in paths]
-    rows.append(("axis", str(files.axis)))
-    rows.append(("simulated by", "usual values" if afresh or not plant.is_file() else str(plant)))
-    rows.append(
-        (
-            "transmission error",
-            str(files.model) if files.model.is_file() else "of the plant, as there is no active model",
-        )
-    )
+    error = str(files.model) if files.model.is_file() else "of the plant, as there is no active model"
+    rows = [
+        *(("recording", str(each)) for each in paths),
+        ("axis", str(files.axis)),
+        ("simulated by", "usual values" if afresh or not plant.is_file() else str(plant)),
+        ("transmission error", error),
+    ]
     if recording.date:
         rows.append(("recorded", recording.date))
     return [*rows, ("samples", f"{len(recording.record):,} in {np.ptp(recording.record.time_s):,.0f} s")]

@@ -181,22 +181,17 @@ def _is_new(file: Sequence[Source], stored: Stored) -> bool:
     return not stored.unchanged(file)
 
 
+@dataclass
 class _Run:
-    def __init__(
-        self,
-        clients: Callable[[], Client],
-        dataset: Dataset,
-        progress: Callable[[Progress], None],
-        interrupted: Callable[[], bool],
-        retried: Collection[str],
-    ) -> None:
-        self._clients = clients
-        """Function that returns the cluster's client; its first call starts the cluster."""
-        self._dataset = dataset
-        self._stored = dataset.stored()
-        self._progress = progress
-        self._interrupted = interrupted
-        self._retried = retried
+    clients: Callable[[], Client]
+    """Function that returns the cluster's client; its first call starts the cluster."""
+    dataset: Dataset
+    progress: Callable[[Progress], None]
+    interrupted: Callable[[], bool]
+    retried: Collection[str]
+
+    def __post_init__(self) -> None:
+        self._stored = self.dataset.stored()
         self._renewed: dict[tuple[str, str], Row] = {}
         self._rows: list[Row] = []
         self._present: list[tuple[str, str]] = []
@@ -231,14 +226,14 @@ class _Run:
                     self._take(row if row is not None else lost(task[1][0], KILLED))
         finally:
             self._write()
-            self._dataset.renew(self._renewed)
-            self._dataset.compact(self._present)
+            self.dataset.renew(self._renewed)
+            self.dataset.compact(self._present)
         return self._report()
 
     def _unchanged(self, source: Source) -> Mapping[str, Any] | None:
         """Returns the stored row of an unchanged recording, reusable if its model is the same; or None."""
         row = self._stored.row(source)
-        if row is None or source.stamp is None or row["reason"] in self._retried:
+        if row is None or source.stamp is None or row["reason"] in self.retried:
             return None
         return row if row["stamp"] == source.stamp and row["version"] == __version__ else None
 
@@ -251,7 +246,7 @@ class _Run:
                 flights[each.path].append(each)
         for path, described in [*flights.items()]:
             rows = self._stored.unchanged(described)
-            if rows and not any(row["reason"] in self._retried for row in rows):
+            if rows and not any(row["reason"] in self.retried for row in rows):
                 result += with_axes(path, sorted((row["axis"] for row in rows), key=str), described)
                 del flights[path]
         paths = list(flights)
@@ -277,7 +272,7 @@ class _Run:
             joints[each.joint or ""].append(each)
             if row is None or row["model_sha256"]:
                 fitting.add(each.joint or "")
-        folder = self._dataset.folder / "models"
+        folder = self.dataset.folder / "models"
         found: dict[str, Model] = {"": Model(reason="the joint is not known")}
         to_fit = []
         for joint in sorted(filter(None, joints)):
@@ -317,7 +312,7 @@ class _Run:
         tasks = list(tasks)
         if not tasks:
             return
-        client = self._clients()
+        client = self.clients()
         numbered = enumerate(tasks)
         numbers: dict[str, int] = {}
         """Numbers of the submitted tasks by the key of their future."""
@@ -330,7 +325,7 @@ class _Run:
                 done.add(future)
             if not numbers:
                 break
-            if self._interrupted():
+            if self.interrupted():
                 raise KeyboardInterrupt
             batch = done.next_batch(block=False)
             for future in batch:
@@ -369,11 +364,11 @@ class _Run:
         self._report()
 
     def _write(self) -> None:
-        self._dataset.add(self._rows)
+        self.dataset.add(self._rows)
         self._rows.clear()
         self._written_s = time.monotonic()
 
     def _report(self) -> Progress:
         state = Progress(len(self._present), self._total, self._failed, self._known, self._memory)
-        self._progress(state)
+        self.progress(state)
         return state

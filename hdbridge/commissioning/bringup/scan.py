@@ -296,44 +296,44 @@ def _identity_lines(axis: AxisConfig, node: Node) -> list[str]:
 
 
 def axis_lines(node: Node) -> list[str]:
-    """Returns the lines of an axis file that the node's own objects determine."""
+    """Returns the lines of `axis_sections`."""
+    return [line for name, own in axis_sections(node).items() for line in (f"{name}:", *own)]
+
+
+def axis_sections(node: Node) -> dict[str, list[str]]:
+    """Returns the lines for an axis file by section: the node's data; none for a node that is of no use."""
     if node.profile == 406:
-        return _encoder_lines(node)
+        units = node.values.get(ENCODER_UNITS_PER_TURN)
+        return {
+            "load_encoder": [
+                *([f"  counts_per_turn: {units}         # 6001h"] if units else []),
+                f"  source: {{index: 0x6004, subindex: 0, type: uint32, node: {node.node_id}}}",
+            ]
+        }
+    if not node.usable:
+        return {}
     identity = ", ".join(f"{name}: {value:#x}" for name, value in node.identity.items())
-    lines = [
-        "drive:",
+    drive = [
         f"  node_id: {node.node_id}",
         "  eds: FILE.eds                 # the EDS file of this drive, next to the axis file",
         f"  identity: {{{identity}}}",
     ]
     if node.cyclic == "ip":
-        lines.append("  mode: ip                      # 6502h: it has interpolated position, and not csp")
-    torque = node.values.get(objects.RATED_TORQUE)
-    if torque:
-        lines.append(f"  rated_torque_nm: {torque / 1000.0:g}        # 6076h")
-    counts = _ratio(node, objects.ENCODER_INCREMENTS, objects.ENCODER_REVOLUTIONS)
-    if counts is not None:
-        lines += ["motor_encoder:", f"  counts_per_turn: {_number(counts)}         # 608Fh"]
-    counts = _ratio(node, *objects.additional_resolution(1))
-    if counts is not None:
-        lines += [
-            "load_encoder:",
+        drive.append("  mode: ip                      # 6502h: it has interpolated position, and not csp")
+    if torque := node.values.get(objects.RATED_TORQUE):
+        drive.append(f"  rated_torque_nm: {torque / 1000.0:g}        # 6076h")
+    sections = {"drive": drive}
+    if counts := _ratio(node, objects.ENCODER_INCREMENTS, objects.ENCODER_REVOLUTIONS):
+        sections["motor_encoder"] = [f"  counts_per_turn: {_number(counts)}         # 608Fh"]
+    if counts := _ratio(node, *objects.additional_resolution(1)):
+        sections["load_encoder"] = [
             f"  counts_per_turn: {_number(counts)}         # 60E6h:01 over 60EBh:01; is it per load turn?",
             "  source: {index: 0x60E4, subindex: 1, type: int32}",
         ]
     ratio = _ratio(node, objects.GEAR_MOTOR, objects.GEAR_SHAFT)
     if ratio is not None and ratio != 1:
-        lines += ["gear:", f"  ratio: {_number(ratio)}                     # 6091h"]
-    return lines
-
-
-def _encoder_lines(node: Node) -> list[str]:
-    counts = node.values.get(ENCODER_UNITS_PER_TURN)
-    return [
-        "load_encoder:",
-        *([f"  counts_per_turn: {counts}         # 6001h"] if counts else []),
-        f"  source: {{index: 0x6004, subindex: 0, type: uint32, node: {node.node_id}}}",
-    ]
+        sections["gear"] = [f"  ratio: {_number(ratio)}                     # 6091h"]
+    return sections
 
 
 def _ratio(node: Node, above: objects.Address, below: objects.Address) -> Fraction | None:

@@ -143,7 +143,11 @@ def choose(
     experiment of the axis is of use.
     """
     menu = sorted(
-        ((_duration_s(plan, view), plan) for name, plan in machine_plans().items() if name not in done),
+        (
+            (total_duration_s((each.procedure for each in plan.tasks(view).tasks), view), plan)
+            for name, plan in machine_plans().items()
+            if name not in done
+        ),
         key=lambda each: each[0],
     )
     pairs = [
@@ -190,7 +194,3 @@ def _separates(report: dict[str, Any], one: str, other: str, peak_arcsec: float)
     if not seen["detectable"] or limit is None or limit > peak_arcsec:
         return False
     return other not in seen["aliases"] and one not in report[other]["aliases"]
-
-
-def _duration_s(plan: Plan, view: AxisView) -> float:
-    return total_duration_s((each.procedure for each in plan.tasks(view).tasks), view)
