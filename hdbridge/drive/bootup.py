@@ -234,13 +234,10 @@ class BootUp:
                     f"{self._sdo.describe(0x6041, 0)}: the drive stays in '{state.value}' after 'disable "
                     "voltage'; switch it off by its enable input and look at its error display"
                 )
-            self._pause(_POLL_S)
+            again_s = self._link.now() + _POLL_S
+            while self._receive_until(again_s):
+                pass
             state = decode(self._sdo.fetch(objects.STATUSWORD))
-
-    def _pause(self, duration_s: float) -> None:
-        deadline_s = self._link.now() + duration_s
-        while self._receive_until(deadline_s):
-            pass
 
     def _configure(self, rows: list[PlannedWrite]) -> None:
         """Configures a PDO unless it is already configured as planned, because a correct configuration may be

@@ -321,36 +321,24 @@ def _limits(axis: AxisConfig) -> Iterator[PlannedWrite]:
     rpm = math.ceil((limits.velocity_deg_s + slew / ARCSEC_PER_DEG) * axis.gear.ratio / 6.0)
     ramp = motor_rate(axis, limits.acceleration_deg_s2)
     late = "time after which a following error counts"
-    yield _row(
-        axis, objects.LIMIT_MIN, least, f"lower end in motor counts ({margin})", ends[0],
-        without=f"lower end of travel; {alone}",
-    )  # fmt: skip
-    yield _row(
-        axis, objects.LIMIT_MAX, greatest, f"upper end in motor counts ({margin})", ends[1],
-        without=f"upper end of travel; {alone}",
-    )  # fmt: skip
-    yield _row(
-        axis, objects.MAX_MOTOR_SPEED, rpm,
-        f"speed limit in rpm of the motor (higher by the compensation's {slew:g} arcsec/s)",
-        "limits.velocity_deg_s",
-        without=f"speed limit; {alone}",
-    )  # fmt: skip
-    yield _row(
-        axis, objects.QUICK_STOP_DECELERATION, ramp, "ramp of a quick stop, motor counts/s2",
-        "limits.acceleration_deg_s2", without="ramp of a quick stop",
-    )  # fmt: skip
-    yield _row(
-        axis, objects.MAX_TORQUE, round(limits.torque_percent * 10.0),
-        "torque limit in per mille of the rated torque", "limits.torque_percent", without="torque limit",
-    )  # fmt: skip
-    yield _row(
-        axis, objects.FOLLOWING_WINDOW, window, "following error window, motor counts",
-        "drive.following_error_deg", without="following error window; hdbridge applies its own",
-    )  # fmt: skip
-    yield _row(
-        axis, objects.FOLLOWING_TIME, drive.following_error_time_ms, f"{late}, ms",
-        "drive.following_error_time_ms", without=late,
-    )  # fmt: skip
+    for address, value, why, field, without in (
+        (objects.LIMIT_MIN, least, f"lower end in motor counts ({margin})", ends[0],
+         f"lower end of travel; {alone}"),
+        (objects.LIMIT_MAX, greatest, f"upper end in motor counts ({margin})", ends[1],
+         f"upper end of travel; {alone}"),
+        (objects.MAX_MOTOR_SPEED, rpm,
+         f"speed limit in rpm of the motor (higher by the compensation's {slew:g} arcsec/s)",
+         "limits.velocity_deg_s", f"speed limit; {alone}"),
+        (objects.QUICK_STOP_DECELERATION, ramp, "ramp of a quick stop, motor counts/s2",
+         "limits.acceleration_deg_s2", "ramp of a quick stop"),
+        (objects.MAX_TORQUE, round(limits.torque_percent * 10.0),
+         "torque limit in per mille of the rated torque", "limits.torque_percent", "torque limit"),
+        (objects.FOLLOWING_WINDOW, window, "following error window, motor counts",
+         "drive.following_error_deg", "following error window; hdbridge applies its own"),
+        (objects.FOLLOWING_TIME, drive.following_error_time_ms, f"{late}, ms",
+         "drive.following_error_time_ms", late),
+    ):  # fmt: skip
+        yield _row(axis, address, value, why, field, without=without)
 
 
 def motor_rate(axis: AxisConfig, load_deg: float) -> int:
