@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime
 from itertools import accumulate
@@ -188,7 +187,6 @@ def step(
 
     Uses the article's four schemes, and the whole model if it has more than their two parts.
     """
-    from hdbridge.axis.model import TransmissionModel
     from hdbridge.control.bench import axis_view
     from hdbridge.motion.procedures.rehearsal import rehearse
     from hdbridge.motion.procedures.stepping import Stepping
@@ -200,40 +198,30 @@ def step(
     if model is not None or not scheme or set(scheme) != {Scheme.NONE}:  # the scheme none needs no model
         chosen = compensating_model(files, session.profile, model, ", or step without one: --scheme none")
 
-    def notify(comparison: Comparison) -> None:
-        write_json(json_file, comparison.as_dict())
-        if html_file is not None:
-            _write_stepping_page(html_file, axis, chosen, comparison, stepping, session.simulated_seed)
-        _print_stepping(axis, comparison)
-
-    run_comparison(
-        session,
-        TransmissionModel.load(chosen) if chosen else TransmissionModel(axis.gear.ratio),
-        stepping,
-        scheme,
-        record=record,
-        notify=notify,
-    )
+    run_comparison(session, chosen, stepping, scheme, record=record, json_file=json_file, html_file=html_file)
 
 
 def run_comparison(
     session: Session,
-    model: TransmissionModel,
+    model_path: Path | None,
     stepping: Stepping,
     schemes: list[Scheme] | None,
     *,
-    record: Path | None = None,
-    notify: Callable[[Comparison], None],
+    record: Path | None,
+    json_file: Path | None,
+    html_file: Path | None,
 ) -> None:
     """Connects and boots the drive, and compares the schemes; keeps each record as soon as it is complete.
 
-    ``notify`` receives the result. For an interrupted test, this is the result of the completed schemes.
+    Writes and prints the result; for an interrupted test, that of the completed schemes.
     """
+    from hdbridge.axis.model import TransmissionModel
     from hdbridge.commissioning.evaluation.comparison import Comparison, compare_schemes
     from hdbridge.control.bench import compensation_for
     from hdbridge.control.caps import cap_remark
 
     axis = session.axis
+    model = TransmissionModel.load(model_path) if model_path else TransmissionModel(axis.gear.ratio)
     offered = Scheme.offered_by(model)
     wanted = tuple(schemes) if schemes else offered
     if Scheme.EXTENDED in wanted and Scheme.EXTENDED not in offered:
@@ -279,7 +267,11 @@ def run_comparison(
                         run.record.write_csv(record / f"stepping-{scheme.value}.csv.gz")
     finally:
         if done:
-            notify(Comparison.of(axis, done))
+            comparison = Comparison.of(axis, done)
+            write_json(json_file, comparison.as_dict())
+            if html_file is not None:
+                _write_stepping_page(html_file, session, model_path, comparison, stepping)
+            _print_stepping(axis, comparison)
 
 
 def _print_stepping(axis: AxisConfig, comparison: Comparison) -> None:
@@ -296,22 +288,18 @@ def _print_stepping(axis: AxisConfig, comparison: Comparison) -> None:
 
 
 def _write_stepping_page(
-    path: Path,
-    axis: AxisConfig,
-    model: Path | None,
-    comparison: Comparison,
-    stepping: Stepping,
-    simulated_seed: int | None,
+    path: Path, session: Session, model: Path | None, comparison: Comparison, stepping: Stepping
 ) -> None:
     """Writes the result as a self-contained page with axis, date and model of the test."""
     from hdbridge.report.page import render
     from hdbridge.report.stepping import stepping_page
 
+    axis, seed = session.axis, session.simulated_seed
     cycle = f"cycle {axis.drive.cycle_ms:g} ms"
     drive = (
         f"node {axis.drive.node_id} on {axis.bus.interface}:{axis.bus.channel}, {cycle}"
-        if simulated_seed is None
-        else f"simulated, seed {simulated_seed}, {cycle}"
+        if seed is None
+        else f"simulated, seed {seed}, {cycle}"
     )
     facts = {
         "axis": f"{axis.name} ({axis.path})",
@@ -437,20 +425,20 @@ def demo(
 
     FOLDER receives table, JSON, records and a page.
     """
-    from hdbridge.axis.model import TransmissionModel
     from hdbridge.motion.procedures.stepping import Stepping
 
     session = Session(profile="article", simulate=True, seed=seed)
-    files, axis = session.files, session.axis
-    stepping = Stepping(count=count)
     folder = new_folder(Path("demo-output")) if out is None else make_folder(out)
 
-    def notify(comparison: Comparison) -> None:
-        write_json(folder / "stepping.json", comparison.as_dict())
-        _write_stepping_page(folder / "stepping.html", axis, files.model, comparison, stepping, seed)
-        _print_stepping(axis, comparison)
-
-    run_comparison(session, TransmissionModel.load(files.model), stepping, None, record=folder, notify=notify)
+    run_comparison(
+        session,
+        session.files.model,
+        Stepping(count=count),
+        None,
+        record=folder,
+        json_file=folder / "stepping.json",
+        html_file=folder / "stepping.html",
+    )
     say(f"\nopen {folder / 'stepping.html'} in a browser for the picture; next: docs/tutorial.md")
 
 

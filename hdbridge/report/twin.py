@@ -10,7 +10,6 @@ import numpy as np
 from hdbridge import __version__
 from hdbridge.axis.effects import FloatArray
 from hdbridge.report.page import (
-    Block,
     Chart,
     Command,
     Facts,
@@ -211,25 +210,23 @@ def _pictures(name: str, report: TwinReport) -> Section:
     trace, before = report.now.traces[name], report.before.traces[name]
     label = f"{TITLES[name]}, {UNITS[name]}"
     worst = _worst(before)
-    charts: list[Block] = [
-        Grid(
-            [
-                _chart(f"{TITLES[name].capitalize()} over the whole record", label, trace, slice(None)),
-                _chart(
-                    "Largest deviation of the initial simulation"
-                    if report.after
-                    else "Largest deviation of the simulation",
-                    label,
-                    trace,
-                    worst,
-                    before if report.after else None,
-                ),
-                _difference(f"Difference, {label}", before, trace if report.after else None),
-                *_spectrum(name, report.now.spectra.get(name)),
-            ]
-        )
-    ]
-    return Section(TITLES[name].capitalize(), "", charts)
+    grid = Grid(
+        [
+            _chart(f"{TITLES[name].capitalize()} over the whole record", label, trace, slice(None)),
+            _chart(
+                "Largest deviation of the initial simulation"
+                if report.after
+                else "Largest deviation of the simulation",
+                label,
+                trace,
+                worst,
+                before if report.after else None,
+            ),
+            _difference(f"Difference, {label}", before, trace if report.after else None),
+            *_spectrum(name, report.now.spectra.get(name)),
+        ]
+    )
+    return Section(TITLES[name].capitalize(), "", [grid])
 
 
 def _chart(caption: str, label: str, trace: Trace, where: slice, before: Trace | None = None) -> Chart:

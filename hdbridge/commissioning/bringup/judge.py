@@ -113,7 +113,12 @@ def judge_turn(
         )
     remedies = []
     if factor < 0:
-        remedies += _direction(axis)
+        load_way, motor_way = axis.load_encoder.direction, axis.motor_encoder.direction
+        remedies.append(
+            f"{axis.where('load_encoder.direction')}: found {load_way}, expected {-load_way} (the load "
+            "encoder counts the other way round); or, if the load turned to the wrong side, "
+            f"{axis.where('motor_encoder.direction')}: found {motor_way}, expected {-motor_way}"
+        )
     if abs(abs(factor) - 1.0) > tolerance:
         remedies += [each.text(axis) for each in suspect_entries(axis, abs(factor), tolerance, confirmed)]
     elif lost > 4.0 + 0.05 * abs(load) / 2.0:
@@ -125,15 +130,6 @@ def judge_turn(
     sign = "" if factor > 0 else ", reversed"
     text += f"; {ratio}{sign} (within {100 * tolerance:.2g} %)" if not remedies else f"; {ratio}{sign}"
     return judged(not remedies, text, *remedies, **figures)
-
-
-def _direction(axis: AxisConfig) -> list[str]:
-    load, motor = axis.load_encoder.direction, axis.motor_encoder.direction
-    return [
-        f"{axis.where('load_encoder.direction')}: found {load}, expected {-load} (the load encoder counts "
-        f"the other way round); or, if the load turned to the wrong side, "
-        f"{axis.where('motor_encoder.direction')}: found {motor}, expected {-motor}"
-    ]
 
 
 def suspect_entries(
