@@ -109,9 +109,8 @@ def ready(t: NodeTester) -> None:
 
 
 def _leads(name: str, text: str, begin: Callable[[NodeTester], None], word: int, state: State) -> None:
-    @check(f"402.state.{name}", text, _STATES)
+    @check(f"402.state.{name}", text, _STATES, first=begin)
     def _(t: NodeTester) -> None:
-        begin(t)
         t.control(word)
         t.reaches(state)
 
@@ -147,16 +146,14 @@ _no_effect("disabled.fault-reset", 0x80, "Fault reset", _DISABLED)
 _no_effect("ready.repeated", 0x06, "Repeated shutdown", _READY)
 
 
-@check("402.state.stable", "The drive stays in ready to switch on without a command", _STATES)
+@check("402.state.stable", "The drive stays in ready to switch on without a command", _STATES, first=ready)
 def _(t: NodeTester) -> None:
-    ready(t)
     t.stays(_READY, 0.5)
 
 
 def _bit(name: str, bit: int, value: int, text: str, begin: Callable[[NodeTester], None]) -> None:
-    @check(f"402.status.{name}", f"Bit {bit} of the statusword{text}", _STATES)
+    @check(f"402.status.{name}", f"Bit {bit} of the statusword{text}", _STATES, first=begin)
     def _(t: NodeTester) -> None:
-        begin(t)
         t.equal(t.read(0x6041) >> bit & 1, value, f"bit {bit}")
 
 
@@ -178,9 +175,8 @@ def _(t: NodeTester) -> None:
     t.equal(t.read(0x6040), 0x06, "6040h")
 
 
-@check("402.controlword.pdo", "The controlword is obeyed as an RPDO", _STATES)
+@check("402.controlword.pdo", "The controlword is obeyed as an RPDO", _STATES, first=NodeTester.disable)
 def _(t: NodeTester) -> None:
-    t.disable()
     can_id = t.map_pdo(0x1400, ((0x6040, 0, 16),), 255)
     t.nmt(NmtCommand.START)
     t.send(can_id, b"\x06\0")
@@ -200,9 +196,8 @@ def _(t: NodeTester) -> None:
     t.reaches(_READY)
 
 
-@check("402.statusword.pdo", "A TPDO carries the statusword", _STATES)
+@check("402.statusword.pdo", "A TPDO carries the statusword", _STATES, first=ready)
 def _(t: NodeTester) -> None:
-    ready(t)
     can_id = t.map_pdo(0x1800, ((0x6041, 0, 16),), 1)
     t.nmt(NmtCommand.START)
     data = t.true(t.reply(can_id, t.sync), "no TPDO", "the statusword")

@@ -41,9 +41,8 @@ def _(t: NodeTester) -> None:
     t.aborts(expedited(0x1001, 0, b"\0"), READ_ONLY, "download to 1001h")
 
 
-@check("emcy.identifier", "1014h is 80h + node id by default", _EMCY, 0x1014)
+@check("emcy.identifier", "1014h is 80h + node id by default", _EMCY, 0x1014, first=NodeTester.reset)
 def _(t: NodeTester) -> None:
-    t.reset()
     t.equal(f"{t.read(0x1014) & 0x7FF:03X}h", f"{0x80 + t.node_id:03X}h", "identifier")
 
 

@@ -474,9 +474,8 @@ def _(t: NodeTester) -> None:
     _stands(t, 0.3)
 
 
-@check("402.pp.stale", "A target from before enabling moves nothing", _PP)
+@check("402.pp.stale", "A target from before enabling moves nothing", _PP, first=_select_slowly)
 def _(t: NodeTester) -> None:
-    _select_slowly(t)
     t.put(0x607A, 0, _ahead(t, 3), 4)
     t.walk()
     _stands(t, 0.3)

@@ -125,17 +125,15 @@ def _(t: NodeTester) -> None:
     t.reset()
 
 
-@check("nmt.broadcast", "A command to node 0 is obeyed", _NMT)
+@check("nmt.broadcast", "A command to node 0 is obeyed", _NMT, first=NodeTester.watch_state)
 def _(t: NodeTester) -> None:
-    t.watch_state()
     t.nmt(_START, 0)
     t.equal(t.state(), ENTERED[_START], "NMT state")
 
 
 def _ignored(name: str, what: str, send: Callable[[NodeTester], None]) -> None:
-    @check(f"nmt.ignores.{name}", f"The node ignores {what}", _NMT)
+    @check(f"nmt.ignores.{name}", f"The node ignores {what}", _NMT, first=NodeTester.watch_state)
     def _(t: NodeTester) -> None:
-        t.watch_state()
         send(t)
         t.equal(t.state(), ENTERED[_PRE], "NMT state")
 
@@ -257,9 +255,8 @@ def _beat(t: NodeTester, count: int = 3, period_s: float = 0.04, node_id: int = 
         t.wait(period_s)
 
 
-@check("consumer.idle", "The consumer waits for the first heartbeat", _CONSUMER)
+@check("consumer.idle", "The consumer waits for the first heartbeat", _CONSUMER, first=_watch)
 def _(t: NodeTester) -> None:
-    _watch(t)
     t.equal(t.emergencies_after(0.4), [], "EMCY codes")
 
 
@@ -284,17 +281,15 @@ def _(t: NodeTester) -> None:
     t.near(frame.time_s - begun_s, 0.2, "time to the EMCY")
 
 
-@check("consumer.off", "1016h with time 0 supervises nothing", _CONSUMER)
+@check("consumer.off", "1016h with time 0 supervises nothing", _CONSUMER, first=_watch)
 def _(t: NodeTester) -> None:
-    _watch(t)
     _beat(t)
     t.put(0x1016, 1, _MASTER << 16, 4)
     t.equal(t.emergencies_after(0.4), [], "EMCY codes")
 
 
-@check("consumer.other-node", "Heartbeats of another node do not count", _CONSUMER)
+@check("consumer.other-node", "Heartbeats of another node do not count", _CONSUMER, first=_watch)
 def _(t: NodeTester) -> None:
-    _watch(t)
     _beat(t)
     codes = t.emergencies_after(0.0, lambda: _beat(t, 8, 0.05, _MASTER - 1))
     t.true(0x8130 in codes, f"EMCY codes {codes}", "8130h")

@@ -534,9 +534,8 @@ def _maps_dummy(t: NodeTester) -> bool:
 # ---------------------------------------------------------------- SYNC
 
 
-@check("sync.identifier", "1005h is 80h by default", _SYNC, 0x1005)
+@check("sync.identifier", "1005h is 80h by default", _SYNC, 0x1005, first=NodeTester.reset)
 def _(t: NodeTester) -> None:
-    t.reset()
     t.equal(t.read(0x1005) & 0x7FF, 0x80, "identifier")
 
 
@@ -562,9 +561,8 @@ def _(t: NodeTester) -> None:
     t.equal(_syncs(t, can_id, 3, 1), [1, 1, 1], "TPDOs")
 
 
-@check("sync.counter.start", "SYNC start value: the first TPDO comes at this counter", _COUNTER)
+@check("sync.counter.start", "SYNC start value: the first TPDO comes at this counter", _COUNTER, 0x1019)
 def _(t: NodeTester) -> None:
-    t.require(0x1019)
     t.require(_TPDO, 6)
     t.write(0x1019, 0, 10, 1)
     can_id = _sent(t, (_REGISTER,), 2, timers={6: 3})

@@ -203,18 +203,17 @@ class SdoServer:
         raise SdoAbortError(Abort.COMMAND)
 
     def _begin_block_upload(self, entry: Entry, block_size: int) -> bytes:
-        self._block_size = self._checked_size(block_size)
+        self._take_block_size(block_size)
         data = entry.read()
         self._begin(entry, uploading=True)
         self._buffer, self._sent = data, 0
         self._block = _Block.START_OUT
         return _HEAD.pack(0xC6, *self._object) + struct.pack("<I", len(data))
 
-    @staticmethod
-    def _checked_size(size: int) -> int:
+    def _take_block_size(self, size: int) -> None:
         if not 1 <= size <= _MOST_SEGMENTS:
             raise SdoAbortError(Abort.BLOCK_SIZE)
-        return size
+        self._block_size = size
 
     def _segments(self) -> list[bytes]:
         """Returns the segments of one block, starting at ``_sent``."""
@@ -229,7 +228,7 @@ class SdoServer:
         return frames
 
     def _acknowledged(self, number: int, block_size: int) -> list[bytes]:
-        self._block_size = self._checked_size(block_size)
+        self._take_block_size(block_size)
         if number > self._sequence:
             raise SdoAbortError(Abort.SEQUENCE)
         self._sent += 7 * number

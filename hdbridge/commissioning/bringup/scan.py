@@ -137,20 +137,14 @@ class _BusObserver:
         self.spoken: set[int] = set()
         """Nodes that have sent a frame."""
         self.busy: set[int] = set()
-        self.syncs = 0
-        self.commands = 0
         self.detector = MasterDetector(NODE_IDS)
 
     def take(self, frame: Frame) -> None:
         self.detector.take(frame)
-        can_id, node_id = frame.can_id, frame.can_id & 0x7F
-        function = can_id - node_id
+        node_id = frame.can_id & 0x7F
+        function = frame.can_id - node_id
         if self.monitor.dispatch(frame):
             self.spoken.add(node_id)
-        elif can_id == objects.COB_SYNC:
-            self.syncs += 1
-        elif can_id == objects.COB_NMT:
-            self.commands += 1
         elif function in (objects.COB_SDO_REQUEST, objects.COB_SDO_ANSWER) and node_id:
             self.busy.add(node_id)
 
@@ -163,13 +157,14 @@ class _BusObserver:
 
     def remarks(self) -> list[str]:
         remarks = []
-        if self.syncs:
+        counts = self.detector.counts
+        if syncs := counts[objects.COB_SYNC]:
             remarks.append(
-                f"{self.syncs} SYNC messages were heard: another master runs on this bus; stop it before you "
+                f"{syncs} SYNC messages were heard: another master runs on this bus; stop it before you "
                 "control an axis here"
             )
-        if self.commands:
-            remarks.append(f"{self.commands} NMT commands of another master were heard")
+        if commands := counts[objects.COB_NMT]:
+            remarks.append(f"{commands} NMT commands of another master were heard")
         if self.busy:
             who = ", ".join(map(str, sorted(self.busy)))
             remarks.append(
