@@ -248,11 +248,9 @@ def _title(recording: Recording, records: Sequence[Path]) -> str:
 def _provenance(recording: Recording, records: Sequence[Path], model: Path) -> list[tuple[str, str]]:
     import numpy as np
 
-    rows = [("record", str(each)) for each in records]
-    rows += [("model", str(model))]
-    rows += [
-        (name, value) for name, value in (("axis", recording.axis), ("recorded", recording.date)) if value
-    ]
+    known = (("axis", recording.axis), ("recorded", recording.date))
+    rows = [*(("record", str(each)) for each in records), ("model", str(model))]
+    rows += [(name, value) for name, value in known if value]
     return [*rows, ("samples", f"{len(recording.record):,} in {np.ptp(recording.record.time_s):,.0f} s")]
 
 

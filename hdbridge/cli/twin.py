@@ -46,6 +46,8 @@ def twin(
     commit PROFILE --twin`.
     """
     from hdbridge.axis import AxisConfig
+    from hdbridge.report.page import render
+    from hdbridge.report.twin import twin_page
     from hdbridge.twin.replay import doubts
 
     files = Profile.find(profile)
@@ -66,14 +68,7 @@ def twin(
         report = _compared(axis, recording, begun, facts)
     else:
         report = _learned(files, axis, recording, recordings, begun, facts)
-    _give(report, json_file, html_file)
-
-
-def _give(report: TwinReport, json_file: Path | None, html_file: Path | None) -> None:
-    """Writes files first, because the reader of the tables may close the pipe (`| head`)."""
-    from hdbridge.report.page import render
-    from hdbridge.report.twin import twin_page
-
+    # Files are written first, because the reader of the tables may close the pipe (`| head`).
     write_json(json_file, as_dict(report))
     if html_file is not None:
         write_result(html_file, render(twin_page(report)))

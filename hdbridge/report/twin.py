@@ -145,16 +145,10 @@ def verdict(report: TwinReport) -> str:
         if now is None or before is None:
             continue
         was = f" (before: {_figure(before.difference)})" if report.after is not None else ""
-        parts.append(f"{TITLES[name]} {_figure(now.difference)} {now.unit}{was}, {_times(now)}")
+        noisy = math.isfinite(now.in_noise)
+        times = f"{_figure(now.in_noise)} times the noise" if noisy else "without measurable noise"
+        parts.append(f"{TITLES[name]} {_figure(now.difference)} {now.unit}{was}, {times}")
     return f"The simulated drive differs from the axis by, rms: {'; '.join(parts)}." if parts else ""
-
-
-def _times(row: Row) -> str:
-    return (
-        f"{_figure(row.in_noise)} times the noise"
-        if math.isfinite(row.in_noise)
-        else "without measurable noise"
-    )
 
 
 def _figure(value: float) -> str:
