@@ -22,7 +22,7 @@ from scipy.optimize import brentq
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Hysteresis, HysteresisMemory, Moment, Motion, Start, Tracker
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.comparison import compare_schemes
+from hdbridge.commissioning.evaluation.comparison import Comparison, compare_schemes
 from hdbridge.commissioning.evaluation.stepping import quantisation_floor_arcsec
 from hdbridge.drive.drive import Drive
 from hdbridge.enums import Scheme
@@ -171,7 +171,7 @@ def simulated() -> dict[str, Any]:
         Drive(bus, axis, clock) as drive,
     ):
         drive.boot()
-        comparison = compare_schemes(drive, model, SCHEMES, stepping)
+        comparison = Comparison.of(axis, dict(compare_schemes(drive, model, SCHEMES, stepping)))
     result = {}
     for scheme, measured in comparison.results.items():
         there, back = step_errors(model, scheme.of(model))

@@ -311,8 +311,17 @@ def scan(
     write_json(json_file, result)
     _print_scan(link.name, found)
     if axis is not None:
-        _print_match(axis, matches, lines)
-    _judge_scan(link.name, found, axis, matches)
+        if matches:
+            say(f"\nnode {axis.drive.node_id} is the drive of {axis.path}")
+        for line in lines:
+            say(line)
+    if not found.nodes:
+        raise DriveError(
+            f"{link.name}: no node answers; check power, wiring, the termination at both ends (60 ohm "
+            "between CAN_H and CAN_L) and that every node has the same bit rate"
+        )
+    if axis is not None and not matches:
+        raise DriveError(f"{link.name}: the drive of {axis.path} is not among the nodes; see the lines above")
 
 
 def _print_scan(name: str, found: Scan) -> None:
@@ -324,9 +333,9 @@ def _print_scan(name: str, found: Scan) -> None:
         say(f"\nnode {node.node_id}: {node.kind}", style="bold")
         for label, value in _facts_of_node(node).items():
             say(f"{label:>12}  {value}")
-        if node.usable or node.profile == 406:
+        if lines := axis_lines(node):
             say("  for the axis file:")
-            for line in axis_lines(node):
+            for line in lines:
                 say(f"    {line}")
     for remark in found.remarks:
         note(f"note: {remark}")
@@ -344,23 +353,6 @@ def _facts_of_node(node: Node) -> dict[str, str]:
     if node.modes is not None:
         facts["modes"] = ", ".join(node.mode_names) or "none"
     return facts
-
-
-def _print_match(axis: AxisConfig, matches: bool, lines: list[str]) -> None:
-    if matches:
-        say(f"\nnode {axis.drive.node_id} is the drive of {axis.path}")
-    for line in lines:
-        say(line)
-
-
-def _judge_scan(name: str, found: Scan, axis: AxisConfig | None, matches: bool) -> None:
-    if not found.nodes:
-        raise DriveError(
-            f"{name}: no node answers; check power, wiring, the termination at both ends (60 ohm between "
-            "CAN_H and CAN_L) and that every node has the same bit rate"
-        )
-    if axis is not None and not matches:
-        raise DriveError(f"{name}: the drive of {axis.path} is not among the nodes; see the lines above")
 
 
 def _scan_document(name: str, found: Scan) -> dict[str, Any]:
@@ -382,7 +374,7 @@ def _scan_document(name: str, found: Scan) -> dict[str, Any]:
                 "names": node.names,
                 "modes": node.mode_names,
                 "usable": node.usable,
-                "axis_file": axis_lines(node) if node.usable or node.profile == 406 else [],
+                "axis_file": axis_lines(node),
             }
             for node in found.nodes
         ],

@@ -22,7 +22,7 @@ from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.cli.session import Session
-    from hdbridge.commissioning.calibration import Calibration, Journal, Validation
+    from hdbridge.commissioning.calibration import Calibration, Callbacks, Journal, Validation
     from hdbridge.commissioning.calibration.pipeline import Offer
     from hdbridge.commissioning.evaluation.stepping import Stepped
     from hdbridge.drive.drive import Drive
@@ -114,13 +114,14 @@ class Measurement:
         return start_journal(self.folder, self.session.axis, self.plan, self.date, drive.identity, about)
 
     @contextmanager
-    def booted(self) -> Iterator[tuple[Drive, Callable[[str, float, float], None], Callable[[], bool]]]:
-        """Yields the booted drive, and functions that show progress and return True once an end is requested.
+    def booted(self) -> Iterator[tuple[Drive, Callbacks]]:
+        """Yields the booted drive, and the functions that a measurement calls.
 
         Locks the axis against other measurements. If the measurement fails, prints the location of its
         record; removes an empty folder.
         """
         from hdbridge.axis.model.store import measuring
+        from hdbridge.commissioning.calibration import Callbacks
 
         try:
             with (
@@ -128,7 +129,7 @@ class Measurement:
                 self.session.booted() as (drive, interrupted),
                 phases() as progress,
             ):
-                yield drive, progress, interrupted
+                yield drive, Callbacks(progress, interrupted, note)
         except BaseException:
             if (self.folder / "recording.yaml").exists():
                 note(f"the measured data are kept; continue with --resume {self.folder}")
@@ -171,16 +172,8 @@ def calibrate(
         with suppress(InputError):  # too little travel: the calibration reports it and skips the test
             test_s += motion_test_s(axis)
     work.announce(f"{test_s / 60:.1f} min to test the model")
-    with work.booted() as (drive, progress, interrupted):
-        result = calibrate(
-            drive,
-            work.begun(drive),
-            session.files.folder,
-            work.date,
-            progress=progress,
-            interrupted=interrupted,
-            notify=note,
-        )
+    with work.booted() as (drive, callbacks):
+        result = calibrate(drive, work.begun(drive), session.files.folder, work.date, callbacks)
     _conclude(result, work.folder, json_file, html_file, session)
 
 
@@ -213,9 +206,9 @@ def measure(session: Session, measured: Measured) -> None:
 
     work, files = measured.of(session), session.files
     work.announce()
-    with work.booted() as (drive, progress, interrupted):
+    with work.booted() as (drive, callbacks):
         journal = work.begun(drive)
-        measure(drive, journal, progress=progress, interrupted=interrupted)
+        measure(drive, journal, callbacks)
     recording = journal.recording()
     say(f"recording: {work.folder}, {len(journal.done)} tasks, {len(recording.record)} samples")
     if files.model.exists():
@@ -396,22 +389,15 @@ def print_worse(test: str, ways: Iterable[str]) -> None:
 
 
 def _print_accuracy(checked: Validation) -> None:
+    from hdbridge.report.stepping import ISO_FIGURES
+
     found = ((checked.before.model, checked.accuracy_before), (checked.after.model, checked.accuracy_after))
     rows = [(model, each) for model, each in found if each is not None]
     if not rows:
         return
-    figures = [
-        (
-            model,
-            *(
-                f"{value:z.2f}"
-                for value in (each.accuracy, each.repeatability, each.reversal, each.systematic, each.range)
-            ),
-        )
-        for model, each in rows
-    ]
+    figures = [(model, *(f"{getattr(each, name):z.2f}" for name, _ in ISO_FIGURES)) for model, each in rows]
     print_table(
-        ("with", "accuracy\nA", "repeatability\nR", "reversal\nB", "systematic\nE", "range\nM"),
+        ("with", *(words.replace(" ", "\n") for _, words in ISO_FIGURES)),
         figures,
         f"Positioning test (ISO 230-2), arcsec: {rows[0][1].targets} targets, {rows[0][1].runs} "
         "approaches from each side",

@@ -22,7 +22,7 @@ from typer import Argument, Option
 from hdbridge.cli import options as opt
 from hdbridge.cli.options import taking
 from hdbridge.cli.printing import console, note, print_object, print_table, say, tables, write_json
-from hdbridge.cli.session import note_clamped
+from hdbridge.cli.session import handling, note_clamped
 from hdbridge.enums import AdaptationMode, Scheme
 from hdbridge.errors import DaemonError, HdbridgeError, InputError
 
@@ -148,21 +148,14 @@ def stopped_by_signals(client: Client, name: str) -> Iterator[None]:
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = {
-        each: signal.signal(each, interrupt)
-        for each in (signal.SIGTERM, signal.SIGHUP)
-        if signal.getsignal(each) is not signal.SIG_IGN
-    }
     try:
-        yield
+        with handling(interrupt, signal.SIGTERM, signal.SIGHUP):
+            yield
     except KeyboardInterrupt:
         with suppress(HdbridgeError):  # the daemon's own supervision remains
             client.axis(name).stop()
             note(f"axis '{name}' is stopped; it stays enabled")
         raise
-    finally:
-        for each, handler in before.items():
-            signal.signal(each, handler)
 
 
 def print_state(state: AxisState) -> None:

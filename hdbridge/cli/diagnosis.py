@@ -21,7 +21,7 @@ from hdbridge.files.profile import Profile
 from hdbridge.units import figure
 
 if TYPE_CHECKING:
-    from hdbridge.analysis.findings import Diagnosis, Finding, Parameter
+    from hdbridge.analysis.findings import Diagnosis, Finding
     from hdbridge.analysis.probability import Prior
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.commissioning.improvement import Improvement
@@ -200,7 +200,10 @@ def print_diagnosis(result: Diagnosis) -> None:
 
 def _details(finding: Finding) -> Iterator[str]:
     """Yields the details of a finding that its table row does not show."""
-    said = [f"{name} {_number(each)}" for name, each in finding.parameters.items()]
+    said = []
+    for name, each in finding.parameters.items():
+        value, low, high = map(figure, (each.value, each.low, each.high))
+        said.append(f"{name} {value} ({low} to {high}) {each.unit}".rstrip())
     if finding.aliases:
         said.insert(0, f"it may also be: {', '.join(finding.aliases)}")
     if finding.lives_in:
@@ -214,11 +217,6 @@ def _details(finding: Finding) -> Iterator[str]:
     if said:
         yield f"{finding.cause}:"
         yield from (f"  {each}" for each in said)
-
-
-def _number(parameter: Parameter) -> str:
-    value, low, high = map(figure, (parameter.value, parameter.low, parameter.high))
-    return f"{value} ({low} to {high}) {parameter.unit}".rstrip()
 
 
 def _print_figures(result: Diagnosis) -> None:
@@ -250,11 +248,9 @@ def _title(recording: Recording, records: Sequence[Path]) -> str:
 def _provenance(recording: Recording, records: Sequence[Path], model: Path) -> list[tuple[str, str]]:
     import numpy as np
 
-    rows = [("record", str(each)) for each in records]
-    rows += [("model", str(model))]
-    rows += [
-        (name, value) for name, value in (("axis", recording.axis), ("recorded", recording.date)) if value
-    ]
+    known = (("axis", recording.axis), ("recorded", recording.date))
+    rows = [*(("record", str(each)) for each in records), ("model", str(model))]
+    rows += [(name, value) for name, value in known if value]
     return [*rows, ("samples", f"{len(recording.record):,} in {np.ptp(recording.record.time_s):,.0f} s")]
 
 
@@ -317,19 +313,11 @@ def improve(
         note(f"no measurement first; {trial}")
     else:
         work.announce(trial)
-    with work.booted() as (drive, progress, interrupted):
+    with work.booted() as (drive, callbacks):
         journal = None if recordings else work.begun(drive)
-        result = improve(
-            drive,
-            Source(work.plan, work.folder, journal, recordings, independent_zeros),
-            session.files.folder,
-            active,
-            work.date,
-            rounds=rounds if auto else 0,
-            progress=progress,
-            interrupted=interrupted,
-            notify=note,
-        )
+        source = Source(work.plan, work.folder, journal, recordings, independent_zeros)
+        rounds = rounds if auto else 0
+        result = improve(drive, source, session.files.folder, active, work.date, callbacks, rounds=rounds)
     _conclude(result, work.folder, session, json_file, html_file)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
     from hdbridge.daemon.systemd import ServiceFile
     from hdbridge.device.node import DriveNode
     from hdbridge.drive.link import Frame
-
-    Maker = Callable[[can.BusABC, Clock, Path], DriveNode]
 
 
 # ---------------------------------------------------------------- run
@@ -242,13 +241,14 @@ def doctor(
     """
     from hdbridge.daemon.gateway.trace import Trace
 
-    logged = None if log is None else _begun(_logged(log))
+    logged = None if log is None else _logged(log)
+    first = [] if logged is None else list(islice(logged, 1))  # an unreadable file is refused early
     config, settings, model = gateway_axis(machine, axis)
     node_id = settings.nodes[config.name]
     trace = Trace(node_id, eds_of(config, settings, model))
     rows: list[dict[str, Any]] = []
     begun_s: float | None = None
-    frames = logged if logged is not None else _heard(settings, duration_s)
+    frames = _heard(settings, duration_s) if logged is None else chain(first, logged)
     for frame in frames:
         begun_s = frame.time_s if begun_s is None else begun_s
         for line in trace.take(frame):
@@ -287,8 +287,6 @@ def eds_of(axis: AxisConfig, settings: GatewaySettings, model: TransmissionModel
 
 def _heard(settings: GatewaySettings, duration_s: float) -> Iterator[Frame]:
     """Yields the frames on the bus of the gateway for ``duration_s``."""
-    from hdbridge.cli.session import deferred_interrupt
-    from hdbridge.clock import MonotonicClock
     from hdbridge.drive.link import Link, open_bus
 
     with deferred_interrupt() as interrupted, open_bus(settings.bus, shared=True) as bus:
@@ -298,11 +296,6 @@ def _heard(settings: GatewaySettings, duration_s: float) -> Iterator[Frame]:
         while not interrupted() and (now_s := link.now()) < end_s:
             if (frame := link.recv(min(end_s, now_s + 0.2))) is not None:
                 yield frame
-
-
-def _begun(frames: Iterator[Frame]) -> Iterator[Frame]:
-    """Returns the same frames after reading the first one, so that an unreadable file is refused early."""
-    return chain(list(islice(frames, 1)), frames)
 
 
 def _logged(path: Path) -> Iterator[Frame]:
@@ -375,20 +368,19 @@ def simulate(
         )
     if axis and not gateway:
         raise InputError("--axis: names an axis of a gateway; add --gateway, or leave it out")
-    name, config, make = (
-        _ideal(profile, axis) if gateway else _simulated(profile, truth, seed, interface, channel)
-    )
     clock = MonotonicClock()
-    with (
-        deferred_interrupt() as interrupted,
-        open_bus(config, shared=True) as bus,
-        TemporaryDirectory(prefix="hdbridge-gateway-") as folder,
-    ):
-        node = make(bus, clock, Path(folder))
-        _refuse_another(bus, clock, node.node_id)
-        note(f"{name} drive: node {node.node_id} on {bus.channel_info}; Ctrl-C ends it")
-        end = float("inf") if duration_s is None else clock.now() + duration_s
-        run(bus, node, clock, lambda: interrupted() or clock.now() >= end)
+    with deferred_interrupt() as interrupted, TemporaryDirectory(prefix="hdbridge-gateway-") as folder:
+        name, config, make = (
+            _ideal(profile, axis, Path(folder))
+            if gateway
+            else _simulated(profile, truth, seed, interface, channel)
+        )
+        with open_bus(config, shared=True) as bus:
+            node = make(bus=bus, clock=clock)
+            _refuse_another(bus, clock, node.node_id)
+            note(f"{name} drive: node {node.node_id} on {bus.channel_info}; Ctrl-C ends it")
+            end = float("inf") if duration_s is None else clock.now() + duration_s
+            run(bus, node, clock, lambda: interrupted() or clock.now() >= end)
 
 
 def _refuse_another(bus: can.BusABC, clock: Clock, node_id: int) -> None:
@@ -410,7 +402,7 @@ def _refuse_another(bus: can.BusABC, clock: Clock, node_id: int) -> None:
 
 def _simulated(
     profile: str, truth: Path | None, seed: int, interface: str | None, channel: str | None
-) -> tuple[str, BusConfig, Maker]:
+) -> tuple[str, BusConfig, partial[DriveNode]]:
     from hdbridge.device.node import DriveNode
     from hdbridge.sim.lockstep import nameplate_of
     from hdbridge.sim.machine import Machine
@@ -425,33 +417,35 @@ def _simulated(
             "or use 'hdbridge step --simulate'"
         )
     known = Truth.load(simulated_by(session.files, truth))
-
-    def make(bus: can.BusABC, clock: Clock, _: Path) -> DriveNode:
-        plate = nameplate_of(known, load_object=axis.load_encoder.source.address)
-        return DriveNode(
-            bus, Machine(known, seed), axis.eds_path, axis.drive.node_id, clock, plate, known.firmware,
-            bit_rate_bps=axis.bus.bitrate_bps,
-        )  # fmt: skip
-
+    make = partial(
+        DriveNode,
+        machine=Machine(known, seed),
+        eds_path=axis.eds_path,
+        node_id=axis.drive.node_id,
+        nameplate=nameplate_of(known, load_object=axis.load_encoder.source.address),
+        behaviour=known.firmware,
+        bit_rate_bps=axis.bus.bitrate_bps,
+    )
     return "simulated", axis.bus, make
 
 
-def _ideal(machine: str, name: str | None) -> tuple[str, BusConfig, Maker]:
+def _ideal(machine: str, name: str | None, folder: Path) -> tuple[str, BusConfig, partial[DriveNode]]:
     from hdbridge.daemon.gateway.ideal import IdealAxis
     from hdbridge.daemon.gateway.objects import nameplate, write_eds
     from hdbridge.daemon.gateway.slave import BEHAVIOUR
     from hdbridge.device.node import DriveNode
 
     axis, settings, model = gateway_axis(machine, name)
-
-    def make(bus: can.BusABC, clock: Clock, folder: Path) -> DriveNode:
-        plate = nameplate(axis, settings)
-        plant = IdealAxis(axis.gear.ratio * plate.load_counts_per_turn / plate.motor_counts_per_turn)
-        return DriveNode(
-            bus, plant, write_eds(folder, axis, settings, model), settings.nodes[axis.name], clock, plate,
-            BEHAVIOUR, bit_rate_bps=settings.bus.bitrate_bps,
-        )  # fmt: skip
-
+    plate = nameplate(axis, settings)
+    make = partial(
+        DriveNode,
+        machine=IdealAxis(axis.gear.ratio * plate.load_counts_per_turn / plate.motor_counts_per_turn),
+        eds_path=write_eds(folder, axis, settings, model),
+        node_id=settings.nodes[axis.name],
+        nameplate=plate,
+        behaviour=BEHAVIOUR,
+        bit_rate_bps=settings.bus.bitrate_bps,
+    )
     return "ideal", settings.bus, make
 
 

@@ -51,7 +51,8 @@ def compare(
 ) -> None:
     """Show the differences between two models, parameter by parameter."""
     folder, store = _folder(profile), _store(twin)
-    names = {name for each in store.log(folder) for name in _names(each)}
+    log = store.log(folder)
+    names = {each.name for each in log} | ({ACTIVE} if any(each.active for each in log) else set())
     if after is None and before is None and PENDING not in names:
         others = f", or name two of: {', '.join(sorted(names))}" if len(names) > 1 else ""
         raise InputError(f"{folder}: there is no pending {store.noun} to compare with; {store.first}{others}")
@@ -152,10 +153,6 @@ def _print_diff(title: str, rows: Sequence[Difference]) -> None:
         cells = (before, after, change, half_width) if compared else (after, half_width)
         table.append((f"{'  ' if row.effect else ''}{row.parameter}", *cells))
     print_table(("parameter", *columns), table, title)
-
-
-def _names(version: Version[Any]) -> set[str]:
-    return {version.name, ACTIVE} if version.active else {version.name}
 
 
 def _cells(row: Difference) -> tuple[str, str, str, str]:

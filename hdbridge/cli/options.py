@@ -190,7 +190,7 @@ def taking(*groups: type[Any]) -> Callable[[Callable[..., None]], Callable[..., 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         fields = [_parameters(group) for group in groups]
         every = [each for group in fields for each in group]
-        first = [each for each in every if _is_argument(each)]
+        first = [each for each in every if any(isinstance(one, ArgumentInfo) for one in _metadata(each))]
 
         @wraps(command)
         def with_options(**values: Any) -> None:
@@ -219,8 +219,8 @@ def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
     return [each.replace(annotation=hints[each.name]) for each in given]
 
 
-def _is_argument(parameter: inspect.Parameter) -> bool:
-    return any(isinstance(each, ArgumentInfo) for each in getattr(parameter.annotation, "__metadata__", ()))
+def _metadata(parameter: inspect.Parameter) -> tuple[Any, ...]:
+    return getattr(parameter.annotation, "__metadata__", ())
 
 
 def need_extra(subject: str, packages: Sequence[str], extra: str) -> None:
@@ -310,7 +310,7 @@ def _naming(options: Mapping[str, tuple[str, Kind | None]]) -> Iterator[None]:
 def _options_of(command: Callable[..., Any]) -> Iterator[tuple[str, tuple[str, Kind | None]]]:
     """Yields each parameter with its option and the kind of its output, or None if it is no output."""
     for parameter in _parameters(command):
-        metadata = getattr(parameter.annotation, "__metadata__", ())
+        metadata = _metadata(parameter)
         kinds = (each for each in metadata if isinstance(each, Kind))
         yield parameter.name, (_option(parameter.name, metadata), next(kinds, None))
 

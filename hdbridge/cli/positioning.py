@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from datetime import datetime
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -80,7 +80,7 @@ def move(
             hold_s = 0.0  # a simulated axis need not hold its position
         hold = Hold(math.inf if hold_s is None else hold_s, released=interrupted)
         stands_deg = drive.read_positions().motor_deg / axis.gear.ratio
-        targets_deg = _absolute(angles_deg, stands_deg) if relative else angles_deg
+        targets_deg = [*accumulate(angles_deg, initial=stands_deg)][1:] if relative else angles_deg
         way = WayPoints(tuple(targets_deg), hold, velocity_deg_s)
         bench = Bench(drive, compensation, interrupted=lambda: interrupted() and not hold.begun)
         with progress_bar() as bar:
@@ -125,14 +125,6 @@ def _compensating(
         note(f"not compensated: {files.model} does not exist")
         return TransmissionModel(ratio)
     return TransmissionModel.load(given or files.model)
-
-
-def _absolute(steps_deg: list[float], start_deg: float) -> list[float]:
-    targets = []
-    for step_deg in steps_deg:
-        start_deg += step_deg
-        targets.append(start_deg)
-    return targets
 
 
 def _move_document(axis: str, model: TransmissionModel, stands: tuple[Standing, ...]) -> dict[str, Any]:
@@ -195,7 +187,6 @@ def step(
 
     Uses the article's four schemes, and the whole model if it has more than their two parts.
     """
-    from hdbridge.axis.model import TransmissionModel
     from hdbridge.control.bench import axis_view
     from hdbridge.motion.procedures.rehearsal import rehearse
     from hdbridge.motion.procedures.stepping import Stepping
@@ -207,40 +198,30 @@ def step(
     if model is not None or not scheme or set(scheme) != {Scheme.NONE}:  # the scheme none needs no model
         chosen = compensating_model(files, session.profile, model, ", or step without one: --scheme none")
 
-    def notify(comparison: Comparison) -> None:
-        write_json(json_file, comparison.as_dict())
-        if html_file is not None:
-            _write_stepping_page(html_file, axis, chosen, comparison, stepping, session.simulated_seed)
-        _print_stepping(axis, comparison)
-
-    run_comparison(
-        session,
-        TransmissionModel.load(chosen) if chosen else TransmissionModel(axis.gear.ratio),
-        stepping,
-        scheme,
-        record=record,
-        notify=notify,
-    )
+    run_comparison(session, chosen, stepping, scheme, record=record, json_file=json_file, html_file=html_file)
 
 
 def run_comparison(
     session: Session,
-    model: TransmissionModel,
+    model_path: Path | None,
     stepping: Stepping,
     schemes: list[Scheme] | None,
     *,
-    record: Path | None = None,
-    notify: Callable[[Comparison], None],
+    record: Path | None,
+    json_file: Path | None,
+    html_file: Path | None,
 ) -> None:
     """Connects and boots the drive, and compares the schemes; keeps each record as soon as it is complete.
 
-    ``notify`` receives the result. For an interrupted test, this is the result of the completed schemes.
+    Writes and prints the result; for an interrupted test, that of the completed schemes.
     """
-    from hdbridge.commissioning.evaluation.comparison import compare_schemes
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.commissioning.evaluation.comparison import Comparison, compare_schemes
     from hdbridge.control.bench import compensation_for
     from hdbridge.control.caps import cap_remark
 
     axis = session.axis
+    model = TransmissionModel.load(model_path) if model_path else TransmissionModel(axis.gear.ratio)
     offered = Scheme.offered_by(model)
     wanted = tuple(schemes) if schemes else offered
     if Scheme.EXTENDED in wanted and Scheme.EXTENDED not in offered:
@@ -255,12 +236,6 @@ def run_comparison(
 
     done: dict[Scheme, Run[SteppingOutcome]] = {}
 
-    def keep(scheme: Scheme, run: Run[SteppingOutcome]) -> None:
-        done[scheme] = run
-        if record is not None:
-            with writing():
-                run.record.write_csv(record / f"stepping-{scheme.value}.csv.gz")
-
     def stopped(scheme: Scheme, measured: Record) -> None:
         path = None if record is None else record / f"stepping-{scheme.value}-stopped.csv.gz"
         if path is not None:
@@ -270,49 +245,33 @@ def run_comparison(
         seconds = float(measured.time_s[-1] - measured.time_s[0])
         note(f"stopped in '{scheme.value}' after {seconds:.1f} s, {kept}")
 
-    with (
-        _reported_when_stopped(axis, done, notify),
-        session.booted() as (drive, interrupted),
-        progress_bar() as bar,
-    ):
-        bars = {each: bar.add_task(f"{each.value:>12}", total=1.0, visible=False) for each in wanted}
-
-        begun: set[Scheme] = set()
-
-        def show(scheme: Scheme, share: float) -> None:
-            if scheme not in begun:
-                begun.add(scheme)
-                bar.reset(bars[scheme])  # the bar's elapsed time starts here
-                for each in bars.values():  # no progress bar for a refused test
-                    bar.update(each, visible=True)
-            bar.update(bars[scheme], completed=share)
-
-        comparison = compare_schemes(
-            drive,
-            model,
-            wanted,
-            stepping,
-            progress=show,
-            interrupted=interrupted,
-            finished=keep,
-            stopped=stopped,
-        )
-    notify(comparison)
-
-
-@contextmanager
-def _reported_when_stopped(
-    axis: AxisConfig, done: dict[Scheme, Run[SteppingOutcome]], notify: Callable[[Comparison], None]
-) -> Iterator[None]:
-    """Reports the results of the completed schemes if a test is interrupted."""
-    from hdbridge.commissioning.evaluation.comparison import Comparison
-
     try:
-        yield
-    except BaseException:
+        with session.booted() as (drive, interrupted), progress_bar() as bar:
+            bars = {each: bar.add_task(f"{each.value:>12}", total=1.0, visible=False) for each in wanted}
+            begun: set[Scheme] = set()
+
+            def show(scheme: Scheme, share: float) -> None:
+                if scheme not in begun:
+                    begun.add(scheme)
+                    bar.reset(bars[scheme])  # the bar's elapsed time starts here
+                    for each in bars.values():  # no progress bar for a refused test
+                        bar.update(each, visible=True)
+                bar.update(bars[scheme], completed=share)
+
+            for scheme, run in compare_schemes(
+                drive, model, wanted, stepping, progress=show, interrupted=interrupted, stopped=stopped
+            ):
+                done[scheme] = run
+                if record is not None:
+                    with writing():
+                        run.record.write_csv(record / f"stepping-{scheme.value}.csv.gz")
+    finally:
         if done:
-            notify(Comparison.of(axis, done))
-        raise
+            comparison = Comparison.of(axis, done)
+            write_json(json_file, comparison.as_dict())
+            if html_file is not None:
+                _write_stepping_page(html_file, session, model_path, comparison, stepping)
+            _print_stepping(axis, comparison)
 
 
 def _print_stepping(axis: AxisConfig, comparison: Comparison) -> None:
@@ -329,22 +288,18 @@ def _print_stepping(axis: AxisConfig, comparison: Comparison) -> None:
 
 
 def _write_stepping_page(
-    path: Path,
-    axis: AxisConfig,
-    model: Path | None,
-    comparison: Comparison,
-    stepping: Stepping,
-    simulated_seed: int | None,
+    path: Path, session: Session, model: Path | None, comparison: Comparison, stepping: Stepping
 ) -> None:
     """Writes the result as a self-contained page with axis, date and model of the test."""
     from hdbridge.report.page import render
     from hdbridge.report.stepping import stepping_page
 
+    axis, seed = session.axis, session.simulated_seed
     cycle = f"cycle {axis.drive.cycle_ms:g} ms"
     drive = (
         f"node {axis.drive.node_id} on {axis.bus.interface}:{axis.bus.channel}, {cycle}"
-        if simulated_seed is None
-        else f"simulated, seed {simulated_seed}, {cycle}"
+        if seed is None
+        else f"simulated, seed {seed}, {cycle}"
     )
     facts = {
         "axis": f"{axis.name} ({axis.path})",
@@ -391,6 +346,7 @@ def motion(
     """
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.axis.model.store import propose as keep
+    from hdbridge.commissioning.calibration import Callbacks
     from hdbridge.commissioning.calibration.motion import motion_test, motion_test_s
 
     files, axis = session.files, session.axis
@@ -401,7 +357,7 @@ def motion(
     used.check_bound_to(axis)
     note(f"motion test: {motion_test_s(axis) / 60.0:.1f} min at most")
     with session.booted() as (drive, interrupted), phases() as progress:
-        result = motion_test(drive, used, measure=measure, progress=progress, interrupted=interrupted)
+        result = motion_test(drive, used, Callbacks(progress, interrupted), measure=measure)
         identity = drive.identity
     write_json(json_file, result.as_dict())
     if html_file is not None:
@@ -469,20 +425,20 @@ def demo(
 
     FOLDER receives table, JSON, records and a page.
     """
-    from hdbridge.axis.model import TransmissionModel
     from hdbridge.motion.procedures.stepping import Stepping
 
     session = Session(profile="article", simulate=True, seed=seed)
-    files, axis = session.files, session.axis
-    stepping = Stepping(count=count)
     folder = new_folder(Path("demo-output")) if out is None else make_folder(out)
 
-    def notify(comparison: Comparison) -> None:
-        write_json(folder / "stepping.json", comparison.as_dict())
-        _write_stepping_page(folder / "stepping.html", axis, files.model, comparison, stepping, seed)
-        _print_stepping(axis, comparison)
-
-    run_comparison(session, TransmissionModel.load(files.model), stepping, None, record=folder, notify=notify)
+    run_comparison(
+        session,
+        session.files.model,
+        Stepping(count=count),
+        None,
+        record=folder,
+        json_file=folder / "stepping.json",
+        html_file=folder / "stepping.html",
+    )
     say(f"\nopen {folder / 'stepping.html'} in a browser for the picture; next: docs/tutorial.md")
 
 

@@ -162,16 +162,23 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
         if wishes >= 3:  # the user insists: end even if the program hangs
             raise KeyboardInterrupt
 
+    with handling(note, signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+        yield lambda: wishes > 0
+
+
+@contextmanager
+def handling(handler: Callable[[int, FrameType | None], None], *signals: signal.Signals) -> Iterator[None]:
+    """Handles signals within the block. One that was ignored from the start stays ignored, except SIGINT."""
     before = {
-        each: signal.signal(each, note)
-        for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+        each: signal.signal(each, handler)
+        for each in signals
         if each is signal.SIGINT or signal.getsignal(each) is not signal.SIG_IGN
     }
     try:
-        yield lambda: wishes > 0
+        yield
     finally:
-        for each, handler in before.items():
-            signal.signal(each, handler)
+        for each, previous in before.items():
+            signal.signal(each, previous)
 
 
 def check_bus_options(interface: str | None, channel: str | None, *, simulate: bool) -> None:

@@ -5,6 +5,7 @@ import json
 import re
 import shlex
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -70,10 +71,11 @@ def setup(
         work.make_profile(interface, channel, bitrate_bps, node_id, eds)
         work.ask_facts()
         work.examine()
-        work.measure_latency()
-        work.calibrate(plan)
-        work.commit()
-        work.move()
+        if not work.simulated:
+            work.complete("latency", work.measure_latency)
+        work.complete("calibrate", lambda: work.calibrate(plan))
+        work.complete("commit", work.commit)
+        work.complete("move", work.move)
     except (HdbridgeError, KeyboardInterrupt, typer.Abort, typer.Exit):
         note(f"resume: hdbridge setup {shlex.quote(str(folder))}")
         raise
@@ -96,7 +98,8 @@ class _Setup:
         self._folder, self._yes = folder, yes
         self._path = folder / STATE
         self._state = _read(self._path) if self._path.exists() else _State(simulate, seed)
-        if simulate and not self._state.simulated:
+        self.simulated = self._state.simulated
+        if simulate and not self.simulated:
             raise InputError(f"{self._path}: this axis was set up on a real bus; leave out --simulate")
 
     # ---------------------------------------------------------------- steps
@@ -112,7 +115,7 @@ class _Setup:
         """Creates the axis file from the data of the drive."""
         if (self._folder / "axis.yaml").exists():
             return
-        if self._state.simulated:
+        if self.simulated:
             self._run("new", self._folder, "--from", "demo")
             return
         if interface is None or channel is None:
@@ -133,7 +136,7 @@ class _Setup:
         path = self._folder / "axis.yaml"
         if "facts" in self._state.done:
             return
-        for key, question in () if self._state.simulated else QUESTIONS:
+        for key, question in () if self.simulated else QUESTIONS:
             text = path.read_text(encoding="utf-8")
             found = value_of(text, key)
             if found is None:
@@ -156,38 +159,30 @@ class _Setup:
             try:
                 self._run("doctor", self._folder, *self._how, "--yes", "--json", self._folder / DOCTOR)
             except DriveError:
-                if self._state.simulated or not self._mended():
+                if self.simulated or not self._mended():
                     raise
                 continue
             self._finish("doctor")
             return
 
     def measure_latency(self) -> None:
-        """Checks that this computer sustains the cycle time; skipped for a simulated drive."""
-        if self._state.simulated or self._is_done("latency"):
-            return
+        """Checks that this computer sustains the cycle time."""
         from hdbridge.axis import AxisConfig
 
         cycle_ms = AxisConfig.load(self._folder).drive.cycle_ms
         self._run("latency", "--cycle-ms", f"{cycle_ms:g}")
         self._confirm(f"Does this computer sustain {cycle_ms:g} ms, by the table above?")
-        self._finish("latency")
 
     def calibrate(self, plan: str) -> None:
         """Measures the axis, fits its model, and tests the model on the axis."""
-        if self._is_done("calibrate"):
-            return
         self._confirm("The calibration moves the axis within its limits for some minutes. Move now?")
         recording = self._folder / RECORDING
         begun = (recording / "recording.yaml").exists()
         where = ("--resume", recording) if begun else ("--plan", plan, "--out", recording)
         self._run("calibrate", self._folder, *where, *self._how)
-        self._finish("calibrate")
 
     def commit(self) -> None:
         """Compares the new model with the previous one and makes it the active one."""
-        if self._is_done("commit"):
-            return
         from hdbridge.axis.model.store import MODELS, PENDING
 
         if PENDING not in {each.name for each in MODELS.log(self._folder)}:
@@ -199,12 +194,9 @@ class _Setup:
         self._run("model", "diff", self._folder)
         self._confirm("Make this the active model?")
         self._run("model", "commit", self._folder)
-        self._finish("commit")
 
     def move(self) -> None:
         """Makes the first compensated move."""
-        if self._is_done("move"):
-            return
         from hdbridge.axis import AxisConfig
 
         limits = AxisConfig.load(self._folder).limits
@@ -213,11 +205,10 @@ class _Setup:
         places = f"{beside_deg:g}", f"{middle_deg:g}"
         self._confirm(f"The axis moves to {places[0]} and {places[1]} deg, compensated. Move now?")
         self._run("move", self._folder, *self._how, "--hold", "1", *places)
-        self._finish("move")
 
     def print_next(self) -> None:
         """Prints the path of the calibration's page and the commands for daily use."""
-        how = " --simulate" if self._state.simulated else ""
+        how = " --simulate" if self.simulated else ""
         say(
             f"\nthe axis is set up. Its page: {self._folder / RECORDING / 'report.html'}\n"
             f"every day: hdbridge run {self._folder} --page{how}\n"
@@ -228,7 +219,7 @@ class _Setup:
 
     @property
     def _how(self) -> tuple[str, ...]:
-        return ("--simulate", "--seed", str(self._state.seed)) if self._state.simulated else ()
+        return ("--simulate", "--seed", str(self._state.seed)) if self.simulated else ()
 
     def _run(self, *arguments: object) -> None:
         """Prints and runs an hdbridge command. Raises its error."""
@@ -275,6 +266,12 @@ class _Setup:
 
     def _is_done(self, step: str) -> bool:
         return self._state.done.get(step) == self._digest()
+
+    def complete(self, step: str, act: Callable[[], None]) -> None:
+        """Does a step unless it is done already for this version of the axis file."""
+        if not self._is_done(step):
+            act()
+            self._finish(step)
 
     def _finish(self, step: str) -> None:
         self._state.done[step] = self._digest()

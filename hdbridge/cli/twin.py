@@ -46,6 +46,8 @@ def twin(
     commit PROFILE --twin`.
     """
     from hdbridge.axis import AxisConfig
+    from hdbridge.report.page import render
+    from hdbridge.report.twin import twin_page
     from hdbridge.twin.replay import doubts
 
     files = Profile.find(profile)
@@ -66,14 +68,7 @@ def twin(
         report = _compared(axis, recording, begun, facts)
     else:
         report = _learned(files, axis, recording, recordings, begun, facts)
-    _give(report, json_file, html_file)
-
-
-def _give(report: TwinReport, json_file: Path | None, html_file: Path | None) -> None:
-    """Writes files first, because the reader of the tables may close the pipe (`| head`)."""
-    from hdbridge.report.page import render
-    from hdbridge.report.twin import twin_page
-
+    # Files are written first, because the reader of the tables may close the pipe (`| head`).
     write_json(json_file, as_dict(report))
     if html_file is not None:
         write_result(html_file, render(twin_page(report)))
@@ -238,15 +233,13 @@ def _facts(
     import numpy as np
 
     plant = truth or files.simulated
-    rows = [("recording", str(each)) for each in paths]
-    rows.append(("axis", str(files.axis)))
-    rows.append(("simulated by", "usual values" if afresh or not plant.is_file() else str(plant)))
-    rows.append(
-        (
-            "transmission error",
-            str(files.model) if files.model.is_file() else "of the plant, as there is no active model",
-        )
-    )
+    error = str(files.model) if files.model.is_file() else "of the plant, as there is no active model"
+    rows = [
+        *(("recording", str(each)) for each in paths),
+        ("axis", str(files.axis)),
+        ("simulated by", "usual values" if afresh or not plant.is_file() else str(plant)),
+        ("transmission error", error),
+    ]
     if recording.date:
         rows.append(("recorded", recording.date))
     return [*rows, ("samples", f"{len(recording.record):,} in {np.ptp(recording.record.time_s):,.0f} s")]

@@ -1,22 +1,12 @@
 """Checks of CiA 402 that need no power: objects, units, modes, and states up to *ready to switch on*."""
 
 import struct
+from collections.abc import Callable
 from typing import Final
 
-from hdbridge.conformance.tester import (
-    NMT_RESET_NODE,
-    NMT_START,
-    RANGE,
-    READ_ONLY,
-    READY_TO_SWITCH_ON,
-    SWITCH_ON_DISABLED,
-    NodeTester,
-    NotApplicableError,
-    Table,
-    expedited,
-    pack,
-    power_state,
-)
+from hdbridge.cia301 import NmtCommand
+from hdbridge.conformance.tester import RANGE, READ_ONLY, NodeTester, Table, expedited, pack, state_name
+from hdbridge.drive.states import State, decode
 
 CHECKS: Final = Table(drives=True)
 check: Final = CHECKS.check
@@ -24,6 +14,8 @@ _PROFILE: Final = "CiA 402-2"
 _STATES: Final = "CiA 402-2, finite state automaton"
 _MODES: Final = "CiA 402-2, objects 6060h, 6061h, 6502h"
 _OPTIONS: Final = "CiA 402-2, objects 605Ah to 605Eh, 6007h"
+_DISABLED: Final = State.SWITCH_ON_DISABLED
+_READY: Final = State.READY_TO_SWITCH_ON
 _UNITS: Final = "CiA 402-2, objects 608Fh, 6091h, 6092h"
 MODES: Final = {
     1: "profile position",
@@ -105,89 +97,70 @@ def _refuses_mode(t: NodeTester, number: int) -> None:
 
 @check("402.state.reset", "After the NMT command reset node the drive reaches switch on disabled", _STATES)
 def _(t: NodeTester) -> None:
-    t.reset(NMT_RESET_NODE)
-    t.reaches(SWITCH_ON_DISABLED)
-
-
-@check("402.state.shutdown", "Shutdown leads from switch on disabled to ready to switch on (2)", _STATES)
-def _(t: NodeTester) -> None:
-    ready(t)
+    t.reset(NmtCommand.RESET_NODE)
+    t.reaches(_DISABLED)
 
 
 def ready(t: NodeTester) -> None:
     """Brings the drive to READY TO SWITCH ON."""
     t.disable()
     t.control(0x06)
-    t.reaches(READY_TO_SWITCH_ON)
+    t.reaches(_READY)
 
 
-def _back(name: str, word: int, command: str) -> None:
-    @check(f"402.state.{name}", f"{command} leads from ready to switch on to switch on disabled (7)", _STATES)
+def _leads(name: str, text: str, begin: Callable[[NodeTester], None], word: int, state: State) -> None:
+    @check(f"402.state.{name}", text, _STATES, first=begin)
     def _(t: NodeTester) -> None:
-        ready(t)
         t.control(word)
-        t.reaches(SWITCH_ON_DISABLED)
+        t.reaches(state)
 
 
-_back("disable-voltage", 0x00, "Disable voltage")
-_back("quick-stop", 0x02, "Quick stop")
+_leads(
+    "shutdown", "Shutdown leads from switch on disabled to ready to switch on (2)", NodeTester.disable,
+    0x06, _READY,
+)  # fmt: skip
+for _name, _word, _command in (
+    ("disable-voltage", 0x00, "Disable voltage"),
+    ("quick-stop", 0x02, "Quick stop"),
+):
+    _leads(
+        _name, f"{_command} leads from ready to switch on to switch on disabled (7)", ready, _word, _DISABLED
+    )
+_leads(
+    "mode-bits", "Bits 4 to 6 and 8 of the controlword do not disturb shutdown", NodeTester.disable,
+    0x176, _READY,
+)  # fmt: skip
 
 
-def _no_effect(name: str, word: int, text: str) -> None:
-    @check(f"402.state.disabled.{name}", f"{text} changes nothing in switch on disabled", _STATES)
+def _no_effect(name: str, word: int, text: str, state: State) -> None:
+    @check(f"402.state.{name}", f"{text} changes nothing in {state.value}", _STATES)
     def _(t: NodeTester) -> None:
-        t.disable()
+        (ready if state is _READY else NodeTester.disable)(t)
         t.control(word)
-        t.stays(SWITCH_ON_DISABLED)
+        t.stays(state)
 
 
-_no_effect("disable-voltage", 0x00, "Disable voltage")
-_no_effect("quick-stop", 0x02, "Quick stop")
-_no_effect("fault-reset", 0x80, "Fault reset")
+_no_effect("disabled.disable-voltage", 0x00, "Disable voltage", _DISABLED)
+_no_effect("disabled.quick-stop", 0x02, "Quick stop", _DISABLED)
+_no_effect("disabled.fault-reset", 0x80, "Fault reset", _DISABLED)
+_no_effect("ready.repeated", 0x06, "Repeated shutdown", _READY)
 
 
-@check("402.state.ready.repeated", "Repeated shutdown changes nothing in ready to switch on", _STATES)
+@check("402.state.stable", "The drive stays in ready to switch on without a command", _STATES, first=ready)
 def _(t: NodeTester) -> None:
-    ready(t)
-    t.control(0x06)
-    t.stays(READY_TO_SWITCH_ON)
+    t.stays(_READY, 0.5)
 
 
-@check("402.state.mode-bits", "Bits 4 to 6 and 8 of the controlword do not disturb shutdown", _STATES)
-def _(t: NodeTester) -> None:
-    t.disable()
-    t.control(0x176)
-    t.reaches(READY_TO_SWITCH_ON)
+def _bit(name: str, bit: int, value: int, text: str, begin: Callable[[NodeTester], None]) -> None:
+    @check(f"402.status.{name}", f"Bit {bit} of the statusword{text}", _STATES, first=begin)
+    def _(t: NodeTester) -> None:
+        t.equal(t.read(0x6041) >> bit & 1, value, f"bit {bit}")
 
 
-@check("402.state.stable", "The drive stays in ready to switch on without a command", _STATES)
-def _(t: NodeTester) -> None:
-    ready(t)
-    t.stays(READY_TO_SWITCH_ON, 0.5)
-
-
-@check("402.status.quick-stop", "Bit 5 of the statusword is 1 in ready to switch on", _STATES)
-def _(t: NodeTester) -> None:
-    ready(t)
-    t.equal(t.read(0x6041) & 0x6F, 0x21, "bits 0 to 3, 5 and 6")
-
-
-@check("402.status.fault", "Bit 3 of the statusword is 0 without a fault", _STATES)
-def _(t: NodeTester) -> None:
-    t.disable()
-    t.equal(t.read(0x6041) & 0x08, 0, "bit 3")
-
-
-@check("402.status.remote", "Bit 9 of the statusword, remote, is 1 while the controlword is obeyed", _STATES)
-def _(t: NodeTester) -> None:
-    ready(t)
-    t.equal(t.read(0x6041) >> 9 & 1, 1, "bit 9")
-
-
-@check("402.status.limit", "Bit 11 of the statusword, internal limit, is 0 at rest without power", _STATES)
-def _(t: NodeTester) -> None:
-    t.disable()
-    t.equal(t.read(0x6041) >> 11 & 1, 0, "bit 11")
+_bit("quick-stop", 5, 1, " is 1 in ready to switch on", ready)
+_bit("fault", 3, 0, " is 0 without a fault", NodeTester.disable)
+_bit("remote", 9, 1, ", remote, is 1 while the controlword is obeyed", ready)
+_bit("limit", 11, 0, ", internal limit, is 0 at rest without power", NodeTester.disable)
 
 
 @check("402.error-code", "603Fh is 0 without a fault", "CiA 402-2, object 603Fh", 0x603F)
@@ -202,51 +175,45 @@ def _(t: NodeTester) -> None:
     t.equal(t.read(0x6040), 0x06, "6040h")
 
 
-@check("402.controlword.pdo", "The controlword is obeyed as an RPDO", _STATES)
+@check("402.controlword.pdo", "The controlword is obeyed as an RPDO", _STATES, first=NodeTester.disable)
 def _(t: NodeTester) -> None:
-    t.disable()
     can_id = t.map_pdo(0x1400, ((0x6040, 0, 16),), 255)
-    t.nmt(NMT_START)
+    t.nmt(NmtCommand.START)
     t.send(can_id, b"\x06\0")
-    t.reaches(READY_TO_SWITCH_ON)
+    t.reaches(_READY)
     t.send(can_id, b"\0\0")
-    t.reaches(SWITCH_ON_DISABLED)
+    t.reaches(_DISABLED)
 
 
 @check("402.controlword.pdo.sync", "A synchronous controlword is obeyed at SYNC, not before", _STATES)
 def _(t: NodeTester) -> None:
     t.disable()
     can_id = t.map_pdo(0x1400, ((0x6040, 0, 16),), 1)
-    t.nmt(NMT_START)
+    t.nmt(NmtCommand.START)
     t.send(can_id, b"\x06\0")
-    t.stays(SWITCH_ON_DISABLED)
+    t.stays(_DISABLED)
     t.sync()
-    t.reaches(READY_TO_SWITCH_ON)
+    t.reaches(_READY)
 
 
-@check("402.statusword.pdo", "A TPDO carries the statusword", _STATES)
+@check("402.statusword.pdo", "A TPDO carries the statusword", _STATES, first=ready)
 def _(t: NodeTester) -> None:
-    ready(t)
     can_id = t.map_pdo(0x1800, ((0x6041, 0, 16),), 1)
-    t.nmt(NMT_START)
-    since = t.mark()
-    t.sync()
-    frame = t.true(t.hears(can_id, since=since), "no TPDO", "the statusword")
-    t.equal(power_state(struct.unpack("<H", frame.data)[0]), READY_TO_SWITCH_ON, "state in the TPDO")
+    t.nmt(NmtCommand.START)
+    data = t.true(t.reply(can_id, t.sync), "no TPDO", "the statusword")
+    t.equal(state_name(struct.unpack("<H", data)[0]), _READY.value, "state in the TPDO")
 
 
 @check("402.statusword.event", "An event-driven statusword is sent when the state changes", _STATES)
 def _(t: NodeTester) -> None:
     ready(t)
     can_id = t.map_pdo(0x1800, ((0x6041, 0, 16),), 255)
-    t.nmt(NMT_START)
+    t.nmt(NmtCommand.START)
     t.wait(0.05)
-    since = t.mark()
-    t.control(0x00)
-    t.wait(0.1)
-    words = [struct.unpack("<H", frame.data)[0] for frame in t.heard(can_id, since)]
+    frames = t.heard_after(can_id, 0.1, lambda: t.control(0x00))
+    words = [struct.unpack("<H", frame.data)[0] for frame in frames]
     t.true(
-        SWITCH_ON_DISABLED in [power_state(word) for word in words],
+        _DISABLED in map(decode, words),
         f"statuswords {[f'{word:04X}h' for word in words]}", "one in switch on disabled",
     )  # fmt: skip
 
@@ -254,15 +221,15 @@ def _(t: NodeTester) -> None:
 # ---------------------------------------------------------------- option codes
 
 
-def _option(index: int, name: str, reserved: int, defined: tuple[int, ...]) -> None:
-    @check(
-        f"402.option.{index:04X}.reserved",
-        f"{index:04X}h, {name}: the reserved value {reserved} is refused",
-        _OPTIONS,
-    )
+def _reserved(name: str, text: str, clause: str, index: int, value: int, size: int = 2) -> None:
+    @check(f"402.{name}.reserved", text, clause, index)
     def _(t: NodeTester) -> None:
-        t.require(index)
-        t.refuses_value(index, 0, pack(reserved, 2), RANGE)
+        t.refuses_value(index, 0, pack(value, size), RANGE)
+
+
+def _option(index: int, name: str, reserved: int, defined: tuple[int, ...]) -> None:
+    text = f"{index:04X}h, {name}: the reserved value {reserved} is refused"
+    _reserved(f"option.{index:04X}", text, _OPTIONS, index, reserved)
 
     @check(f"402.option.{index:04X}", f"{index:04X}h, {name}, holds a defined value", _OPTIONS, index)
     def _(t: NodeTester) -> None:
@@ -295,13 +262,15 @@ _ratio(0x6091, "gear", "motor and driving shaft revolutions")
 _ratio(0x6092, "feed", "feed and driving shaft revolutions")
 
 
-@check("402.units.position", "6064h is 6063h · 6092h / (608Fh · 6091h) apart from a home offset", _UNITS)
+@check(
+    "402.units.position", "6064h is 6063h · 6092h / (608Fh · 6091h) apart from a home offset", _UNITS,
+    (0x608F, 1), (0x6091, 1), (0x6092, 1),
+)  # fmt: skip
 def _(t: NodeTester) -> None:
-    for index, sub in ((0x6063, 0), (0x608F, 1), (0x6091, 1), (0x6092, 1)):
-        t.require(index, sub)
-    increments, turns = t.read(0x608F, 1), t.read(0x608F, 2)
-    motor, shaft = t.read(0x6091, 1), t.read(0x6091, 2)
-    feed, driven = t.read(0x6092, 1), t.read(0x6092, 2)
+    t.require(0x6063)
+    increments, turns, motor, shaft, feed, driven = (
+        t.read(index, sub) for index in (0x608F, 0x6091, 0x6092) for sub in (1, 2)
+    )
     scale = feed * shaft * turns / (increments * motor * driven)
     offset = t.read(0x607C, signed=True) if t.has(0x607C) else 0
     internal, actual = t.read(0x6063, signed=True), t.read(0x6064, signed=True)
@@ -322,9 +291,10 @@ def _(t: NodeTester) -> None:
 
 
 def _positive(index: int, name: str) -> None:
-    @check(f"402.limits.{index:04X}", f"{index:04X}h, {name}, is above 0", f"CiA 402-2, object {index:04X}h")
+    text, clause = f"{index:04X}h, {name}, is above 0", f"CiA 402-2, object {index:04X}h"
+
+    @check(f"402.limits.{index:04X}", text, clause, index)
     def _(t: NodeTester) -> None:
-        t.require(index)
         t.true(t.read(index), f"{index:04X}h = 0", "a value above 0")
 
 
@@ -350,19 +320,11 @@ def _(t: NodeTester) -> None:
         t.write(0x6098, 0, t.read(0x60E3, sub, signed=True), 1)
 
 
-@check("402.homing.reserved", "A reserved homing method, 38, is refused", "CiA 402-2, object 6098h", 0x6098)
-def _(t: NodeTester) -> None:
-    t.refuses_value(0x6098, 0, b"\x26", RANGE)
-
-
-@check(
-    "402.profile-type.reserved",
-    "6086h, motion profile type: the reserved value 5 is refused",
-    "CiA 402-2, object 6086h",
-)
-def _(t: NodeTester) -> None:
-    t.require(0x6086)
-    t.refuses_value(0x6086, 0, b"\x05\0", RANGE)
+_reserved("homing", "A reserved homing method, 38, is refused", "CiA 402-2, object 6098h", 0x6098, 38, 1)
+_reserved(
+    "profile-type", "6086h, motion profile type: the reserved value 5 is refused", "CiA 402-2, object 6086h",
+    0x6086, 5,
+)  # fmt: skip
 
 
 @check("402.following-error", "60F4h is 6062h minus 6064h", "CiA 402-2, object 60F4h", 0x60F4, 0x6062)
@@ -375,7 +337,7 @@ def _(t: NodeTester) -> None:
 
 @check("402.still", "The axis has not moved during the checks without power", _PROFILE)
 def _(t: NodeTester) -> None:
-    if t.start_position is None:
-        raise NotApplicableError("the position at the start is not known")
-    moved = t.read(0x6064, signed=True) - t.start_position
+    start = t.start_position
+    t.need(start is not None, "the position at the start is not known")
+    moved = t.read(0x6064, signed=True) - (start or 0)
     t.true(abs(moved) <= t.travel, f"moved by {moved}", f"at most {t.travel}")

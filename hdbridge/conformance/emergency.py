@@ -1,19 +1,11 @@
 """Checks of EMCY, the error objects, stored parameters and identity."""
 
-import struct
+from collections.abc import Callable
 from typing import Final
 
+from hdbridge.cia301 import NmtCommand
 from hdbridge.conformance.network import lose_heartbeat
-from hdbridge.conformance.tester import (
-    NMT_RESET_NODE,
-    PDO_INVALID,
-    RANGE,
-    READ_ONLY,
-    NodeTester,
-    Table,
-    expedited,
-    pack,
-)
+from hdbridge.conformance.tester import PDO_INVALID, RANGE, READ_ONLY, NodeTester, Table, expedited
 
 CHECKS: Final = Table()
 check: Final = CHECKS.check
@@ -29,20 +21,19 @@ _LOAD: Final = b"load"
 
 @check("emcy.register", "1001h is 0 without an error", _REGISTER)
 def _(t: NodeTester) -> None:
-    t.reset(NMT_RESET_NODE)
+    t.reset(NmtCommand.RESET_NODE)
     t.equal(t.upload(0x1001), b"\0", "1001h")
 
 
-@check("emcy.register.error", "An error sets bit 0 of 1001h", _REGISTER)
-def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
-    t.equal(t.read(0x1001) & 1, 1, "bit 0")
+def _register(name: str, text: str, bit: int) -> None:
+    @check(f"emcy.register.{name}", f"{text} sets bit {bit} of 1001h", _REGISTER)
+    def _(t: NodeTester) -> None:
+        lose_heartbeat(t)
+        t.equal(t.read(0x1001) & 1 << bit, 1 << bit, f"bit {bit}")
 
 
-@check("emcy.register.communication", "A communication error sets bit 4 of 1001h", _REGISTER)
-def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
-    t.equal(t.read(0x1001) & 0x10, 0x10, "bit 4")
+_register("error", "An error", 0)
+_register("communication", "A communication error", 4)
 
 
 @check("emcy.register.read-only", "1001h cannot be written", _REGISTER)
@@ -50,40 +41,33 @@ def _(t: NodeTester) -> None:
     t.aborts(expedited(0x1001, 0, b"\0"), READ_ONLY, "download to 1001h")
 
 
-@check("emcy.identifier", "1014h is 80h + node id by default", _EMCY, 0x1014)
+@check("emcy.identifier", "1014h is 80h + node id by default", _EMCY, 0x1014, first=NodeTester.reset)
 def _(t: NodeTester) -> None:
-    t.reset()
     t.equal(f"{t.read(0x1014) & 0x7FF:03X}h", f"{0x80 + t.node_id:03X}h", "identifier")
 
 
-@check("emcy.frame", "An EMCY message has eight bytes", _EMCY)
+@check("emcy.frame", "An EMCY message has eight bytes", _EMCY, first=lose_heartbeat)
 def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
     t.equal({len(frame.data) for frame in t.heard(0x80 + t.node_id)}, {8}, "length")
 
 
-@check("emcy.frame.register", "Byte 2 of an EMCY message is 1001h", _EMCY)
+@check("emcy.frame.register", "Byte 2 of an EMCY message is 1001h", _EMCY, first=lose_heartbeat)
 def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
     t.equal(t.heard(0x80 + t.node_id)[-1].data[2], t.read(0x1001), "error register")
 
 
-@check("emcy.once", "An error is reported once", _EMCY)
+@check("emcy.once", "An error is reported once", _EMCY, first=lose_heartbeat)
 def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
     t.wait(0.5)
-    t.equal(t.emergencies(0).count(0x8130), 1, "number of EMCY messages")
+    t.equal(t.emergencies().count(0x8130), 1, "number of EMCY messages")
 
 
-@check("emcy.disabled", "1014h with bit 31 set sends no EMCY", _EMCY, 0x1014)
+@check("emcy.disabled", "1014h with bit 31 set sends no EMCY", _EMCY, 0x1014, first=lose_heartbeat)
 def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
     t.send(0x77E, b"\x05")
     t.wait(0.02)
     t.write(0x1014, 0, t.read(0x1014) | PDO_INVALID, 4)
-    since = t.mark()
-    t.wait(0.4)
-    t.equal(t.emergencies(since), [], "EMCY codes")
+    t.equal(t.emergencies_after(0.4), [], "EMCY codes")
 
 
 @check("emcy.identifier.other", "EMCY is sent with the identifier in 1014h", _EMCY, 0x1014)
@@ -93,15 +77,12 @@ def _(t: NodeTester) -> None:
     t.write(0x1014, 0, other, 4)
     t.require(0x1016, 1)
     t.write(0x1016, 1, 126 << 16 | 50, 4)
-    since = t.mark()
-    t.send(0x77E, b"\x05")
-    t.wait(0.2)
-    t.true(t.heard(other, since), "no EMCY with the new identifier", "EMCY 8130h")
+    heard = t.heard_after(other, 0.2, lambda: t.send(0x77E, b"\x05"))
+    t.true(heard, "no EMCY with the new identifier", "EMCY 8130h")
 
 
-@check("emcy.history", "An error is the first entry of 1003h", _HISTORY, 0x1003)
+@check("emcy.history", "An error is the first entry of 1003h", _HISTORY, 0x1003, first=lose_heartbeat)
 def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
     t.equal(f"{t.read(0x1003, 1) & 0xFFFF:04X}h", "8130h", "1003h:01")
 
 
@@ -129,10 +110,10 @@ def _(t: NodeTester) -> None:
     index, sub, bits = t.scratch()
     can_id = t.map_pdo(0x1400, ((index, sub, bits),), 255)
     lose_heartbeat(t)
-    t.nmt(1)
+    t.nmt(NmtCommand.START)
     t.send(can_id, b"")
     t.wait(0.05)
-    t.need(t.emergencies(0)[-1:] == [0x8210], "a short RPDO is not EMCY 8210h")
+    t.need(t.emergencies()[-1:] == [0x8210], "a short RPDO is not EMCY 8210h")
     codes = [t.read(0x1003, place) & 0xFFFF for place in (1, 2)]
     t.send(can_id, bytes(t.upload(index, sub)))
     t.equal([f"{code:04X}h" for code in codes], ["8210h", "8130h"], "1003h:01 and 02")
@@ -214,35 +195,30 @@ def _saved(t: NodeTester, value: int) -> None:
 
 def _forget(t: NodeTester) -> None:
     t.download(0x1011, 1, _LOAD)
-    t.reset(NMT_RESET_NODE)
+    t.reset(NmtCommand.RESET_NODE)
 
 
-@check("store.save", "Saved parameters survive a reset", _STORE, stores=True)
-def _(t: NodeTester) -> None:
-    _saved(t, 700)
-    t.reset(NMT_RESET_NODE)
-    found = t.read(0x1017)
-    _forget(t)
-    t.equal(found, 700, "1017h")
+def _stored(name: str, text: str, act: Callable[[NodeTester], object], what: str = "1017h") -> None:
+    @check(f"store.{name}", text, _STORE, stores=True)
+    def _(t: NodeTester) -> None:
+        _saved(t, 700)
+        act(t)
+        found = t.read(0x1017)
+        _forget(t)
+        t.equal(found, 700, what)
 
 
-@check("store.unsaved", "Parameters that were not saved do not survive a reset", _STORE, stores=True)
-def _(t: NodeTester) -> None:
-    _saved(t, 700)
+def _overwrite(t: NodeTester) -> None:
     t.put(0x1017, 0, 800, 2)
-    t.reset(NMT_RESET_NODE)
-    found = t.read(0x1017)
-    _forget(t)
-    t.equal(found, 700, "1017h")
+    t.reset(NmtCommand.RESET_NODE)
 
 
-@check("store.load.later", "Default values become valid at the next reset, not at once", _STORE, stores=True)
-def _(t: NodeTester) -> None:
-    _saved(t, 700)
-    t.download(0x1011, 1, _LOAD)
-    found = t.read(0x1017)
-    t.reset(NMT_RESET_NODE)
-    t.equal(found, 700, "1017h before the reset")
+_stored("save", "Saved parameters survive a reset", lambda t: t.reset(NmtCommand.RESET_NODE))
+_stored("unsaved", "Parameters that were not saved do not survive a reset", _overwrite)
+_stored(
+    "load.later", "Default values become valid at the next reset, not at once",
+    lambda t: t.download(0x1011, 1, _LOAD), "1017h before the reset",
+)  # fmt: skip
 
 
 @check("store.load", "Default values are valid after the reset", _STORE, stores=True)
@@ -258,6 +234,6 @@ def _(t: NodeTester) -> None:
 def _(t: NodeTester) -> None:
     before = t.read(0x1017)
     t.put(0x1017, 0, before + 300, 2)
-    t.ask(expedited(0x1010, 1, pack(struct.unpack("<I", b"evas")[0], 4)))
-    t.reset(NMT_RESET_NODE)
+    t.ask(expedited(0x1010, 1, b"evas"))
+    t.reset(NmtCommand.RESET_NODE)
     t.equal(t.read(0x1017), before, "1017h")

@@ -5,15 +5,11 @@ Only the node with the identity in 1018h is selected, so no other node on the bu
 
 import struct
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
-from hdbridge.conformance.tester import (
-    NMT_RESET_COMMUNICATION,
-    NodeTester,
-    NotApplicableError,
-    Table,
-    upload_request,
-)
+from hdbridge.cia301 import NmtCommand
+from hdbridge.conformance.tester import NodeTester, NotApplicableError, Table, upload_request
 
 CHECKS: Final = Table()
 _REQUEST, _ANSWER = 0x7E5, 0x7E4
@@ -29,16 +25,7 @@ def _ask(t: NodeTester, command: int, *values: int, number: int | None = None) -
     answer or None.
     """
     data = bytes(values) if number is None else struct.pack("<I", number) + bytes(values)
-    since = t.mark()
-    t.send(_REQUEST, (bytes((command,)) + data).ljust(8, b"\0"))
-    frame = t.hears(_ANSWER, since=since)
-    return None if frame is None else frame.data
-
-
-def _identity(t: NodeTester) -> list[int]:
-    for sub in range(1, 5):
-        t.require(0x1018, sub)
-    return [t.read(0x1018, sub) for sub in range(1, 5)]
+    return t.reply(_ANSWER, lambda: t.send(_REQUEST, (bytes((command,)) + data).ljust(8, b"\0")))
 
 
 def _select(t: NodeTester, identity: list[int]) -> bytes | None:
@@ -61,7 +48,9 @@ def _check(name: str, text: str, *, stores: bool = False) -> Callable[[_Function
     def add(function: _Function) -> None:
         @CHECKS.check(f"lss.{name}", text, "CiA 305", stores=stores)
         def _(t: NodeTester) -> None:
-            identity = _identity(t)
+            for sub in range(1, 5):
+                t.require(0x1018, sub)
+            identity = [t.read(0x1018, sub) for sub in range(1, 5)]
             t.need(_select(t, identity), "no answer to LSS switch state selective: the node has no LSS")
             try:
                 function(t, identity)
@@ -86,7 +75,7 @@ def _restore_node_id(t: NodeTester, identity: list[int], now: int) -> None:
     for request in (_WAITING, *requests, bytes((0x11, t.node_id)).ljust(8, b"\0"), _WAITING):
         t.send(_REQUEST, request)
     if now != _NO_NODE_ID:
-        t.nmt(NMT_RESET_COMMUNICATION, now)
+        t.nmt(NmtCommand.RESET_COMMUNICATION, now)
     t.boot_up(since)
     t.answers(t.timing.boot_s)
 
@@ -137,9 +126,7 @@ def _(t: NodeTester, identity: list[int]) -> None:
 
 @_check("short", "A request of fewer than eight bytes is ignored")
 def _(t: NodeTester, _: list[int]) -> None:
-    since = t.mark()
-    t.send(_REQUEST, b"\x5e")
-    t.equal(t.hears(_ANSWER, since=since), None, "answer")
+    t.equal(t.reply(_ANSWER, lambda: t.send(_REQUEST, b"\x5e")), None, "answer")
 
 
 @_check("node-id.range", "Node ids 0 and 128 are refused with error 1")
@@ -150,8 +137,7 @@ def _(t: NodeTester, _: list[int]) -> None:
 
 @_check("node-id.pending", "A new node id waits for a reset of the communication")
 def _(t: NodeTester, identity: list[int]) -> None:
-    other = _free_node_id(t)
-    _set_node_id(t, identity, other)
+    _set_node_id(t, identity, _free_node_id(t))
     try:
         t.true(t.ask(upload_request(0x1000)), "no SDO answer", "one at the node id in use")
     finally:
@@ -162,10 +148,9 @@ def _(t: NodeTester, identity: list[int]) -> None:
 def _(t: NodeTester, identity: list[int]) -> None:
     other = _free_node_id(t)
     _set_node_id(t, identity, other)
-    since = t.mark()
-    t.nmt(NMT_RESET_COMMUNICATION)
     try:
-        t.true(t.hears(0x700 + other, t.timing.boot_s, since), "no boot-up message", f"one of node {other}")
+        boot = t.reply(0x700 + other, lambda: t.nmt(NmtCommand.RESET_COMMUNICATION), t.timing.boot_s)
+        t.true(boot, "no boot-up message", f"one of node {other}")
     finally:
         _restore_node_id(t, identity, other)
 
@@ -173,10 +158,9 @@ def _(t: NodeTester, identity: list[int]) -> None:
 @_check("fast-scan", "Without a node id the node is silent until a fast scan finds it")
 def _(t: NodeTester, identity: list[int]) -> None:
     _set_node_id(t, identity, _NO_NODE_ID)
-    since = t.mark()
-    t.nmt(NMT_RESET_COMMUNICATION)
     try:
-        t.equal(t.hears(0x700 + t.node_id, since=since), None, "boot-up message")
+        boot = t.reply(0x700 + t.node_id, lambda: t.nmt(NmtCommand.RESET_COMMUNICATION))
+        t.equal(boot, None, "boot-up message")
         t.send(_REQUEST, _WAITING)
         _answered(t, _ask(t, 0x4C), 0x50)
         _answered(t, _ask(t, 0x51, 0x80, 0, 0, number=0), 0x4F)
@@ -208,9 +192,7 @@ def _(t: NodeTester, _: list[int]) -> None:
 
 def _free_node_id(t: NodeTester) -> int:
     """Returns a node id to which no node on the bus responds."""
-    for node_id in range(127, 0, -1):
-        since = t.mark()
-        t.send(0x600 + node_id, upload_request(0x1000))
-        if node_id != t.node_id and t.hears(0x580 + node_id, since=since) is None:
+    for node_id in (each for each in range(127, 0, -1) if each != t.node_id):
+        if t.reply(0x580 + node_id, partial(t.send, 0x600 + node_id, upload_request(0x1000))) is None:
             return node_id
     raise NotApplicableError("every node id is in use")

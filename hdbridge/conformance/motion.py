@@ -4,28 +4,21 @@ homing.
 
 import struct
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Self
 
+from hdbridge.cia301 import NmtCommand
 from hdbridge.conformance.drive import MODES
 from hdbridge.conformance.tester import (
     ENABLING,
-    FAULT,
-    NMT_PRE_OPERATIONAL,
-    NMT_RESET_NODE,
-    NMT_START,
-    NMT_STOP,
-    OPERATION_ENABLED,
-    POWER_STATES,
-    QUICK_STOP_ACTIVE,
-    READY_TO_SWITCH_ON,
-    SWITCH_ON_DISABLED,
-    SWITCHED_ON,
+    Decorator,
     NodeTester,
     NotApplicableError,
     Table,
+    expedited,
     pack,
-    power_state,
+    state_name,
 )
+from hdbridge.drive.states import State, decode
 
 CHECKS: Final = Table(drives=True, moves=True)
 check: Final = CHECKS.check
@@ -38,6 +31,12 @@ _REACHED: Final = 1 << 10
 _LIMIT: Final = 1 << 11
 _BIT_12: Final = 1 << 12
 _BIT_13: Final = 1 << 13
+_DISABLED: Final = State.SWITCH_ON_DISABLED
+_READY: Final = State.READY_TO_SWITCH_ON
+_SWITCHED_ON: Final = State.SWITCHED_ON
+_ENABLED: Final = State.OPERATION_ENABLED
+_STOPPED: Final = State.QUICK_STOP_ACTIVE
+_FAULT: Final = State.FAULT
 _MASTER: Final = 126
 _CYCLE_S: Final = 0.01
 _STOP_S: Final = 0.5
@@ -83,34 +82,32 @@ def _some_mode(t: NodeTester) -> int:
     raise NotApplicableError("the drive has no position mode (6502h)")
 
 
-def _bring(t: NodeTester, state: int, mode: int | None = None) -> None:
+def _bring(t: NodeTester, state: State, mode: int | None = None) -> None:
     """Brings the drive to a power state, at rest."""
     mode = _some_mode(t) if mode is None else mode
     t.disable()
     _select(t, mode)
-    if state == QUICK_STOP_ACTIVE:
+    if state is _STOPPED:
         t.require(0x605A)
         t.write(0x605A, 0, 6, 2)
-    if state == FAULT:
-        _fault(t)
+    if state is _FAULT:
+        _fault_when_lost(t)
+        _guarded(t)
+        _enable_and_beat(t)
+        _lose_master(t)
         return
-    words = (*ENABLING, (QUICK_STOP_ACTIVE, 0x02))
-    for reached, word in words if state != SWITCH_ON_DISABLED else ():
+    words = (*ENABLING, (_STOPPED, 0x02))
+    for reached, word in words if state is not _DISABLED else ():
         t.control(word)
         t.reaches(reached)
-        if reached == state:
+        if reached is state:
             return
 
 
-def _fault(t: NodeTester) -> None:
-    """Enables the drive and brings it to FAULT by the loss of a heartbeat (6007h = 1)."""
+def _fault_when_lost(t: NodeTester) -> None:
+    """Makes the loss of the master a fault (6007h = 1)."""
     t.require(0x6007)
-    t.require(0x1016, 1)
     t.write(0x6007, 0, 1, 2)
-    _guarded(t)
-    _enable_after_select(t)
-    t.wait(0.35)
-    t.reaches(FAULT)
 
 
 def _guarded(t: NodeTester) -> None:
@@ -118,16 +115,30 @@ def _guarded(t: NodeTester) -> None:
     t.write(0x1016, 1, _MASTER << 16 | 300, 4)
 
 
-def _enable_after_select(t: NodeTester) -> None:
+def _enable_and_beat(t: NodeTester) -> None:
+    """Enables the drive, and begins its supervision of the tester with a heartbeat."""
     t.walk()
     t.send(0x700 + _MASTER, b"\x05")
+
+
+def _lose_master(t: NodeTester, *states: State) -> None:
+    """Waits until the drive has lost the tester's heartbeat and reached one of the states, a fault by
+    default.
+    """
+    t.wait(0.35)
+    t.reaches(*(states or (_FAULT,)))
+
+
+def _reset_fault(t: NodeTester, word: int = 0x80) -> None:
+    t.control(word)
+    t.reaches(_DISABLED)
 
 
 # ---------------------------------------------------------------- transitions
 
 
-def _transition(number: str, state: int, word: int, command: str, then: int) -> None:
-    text = f"{command} leads from {POWER_STATES[state]} to {POWER_STATES[then]}"
+def _transition(number: str, state: State, word: int, command: str, then: State) -> None:
+    text = f"{command} leads from {state.value} to {then.value}"
 
     @check(f"402.transition.{number}", f"Transition {number.split('.', maxsplit=1)[0]}: {text}", _STATES)
     def _(t: NodeTester) -> None:
@@ -138,127 +149,106 @@ def _transition(number: str, state: int, word: int, command: str, then: int) -> 
         _moved_at_most(t, before, t.travel)
 
 
-_transition("2", SWITCH_ON_DISABLED, 0x06, "Shutdown", READY_TO_SWITCH_ON)
-_transition("3", READY_TO_SWITCH_ON, 0x07, "Switch on", SWITCHED_ON)
-_transition("3+4", READY_TO_SWITCH_ON, 0x0F, "Switch on and enable operation", OPERATION_ENABLED)
-_transition("4", SWITCHED_ON, 0x0F, "Enable operation", OPERATION_ENABLED)
-_transition("5", OPERATION_ENABLED, 0x07, "Disable operation", SWITCHED_ON)
-_transition("6", SWITCHED_ON, 0x06, "Shutdown", READY_TO_SWITCH_ON)
-_transition("8", OPERATION_ENABLED, 0x06, "Shutdown", READY_TO_SWITCH_ON)
-_transition("9", OPERATION_ENABLED, 0x00, "Disable voltage", SWITCH_ON_DISABLED)
-_transition("10", SWITCHED_ON, 0x00, "Disable voltage", SWITCH_ON_DISABLED)
-_transition("10.quick-stop", SWITCHED_ON, 0x02, "Quick stop", SWITCH_ON_DISABLED)
-_transition("12", QUICK_STOP_ACTIVE, 0x00, "Disable voltage", SWITCH_ON_DISABLED)
-_transition("16", QUICK_STOP_ACTIVE, 0x0F, "Enable operation", OPERATION_ENABLED)
-_transition("15", FAULT, 0x80, "Fault reset", SWITCH_ON_DISABLED)
+_transition("2", _DISABLED, 0x06, "Shutdown", _READY)
+_transition("3", _READY, 0x07, "Switch on", _SWITCHED_ON)
+_transition("3+4", _READY, 0x0F, "Switch on and enable operation", _ENABLED)
+_transition("4", _SWITCHED_ON, 0x0F, "Enable operation", _ENABLED)
+_transition("5", _ENABLED, 0x07, "Disable operation", _SWITCHED_ON)
+_transition("6", _SWITCHED_ON, 0x06, "Shutdown", _READY)
+_transition("8", _ENABLED, 0x06, "Shutdown", _READY)
+_transition("9", _ENABLED, 0x00, "Disable voltage", _DISABLED)
+_transition("10", _SWITCHED_ON, 0x00, "Disable voltage", _DISABLED)
+_transition("10.quick-stop", _SWITCHED_ON, 0x02, "Quick stop", _DISABLED)
+_transition("12", _STOPPED, 0x00, "Disable voltage", _DISABLED)
+_transition("16", _STOPPED, 0x0F, "Enable operation", _ENABLED)
+_transition("15", _FAULT, 0x80, "Fault reset", _DISABLED)
 
 
-def _unmoved(name: str, state: int, word: int, command: str) -> None:
-    @check(f"402.no-transition.{name}", f"{command} changes nothing in {POWER_STATES[state]}", _STATES)
+def _unmoved(name: str, state: State, word: int, command: str) -> None:
+    @check(f"402.no-transition.{name}", f"{command} changes nothing in {state.value}", _STATES)
     def _(t: NodeTester) -> None:
         _bring(t, state)
         t.control(word)
         t.stays(state)
 
 
-_unmoved("disabled.switch-on", SWITCH_ON_DISABLED, 0x07, "Switch on")
-_unmoved("disabled.enable", SWITCH_ON_DISABLED, 0x0F, "Enable operation")
-_unmoved("switched-on.repeated", SWITCHED_ON, 0x07, "Repeated switch on")
-_unmoved("enabled.repeated", OPERATION_ENABLED, 0x0F, "Repeated enable operation")
-_unmoved("stopped.shutdown", QUICK_STOP_ACTIVE, 0x06, "Shutdown")
-_unmoved("stopped.repeated", QUICK_STOP_ACTIVE, 0x02, "Repeated quick stop")
-_unmoved("fault.disable-voltage", FAULT, 0x00, "Disable voltage")
-_unmoved("fault.shutdown", FAULT, 0x06, "Shutdown")
-_unmoved("fault.switch-on", FAULT, 0x07, "Switch on")
-_unmoved("fault.enable", FAULT, 0x0F, "Enable operation")
-_unmoved("fault.quick-stop", FAULT, 0x02, "Quick stop")
+_unmoved("disabled.switch-on", _DISABLED, 0x07, "Switch on")
+_unmoved("disabled.enable", _DISABLED, 0x0F, "Enable operation")
+_unmoved("switched-on.repeated", _SWITCHED_ON, 0x07, "Repeated switch on")
+_unmoved("enabled.repeated", _ENABLED, 0x0F, "Repeated enable operation")
+_unmoved("stopped.shutdown", _STOPPED, 0x06, "Shutdown")
+_unmoved("stopped.repeated", _STOPPED, 0x02, "Repeated quick stop")
+_unmoved("fault.disable-voltage", _FAULT, 0x00, "Disable voltage")
+_unmoved("fault.shutdown", _FAULT, 0x06, "Shutdown")
+_unmoved("fault.switch-on", _FAULT, 0x07, "Switch on")
+_unmoved("fault.enable", _FAULT, 0x0F, "Enable operation")
+_unmoved("fault.quick-stop", _FAULT, 0x02, "Quick stop")
 
 
-@check("402.fault.reset.again", "A second fault is reset by another rising edge of bit 7", _STATES)
+def _in_fault(name: str, text: str, clause: str = _STATES, *needs: int) -> Decorator:
+    """Decorates a check that begins with a fault."""
+    return check(f"402.fault.{name}", text, clause, *needs, first=lambda t: _bring(t, _FAULT))
+
+
+@_in_fault("reset.again", "A second fault is reset by another rising edge of bit 7")
 def _(t: NodeTester) -> None:
-    _bring(t, FAULT)
-    t.control(0x80)
-    t.reaches(SWITCH_ON_DISABLED)
-    _enable_after_select(t)
-    t.wait(0.35)
-    t.reaches(FAULT)
-    t.control(0x8F)
-    t.reaches(SWITCH_ON_DISABLED)
+    _reset_fault(t)
+    _enable_and_beat(t)
+    _lose_master(t)
+    _reset_fault(t, 0x8F)
 
 
-@check(
-    "402.fault.reset.edge",
-    "Bit 7 that is held does not reset a fault: only a rising edge of bit 7 resets a fault",
-    _STATES,
+@_in_fault(
+    "reset.edge", "Bit 7 that is held does not reset a fault: only a rising edge of bit 7 resets a fault"
 )
 def _(t: NodeTester) -> None:
-    _bring(t, FAULT)
     t.control(0x00)
-    t.control(0x80)
-    t.reaches(SWITCH_ON_DISABLED)
+    _reset_fault(t)
     # The last controlword before the second fault already sets bit 7, so no rising edge follows the fault.
     t.control(0x06)
-    t.reaches(READY_TO_SWITCH_ON)
+    t.reaches(_READY)
     t.control(0x0F)
-    t.reaches(OPERATION_ENABLED)
+    t.reaches(_ENABLED)
     t.send(0x700 + _MASTER, b"\x05")
     t.control(0x8F)
-    t.stays(OPERATION_ENABLED, 0.0)
-    t.wait(0.35)
-    t.reaches(FAULT)
+    t.stays(_ENABLED, 0.0)
+    _lose_master(t)
     t.control(0x8F)
-    t.stays(FAULT, 0.1)
+    t.stays(_FAULT, 0.1)
 
 
-@check(
-    "402.fault.reset.enables-nothing",
-    "A fault reset with the bits of enable operation does not enable",
-    _STATES,
-)
+@_in_fault("reset.enables-nothing", "A fault reset with the bits of enable operation does not enable")
 def _(t: NodeTester) -> None:
-    _bring(t, FAULT)
-    t.control(0x8F)
-    t.reaches(SWITCH_ON_DISABLED)
+    _reset_fault(t, 0x8F)
     t.control(0x0F)
-    t.stays(SWITCH_ON_DISABLED, 0.1)
+    t.stays(_DISABLED, 0.1)
 
 
-@check("402.fault.code", "603Fh is the code of the fault", "CiA 402-2, object 603Fh", 0x603F)
+@_in_fault("code", "603Fh is the code of the fault", "CiA 402-2, object 603Fh", 0x603F)
 def _(t: NodeTester) -> None:
-    _bring(t, FAULT)
     t.equal(f"{t.read(0x603F):04X}h", "8130h", "603Fh")
 
 
-@check("402.fault.code.reset", "603Fh is 0 after the fault reset", "CiA 402-2, object 603Fh", 0x603F)
+@_in_fault("code.reset", "603Fh is 0 after the fault reset", "CiA 402-2, object 603Fh", 0x603F)
 def _(t: NodeTester) -> None:
-    _bring(t, FAULT)
-    t.control(0x80)
-    t.reaches(SWITCH_ON_DISABLED)
+    _reset_fault(t)
     t.equal(t.read(0x603F), 0, "603Fh")
 
 
-@check("402.fault.emergency", "A fault is reported by EMCY with its code", _STATES)
+@_in_fault("emergency", "A fault is reported by EMCY with its code")
 def _(t: NodeTester) -> None:
-    _bring(t, FAULT)
-    t.true(0x8130 in t.emergencies(0), f"EMCY codes {t.emergencies(0)}", "8130h")
+    t.true(0x8130 in t.emergencies(), f"EMCY codes {t.emergencies()}", "8130h")
 
 
-@check("402.fault.emergency.reset", "The fault reset is reported by EMCY 0000h", _STATES)
+@_in_fault("emergency.reset", "The fault reset is reported by EMCY 0000h")
 def _(t: NodeTester) -> None:
-    _bring(t, FAULT)
-    since = t.mark()
-    t.control(0x80)
-    t.reaches(SWITCH_ON_DISABLED)
-    t.wait(0.05)
-    t.equal(t.emergencies(since)[-1:], [0], "last EMCY code")
+    t.equal(t.emergencies_after(0.05, lambda: _reset_fault(t))[-1:], [0], "last EMCY code")
 
 
-@check("402.fault.register", "1001h is not 0 during a fault, and 0 after its reset", _STATES)
+@_in_fault("register", "1001h is not 0 during a fault, and 0 after its reset")
 def _(t: NodeTester) -> None:
-    _bring(t, FAULT)
     t.true(t.read(0x1001), "1001h = 0 during the fault", "bit 0")
-    t.control(0x80)
-    t.reaches(SWITCH_ON_DISABLED)
+    _reset_fault(t)
     t.wait(0.05)
     t.equal(t.read(0x1001), 0, "1001h after the reset")
 
@@ -266,7 +256,7 @@ def _(t: NodeTester) -> None:
 # ---------------------------------------------------------------- option codes
 
 
-def _lost_master(code: int, states: tuple[int, ...], text: str) -> None:
+def _lost_master(code: int, states: tuple[State, ...], text: str) -> None:
     @check(f"402.option.6007.{code}", f"6007h = {code}: a lost heartbeat {text}", _OPTIONS, 0x6007)
     def _(t: NodeTester) -> None:
         mode = _some_mode(t)
@@ -275,31 +265,26 @@ def _lost_master(code: int, states: tuple[int, ...], text: str) -> None:
         t.write(0x6007, 0, code, 2)
         t.write(0x1029, 1, 1, 1) if t.has(0x1029, 1) else None
         _guarded(t)
-        _enable_after_select(t)
-        t.wait(0.35)
-        if code:
-            t.reaches(*states)
-        else:
-            t.stays(OPERATION_ENABLED, 0.1)
+        _enable_and_beat(t)
+        _lose_master(t, *states)
+        if not code:
+            t.stays(_ENABLED, 0.1)
 
 
-_lost_master(0, (OPERATION_ENABLED,), "changes nothing")
-_lost_master(1, (FAULT,), "is a fault")
-_lost_master(2, (SWITCH_ON_DISABLED,), "disables the voltage")
-_lost_master(3, (QUICK_STOP_ACTIVE, SWITCH_ON_DISABLED), "is a quick stop")
+_lost_master(0, (_ENABLED,), "changes nothing")
+_lost_master(1, (_FAULT,), "is a fault")
+_lost_master(2, (_DISABLED,), "disables the voltage")
+_lost_master(3, (_STOPPED, _DISABLED), "is a quick stop")
 
 
-def _stopping(index: int, code: int, word: int, state: int, name: str) -> None:
-    @check(
-        f"402.option.{index:04X}.{code}",
-        f"{name} of a move with {index:04X}h = {code}: {POWER_STATES[state]}",
-        _OPTIONS,
-    )
+def _stopping(index: int, code: int, word: int, state: State, name: str) -> None:
+    text = f"{name} of a move with {index:04X}h = {code}: {state.value}"
+
+    @check(f"402.option.{index:04X}.{code}", text, _OPTIONS, index)
     def _(t: NodeTester) -> None:
-        t.require(index)
         before = t.read(index, signed=True)
         _enable_slowly(t)
-        _set_option(t, index, code, before)
+        _set_if_supported(t, index, code, before, 2)
         target = _begin_move(t, 4)
         t.control(word)
         t.reaches(state)
@@ -309,41 +294,39 @@ def _stopping(index: int, code: int, word: int, state: int, name: str) -> None:
         t.stays(state)
 
 
-def _set_option(t: NodeTester, index: int, code: int, before: int) -> None:
-    if code != before:
-        answer = t.answer(struct.pack("<BHBh2x", 0x2B, index, 0, code))
-        t.need(answer[0] != 0x80, f"{index:04X}h = {code} is not supported")
-        t.download(index, 0, pack(before, 2))
-        t.write(index, 0, code, 2)
+def _set_if_supported(t: NodeTester, index: int, value: int, before: int, size: int) -> None:
+    """Sets an object whose values are optional; ends the check as not applicable if the node refuses."""
+    if value != before:
+        answer = t.answer(expedited(index, 0, pack(value, size)))
+        t.need(answer[0] != 0x80, f"{index:04X}h = {value} is not supported")
+        t.put(index, 0, before, size)
+        t.write(index, 0, value, size)
 
 
-for _code, _state in ((0, SWITCH_ON_DISABLED), (1, SWITCH_ON_DISABLED), (2, SWITCH_ON_DISABLED)):
-    _stopping(0x605A, _code, 0x02, _state, "Quick stop")
-for _code in (5, 6):
-    _stopping(0x605A, _code, 0x02, QUICK_STOP_ACTIVE, "Quick stop")
-for _code in (0, 1):
-    _stopping(0x605B, _code, 0x06, READY_TO_SWITCH_ON, "Shutdown")
-    _stopping(0x605C, _code, 0x07, SWITCHED_ON, "Disable operation")
-for _code in (1, 2):
-    _stopping(0x605D, _code, 0x10F, OPERATION_ENABLED, "Halt")
+for _index, _codes, _word, _state, _name in (
+    (0x605A, (0, 1, 2), 0x02, _DISABLED, "Quick stop"),
+    (0x605A, (5, 6), 0x02, _STOPPED, "Quick stop"),
+    (0x605B, (0, 1), 0x06, _READY, "Shutdown"),
+    (0x605C, (0, 1), 0x07, _SWITCHED_ON, "Disable operation"),
+    (0x605D, (1, 2), 0x10F, _ENABLED, "Halt"),
+):
+    for _code in _codes:
+        _stopping(_index, _code, _word, _state, _name)
 
 
 def _reaction(code: int) -> None:
-    @check(
-        f"402.option.605E.{code}", f"A fault in a move with 605Eh = {code} ends in fault, at rest", _OPTIONS
-    )
+    text = f"A fault in a move with 605Eh = {code} ends in fault, at rest"
+
+    @check(f"402.option.605E.{code}", text, _OPTIONS, 0x605E, 0x6007)
     def _(t: NodeTester) -> None:
-        t.require(0x605E)
-        t.require(0x6007)
         before = t.read(0x605E, signed=True)
         _select_slowly(t)
-        t.write(0x6007, 0, 1, 2)
-        _set_option(t, 0x605E, code, before)
+        _fault_when_lost(t)
+        _set_if_supported(t, 0x605E, code, before, 2)
         _guarded(t)
-        _enable_after_select(t)
+        _enable_and_beat(t)
         _begin_move(t, 8)
-        t.wait(0.35)
-        t.reaches(FAULT)
+        _lose_master(t)
         t.wait(_STOP_S)
         _stands(t)
 
@@ -367,6 +350,11 @@ def _enable_slowly(t: NodeTester) -> None:
     t.walk()
 
 
+def _pp(name: str, text: str) -> Decorator:
+    """Decorates a check that begins with the drive enabled in profile position mode."""
+    return check(f"402.pp.{name}", text, _PP, first=_enable_slowly)
+
+
 def _direction(t: NodeTester, distances: int) -> int:
     """Returns 1 or -1, the direction in which the software limits leave room for this many test distances."""
     if not t.has(0x607D, 1):
@@ -382,10 +370,14 @@ def _set_point(t: NodeTester, target: int, extra: int = 0) -> None:
     t.control(0x1F | extra)
 
 
+def _ahead(t: NodeTester, distances: int) -> int:
+    """Returns the position that is this many test distances away, in the direction with room."""
+    return _position(t) + _direction(t, distances) * distances * t.travel
+
+
 def _begin_move(t: NodeTester, distances: int) -> int:
     """Begins a move of ``distances`` test distances; returns its target once the axis moves."""
-    start = _position(t)
-    target = start + _direction(t, distances) * distances * t.travel
+    start, target = _position(t), _ahead(t, distances)
     _set_point(t, target)
     end_s = t.now + 2.0
     while abs(_position(t) - start) < 0.2 * t.travel:
@@ -397,6 +389,27 @@ def _begin_move(t: NodeTester, distances: int) -> int:
 
 def _window(t: NodeTester) -> float:
     return max(t.read(0x6067) if t.has(0x6067) else 0, 0.05 * t.travel, 3)
+
+
+def _short_of(t: NodeTester, target: int) -> None:
+    """Fails if the axis is at the target."""
+    t.true(abs(_position(t) - target) > _window(t), "the move was completed", "a stop before the target")
+
+
+def _limited(t: NodeTester, here: int, side: int, distance: int) -> Callable[[int], None]:
+    """Sets the software limits (607Dh) to ``distance`` ahead and three test distances behind a position.
+
+    Returns a function that fails for a position beyond the limit.
+    """
+    edge = here + side * distance
+    for sub, limit in enumerate(sorted((here - side * 3 * t.travel, edge)), start=1):
+        t.write(0x607D, sub, limit, 4)
+
+    def within(position: int) -> None:
+        beyond = side * (position - edge)
+        t.true(beyond <= _window(t), f"{beyond} units beyond the limit", "the limit")
+
+    return within
 
 
 def _arrives(t: NodeTester, target: int, timeout_s: float = 10.0) -> None:
@@ -413,53 +426,47 @@ def _(t: NodeTester) -> None:
     mode = _some_mode(t)
     t.disable()
     before = _position(t)
-    _bring(t, OPERATION_ENABLED, mode)
+    _bring(t, _ENABLED, mode)
     _stands(t, 0.3)
     _moved_at_most(t, before, 0.5 * t.travel)
 
 
-@check("402.pp.move", "A new set-point is reached", _PP)
+@_pp("move", "A new set-point is reached")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     _arrives(t, _begin_move(t, 2))
 
 
-@check("402.pp.acknowledge", "Bit 12 acknowledges a new set-point", _PP)
+@_pp("acknowledge", "Bit 12 acknowledges a new set-point")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     t.equal(t.read(0x6041) & _BIT_12, 0, "bit 12 before the set-point")
     _begin_move(t, 2)
     t.equal(t.read(0x6041) & _BIT_12, _BIT_12, "bit 12 while bit 4 of the controlword is 1")
 
 
-@check("402.pp.acknowledge.end", "Bit 12 falls when bit 4 of the controlword falls", _PP)
+@_pp("acknowledge.end", "Bit 12 falls when bit 4 of the controlword falls")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     _begin_move(t, 2)
     t.control(0x0F)
     t.wait(0.05)
     t.equal(t.read(0x6041) & _BIT_12, 0, "bit 12")
 
 
-@check("402.pp.reached", "Target reached is 0 during a move and 1 after it", _PP)
+@_pp("reached", "Target reached is 0 during a move and 1 after it")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     target = _begin_move(t, 3)
     t.equal(t.read(0x6041) & _REACHED, 0, "bit 10 in motion")
     _arrives(t, target)
 
 
-@check("402.pp.target-alone", "A target without a new set-point moves nothing", _PP)
+@_pp("target-alone", "A target without a new set-point moves nothing")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
-    t.put(0x607A, 0, _position(t) + _direction(t, 3) * 3 * t.travel, 4)
+    t.put(0x607A, 0, _ahead(t, 3), 4)
     t.control(0x0F)
     _stands(t, 0.3)
 
 
-@check("402.pp.held", "Bit 4 that is held does not start a second move", _PP)
+@_pp("held", "Bit 4 that is held does not start a second move")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     target = _begin_move(t, 2)
     _arrives(t, target)
     t.put(0x607A, 0, 2 * _position(t) - target + _direction(t, 2) * t.travel, 4)
@@ -467,17 +474,15 @@ def _(t: NodeTester) -> None:
     _stands(t, 0.3)
 
 
-@check("402.pp.stale", "A target from before enabling moves nothing", _PP)
+@check("402.pp.stale", "A target from before enabling moves nothing", _PP, first=_select_slowly)
 def _(t: NodeTester) -> None:
-    _select_slowly(t)
-    t.put(0x607A, 0, _position(t) + _direction(t, 3) * 3 * t.travel, 4)
+    t.put(0x607A, 0, _ahead(t, 3), 4)
     t.walk()
     _stands(t, 0.3)
 
 
-@check("402.pp.relative", "A relative set-point counts from the one before", _PP)
+@_pp("relative", "A relative set-point counts from the one before")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     first = _begin_move(t, 1)
     _arrives(t, first)
     distance = _direction(t, 2) * t.travel
@@ -486,9 +491,8 @@ def _(t: NodeTester) -> None:
     _arrives(t, first + distance)
 
 
-@check("402.pp.again", "A set-point where the axis is already is acknowledged and reached", _PP)
+@_pp("again", "A set-point where the axis is already is acknowledged and reached")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     target = _begin_move(t, 1)
     _arrives(t, target)
     _set_point(t, target)
@@ -528,12 +532,11 @@ def _(t: NodeTester) -> None:
     t.true(farthest < 0.9 * first, f"the axis turned back at {farthest}", f"clearly before {first}")
 
 
-@check("402.pp.velocity", "A move is not faster than the profile velocity", _PP)
+@_pp("velocity", "A move is not faster than the profile velocity")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     speed = t.read(0x6081)
     start, begun_s = _position(t), t.now
-    target = start + _direction(t, 4) * 4 * t.travel
+    target = _ahead(t, 4)
     _set_point(t, target)
     _arrives(t, target)
     duration_s = t.now - begun_s
@@ -541,21 +544,19 @@ def _(t: NodeTester) -> None:
     t.true(duration_s > 0.9 * shortest_s, f"{duration_s:.3f} s", f"at least {shortest_s:.3f} s")
 
 
-@check("402.pp.halt", "Halt stops a move, and bit 10 is 1 at rest", _PP)
+@_pp("halt", "Halt stops a move, and bit 10 is 1 at rest")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     target = _begin_move(t, 4)
     t.control(0x11F)
     t.wait(_STOP_S)
     _stands(t)
-    t.true(abs(_position(t) - target) > _window(t), "the move was completed", "a stop before the target")
+    _short_of(t, target)
     t.equal(t.read(0x6041) & _REACHED, _REACHED, "bit 10 at rest")
-    t.stays(OPERATION_ENABLED)
+    t.stays(_ENABLED)
 
 
-@check("402.pp.halt.end", "When halt ends the move is continued", _PP)
+@_pp("halt.end", "When halt ends the move is continued")
 def _(t: NodeTester) -> None:
-    _enable_slowly(t)
     target = _begin_move(t, 4)
     t.control(0x11F)
     t.wait(_STOP_S)
@@ -566,17 +567,12 @@ def _(t: NodeTester) -> None:
 @check("402.pp.limit", "A set-point beyond 607Dh leads at most to the limit", _PP, (0x607D, 1))
 def _(t: NodeTester) -> None:
     _select_slowly(t)
-    start = _position(t)
-    side = _direction(t, 3)
-    edge = start + side * t.travel
-    low, high = sorted((start - side * 3 * t.travel, edge))
-    t.write(0x607D, 1, low, 4)
-    t.write(0x607D, 2, high, 4)
+    start, side = _position(t), _direction(t, 3)
+    within = _limited(t, start, side, t.travel)
     t.walk()
     _set_point(t, start + side * 3 * t.travel)
     for _ in range(100):
-        beyond = side * (_position(t) - edge)
-        t.true(beyond <= _window(t), f"{beyond} units beyond the limit", "the limit")
+        within(_position(t))
         t.wait(0.01)
 
 
@@ -587,15 +583,15 @@ def _ends_the_move(name: str, text: str, act: Callable[[NodeTester], None]) -> N
         target = _begin_move(t, 5)
         act(t)
         t.wait(_STOP_S)
-        t.true(abs(_position(t) - target) > _window(t), "the move was completed", "a stop before the target")
+        _short_of(t, target)
         _stands(t)
-        t.nmt(NMT_START)
+        t.nmt(NmtCommand.START)
         _stands(t)
 
 
 def _resets(t: NodeTester) -> None:
-    t.reset(NMT_RESET_NODE)
-    t.reaches(SWITCH_ON_DISABLED)
+    t.reset(NmtCommand.RESET_NODE)
+    t.reaches(_DISABLED)
 
 
 _ends_the_move("disable-voltage", "Disable voltage ends a move", lambda t: t.control(0x00))
@@ -623,7 +619,15 @@ class _Stream:
         self.word, self.target = 0x00, _position(t)
         self.status, self.position = 0, self.target
         self._next_s = t.now
-        t.nmt(NMT_START)
+        t.nmt(NmtCommand.START)
+
+    @classmethod
+    def running(cls, t: NodeTester) -> Self:
+        """Returns the stream of an axis in motion."""
+        stream = cls(t)
+        stream.enable()
+        stream.move()
+        return stream
 
     def cycle(self, count: int = 1, step: float = 0.0) -> None:
         """Runs cycles in which the target advances by ``step``."""
@@ -644,10 +648,8 @@ class _Stream:
         for state, word in ENABLING:
             self.word = word
             end_s = self.t.now + self.t.timing.power_s
-            while power_state(self.status) != state:
-                self.t.true(
-                    self.t.now < end_s, POWER_STATES.get(power_state(self.status)), POWER_STATES[state]
-                )
+            while decode(self.status) is not state:
+                self.t.true(self.t.now < end_s, state_name(self.status), state.value)
                 self.cycle()
                 if word != 0x0F:
                     self.target = self.position
@@ -673,9 +675,7 @@ def _(t: NodeTester) -> None:
 
 @check("402.csp.follow", "The position follows the target of every SYNC", _CSP)
 def _(t: NodeTester) -> None:
-    stream = _Stream(t)
-    stream.enable()
-    stream.move()
+    stream = _Stream.running(t)
     stream.cycle(20)
     off = abs(stream.position - stream.target)
     t.true(off <= _window(t), f"{off} units from the target", "the target")
@@ -683,9 +683,7 @@ def _(t: NodeTester) -> None:
 
 @check("402.csp.status", "Bit 12 is 1 while the drive follows the target", _CSP)
 def _(t: NodeTester) -> None:
-    stream = _Stream(t)
-    stream.enable()
-    stream.move()
+    stream = _Stream.running(t)
     t.equal(stream.status & (_BIT_12 | _BIT_13), _BIT_12, "bits 12 and 13")
 
 
@@ -712,22 +710,16 @@ def _(t: NodeTester) -> None:
 def _(t: NodeTester) -> None:
     stream = _Stream(t)
     side = _direction(t, 3)
-    edge = stream.position + side * t.travel // 2
-    low, high = sorted((stream.position - side * 3 * t.travel, edge))
-    t.write(0x607D, 1, low, 4)
-    t.write(0x607D, 2, high, 4)
+    within = _limited(t, stream.position, side, t.travel // 2)
     stream.enable()
     stream.move(side)
     stream.cycle(30)
-    beyond = side * (stream.position - edge)
-    t.true(beyond <= _window(t), f"{beyond} units beyond the limit", "the limit")
+    within(stream.position)
 
 
 @check("402.csp.lost-sync", "Without SYNC the axis does not continue to move", _CSP)
 def _(t: NodeTester) -> None:
-    stream = _Stream(t)
-    stream.enable()
-    stream.move()
+    _Stream.running(t)
     t.wait(_STOP_S)
     _stands(t)
 
@@ -738,51 +730,46 @@ def _(t: NodeTester) -> None:
 def _(t: NodeTester) -> None:
     t.require(0x6007)
     stream = _Stream(t)
-    t.write(0x6007, 0, 1, 2)
+    _fault_when_lost(t)
     _guarded(t)
     stream.enable()
     t.send(0x700 + _MASTER, b"\x05")
     stream.cycle(50, 0.02 * t.travel * _direction(t, 3))
-    t.reaches(FAULT)
+    t.reaches(_FAULT)
     _stands(t)
 
 
 @check(
-    "402.csp.return", "After a stop, repeated controlwords and targets do not set the axis in motion", _CSP
-)
+    "402.csp.return", "After a stop, repeated controlwords and targets do not set the axis in motion", _CSP,
+    0x6007,
+)  # fmt: skip
 def _(t: NodeTester) -> None:
-    t.require(0x6007)
-    stream = _Stream(t)
-    t.write(0x6007, 0, 1, 2)
-    stream.enable()
-    stream.move()
-    t.nmt(NMT_STOP)
+    _fault_when_lost(t)
+    stream = _Stream.running(t)
+    t.nmt(NmtCommand.STOP)
     t.wait(_STOP_S)
-    t.nmt(NMT_START)
+    t.nmt(NmtCommand.START)
     before = _position(t)
-    stream.target = before + _direction(t, 2) * t.travel
+    stream.target = _ahead(t, 2)
     stream.cycle(20)
-    t.true(power_state(stream.status) != OPERATION_ENABLED, "operation enabled", "any other state")
+    t.true(decode(stream.status) is not _ENABLED, "operation enabled", "any other state")
     _moved_at_most(t, before, 0.1 * t.travel + 2, stream.position)
 
 
-def _leaves(name: str, command: int, text: str) -> None:
+def _leaves(name: str, command: NmtCommand, text: str) -> None:
     @check(f"402.csp.nmt.{name}", f"{text} stops an axis that follows targets", _CSP, 0x6007)
     def _(t: NodeTester) -> None:
-        stream = _Stream(t)
-        t.write(0x6007, 0, 1, 2)
-        stream.enable()
-        stream.move()
+        _fault_when_lost(t)
+        _Stream.running(t)
         t.nmt(command)
         t.wait(_STOP_S)
-        t.nmt(NMT_PRE_OPERATIONAL)
+        t.nmt(NmtCommand.PRE_OPERATIONAL)
         _stands(t)
-        state = t.power_state()
-        t.true(state != OPERATION_ENABLED, "operation enabled", "any other state")
+        t.true(t.power_state() is not _ENABLED, "operation enabled", "any other state")
 
 
-_leaves("stop", NMT_STOP, "NMT stop")
-_leaves("pre-operational", NMT_PRE_OPERATIONAL, "NMT enter pre-operational")
+_leaves("stop", NmtCommand.STOP, "NMT stop")
+_leaves("pre-operational", NmtCommand.PRE_OPERATIONAL, "NMT enter pre-operational")
 
 
 # ---------------------------------------------------------------- homing
@@ -800,13 +787,10 @@ def _home(t: NodeTester, offset: int) -> None:
 
 
 def _homing(method: int) -> None:
-    @check(
-        f"402.homing.{method}",
-        f"Homing method {method} makes the present position 607Ch, without motion",
-        _HM,
-    )
+    text = f"Homing method {method} makes the present position 607Ch, without motion"
+
+    @check(f"402.homing.{method}", text, _HM, 0x607C)
     def _(t: NodeTester) -> None:
-        t.require(0x607C)
         _enable_for_homing(t, method)
         before, offset = _position(t), t.read(0x607C, signed=True)
         wanted = t.travel if abs(before) > t.travel else 3 * t.travel
@@ -827,13 +811,8 @@ def _home_back(t: NodeTester, position: int, offset: int) -> None:
 def _enable_for_homing(t: NodeTester, method: int) -> None:
     t.disable()
     _select(t, 6)
-    before = t.read(0x6098, signed=True)
-    if before != method:
-        answer = t.answer(struct.pack("<BHBb3x", 0x2F, 0x6098, 0, method))
-        t.need(answer[0] != 0x80, f"6098h = {method} is not supported")
-        t.put(0x6098, 0, before, 1)
-        t.write(0x6098, 0, method, 1)
-    _enable_after_select(t)
+    _set_if_supported(t, 0x6098, method, t.read(0x6098, signed=True), 1)
+    _enable_and_beat(t)
 
 
 _homing(35)
@@ -852,23 +831,19 @@ def _(t: NodeTester) -> None:
 
 
 @check(
-    "402.following-error.fault",
-    "A following error beyond 6065h is fault 8611h or bit 13",
-    "CiA 402-2, objects 6065h, 6066h",
-)
+    "402.following-error.fault", "A following error beyond 6065h is fault 8611h or bit 13",
+    "CiA 402-2, objects 6065h, 6066h", 0x6065, 0x6066, 0x60F4,
+)  # fmt: skip
 def _(t: NodeTester) -> None:
-    for index in (0x6065, 0x6066, 0x60F4):
-        t.require(index)
     _select_slowly(t)
     t.write(0x6065, 0, 1, 4)
     t.write(0x6066, 0, 0, 2)
     t.walk()
-    target = _position(t) + _direction(t, 4) * 4 * t.travel
-    _set_point(t, target)
+    _set_point(t, _ahead(t, 4))
     exceeded = 0
     for _ in range(100):
         word = t.read(0x6041)
-        if power_state(word) == FAULT or word & _BIT_13:
+        if decode(word) is _FAULT or word & _BIT_13:
             return
         exceeded += abs(t.read(0x60F4, signed=True)) > 1
         t.wait(0.01)

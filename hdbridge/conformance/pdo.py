@@ -1,21 +1,24 @@
 """Checks of PDOs and SYNC: communication and mapping parameters, transmission types, timers, reception."""
 
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from statistics import median
-from typing import Final
+from typing import Any, Final
 
+from hdbridge.cia301 import NmtCommand
 from hdbridge.conformance.tester import (
     ABSENT,
-    NMT_PRE_OPERATIONAL,
-    NMT_START,
     PDO_INVALID,
     RANGE,
     NodeTester,
     Table,
+    abort_code,
+    abort_codes,
     expedited,
     pack,
 )
+from hdbridge.drive.link import Frame
 
 CHECKS: Final = Table()
 check: Final = CHECKS.check
@@ -30,8 +33,16 @@ _DUMMY: Final = (0x0005, 0, 8)
 _REGISTER: Final = (0x1001, 0, 8)
 _NOT_MAPPABLE: Final = (0x06040041, 0x06040042, 0x06010002, 0x06010000, *ABSENT)
 _TOO_LONG: Final = (0x06040042, *RANGE)
+_WRONG_LENGTH: Final = (*_NOT_MAPPABLE, 0x06070010, *RANGE)
+_Object = tuple[int, int, int]
+"""Index, sub-index and bits of an object."""
+_OfObject = Callable[[NodeTester, _Object], None]
 _SPARE_ID: Final = 0x57D
 """Identifier to which tests move PDOs and SYNC: the default of RPDO4 of node 125, not used by other nodes."""
+
+
+def _kind(first: int) -> str:
+    return "tpdo" if first == _TPDO else "rpdo"
 
 
 def _word(index: int, sub: int, bits: int) -> bytes:
@@ -40,53 +51,36 @@ def _word(index: int, sub: int, bits: int) -> bytes:
 
 def _syncs(t: NodeTester, can_id: int, count: int, counter: int | None = None) -> list[int]:
     """Sends SYNC ``count`` times; returns the number of frames in response to each."""
-    answers = []
-    for place in range(count):
-        since = t.mark()
-        t.sync(None if counter is None else counter + place)
-        t.wait(0.01)
-        answers.append(len(t.heard(can_id, since)))
-    return answers
+    counters = [None if counter is None else counter + place for place in range(count)]
+    return [len(t.heard_after(can_id, 0.01, partial(t.sync, each))) for each in counters]
 
 
 def _start(t: NodeTester) -> None:
-    t.nmt(NMT_START)
+    t.nmt(NmtCommand.START)
     t.wait(0.01)
 
 
 # ---------------------------------------------------------------- communication parameters
 
 
-def _default(first: int, number: int, base: int) -> None:
-    name = f"{'tpdo' if first == _TPDO else 'rpdo'}.{number}"
-
-    @check(
-        f"{name}.identifier",
-        f"{first + number - 1:04X}h:01 is {base:03X}h + node id by default",
-        _COMMUNICATION,
-    )
+def _default(kind: str, index: int, base: int) -> None:
+    @check(f"{kind}.identifier", f"{index:04X}h:01 is {base:03X}h + node id by default", _COMMUNICATION)
     def _(t: NodeTester) -> None:
-        index = first + number - 1
-        t.need(t.has_pdo(index), f"no PDO at {index:04X}h")
+        t.need_pdo(index)
         t.reset()
         t.equal(f"{t.read(index, 1) & 0x7FF:03X}h", f"{base + t.node_id:03X}h", "identifier")
 
-    @check(
-        f"{name}.parameters",
-        f"{first + number - 1:04X}h has sub-indices 1 and 2, and a mapping",
-        _COMMUNICATION,
-    )
+    @check(f"{kind}.parameters", f"{index:04X}h has sub-indices 1 and 2, and a mapping", _COMMUNICATION)
     def _(t: NodeTester) -> None:
-        index = first + number - 1
-        t.need(t.has_pdo(index), f"no PDO at {index:04X}h")
+        t.need_pdo(index)
         t.true(t.read(index, 0) >= 2, f"highest sub-index {t.read(index, 0)}", "2 or more")
         t.equal(len(t.upload(index, 2)), 1, "bytes of the transmission type")
         t.equal(len(t.upload(index + 0x200, 0)), 1, "bytes of the number of mapped objects")
 
 
-for _number in (1, 2, 3, 4):
-    _default(_RPDO, _number, 0x100 + 0x100 * _number)
-    _default(_TPDO, _number, 0x080 + 0x100 * _number)
+for _place in range(4):
+    _default(f"rpdo.{_place + 1}", _RPDO + _place, 0x200 + 0x100 * _place)
+    _default(f"tpdo.{_place + 1}", _TPDO + _place, 0x180 + 0x100 * _place)
 
 
 @check("tpdo.reserved", "Sub-index 4 of 1800h does not exist, or reads as 0", _COMMUNICATION)
@@ -96,13 +90,14 @@ def _(t: NodeTester) -> None:
 
 
 def _transmission_type(first: int, value: int, *, allowed: bool) -> None:
-    name = "tpdo" if first == _TPDO else "rpdo"
     verb = "is accepted" if allowed else "is reserved and refused"
 
-    @check(f"{name}.type.{value}", f"Transmission type {value} of {first:04X}h {verb}", _COMMUNICATION)
+    @check(
+        f"{_kind(first)}.type.{value}", f"Transmission type {value} of {first:04X}h {verb}", _COMMUNICATION
+    )
     def _(t: NodeTester) -> None:
-        t.need(t.has_pdo(first), f"no PDO at {first:04X}h")
-        t.write(first, 1, t.read(first, 1) | PDO_INVALID, 4)
+        t.need_pdo(first)
+        t.switch_pdo_off(first)
         if allowed:
             t.write(first, 2, value, 1)
             t.equal(t.read(first, 2), value, "transmission type")
@@ -111,15 +106,16 @@ def _transmission_type(first: int, value: int, *, allowed: bool) -> None:
 
 
 for _first in (_TPDO, _RPDO):
-    for _value, _allowed in ((1, True), (240, True), (254, True), (255, True), (241, False), (251, False)):
-        _transmission_type(_first, _value, allowed=_allowed)
+    for _value in (1, 240, 254, 255):
+        _transmission_type(_first, _value, allowed=True)
+    for _value in (241, 251):
+        _transmission_type(_first, _value, allowed=False)
 
 
 def _fixed_while_valid(name: str, first: int, text: str, sub: int, change: Callable[[int], bytes]) -> None:
     @check(f"{name}.fixed", text, _COMMUNICATION)
     def _(t: NodeTester) -> None:
-        kind = ((*t.scratch(),),) if first == _RPDO else (_REGISTER,)
-        t.map_pdo(first, kind, 255)
+        t.map_pdo(first, (t.scratch() if first == _RPDO else _REGISTER,), 255)
         t.require(first, sub)
         t.refuses(expedited(first, sub, change(t.read(first, sub))), "change while the PDO exists")
 
@@ -141,132 +137,91 @@ _fixed_while_valid(
 # ---------------------------------------------------------------- mapping
 
 
-def _fixed_mapping(first: int) -> None:
-    name = "tpdo" if first == _TPDO else "rpdo"
+def _mapping(first: int) -> None:
+    mapping = first + 0x200
+    name = f"{mapping:04X}h"
 
-    def prepare(t: NodeTester) -> tuple[int, int, int]:
-        kind = t.scratch()
-        t.map_pdo(first, (kind,), 255)
-        return kind
+    def of_mapping(suffix: str, text: str, *, opened: bool = True) -> Callable[[_OfObject], None]:
+        """Decorates the function of a check that receives the object mapped to the PDO.
 
-    @check(
-        f"{name}.mapping.valid",
-        f"The mapping of {first + 0x200:04X}h is fixed while the PDO exists",
-        _MAPPING,
-    )
-    def _(t: NodeTester) -> None:
-        prepare(t)
-        t.refuses(expedited(first + 0x200, 0, b"\0"), "number of mapped objects")
+        ``opened``: the PDO is switched off.
+        """
 
-    @check(
-        f"{name}.mapping.count",
-        f"An entry of {first + 0x200:04X}h is fixed while sub-index 0 is not 0",
-        _MAPPING,
-    )
-    def _(t: NodeTester) -> None:
-        kind = prepare(t)
-        t.write(first, 1, t.read(first, 1) | PDO_INVALID, 4)
-        t.refuses(expedited(first + 0x200, 1, _word(*kind)), "mapping entry")
+        def add(function: _OfObject) -> None:
+            @check(f"{_kind(first)}.mapping.{suffix}", text, _MAPPING)
+            def _(t: NodeTester) -> None:
+                mapped = t.scratch()
+                t.map_pdo(first, (mapped,), 255)
+                if opened:
+                    t.switch_pdo_off(first)
+                function(t, mapped)
 
-    def refused(suffix: str, text: str, word: Callable[[NodeTester], bytes], codes: tuple[int, ...]) -> None:
-        @check(f"{name}.mapping.{suffix}", text.format(f"{first + 0x200:04X}h"), _MAPPING)
-        def _(t: NodeTester) -> None:
-            wanted = word(t)
-            prepare(t)
-            t.write(first, 1, t.read(first, 1) | PDO_INVALID, 4)
-            t.write(first + 0x200, 0, 0, 1)
-            _refuses_entry(t, first + 0x200, wanted, codes)
+        return add
 
-    refused(
-        "missing",
-        "{}: an object that does not exist cannot be mapped",
-        lambda _: _word(0x1F7F, 0, 8),
-        _NOT_MAPPABLE,
-    )
-    refused(
-        "not-mappable",
-        "{}: an object without PDO mapping cannot be mapped",
-        lambda _: _word(0x1018, 1, 32),
-        _NOT_MAPPABLE,
-    )
-    refused(
-        "length",
-        "{}: a wrong length of a mapped object is refused",
-        _wrong_length,
-        (*_NOT_MAPPABLE, 0x06070010, *RANGE),
-    )
+    @of_mapping("valid", f"The mapping of {name} is fixed while the PDO exists", opened=False)
+    def _(t: NodeTester, _: _Object) -> None:
+        t.refuses(expedited(mapping, 0, b"\0"), "number of mapped objects")
+
+    @of_mapping("count", f"An entry of {name} is fixed while sub-index 0 is not 0")
+    def _(t: NodeTester, mapped: _Object) -> None:
+        t.refuses(expedited(mapping, 1, _word(*mapped)), "mapping entry")
+
+    def refused(
+        suffix: str, text: str, entry: _Object | None, codes: tuple[int, ...] = _NOT_MAPPABLE
+    ) -> None:
+        """Adds a check with a mapping entry; None is the mapped object with a wrong length."""
+
+        @of_mapping(suffix, f"{name}: {text}")
+        def _(t: NodeTester, mapped: _Object) -> None:
+            t.write(mapping, 0, 0, 1)
+            index, sub, bits = mapped
+            word = _word(*(entry or (index, sub, bits - 8 if bits > 8 else 16)))
+            if code := abort_code(t.answer(expedited(mapping, 1, word))):
+                t.true(code in codes, f"abort {code:08X}h", abort_codes(codes))
+            else:  # the node may refuse the entry when sub-index 0 activates it
+                t.aborts(expedited(mapping, 0, b"\x01"), codes, "activation of the entry")
+
+    refused("missing", "an object that does not exist cannot be mapped", (0x1F7F, 0, 8))
+    refused("not-mappable", "an object without PDO mapping cannot be mapped", (0x1018, 1, 32))
+    refused("length", "a wrong length of a mapped object is refused", None, _WRONG_LENGTH)
     if first == _RPDO:
-        refused(
-            "read-only",
-            "{}: a read-only object cannot be received",
-            lambda _: _word(*_REGISTER),
-            _NOT_MAPPABLE,
-        )
+        refused("read-only", "a read-only object cannot be received", _REGISTER)
 
-    @check(
-        f"{name}.mapping.too-many-bytes", f"{first + 0x200:04X}h: more than eight bytes are refused", _MAPPING
-    )
-    def _(t: NodeTester) -> None:
-        index, sub, bits = prepare(t)
-        t.write(first, 1, t.read(first, 1) | PDO_INVALID, 4)
-        t.write(first + 0x200, 0, 0, 1)
-        count = 64 // bits + 1
-        t.need(t.has(first + 0x200, count), f"only {count - 1} objects can be mapped")
+    @of_mapping("too-many-bytes", f"{name}: more than eight bytes are refused")
+    def _(t: NodeTester, mapped: _Object) -> None:
+        t.write(mapping, 0, 0, 1)
+        count = 64 // mapped[2] + 1
+        t.need(t.has(mapping, count), f"only {count - 1} objects can be mapped")
         for place in range(1, count + 1):
-            answer = t.answer(expedited(first + 0x200, place, _word(index, sub, bits)))
-            if answer[0] == 0x80:
+            if abort_code(t.answer(expedited(mapping, place, _word(*mapped)))):
                 return  # refused when the entry was written
-        t.aborts(expedited(first + 0x200, 0, bytes((count,))), _TOO_LONG, "number of mapped objects")
+        t.aborts(expedited(mapping, 0, bytes((count,))), _TOO_LONG, "number of mapped objects")
 
-    @check(
-        f"{name}.mapping.too-many-objects",
-        f"{first + 0x200:04X}h: sub-index 0 beyond its entries is refused",
-        _MAPPING,
-    )
-    def _(t: NodeTester) -> None:
-        prepare(t)
-        t.write(first, 1, t.read(first, 1) | PDO_INVALID, 4)
-        t.aborts(expedited(first + 0x200, 0, b"\x41"), _TOO_LONG, "65 mapped objects")
+    @of_mapping("too-many-objects", f"{name}: sub-index 0 beyond its entries is refused")
+    def _(t: NodeTester, _: _Object) -> None:
+        t.aborts(expedited(mapping, 0, b"\x41"), _TOO_LONG, "65 mapped objects")
 
 
-def _wrong_length(t: NodeTester) -> bytes:
-    index, sub, bits = t.scratch()
-    return _word(index, sub, bits - 8 if bits > 8 else 16)
+_mapping(_TPDO)
+_mapping(_RPDO)
 
 
-def _refuses_entry(t: NodeTester, mapping: int, word: bytes, codes: tuple[int, ...]) -> None:
-    """Fails unless the node refuses a mapping entry, either at once or when sub-index 0 activates it."""
-    answer = t.answer(expedited(mapping, 1, word))
-    if answer[0] == 0x80:
-        code = int.from_bytes(answer[4:], "little")
-        t.true(code in codes, f"abort {code:08X}h", f"abort {' or '.join(f'{each:08X}h' for each in codes)}")
-        return
-    t.aborts(expedited(mapping, 0, b"\x01"), codes, "activation of the entry")
-
-
-_fixed_mapping(_TPDO)
-_fixed_mapping(_RPDO)
+def _carried(t: NodeTester, *objects: _Object) -> bytes | None:
+    """Returns the data of a TPDO with these objects at the next SYNC, or None."""
+    return t.reply(_sent(t, objects, 1), t.sync)
 
 
 @check("tpdo.mapping.data", "A TPDO carries the value of its object", _PDO)
 def _(t: NodeTester) -> None:
-    kind = t.scratch()
-    can_id = _sent(t, (kind,), 1)
-    since = t.mark()
-    t.sync()
-    frame = t.hears(can_id, since=since)
-    t.equal(None if frame is None else frame.data, t.upload(*kind[:2]), "data")
+    mapped = t.scratch()
+    t.equal(_carried(t, mapped), t.upload(*mapped[:2]), "data")
 
 
 @check("tpdo.mapping.order", "A TPDO carries its objects in the order of the mapping", _PDO)
 def _(t: NodeTester) -> None:
-    index, sub, bits = t.scratch()
-    can_id = _sent(t, (_REGISTER, (index, sub, bits), _REGISTER), 1)
-    since = t.mark()
-    t.sync()
-    frame = t.hears(can_id, since=since)
-    register = t.upload(0x1001)
-    t.equal(None if frame is None else frame.data, register + t.upload(index, sub) + register, "data")
+    mapped = t.scratch()
+    found, register = _carried(t, _REGISTER, mapped, _REGISTER), t.upload(0x1001)
+    t.equal(found, register + t.upload(*mapped[:2]) + register, "data")
 
 
 # ---------------------------------------------------------------- transmission of TPDOs
@@ -274,7 +229,7 @@ def _(t: NodeTester) -> None:
 
 def _sent(
     t: NodeTester,
-    objects: tuple[tuple[int, int, int], ...],
+    objects: tuple[_Object, ...],
     transmission: int,
     can_id: int | None = None,
     timers: dict[int, int] | None = None,
@@ -303,22 +258,17 @@ _every(5)
 
 @check("tpdo.sync.none", "A synchronous TPDO is not sent without SYNC", _PDO)
 def _(t: NodeTester) -> None:
-    can_id = _sent(t, (_REGISTER,), 1)
-    since = t.mark()
-    t.wait(0.2)
-    t.equal(len(t.heard(can_id, since)), 0, "number of TPDOs")
+    t.equal(len(t.heard_after(_sent(t, (_REGISTER,), 1), 0.2)), 0, "number of TPDOs")
 
 
 @check("tpdo.sync.0", "Transmission type 0: a TPDO at the SYNC after a change, and only then", _PDO)
 def _(t: NodeTester) -> None:
-    index, sub, bits = t.scratch()
-    can_id = _sent(t, ((index, sub, bits),), 0)
+    mapped = t.scratch()
+    can_id = _sent(t, (mapped,), 0)
     _syncs(t, can_id, 2)
     t.equal(_syncs(t, can_id, 2), [0, 0], "TPDOs without a change")
-    since = t.mark()
-    t.write(index, sub, t.other_value(index, sub, bits), bits // 8)
-    t.wait(0.02)
-    t.equal(len(t.heard(can_id, since)), 0, "TPDOs between the change and SYNC")
+    early = t.heard_after(can_id, 0.02, lambda: t.change(*mapped))
+    t.equal(len(early), 0, "TPDOs between the change and SYNC")
     t.equal(_syncs(t, can_id, 2), [1, 0], "TPDOs after a change")
 
 
@@ -339,25 +289,18 @@ def _(t: NodeTester) -> None:
 def _event(kind: int) -> None:
     @check(f"tpdo.event.{kind}", f"Transmission type {kind}: a change is sent at once", _PDO)
     def _(t: NodeTester) -> None:
-        index, sub, bits = t.scratch()
-        can_id = _sent(t, ((index, sub, bits),), kind, timers=_off(t, 5))
+        mapped = t.scratch()
+        can_id = _sent(t, (mapped,), kind, timers=_off(t, 5))
         t.wait(0.05)
-        since = t.mark()
-        value = t.other_value(index, sub, bits)
-        t.write(index, sub, value, bits // 8)
-        frame = t.hears(can_id, 0.1, since)
-        t.equal(None if frame is None else frame.data, t.upload(index, sub), "data after the change")
+        data = t.reply(can_id, lambda: t.change(*mapped), 0.1)
+        t.equal(data, t.upload(*mapped[:2]), "data after the change")
 
     @check(f"tpdo.event.{kind}.quiet", f"Transmission type {kind}: nothing is sent without an event", _PDO)
     def _(t: NodeTester) -> None:
-        index, sub, bits = t.scratch()
-        can_id = _sent(t, ((index, sub, bits),), kind, timers=_off(t, 5))
+        can_id = _sent(t, (t.scratch(),), kind, timers=_off(t, 5))
         t.wait(0.1)
-        since = t.mark()
-        for _ in range(3):
-            t.sync()
-            t.wait(0.05)
-        t.equal(len(t.heard(can_id, since)), 0, "number of TPDOs")
+        found = [t.heard_after(can_id, 0.05, t.sync) for _ in range(3)]
+        t.equal(sum(map(len, found)), 0, "number of TPDOs")
 
 
 def _off(t: NodeTester, sub: int) -> dict[int, int]:
@@ -371,37 +314,40 @@ _event(255)
 @check("tpdo.event-timer", "The event timer repeats a TPDO", _PDO, (_TPDO, 5))
 def _(t: NodeTester) -> None:
     can_id = _sent(t, (_REGISTER,), 255, timers={5: 50})
-    since = t.mark()
-    t.wait(0.4)
-    times = [frame.time_s for frame in t.heard(can_id, since)]
+    times = [frame.time_s for frame in t.heard_after(can_id, 0.4)]
     t.true(len(times) >= 4, f"{len(times)} TPDOs in 400 ms", "8")
-    intervals = [after - before for before, after in pairwise(times)]
-    t.near(median(intervals), 0.05, "period")
+    t.near(median(after - before for before, after in pairwise(times)), 0.05, "period")
 
 
 @check("tpdo.event-timer.off", "Event timer 0 repeats nothing", _PDO, (_TPDO, 5))
 def _(t: NodeTester) -> None:
     can_id = _sent(t, (_REGISTER,), 255, timers={5: 0})
     t.wait(0.05)
+    t.equal(len(t.heard_after(can_id, 0.3)), 0, "number of TPDOs")
+
+
+def _inhibited(t: NodeTester, count: int, pause_s: float) -> tuple[list[Frame], bytes]:
+    """Changes an object of a TPDO with an inhibit time of 100 ms to and fro, ``count`` times.
+
+    Returns the TPDOs until ``pause_s`` after the last change, and the final value.
+    """
+    mapped = index, sub, bits = t.scratch()
+    t.require(_TPDO, 3)
+    can_id = _sent(t, (mapped,), 255, timers={3: 1000, **_off(t, 5)})
+    t.wait(0.2)
     since = t.mark()
-    t.wait(0.3)
-    t.equal(len(t.heard(can_id, since)), 0, "number of TPDOs")
+    before = t.upload(index, sub)
+    for _ in range(count):
+        t.put(index, sub, t.other_value(index, sub), bits // 8)
+        t.wait(0.02)
+        t.download(index, sub, before)
+        t.wait(pause_s)
+    return t.heard(can_id, since), before
 
 
 @check("tpdo.inhibit", "Changes come no faster than the inhibit time", _PDO)
 def _(t: NodeTester) -> None:
-    index, sub, bits = t.scratch()
-    t.require(_TPDO, 3)
-    can_id = _sent(t, ((index, sub, bits),), 255, timers={3: 1000, **_off(t, 5)})
-    t.wait(0.2)
-    since = t.mark()
-    before = t.upload(index, sub)
-    for _ in range(8):
-        t.put(index, sub, t.other_value(index, sub, bits), bits // 8)
-        t.wait(0.02)
-        t.download(index, sub, before)
-        t.wait(0.02)
-    times = [frame.time_s for frame in t.heard(can_id, since)]
+    times = [frame.time_s for frame in _inhibited(t, 8, 0.02)[0]]
     shortest = min((after - start for start, after in pairwise(times)), default=0.0)
     t.true(len(times) >= 2, f"{len(times)} TPDOs in 320 ms", "3 or 4")
     t.true(shortest > 0.1 - t.timing.jitter_s, f"{1000 * shortest:.1f} ms between TPDOs", "100 ms or more")
@@ -409,17 +355,7 @@ def _(t: NodeTester) -> None:
 
 @check("tpdo.inhibit.last", "The last change within the inhibit time is sent when it ends", _PDO)
 def _(t: NodeTester) -> None:
-    index, sub, bits = t.scratch()
-    t.require(_TPDO, 3)
-    can_id = _sent(t, ((index, sub, bits),), 255, timers={3: 1000, **_off(t, 5)})
-    t.wait(0.2)
-    since = t.mark()
-    before = t.upload(index, sub)
-    t.put(index, sub, t.other_value(index, sub, bits), bits // 8)
-    t.wait(0.02)
-    t.download(index, sub, before)
-    t.wait(0.2)
-    frames = t.heard(can_id, since)
+    frames, before = _inhibited(t, 1, 0.2)
     t.equal(frames[-1].data if frames else None, before, "data of the last TPDO")
 
 
@@ -438,77 +374,108 @@ class _Reception:
         transmission: int,
         *,
         can_id: int | None = None,
-        ahead: tuple[tuple[int, int, int], ...] = (),
+        ahead: tuple[_Object, ...] = (),
         start: bool = True,
     ) -> None:
-        self._t = t
+        self.t = t
         self.index, self.sub, bits = t.scratch()
         self.size = bits // 8
-        self.value = t.other_value(self.index, self.sub, bits)
-        t.write(self.index, self.sub, int.from_bytes(t.upload(self.index, self.sub), "little"), self.size)
-        self.before = self.read()
+        self.value, self.before = t.other_value(self.index, self.sub), t.read(self.index, self.sub)
+        t.write(self.index, self.sub, self.before, self.size)
         self.can_id = t.map_pdo(_RPDO, (*ahead, (self.index, self.sub, bits)), transmission, can_id)
         if start:
             _start(t)
-
-    def read(self) -> int:
-        return self._t.read(self.index, self.sub)
 
     def data(self, value: int | None = None) -> bytes:
         return pack(self.value if value is None else value, self.size)
 
     def send(self, data: bytes | None = None) -> None:
-        self._t.send(self.can_id, self.data() if data is None else data)
+        self.t.send(self.can_id, self.data() if data is None else data)
+
+    def read(self) -> int:
+        """Returns the object's value once the node had time to process a frame."""
+        self.t.wait(0.02)
+        return self.t.read(self.index, self.sub)
 
     def holds(self, value: int, when: str, found: int | None = None) -> None:
-        """Fails unless ``found`` equals ``value``; by default ``found`` is read once the node had time to
-        process a frame.
-        """
-        if found is None:
-            self._t.wait(0.02)
-            found = self.read()
-        self._t.equal(found, value, f"{self.index:04X}h:{self.sub:02X} {when}")
+        """Fails unless ``found`` equals ``value``; by default ``found`` is read."""
+        found = self.read() if found is None else found
+        self.t.equal(found, value, f"{self.index:04X}h:{self.sub:02X} {when}")
 
     def after(self, data: bytes) -> int:
         """Sends an RPDO of wrong length and returns the object's value; then ends the error with a correct
         RPDO.
         """
         self.send(data)
-        self._t.wait(0.02)
         found = self.read()
         self.send(self.data(self.before))
         return found
 
 
-@check("rpdo.event", "An RPDO of type 255 is taken at once", _PDO)
-def _(t: NodeTester) -> None:
-    rpdo = _Reception(t, 255)
+def _received(
+    name: str,
+    text: str,
+    when: str = "after the RPDO",
+    act: Callable[[_Reception], None] = _Reception.send,
+    transmission: int = 255,
+    *,
+    taken: bool = False,
+    **options: Any,
+) -> None:
+    """Adds a check that ``act`` makes the object hold the value sent if ``taken``, else the original one."""
+
+    @check(f"rpdo.{name}", text, _PDO)
+    def _(t: NodeTester) -> None:
+        rpdo = _Reception(t, transmission, **options)
+        act(rpdo)
+        rpdo.holds(rpdo.value if taken else rpdo.before, when)
+
+
+def _send_and_sync(rpdo: _Reception) -> None:
     rpdo.send()
-    rpdo.holds(rpdo.value, "after the RPDO")
+    rpdo.t.sync()
 
 
-@check("rpdo.sync.before", "A synchronous RPDO has no effect before SYNC", _PDO)
-def _(t: NodeTester) -> None:
-    rpdo = _Reception(t, 1)
-    rpdo.send()
-    rpdo.holds(rpdo.before, "before SYNC")
-
-
-@check("rpdo.sync.after", "A synchronous RPDO takes effect at SYNC", _PDO)
-def _(t: NodeTester) -> None:
-    rpdo = _Reception(t, 1)
-    rpdo.send()
-    t.sync()
-    rpdo.holds(rpdo.value, "after SYNC")
-
-
-@check("rpdo.sync.last", "Of two synchronous RPDOs the last one counts", _PDO)
-def _(t: NodeTester) -> None:
-    rpdo = _Reception(t, 1)
+def _send_two_and_sync(rpdo: _Reception) -> None:
     rpdo.send(rpdo.data(rpdo.value + 5))
+    _send_and_sync(rpdo)
+
+
+def _send_and_restart(rpdo: _Reception) -> None:
     rpdo.send()
-    t.sync()
-    rpdo.holds(rpdo.value, "after SYNC")
+    rpdo.t.nmt(NmtCommand.PRE_OPERATIONAL)
+    _start(rpdo.t)
+    rpdo.t.sync()
+
+
+def _send_when_off(rpdo: _Reception) -> None:
+    rpdo.t.put(_RPDO, 1, rpdo.t.read(_RPDO, 1) | PDO_INVALID, 4)
+    rpdo.send()
+
+
+_received("event", "An RPDO of type 255 is taken at once", taken=True)
+_received("sync.before", "A synchronous RPDO has no effect before SYNC", "before SYNC", transmission=1)
+_received(
+    "sync.after", "A synchronous RPDO takes effect at SYNC", "after SYNC", _send_and_sync, 1, taken=True
+)
+_received(
+    "sync.last", "Of two synchronous RPDOs the last one counts", "after SYNC", _send_two_and_sync, 1,
+    taken=True,
+)  # fmt: skip
+_received("pre-operational", "An RPDO in PRE-OPERATIONAL has no effect", start=False)
+_received(
+    "stale", "An RPDO from before PRE-OPERATIONAL has no effect when the node starts again",
+    "after NMT start and SYNC", _send_and_restart, 1,
+)  # fmt: skip
+_received("disabled", "An RPDO with bit 31 set has no effect", act=_send_when_off)
+_received(
+    "identifier.other", "An RPDO is received with the identifier that was written", taken=True,
+    can_id=_SPARE_ID,
+)  # fmt: skip
+_received(
+    "extended", "A frame with a 29-bit identifier is not an RPDO", "after the frame",
+    lambda rpdo: rpdo.t.send_special(rpdo.can_id, rpdo.data()),
+)  # fmt: skip
 
 
 @check("rpdo.sync.once", "A synchronous RPDO takes effect once", _PDO)
@@ -522,38 +489,6 @@ def _(t: NodeTester) -> None:
     rpdo.holds(rpdo.before, "after a second SYNC without an RPDO")
 
 
-@check("rpdo.pre-operational", "An RPDO in PRE-OPERATIONAL has no effect", _PDO)
-def _(t: NodeTester) -> None:
-    rpdo = _Reception(t, 255, start=False)
-    rpdo.send()
-    rpdo.holds(rpdo.before, "after the RPDO")
-
-
-@check("rpdo.stale", "An RPDO from before PRE-OPERATIONAL has no effect when the node starts again", _PDO)
-def _(t: NodeTester) -> None:
-    rpdo = _Reception(t, 1)
-    rpdo.send()
-    t.nmt(NMT_PRE_OPERATIONAL)
-    _start(t)
-    t.sync()
-    rpdo.holds(rpdo.before, "after NMT start and SYNC")
-
-
-@check("rpdo.disabled", "An RPDO with bit 31 set has no effect", _PDO)
-def _(t: NodeTester) -> None:
-    rpdo = _Reception(t, 255)
-    t.put(_RPDO, 1, t.read(_RPDO, 1) | PDO_INVALID, 4)
-    rpdo.send()
-    rpdo.holds(rpdo.before, "after the RPDO")
-
-
-@check("rpdo.identifier.other", "An RPDO is received with the identifier that was written", _PDO)
-def _(t: NodeTester) -> None:
-    rpdo = _Reception(t, 255, can_id=_SPARE_ID)
-    rpdo.send()
-    rpdo.holds(rpdo.value, "after the RPDO")
-
-
 @check("rpdo.short", "An RPDO that is too short has no effect", _PDO)
 def _(t: NodeTester) -> None:
     rpdo = _Reception(t, 255)
@@ -564,10 +499,7 @@ def _(t: NodeTester) -> None:
 @check("rpdo.short.emergency", "An RPDO that is too short is EMCY 8210h", "CiA 301, 7.2.7")
 def _(t: NodeTester) -> None:
     rpdo = _Reception(t, 255)
-    since = t.mark()
-    rpdo.send(rpdo.data()[:-1])
-    t.wait(0.05)
-    codes = t.emergencies(since)
+    codes = t.emergencies_after(0.05, lambda: rpdo.send(rpdo.data()[:-1]))
     rpdo.send()
     t.true(0x8210 in codes, f"EMCY codes {[f'{code:04X}h' for code in codes]}", "8210h")
 
@@ -576,13 +508,6 @@ def _(t: NodeTester) -> None:
 def _(t: NodeTester) -> None:
     rpdo = _Reception(t, 255)
     rpdo.holds(rpdo.value, "after the RPDO", rpdo.after(rpdo.data() + b"\xff"))
-
-
-@check("rpdo.extended", "A frame with a 29-bit identifier is not an RPDO", _PDO)
-def _(t: NodeTester) -> None:
-    rpdo = _Reception(t, 255)
-    t.send_special(rpdo.can_id, rpdo.data())
-    rpdo.holds(rpdo.before, "after the frame")
 
 
 @check("rpdo.order", "An RPDO fills its objects in the order of the mapping", _PDO)
@@ -597,11 +522,10 @@ def _(t: NodeTester) -> None:
 
 def _maps_dummy(t: NodeTester) -> bool:
     t.need(t.has_pdo(_RPDO), "no RPDO")
-    t.write(_RPDO, 1, t.read(_RPDO, 1) | PDO_INVALID, 4)
+    t.switch_pdo_off(_RPDO)
     t.write(_RPDO + 0x200, 0, 0, 1)
     before = t.read(_RPDO + 0x200, 1)
-    answer = t.answer(expedited(_RPDO + 0x200, 1, _word(*_DUMMY)))
-    if answer[0] == 0x80:
+    if abort_code(t.answer(expedited(_RPDO + 0x200, 1, _word(*_DUMMY)))):
         return False
     t.put(_RPDO + 0x200, 1, before, 4)
     return True
@@ -610,9 +534,8 @@ def _maps_dummy(t: NodeTester) -> bool:
 # ---------------------------------------------------------------- SYNC
 
 
-@check("sync.identifier", "1005h is 80h by default", _SYNC, 0x1005)
+@check("sync.identifier", "1005h is 80h by default", _SYNC, 0x1005, first=NodeTester.reset)
 def _(t: NodeTester) -> None:
-    t.reset()
     t.equal(t.read(0x1005) & 0x7FF, 0x80, "identifier")
 
 
@@ -621,10 +544,8 @@ def _(t: NodeTester) -> None:
     can_id = t.map_pdo(_TPDO, (_REGISTER,), 1)
     t.write(0x1005, 0, _SPARE_ID, 4)
     _start(t)
-    since = t.mark()
-    t.send(_SPARE_ID)
-    t.wait(0.02)
-    t.equal(len(t.heard(can_id, since)), 1, "TPDOs at the new SYNC")
+    found = t.heard_after(can_id, 0.02, lambda: t.send(_SPARE_ID))
+    t.equal(len(found), 1, "TPDOs at the new SYNC")
     t.equal(_syncs(t, can_id, 2), [0, 0], "TPDOs at the old SYNC")
 
 
@@ -640,9 +561,8 @@ def _(t: NodeTester) -> None:
     t.equal(_syncs(t, can_id, 3, 1), [1, 1, 1], "TPDOs")
 
 
-@check("sync.counter.start", "SYNC start value: the first TPDO comes at this counter", _COUNTER)
+@check("sync.counter.start", "SYNC start value: the first TPDO comes at this counter", _COUNTER, 0x1019)
 def _(t: NodeTester) -> None:
-    t.require(0x1019)
     t.require(_TPDO, 6)
     t.write(0x1019, 0, 10, 1)
     can_id = _sent(t, (_REGISTER,), 2, timers={6: 3})

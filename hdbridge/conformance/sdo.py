@@ -3,15 +3,16 @@
 import struct
 from binascii import crc_hqx
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 from canopen.objectdictionary import datatypes
 
+from hdbridge.cia301 import NmtCommand
 from hdbridge.conformance.tester import (
     ABSENT,
     COMMAND,
     LENGTH,
-    NMT_START,
     RANGE,
     READ_ONLY,
     WRITE_ONLY,
@@ -19,7 +20,9 @@ from hdbridge.conformance.tester import (
     NotApplicableError,
     Table,
     abort,
+    abort_code,
     expedited,
+    segmented,
     upload_request,
 )
 
@@ -98,10 +101,8 @@ def _(t: NodeTester) -> None:
 
 @check("sdo.answer.once", "A request has one answer", _SDO)
 def _(t: NodeTester) -> None:
-    since = t.mark()
-    t.answer(upload_request(0x1000))
-    t.wait(0.05)
-    t.equal(len(t.heard(0x580 + t.node_id, since)), 1, "number of answers")
+    answers = t.heard_after(0x580 + t.node_id, 0.05, lambda: t.answer(upload_request(0x1000)))
+    t.equal(len(answers), 1, "number of answers")
 
 
 @check("sdo.answer.time", "50 uploads in a row are answered in time", _SDO)
@@ -114,26 +115,21 @@ def _(t: NodeTester) -> None:
 @check("sdo.operational", "SDO works during PDO traffic", _SDO)
 def _(t: NodeTester) -> None:
     first = t.upload(0x1000)
-    t.nmt(NMT_START)
+    t.nmt(NmtCommand.START)
     for _ in range(10):
         t.sync()
         t.equal(t.upload(0x1000), first, "1000h")
 
 
-@check("sdo.other-node", "Requests to another node are not answered", _SDO)
-def _(t: NodeTester) -> None:
-    since = t.mark()
-    t.send(0x600 + t.node_id % 127 + 1, upload_request(0x1000))
-    t.wait(0.1)
-    t.equal(len(t.heard(0x580 + t.node_id, since)), 0, "number of answers")
+def _not_answered(name: str, what: str, send: Callable[[NodeTester, bytes], None]) -> None:
+    @check(f"sdo.{name}", f"Requests {what} are not answered", _SDO)
+    def _(t: NodeTester) -> None:
+        answers = t.heard_after(0x580 + t.node_id, 0.1, lambda: send(t, upload_request(0x1000)))
+        t.equal(len(answers), 0, "number of answers")
 
 
-@check("sdo.extended", "Requests with a 29-bit identifier are not answered", _SDO)
-def _(t: NodeTester) -> None:
-    since = t.mark()
-    t.send_special(0x600 + t.node_id, upload_request(0x1000))
-    t.wait(0.1)
-    t.equal(len(t.heard(0x580 + t.node_id, since)), 0, "number of answers")
+_not_answered("other-node", "to another node", lambda t, data: t.send(0x600 + t.node_id % 127 + 1, data))
+_not_answered("extended", "with a 29-bit identifier", lambda t, data: t.send_special(0x600 + t.node_id, data))
 
 
 @check("sdo.short", "A request of fewer than eight bytes disturbs nothing", _SDO)
@@ -175,9 +171,8 @@ def _(t: NodeTester) -> None:
     t.aborts(b"\x70" + bytes(7), _TOGGLE, "segment with the wrong toggle bit")
 
 
-@check("sdo.upload.after-abort", "After an abort the transfer has ended", _SDO)
+@check("sdo.upload.after-abort", "After an abort the transfer has ended", _SDO, first=_open_upload)
 def _(t: NodeTester) -> None:
-    _open_upload(t)
     _segment(t, 0x70)
     t.aborts(b"\x60" + bytes(7), COMMAND, "segment after the abort")
 
@@ -277,7 +272,7 @@ _refused(
 )  # fmt: skip
 _refused(
     "long-segmented", "A segmented download of too many bytes is refused at its start", LENGTH,
-    lambda _: b"\x21" + _mux(0x1017, 0) + struct.pack("<I", 9),
+    lambda _: segmented(0x1017, 0, 9),
 )  # fmt: skip
 
 
@@ -304,29 +299,38 @@ def _(t: NodeTester) -> None:
 # ---------------------------------------------------------------- download
 
 
-def _downloads(t: NodeTester, request: Callable[[int, int, bytes], list[bytes]]) -> None:
-    """Writes a different value with the requests that ``request`` builds, and reads it back; restores the old
-    value.
+def _downloads(name: str, text: str, request: Callable[[int, int, bytes], list[bytes]]) -> None:
+    """Adds a check that writes a different value with the requests that ``request`` builds, and reads it
+    back; restores the old value.
     """
-    index, sub, size = _number(t)
-    before = t.upload(index, sub)
-    value = ((int.from_bytes(before, "little") + 100) & 0x7FFF).to_bytes(size, "little")
-    for place, each in enumerate(request(index, sub, value)):
-        answer = t.answer(each)
-        t.true(answer[0] != 0x80, f"request {place + 1}: {answer.hex(' ')}", "the download is carried out")
-    found = t.upload(index, sub)
-    t.download(index, sub, before)
-    t.equal(found, value, f"{index:04X}h")
+
+    @check(f"sdo.download.{name}", text, _SDO)
+    def _(t: NodeTester) -> None:
+        index, sub, size = _number(t)
+        before = t.upload(index, sub)
+        value = ((int.from_bytes(before, "little") + 100) & 0x7FFF).to_bytes(size, "little")
+        for place, each in enumerate(request(index, sub, value)):
+            answer = t.answer(each)
+            t.true(
+                answer[0] != 0x80, f"request {place + 1}: {answer.hex(' ')}", "the download is carried out"
+            )
+        found = t.upload(index, sub)
+        t.download(index, sub, before)
+        t.equal(found, value, f"{index:04X}h")
 
 
-@check("sdo.download.expedited", "An expedited download with its size is carried out", _SDO)
-def _(t: NodeTester) -> None:
-    _downloads(t, lambda index, sub, data: [expedited(index, sub, data)])
+def _last_segment(data: bytes) -> bytes:
+    return bytes(((7 - len(data)) << 1 | 1,)) + data.ljust(7, b"\0")
 
 
-@check("sdo.download.expedited.no-size", "An expedited download without a size is carried out", _SDO)
-def _(t: NodeTester) -> None:
-    _downloads(t, lambda index, sub, data: [b"\x22" + _mux(index, sub) + data.ljust(4, b"\0")])
+_downloads(
+    "expedited", "An expedited download with its size is carried out",
+    lambda index, sub, data: [expedited(index, sub, data)],
+)  # fmt: skip
+_downloads(
+    "expedited.no-size", "An expedited download without a size is carried out",
+    lambda index, sub, data: [b"\x22" + _mux(index, sub) + data.ljust(4, b"\0")],
+)  # fmt: skip
 
 
 @check("sdo.download.response", "The response to a download is 60h with the multiplexer and zeros", _SDO)
@@ -336,21 +340,14 @@ def _(t: NodeTester) -> None:
     t.equal(answer, b"\x60" + _mux(index, sub) + bytes(4), "response")
 
 
-@check("sdo.download.segmented", "A number may come in a segment", _SDO)
-def _(t: NodeTester) -> None:
-    _downloads(t, _segmented)
-
-
-def _segmented(index: int, sub: int, data: bytes) -> list[bytes]:
-    size = struct.pack("<I", len(data))
-    return [b"\x21" + _mux(index, sub) + size, bytes(((7 - len(data)) << 1 | 1,)) + data.ljust(7, b"\0")]
-
-
-@check("sdo.download.segmented.no-size", "A segmented download without a size is carried out", _SDO)
-def _(t: NodeTester) -> None:
-    _downloads(
-        t, lambda index, sub, data: [b"\x20" + _mux(index, sub) + bytes(4), _segmented(index, sub, data)[1]]
-    )
+_downloads(
+    "segmented", "A number may come in a segment",
+    lambda index, sub, data: [segmented(index, sub, len(data)), _last_segment(data)],
+)  # fmt: skip
+_downloads(
+    "segmented.no-size", "A segmented download without a size is carried out",
+    lambda index, sub, data: [b"\x20" + _mux(index, sub) + bytes(4), _last_segment(data)],
+)  # fmt: skip
 
 
 @check("sdo.download.segmented.size", "Segments that do not have the announced size are refused", _SDO)
@@ -358,7 +355,7 @@ def _(t: NodeTester) -> None:
     index, sub, size = _number(t)
     t.need(size >= 2, "the writable object has one byte")
     before = t.upload(index, sub)
-    answer = t.answer(b"\x21" + _mux(index, sub) + struct.pack("<I", size))
+    answer = t.answer(segmented(index, sub, size))
     t.equal(answer[0], 0x60, "response to the initiation")
     t.refuses(bytes(((7 - size + 1) << 1 | 1,)) + bytes(7), "a byte too few")
     t.equal(t.upload(index, sub), before, f"{index:04X}h")
@@ -367,7 +364,7 @@ def _(t: NodeTester) -> None:
 @check("sdo.download.segmented.toggle-error", "A wrong toggle bit of a download is abort 05030000h", _SDO)
 def _(t: NodeTester) -> None:
     index, sub, size = _number(t)
-    t.answer(b"\x21" + _mux(index, sub) + struct.pack("<I", size))
+    t.answer(segmented(index, sub, size))
     t.aborts(b"\x1b" + bytes(7), _TOGGLE, "segment with the wrong toggle bit")
 
 
@@ -381,7 +378,7 @@ def _(t: NodeTester) -> None:
 def _(t: NodeTester) -> None:
     index, sub, size = _number(t)
     before = t.upload(index, sub)
-    t.answer(b"\x21" + _mux(index, sub) + struct.pack("<I", size))
+    t.answer(segmented(index, sub, size))
     t.equal(t.ask(abort(index, sub), 0.05), None, "answer to the abort")
     t.equal(t.upload(index, sub), before, f"{index:04X}h")
 
@@ -400,7 +397,7 @@ def _(t: NodeTester) -> None:
 def _(t: NodeTester) -> None:
     index, sub = _writable_text(t)
     before = t.upload(index, sub)
-    t.answer(b"\x21" + _mux(index, sub) + struct.pack("<I", 14))
+    t.answer(segmented(index, sub, 14))
     answers = [_segment(t, 0x00, b"ABCDEFG"), _segment(t, 0x11, b"HIJKLMN")]
     t.download(index, sub, before or b" ")
     t.equal([answer[0] for answer in answers], [0x20, 0x30], "commands")
@@ -409,21 +406,37 @@ def _(t: NodeTester) -> None:
 # ---------------------------------------------------------------- block transfers
 
 
+def _block_request(index: int, size: int = 127) -> bytes:
+    """Returns the request of a block upload with blocks of ``size`` segments."""
+    return b"\xa4" + _mux(index, 0) + bytes((size, 0, 0, 0))
+
+
+def _need_block_transfers(t: NodeTester, answer: bytes) -> None:
+    t.need(answer[0] != 0x80, f"block transfers are refused: abort {abort_code(answer):08x}h")
+
+
 def _block_upload(t: NodeTester, size: int = 127) -> tuple[bytes, bytes]:
     """Begins a block upload; returns the response and the object's data."""
     index, data = _text(t)
-    answer = t.answer(b"\xa4" + _mux(index, 0) + bytes((size, 0, 0, 0)))
-    t.need(answer[0] != 0x80, f"block transfers are refused: abort {answer[:3:-1].hex()}h")
+    answer = t.answer(_block_request(index, size))
+    _need_block_transfers(t, answer)
     t.equal(answer[0] & 0xE1, 0xC0, "command of the response")
     return answer, data
 
 
-def _segments(t: NodeTester, request: bytes) -> list[bytes]:
-    """Sends the request that starts a block; returns the segments of the block."""
-    since = t.mark()
-    t.send(0x600 + t.node_id, request)
-    t.wait(0.05)
-    return [frame.data for frame in t.heard(0x580 + t.node_id, since)]
+def _segments(t: NodeTester, *acknowledged: int) -> list[bytes]:
+    """Begins or acknowledges a block (segments received, size of the next block); returns its segments."""
+    request = bytes((0xA2, *acknowledged)) if acknowledged else b"\xa3"
+    send = partial(t.send, 0x600 + t.node_id, request.ljust(8, b"\0"))
+    return [frame.data for frame in t.heard_after(0x580 + t.node_id, 0.05, send)]
+
+
+def _whole_block(t: NodeTester) -> tuple[list[bytes], bytes]:
+    """Uploads all segments in one block; returns them and the answer to their acknowledgement."""
+    segments = _segments(t)
+    end = t.answer(bytes((0xA2, len(segments), 127)) + bytes(5))
+    t.ask(b"\xa1" + bytes(7), 0.02)
+    return segments, end
 
 
 @check("sdo.block.upload", "A block upload carries the whole object", _SDO)
@@ -431,12 +444,10 @@ def _(t: NodeTester) -> None:
     answer, data = _block_upload(t)
     if answer[0] & 2:
         t.equal(struct.unpack_from("<I", answer, 4)[0], len(data), "announced size")
-    segments = _segments(t, b"\xa3" + bytes(7))
+    segments, end = _whole_block(t)
     t.equal([each[0] & 0x7F for each in segments], [*range(1, len(segments) + 1)], "sequence numbers")
     t.equal([each[0] >> 7 for each in segments], [0] * (len(segments) - 1) + [1], "last-segment bits")
-    end = t.answer(bytes((0xA2, len(segments), 127)) + bytes(5))
     t.equal(end[0] & 0xE3, 0xC1, "command of the end")
-    t.ask(b"\xa1" + bytes(7), 0.02)
     found = b"".join(each[1:] for each in segments)
     t.equal(found[: len(found) - (end[0] >> 2 & 7)], data, "data")
 
@@ -445,19 +456,17 @@ def _(t: NodeTester) -> None:
 def _(t: NodeTester) -> None:
     answer, data = _block_upload(t)
     t.need(answer[0] & 4, "the server has no checksum")
-    segments = _segments(t, b"\xa3" + bytes(7))
-    end = t.answer(bytes((0xA2, len(segments), 127)) + bytes(5))
-    t.ask(b"\xa1" + bytes(7), 0.02)
+    _, end = _whole_block(t)
     t.equal(struct.unpack_from("<H", end, 1)[0], crc_hqx(data, 0), "checksum")
 
 
 @check("sdo.block.upload.size-1", "Blocks of one segment are possible", _SDO)
 def _(t: NodeTester) -> None:
     _, data = _block_upload(t, 1)
-    segments = _segments(t, b"\xa3" + bytes(7))
+    segments = _segments(t)
     t.equal(len(segments), 1, "segments in the first block")
     t.equal(segments[0][1:], data[:7].ljust(7, b"\0"), "data of the first segment")
-    second = _segments(t, bytes((0xA2, 1, 1)) + bytes(5))
+    second = _segments(t, 1, 1)
     t.ask(abort(), 0.02)
     t.equal(second[0][0] & 0x7F, 1, "sequence number in the second block")
     t.equal(second[0][1 : 1 + len(data[7:14])], data[7:14], "data of the second block")
@@ -466,9 +475,9 @@ def _(t: NodeTester) -> None:
 @check("sdo.block.upload.repeat", "Segments that were not acknowledged are sent again", _SDO)
 def _(t: NodeTester) -> None:
     _, data = _block_upload(t)
-    _segments(t, b"\xa3" + bytes(7))
+    _segments(t)
     t.need(len(data) > 7, "the string fits into one segment")
-    again = _segments(t, bytes((0xA2, 1, 127)) + bytes(5))
+    again = _segments(t, 1, 127)
     t.ask(abort(), 0.02)
     t.true(again, "no segments", "those after the first")
     t.equal(again[0][1 : 1 + len(data[7:14])], data[7:14], "data of the first segment sent again")
@@ -480,7 +489,7 @@ def _block_size(size: int) -> None:
         index, _ = _text(t)
         _block_upload(t)
         t.ask(abort(), 0.02)
-        t.aborts(b"\xa4" + _mux(index, 0) + bytes((size, 0, 0, 0)), (0x05040002,), f"block size {size}")
+        t.aborts(_block_request(index, size), (0x05040002,), f"block size {size}")
 
 
 _block_size(0)
@@ -492,7 +501,7 @@ _block_size(128)
 )
 def _(t: NodeTester) -> None:
     _block_upload(t)
-    segments = _segments(t, b"\xa3" + bytes(7))
+    segments = _segments(t)
     t.aborts(bytes((0xA2, len(segments) + 1, 127)) + bytes(5), (0x05040003,), "acknowledgement")
 
 
@@ -500,13 +509,14 @@ def _(t: NodeTester) -> None:
 def _(t: NodeTester) -> None:
     _block_upload(t)
     t.ask(abort(), 0.02)
-    t.aborts(b"\xa4" + _mux(_NOWHERE, 0) + b"\x7f\0\0\0", ABSENT[:1], "block upload")
+    t.aborts(_block_request(_NOWHERE), ABSENT[:1], "block upload")
 
 
-def _begin_block_download(t: NodeTester, size: int, *, crc: bool) -> tuple[int, int]:
+def _begin_block_download(t: NodeTester, *, crc: bool) -> tuple[int, int]:
+    """Begins a block download; returns 1 if the server has a checksum, else 0, and the object's size."""
     index, sub, own = _number(t)
-    answer = t.answer(bytes((0xC2 | crc << 2,)) + _mux(index, sub) + struct.pack("<I", size or own))
-    t.need(answer[0] != 0x80, f"block transfers are refused: abort {answer[:3:-1].hex()}h")
+    answer = t.answer(bytes((0xC2 | crc << 2,)) + _mux(index, sub) + struct.pack("<I", own))
+    _need_block_transfers(t, answer)
     t.equal(answer[0] & 0xE3, 0xA0, "command of the response")
     t.true(1 <= answer[4] <= 127, f"block size {answer[4]}", "1 to 127")
     return answer[0] >> 2 & 1, own
@@ -518,7 +528,7 @@ def _block_download(t: NodeTester, *, crc: bool, spoil: int = 0, skipped: bool =
     """
     index, sub, size = _number(t)
     data = t.upload(index, sub)
-    server_crc, size = _begin_block_download(t, 0, crc=crc)
+    server_crc, size = _begin_block_download(t, crc=crc)
     t.need(server_crc or not spoil, "the server has no checksum")
     if skipped:
         answer = t.answer(b"\x82" + data.ljust(7, b"\0"))
@@ -528,14 +538,14 @@ def _block_download(t: NodeTester, *, crc: bool, spoil: int = 0, skipped: bool =
     return t.answer(struct.pack("<BH5x", 0xC1 | (7 - size) << 2, (crc_hqx(data, 0) ^ spoil) if crc else 0))
 
 
-@check("sdo.block.download", "A block download is carried out", _SDO)
-def _(t: NodeTester) -> None:
-    t.equal(_block_download(t, crc=True)[0], 0xA1, "command of the end")
+def _downloaded(name: str, text: str, *, crc: bool = True, skipped: bool = False) -> None:
+    @check(f"sdo.block.download{name}", text, _SDO)
+    def _(t: NodeTester) -> None:
+        t.equal(_block_download(t, crc=crc, skipped=skipped)[0], 0xA1, "command of the end")
 
 
-@check("sdo.block.download.no-crc", "A block download without a checksum is carried out", _SDO)
-def _(t: NodeTester) -> None:
-    t.equal(_block_download(t, crc=False)[0], 0xA1, "command of the end")
+_downloaded("", "A block download is carried out")
+_downloaded(".no-crc", "A block download without a checksum is carried out", crc=False)
 
 
 @check("sdo.block.download.crc", "A wrong checksum is abort 05040004h", _SDO)
@@ -544,14 +554,12 @@ def _(t: NodeTester) -> None:
     t.equal(answer[:1] + answer[4:], b"\x80" + struct.pack("<I", 0x05040004), "command and abort code")
 
 
-@check("sdo.block.download.sequence", "A segment out of order is not taken and may be sent again", _SDO)
-def _(t: NodeTester) -> None:
-    t.equal(_block_download(t, crc=True, skipped=True)[0], 0xA1, "command of the end")
+_downloaded(".sequence", "A segment out of order is not taken and may be sent again", skipped=True)
 
 
 @check("sdo.block.download.read-only", "Block download to a read-only object is abort 06010002h", _SDO)
 def _(t: NodeTester) -> None:
-    _begin_block_download(t, 0, crc=False)
+    _begin_block_download(t, crc=False)
     t.ask(b"\x81" + bytes(7), 0.05)
     t.ask(abort(), 0.02)
     t.aborts(b"\xc2" + _mux(0x1000, 0) + struct.pack("<I", 4), READ_ONLY, "block download")

@@ -5,10 +5,6 @@ from contextlib import suppress
 
 from hdbridge.conformance import description, drive, emergency, lss, motion, network, pdo, sdo
 from hdbridge.conformance.tester import (
-    FAULT_REACTION_ACTIVE,
-    OPERATION_ENABLED,
-    POWER_STATES,
-    QUICK_STOP_ACTIVE,
     Check,
     FailedError,
     NodeTester,
@@ -17,9 +13,10 @@ from hdbridge.conformance.tester import (
     StoppedError,
     Verdict,
 )
+from hdbridge.drive.states import State
 from hdbridge.errors import DriveError, HdbridgeError
 
-_POWERED = (OPERATION_ENABLED, QUICK_STOP_ACTIVE, FAULT_REACTION_ACTIVE)
+_POWERED = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 
 
 def checks(*, moves: bool = False, stores: bool = False) -> list[Check]:
@@ -78,11 +75,11 @@ def _refuse_a_powered_drive(tester: NodeTester) -> None:
             f"{tester.timing.boot_s:g} s; check node id, bit rate and power, and that the node is not "
             "STOPPED; nothing was changed"
         )
-    state = tester.power_state() if tester.has(0x6041) else 0
+    state = tester.power_state() if tester.has(0x6041) else State.UNKNOWN
     if tester.has(0x6064):
         tester.start_position = tester.read(0x6064, signed=True)
     if state in _POWERED:
         raise DriveError(
-            f"node {tester.node_id} on {tester.link.name}: found in {POWER_STATES[state]}; expected a drive "
+            f"node {tester.node_id} on {tester.link.name}: found in {state.value}; expected a drive "
             "without power; disable it with its own master first; nothing was changed"
         )

@@ -14,18 +14,20 @@ from typing import Final, NoReturn, TypeVar
 import can
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
+from hdbridge.cia301 import NmtCommand
 from hdbridge.drive.link import Frame, Link
+from hdbridge.drive.states import State, decode
 from hdbridge.errors import DriveError, HdbridgeError
+from hdbridge.files.edsfile import variables
 
-NMT_START: Final = 1
-NMT_STOP: Final = 2
-NMT_PRE_OPERATIONAL: Final = 128
-NMT_RESET_NODE: Final = 129
-NMT_RESET_COMMUNICATION: Final = 130
 STATES: Final = {0x00: "boot-up", 0x04: "STOPPED", 0x05: "OPERATIONAL", 0x7F: "PRE-OPERATIONAL"}
-PRE_OPERATIONAL: Final = "PRE-OPERATIONAL"
-OPERATIONAL: Final = "OPERATIONAL"
-STOPPED: Final = "STOPPED"
+"""NMT states by the byte of a heartbeat."""
+ENTERED: Final = {
+    NmtCommand.START: "OPERATIONAL",
+    NmtCommand.STOP: "STOPPED",
+    NmtCommand.PRE_OPERATIONAL: "PRE-OPERATIONAL",
+}
+"""NMT states by the command that leads there."""
 
 ABSENT: Final = (0x06020000, 0x06090011)
 READ_ONLY: Final = (0x06010002, 0x06010000)
@@ -35,24 +37,11 @@ LENGTH: Final = (0x06070010, 0x06070012, 0x06070013)
 COMMAND: Final = (0x05040001,)
 
 PDO_INVALID: Final = 1 << 31
-SWITCH_ON_DISABLED: Final = 0x40
-READY_TO_SWITCH_ON: Final = 0x21
-SWITCHED_ON: Final = 0x23
-OPERATION_ENABLED: Final = 0x27
-QUICK_STOP_ACTIVE: Final = 0x07
-FAULT_REACTION_ACTIVE: Final = 0x0F
-FAULT: Final = 0x08
-POWER_STATES: Final = {
-    0x00: "not ready to switch on",
-    SWITCH_ON_DISABLED: "switch on disabled",
-    READY_TO_SWITCH_ON: "ready to switch on",
-    SWITCHED_ON: "switched on",
-    OPERATION_ENABLED: "operation enabled",
-    QUICK_STOP_ACTIVE: "quick stop active",
-    FAULT_REACTION_ACTIVE: "fault reaction active",
-    FAULT: "fault",
-}
-ENABLING: Final = ((READY_TO_SWITCH_ON, 0x06), (SWITCHED_ON, 0x07), (OPERATION_ENABLED, 0x0F))
+ENABLING: Final = (
+    (State.READY_TO_SWITCH_ON, 0x06),
+    (State.SWITCHED_ON, 0x07),
+    (State.OPERATION_ENABLED, 0x0F),
+)
 """Power states on the way to OPERATION ENABLED, each with the controlword that leads to the state."""
 _SIGNED: Final = frozenset(datatypes.SIGNED_TYPES)
 _HEARTBEAT_MS: Final = 40
@@ -119,6 +108,9 @@ class Result:
     duration_s: float
 
 
+Decorator = Callable[[Callable[["NodeTester"], None]], Callable[["NodeTester"], None]]
+
+
 class Table(list[Check]):
     """Checks of one subject; `check` adds a function."""
 
@@ -128,9 +120,18 @@ class Table(list[Check]):
         self._drives, self._moves = drives, moves
 
     def check(
-        self, name: str, text: str, clause: str, *needs: int | tuple[int, int], stores: bool = False
-    ) -> Callable[[Callable[[NodeTester], None]], Callable[[NodeTester], None]]:
-        """Decorates the function of a check, which applies only to a node with the objects ``needs``."""
+        self,
+        name: str,
+        text: str,
+        clause: str,
+        *needs: int | tuple[int, int],
+        first: Callable[[NodeTester], object] | None = None,
+        stores: bool = False,
+    ) -> Decorator:
+        """Decorates the function of a check, which applies only to a node with the objects ``needs``.
+
+        ``first`` brings the node into the state in which the function begins.
+        """
 
         def add(function: Callable[[NodeTester], None]) -> Callable[[NodeTester], None]:
             def run(t: NodeTester) -> None:
@@ -138,6 +139,8 @@ class Table(list[Check]):
                     t.need_402()
                 for each in needs:
                     t.require(*((each,) if isinstance(each, int) else each))
+                if first is not None:
+                    first(t)
                 function(t)
 
             self.append(Check(name, text, clause, run, self._moves, stores))
@@ -158,6 +161,10 @@ class Timing:
     """Maximum time to a transition of the power state machine, including brakes and ramps."""
     jitter_s: float = 0.02
     """Tolerance of a period, in addition to a tenth of the period."""
+
+
+def _idle() -> None:
+    """Does nothing."""
 
 
 class NodeTester:
@@ -251,6 +258,22 @@ class NodeTester:
             if not self._received(end_s):
                 return None
 
+    def heard_after(self, can_id: int, duration_s: float, act: Callable[[], object] = _idle) -> list[Frame]:
+        """Calls ``act``; returns the frames with this identifier from then on, for a duration."""
+        since = self.mark()
+        act()
+        self.wait(duration_s)
+        return self.heard(can_id, since)
+
+    def reply(
+        self, can_id: int, act: Callable[[], object] = _idle, timeout_s: float | None = None
+    ) -> bytes | None:
+        """Calls ``act``; returns the data of the first frame with this identifier, or None on time-out."""
+        since = self.mark()
+        act()
+        frame = self.hears(can_id, timeout_s, since)
+        return None if frame is None else frame.data
+
     # ---------------------------------------------------------------- verdicts
 
     @staticmethod
@@ -295,7 +318,7 @@ class NodeTester:
         """Sends an NMT command, to the node under test by default."""
         self.send(0x000, bytes((command, self.node_id if node_id is None else node_id)))
 
-    def reset(self, command: int = NMT_RESET_COMMUNICATION) -> Frame:
+    def reset(self, command: int = NmtCommand.RESET_COMMUNICATION) -> Frame:
         """Resets the node and waits until it has booted and answers SDO; returns the boot-up message."""
         since = self.mark()
         self.nmt(command)
@@ -333,38 +356,35 @@ class NodeTester:
     def state(self) -> str:
         """Returns the NMT state in the next heartbeat, or in the answer to node guarding."""
         can_id = 0x700 + self.node_id
-        since = self.mark()
-        if not self._state_watched:
-            self.send_special(can_id, remote=True)
-        frame = self.need(
-            self.hears(can_id, 4e-3 * _HEARTBEAT_MS + self.timing.answer_s, since),
-            "the node has neither a heartbeat (1017h) nor node guarding",
-        )
-        value = frame.data[0] & 0x7F if frame.data else -1
+        request = _idle if self._state_watched else lambda: self.send_special(can_id, remote=True)
+        data = self.reply(can_id, request, 4e-3 * _HEARTBEAT_MS + self.timing.answer_s)
+        if data is None:
+            raise NotApplicableError("the node has neither a heartbeat (1017h) nor node guarding")
+        value = data[0] & 0x7F if data else -1
         return STATES.get(value, f"{value:02X}h")
 
-    def enter(self, command: int, state: str) -> None:
+    def enter(self, command: NmtCommand) -> None:
         """Sends an NMT command and checks the state that the node then reports."""
         self.watch_state()
         self.nmt(command)
-        self.equal(self.state(), state, "NMT state")
+        self.equal(self.state(), ENTERED[command], "NMT state")
 
     def sync(self, counter: int | None = None) -> None:
         self.send(0x080, b"" if counter is None else bytes((counter,)))
 
-    def emergencies(self, since: int) -> list[int]:
-        """Returns the codes of the EMCY messages from index ``since`` of the log on."""
-        frames = self.heard(0x080 + self.node_id, since)
-        return [struct.unpack_from("<H", frame.data)[0] for frame in frames if len(frame.data) == 8]
+    def emergencies(self) -> list[int]:
+        """Returns the codes of all EMCY messages since the start of the check."""
+        return _codes(self.heard(0x080 + self.node_id))
+
+    def emergencies_after(self, duration_s: float, act: Callable[[], object] = _idle) -> list[int]:
+        """Calls ``act``; returns the codes of the EMCY messages from then on, for a duration."""
+        return _codes(self.heard_after(0x080 + self.node_id, duration_s, act))
 
     # ---------------------------------------------------------------- SDO
 
     def ask(self, request: bytes, timeout_s: float | None = None) -> bytes | None:
         """Sends an SDO request; returns the answer, or None on time-out."""
-        since = self.mark()
-        self.send(0x600 + self.node_id, request)
-        frame = self.hears(0x580 + self.node_id, timeout_s, since)
-        return None if frame is None else frame.data
+        return self.reply(0x580 + self.node_id, lambda: self.send(0x600 + self.node_id, request), timeout_s)
 
     def answer(self, request: bytes) -> bytes:
         """Sends an SDO request like `ask`; fails the check without an answer of eight bytes."""
@@ -379,10 +399,10 @@ class NodeTester:
     def aborts(self, request: bytes, codes: tuple[int, ...], what: str) -> None:
         """Fails unless the request is refused with one of the abort codes."""
         answer = self.answer(request)
-        expected = f"abort {' or '.join(f'{code:08X}h' for code in codes)}"
+        expected = abort_codes(codes)
         if answer[0] != 0x80:
             self.fail(f"{what}: answer {answer.hex(' ')}", expected)
-        code = struct.unpack_from("<I", answer, 4)[0]
+        code = abort_code(answer)
         self.true(code in codes, f"{what}: abort {code:08X}h", expected)
 
     def refuses_value(self, index: int, sub: int, data: bytes, codes: tuple[int, ...]) -> None:
@@ -402,7 +422,7 @@ class NodeTester:
 
     def upload(self, index: int, sub: int = 0) -> bytes:
         """Uploads an object, expedited or segmented; raises `AbortedError` if the node refuses."""
-        answer = self.answer(_request(0x40, index, sub))
+        answer = self.answer(upload_request(index, sub))
         self._raise_abort(answer, f"upload of {index:04X}h:{sub:02X}")
         self.equal(answer[0] >> 5, 2, "command of the upload response")
         self.equal(answer[1:4], struct.pack("<HB", index, sub), "multiplexer")
@@ -424,7 +444,7 @@ class NodeTester:
         if len(data) <= 4:
             self._raise_abort(self.answer(expedited(index, sub, data)), what)
             return
-        self._raise_abort(self.answer(_request(0x21, index, sub)[:4] + struct.pack("<I", len(data))), what)
+        self._raise_abort(self.answer(segmented(index, sub, len(data))), what)
         for place in range(0, len(data), 7):
             part = data[place : place + 7]
             command = (place // 7 & 1) << 4 | (7 - len(part)) << 1 | (place + 7 >= len(data))
@@ -433,14 +453,13 @@ class NodeTester:
     @staticmethod
     def _raise_abort(answer: bytes, what: str) -> None:
         if answer[0] == 0x80:
-            raise AbortedError(what, struct.unpack_from("<I", answer, 4)[0])
+            raise AbortedError(what, abort_code(answer))
 
     def has(self, index: int, sub: int = 0) -> bool:
         """Returns True if the node has the object."""
         if (index, sub) not in self._existing:
-            answer = self.answer(_request(0x40, index, sub))
-            code = struct.unpack_from("<I", answer, 4)[0] if answer[0] == 0x80 else 0
-            self._existing[index, sub] = code not in ABSENT
+            answer = self.answer(upload_request(index, sub))
+            self._existing[index, sub] = abort_code(answer) not in ABSENT
             if answer[0] == 0x41:
                 self.ask(abort(index, sub), 0.0)
         return self._existing[index, sub]
@@ -469,6 +488,14 @@ class NodeTester:
         """Returns True if a PDO exists; ``first`` is the index of its communication parameter."""
         return self.has(first, 1) and self.has(first + 0x200, 0)
 
+    def need_pdo(self, first: int) -> None:
+        """Ends the check as not applicable if the node lacks the PDO."""
+        self.need(self.has_pdo(first), f"no PDO at {first:04X}h")
+
+    def switch_pdo_off(self, first: int) -> None:
+        """Sets bit 31 of the identifier of a PDO; the bit is restored at the end of the check."""
+        self.write(first, 1, self.read(first, 1) | PDO_INVALID, 4)
+
     def map_pdo(
         self,
         first: int,
@@ -481,7 +508,7 @@ class NodeTester:
 
         ``objects`` are (index, sub-index, bits); ``timers`` are values of sub-indices 3, 5 or 6.
         """
-        self.need(self.has_pdo(first), f"no PDO at {first:04X}h")
+        self.need_pdo(first)
         before = self.read(first, 1)
         own = before & 0x7FF if can_id is None else can_id
         self.write(first, 1, before | PDO_INVALID, 4)
@@ -497,8 +524,7 @@ class NodeTester:
 
     def variables(self) -> Iterator[ODVariable]:
         """Yields the entries of the EDS, if any."""
-        for item in (self.od or {}).values():
-            yield from [item] if isinstance(item, ODVariable) else item.subindices.values()
+        return iter(()) if self.od is None else variables(self.od)
 
     def scratch(self) -> tuple[int, int, int]:
         """Returns (index, sub-index, bits) of a writable, mappable object without side effects."""
@@ -519,10 +545,16 @@ class NodeTester:
                 return each.index, each.subindex, len(each)
         raise NotApplicableError("no object is known that can be written, read and mapped without effect")
 
-    def other_value(self, index: int, sub: int, bits: int) -> int:
+    def other_value(self, index: int, sub: int) -> int:
         """Returns a value that differs by 1 from the object's current value."""
-        now = int.from_bytes(self.upload(index, sub), "little")
+        now = self.read(index, sub)
         return now - 1 if now > 1 else now + 1
+
+    def change(self, index: int, sub: int, bits: int) -> int:
+        """Writes a value that differs by 1, and returns it; it is undone at the end of the check."""
+        value = self.other_value(index, sub)
+        self.write(index, sub, value, bits // 8)
+        return value
 
     # ---------------------------------------------------------------- CiA 402
 
@@ -538,17 +570,16 @@ class NodeTester:
             self.powered = True
         self.put(0x6040, 0, word, 2)
 
-    def power_state(self) -> int:
-        """Returns the power state, as the bits of the statusword that define it."""
-        return power_state(self.read(0x6041))
+    def power_state(self) -> State:
+        """Returns the power state."""
+        return decode(self.read(0x6041))
 
-    def reaches(self, *states: int) -> None:
+    def reaches(self, *states: State) -> None:
         """Waits for one of these power states; fails on time-out."""
         deadline_s = self.now + self.timing.power_s
-        while (found := self.power_state()) not in states:
+        while decode(word := self.read(0x6041)) not in states:
             if self.now > deadline_s:
-                expected = " or ".join(POWER_STATES[each] for each in states)
-                self.fail(POWER_STATES.get(found, f"{found:02X}h"), expected)
+                self.fail(state_name(word), " or ".join(each.value for each in states))
             self.wait(0.005)
 
     def walk(self) -> None:
@@ -557,12 +588,11 @@ class NodeTester:
             self.control(word)
             self.reaches(state)
 
-    def stays(self, state: int, duration_s: float = 0.05) -> None:
+    def stays(self, state: State, duration_s: float = 0.05) -> None:
         """Fails if the power state is not ``state`` throughout this duration."""
         end_s = self.now + duration_s
         while True:
-            found = self.power_state()
-            self.equal(POWER_STATES.get(found, f"{found:02X}h"), POWER_STATES[state], "power state")
+            self.equal(state_name(self.read(0x6041)), state.value, "power state")
             if self.now >= end_s:
                 return
             self.wait(0.01)
@@ -571,13 +601,13 @@ class NodeTester:
         """Brings the drive to SWITCH ON DISABLED, resetting a fault if necessary."""
         self.control(0x00)
         deadline_s = self.now + self.timing.power_s
-        while (state := self.power_state()) != SWITCH_ON_DISABLED:
-            if state == FAULT:
+        while (state := decode(word := self.read(0x6041))) is not State.SWITCH_ON_DISABLED:
+            if state is State.FAULT:
                 self.control(0x80)
                 self.wait(0.02)
                 self.control(0x00)
             if self.now > deadline_s:
-                self.fail(POWER_STATES.get(state, f"{state:02X}h"), "switch on disabled")
+                self.fail(state_name(word), State.SWITCH_ON_DISABLED.value)
             self.wait(0.01)
         self.powered = False
 
@@ -595,12 +625,12 @@ class NodeTester:
         """Brings the node to PRE-OPERATIONAL for the next check."""
         self.log.clear()
         self.may_power = moves
-        self.nmt(NMT_PRE_OPERATIONAL)
+        self.nmt(NmtCommand.PRE_OPERATIONAL)
 
     def tidy(self) -> None:
         """Undoes the changes of the check; resets the node if that fails."""
         self.send(0x600 + self.node_id, abort())  # ends a transfer that the check has left open
-        self.nmt(NMT_PRE_OPERATIONAL)
+        self.nmt(NmtCommand.PRE_OPERATIONAL)
         try:
             if self.powered:
                 self.disable()
@@ -614,10 +644,10 @@ class NodeTester:
         self._state_watched = False
 
     def _recover(self) -> None:
-        for command in (NMT_RESET_COMMUNICATION, NMT_RESET_NODE):
+        for command in (NmtCommand.RESET_COMMUNICATION, NmtCommand.RESET_NODE):
             self.nmt(command)
             self.wait(self.timing.jitter_s)
-            self.nmt(NMT_PRE_OPERATIONAL)
+            self.nmt(NmtCommand.PRE_OPERATIONAL)
             if self.answers(self.timing.boot_s):
                 return
         raise DriveError(
@@ -635,10 +665,10 @@ class NodeTester:
         self.tidy()
 
 
-def power_state(statusword: int) -> int:
-    """Returns the bits of a statusword that define the power state (CiA 402)."""
-    masked = statusword & 0x4F
-    return masked if masked in (0x00, SWITCH_ON_DISABLED, FAULT_REACTION_ACTIVE, FAULT) else statusword & 0x6F
+def state_name(statusword: int) -> str:
+    """Returns the name of the power state in a statusword; the bits of an undefined state as hexadecimal."""
+    state = decode(statusword)
+    return f"{statusword & 0x6F:02X}h" if state is State.UNKNOWN else state.value
 
 
 def pack(value: int, size: int) -> bytes:
@@ -663,11 +693,26 @@ def abort(index: int = 0, sub: int = 0, code: int = 0x08000000) -> bytes:
 
 def upload_request(index: int, sub: int = 0) -> bytes:
     """Returns the request of an upload."""
-    return _request(0x40, index, sub)
+    return struct.pack("<BHB4x", 0x40, index, sub)
 
 
-def _request(command: int, index: int, sub: int) -> bytes:
-    return struct.pack("<BHB4x", command, index, sub)
+def segmented(index: int, sub: int, size: int) -> bytes:
+    """Returns the request that begins a segmented download of ``size`` bytes."""
+    return struct.pack("<BHBI", 0x21, index, sub, size)
+
+
+def abort_code(answer: bytes) -> int:
+    """Returns the abort code in an SDO answer; 0 for any other answer."""
+    return int.from_bytes(answer[4:], "little") if answer[0] == 0x80 else 0
+
+
+def abort_codes(codes: tuple[int, ...]) -> str:
+    """Returns the abort codes as text, for example "abort 06010002h or 06010000h"."""
+    return f"abort {' or '.join(f'{code:08X}h' for code in codes)}"
+
+
+def _codes(emergencies: list[Frame]) -> list[int]:
+    return [struct.unpack_from("<H", each.data)[0] for each in emergencies if len(each.data) == 8]
 
 
 def _text(value: object) -> str:

@@ -15,7 +15,7 @@ from typing import Any, Final
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
 from hdbridge.errors import InputError
-from hdbridge.files.edsfile import shared_eds
+from hdbridge.files.edsfile import shared_eds, variables
 from hdbridge.files.profile import bundled_folder
 
 BUNDLED: Final = bundled_folder("eds") / "hdbridge-402.eds"
@@ -74,14 +74,19 @@ class SdoAbortError(Exception):
         self.code = code
 
 
-def only(*allowed: int) -> Callable[[int], None]:
-    """Returns a guard that refuses all values except ``allowed``."""
+def refusing(wrong: Callable[[int], object], code: Abort = Abort.RANGE) -> Callable[[int], None]:
+    """Returns a guard that refuses the values for which ``wrong`` is true."""
 
     def check(value: int) -> None:
-        if value not in allowed:
-            raise SdoAbortError(Abort.RANGE)
+        if wrong(value):
+            raise SdoAbortError(code)
 
     return check
+
+
+def only(*allowed: int) -> Callable[[int], None]:
+    """Returns a guard that refuses all values except ``allowed``."""
+    return refusing(lambda value: value not in allowed)
 
 
 class Entry:
@@ -240,8 +245,8 @@ class Dictionary:
         self._note_indices()
 
     def _add(self, variable: ODVariable, own: ODVariable | None) -> Entry:
-        if own is not None and _is_vendors(variable, own):
-            own = None
+        if own is not None and _VENDORS[0] <= variable.index <= _VENDORS[1]:
+            own = own if own.data_type == variable.data_type else None  # else the same index by chance
         entry = Entry(variable, own)
         if own is not None and (entry.codec is None) != (own.data_type not in NUMBERS):
             raise InputError(
@@ -297,16 +302,5 @@ class Dictionary:
                 entry.value = entry.default
 
 
-def _is_vendors(variable: ODVariable, own: ODVariable) -> bool:
-    """Returns True for a manufacturer-specific object that has the same index by chance, but a different
-    type.
-    """
-    return _VENDORS[0] <= variable.index <= _VENDORS[1] and variable.data_type != own.data_type
-
-
 def _variables(od: ObjectDictionary) -> dict[tuple[int, int], ODVariable]:
-    found = {}
-    for item in od.values():
-        for each in [item] if isinstance(item, ODVariable) else item.subindices.values():
-            found[each.index, each.subindex] = each
-    return found
+    return {(each.index, each.subindex): each for each in variables(od)}

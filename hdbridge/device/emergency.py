@@ -6,11 +6,13 @@ from enum import IntEnum
 from functools import partial
 from typing import Final
 
-from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError, only
+from hdbridge.device.dictionary import Dictionary, only, refusing
 
 HISTORY_DEPTH: Final = 8
 _FRAME: Final = struct.Struct("<HB5s")
 _DISABLED: Final = 1 << 31
+_REGISTER_BITS: Final = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x8: 0x10, 0xF: 0x80}
+"""Bits of 1001h by the leading digit of an error code."""
 
 
 class ErrorCode(IntEnum):
@@ -35,7 +37,9 @@ class Emergency:
         self.active: list[int] = []
         """Codes of the errors that are still active, oldest first."""
         dictionary[0x1001, 0].bind(self._register)
-        dictionary[0x1014, 0].guard = self._check_can_id
+        dictionary[0x1014, 0].guard = refusing(
+            lambda value: not 0x81 <= value & 0x7FF <= 0xFF or value & 0x7FFFF800
+        )
         dictionary[0x1003, 0].guard = only(0)
         dictionary[0x1003, 0].bind(lambda: len(self._history))
         dictionary[0x1003, 0].follower = lambda _: self._history.clear()
@@ -81,25 +85,5 @@ class Emergency:
         """Returns object 1001h: bit 0 for any error, bits 1 to 7 by the class of the code."""
         register = 0
         for code in self.active:
-            register |= 1 | _register_bit(code)
+            register |= 1 | (0x20 if code >> 8 == 0x86 else _REGISTER_BITS.get(code >> 12, 0))
         return register
-
-    @staticmethod
-    def _check_can_id(value: int) -> None:
-        if not 0x81 <= value & 0x7FF <= 0xFF or value & 0x7FFFF800:
-            raise SdoAbortError(Abort.RANGE)
-
-
-def _register_bit(code: int) -> int:
-    for high_byte, bit in (
-        (0x86, 0x20),
-        (0x20, 0x02),
-        (0x30, 0x04),
-        (0x40, 0x08),
-        (0x80, 0x10),
-        (0xF0, 0x80),
-    ):
-        mask = 0xFF00 if high_byte == 0x86 else 0xF000
-        if code & mask == high_byte << 8:
-            return bit
-    return 0

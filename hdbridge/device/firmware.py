@@ -8,7 +8,7 @@ from typing import Final
 
 from hdbridge.cia301 import wrap_int32
 from hdbridge.device.behaviour import Behaviour, Controlword
-from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError, only
+from hdbridge.device.dictionary import Abort, Dictionary, only, refusing
 from hdbridge.device.emergency import Emergency, ErrorCode
 from hdbridge.device.faults import Faults
 from hdbridge.device.modes import (
@@ -138,10 +138,10 @@ class Firmware:
         entry[0x6040, 0].follower = self.control
         entry[0x6072, 0].follower = self._limit_torque
         entry[0x6086, 0].guard = only(0)  # trapezoidal profiles
-        entry[0x6060, 0].guard = self._check_mode
+        entry[0x6060, 0].guard = refusing(self._lacks_mode)
         entry[0x6060, 0].follower = self._change_mode
         for index, sub in ((0x60C2, 1), (0x60C2, 2), (0x607E, 0)):
-            entry[index, sub].guard = self._refuse_while_powered
+            entry[index, sub].guard = refusing(lambda _: self.state in POWERED, Abort.STATE)
 
     def _limit_torque(self, permille: int) -> None:
         self.motion.machine.torque_limit_permille = permille
@@ -177,14 +177,9 @@ class Firmware:
                 self._old_statusword, self._old_mode = self._statusword(), self._mode.number
             self._old_status_s = self._status_delay_s
 
-    def _check_mode(self, mode: int) -> None:
+    def _lacks_mode(self, mode: int) -> bool:
         has = self._dictionary.value(0x6502)
-        if mode not in self._modes or (mode and has and not has >> mode - 1 & 1):
-            raise SdoAbortError(Abort.RANGE)
-
-    def _refuse_while_powered(self, _: int) -> None:
-        if self.state in POWERED:
-            raise SdoAbortError(Abort.STATE)
+        return mode not in self._modes or bool(mode and has and not has >> mode - 1 & 1)
 
     def _change_mode(self, number: int) -> None:
         if self._mode.number == number:

@@ -8,7 +8,7 @@ import math
 from typing import ClassVar, Final
 
 from hdbridge.cia301 import wrap_int32
-from hdbridge.device.dictionary import only
+from hdbridge.device.dictionary import Entry, only
 from hdbridge.device.motion import Motion
 from hdbridge.device.powerstate import Control, Status
 from hdbridge.device.profile import Profile, move
@@ -62,18 +62,13 @@ class CyclicSynchronousPosition(Mode):
 
     def __init__(self, motion: Motion) -> None:
         super().__init__(motion)
-        self._target = motion.dictionary[0x607A, 0]
-        self._offset = motion.dictionary[0x60B0, 0]
-
-    def _aim(self) -> int:
-        """Returns the user position to be reached at the end of the next period."""
-        target: int = self._target.value + self._offset.value
-        return target
+        self._aims: tuple[Entry, ...] = (motion.dictionary[0x607A, 0], motion.dictionary[0x60B0, 0])
+        """Objects whose sum is the user position to be reached at the end of the next period."""
 
     def step(self, period_s: float) -> tuple[float, float]:
         motion = self.motion
         motion.limited = False
-        goal = motion.goal(self._aim())
+        goal = motion.goal(sum([each.value for each in self._aims]))
         step = goal - motion.demand_counts
         longest = motion.max_speed_counts_s * period_s
         if abs(step) > longest:
@@ -93,13 +88,9 @@ class InterpolatedPosition(CyclicSynchronousPosition):
 
     def __init__(self, motion: Motion) -> None:
         super().__init__(motion)
-        self._data = motion.dictionary[0x60C1, 1]
+        self._aims = (motion.dictionary[0x60C1, 1],)
         self._active = False
         motion.dictionary[0x60C0, 0].guard = only(0)  # linear interpolation
-
-    def _aim(self) -> int:
-        data: int = self._data.value
-        return data
 
     def enter(self) -> None:
         self._active = False

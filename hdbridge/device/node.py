@@ -18,7 +18,7 @@ from hdbridge.canframe import DataFrame
 from hdbridge.cia301 import NmtCommand, NmtState
 from hdbridge.clock import Clock
 from hdbridge.device.behaviour import Behaviour, HeartbeatConsumer
-from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError, only
+from hdbridge.device.dictionary import Dictionary, only, refusing
 from hdbridge.device.emergency import Emergency, ErrorCode
 from hdbridge.device.faults import Faults, Outgoing
 from hdbridge.device.firmware import Firmware
@@ -85,7 +85,8 @@ class DriveNode:
         """Start of the current period of the axis, on the node's clock."""
         self.dictionary = Dictionary(Path(eds_path), node_id)
         self._clock = clock
-        self._now_s = clock.now()
+        self.now_s = clock.now()
+        """Time of reception of the frame, or of the event, that is being processed; on the node's clock."""
         self._assemble(machine, nameplate or Nameplate(), stage, store)
         self._begin()
 
@@ -106,10 +107,11 @@ class DriveNode:
         holds, receiving = self.behaviour.holds_rpdo, self._pdos(0x1400)
         self._rpdos = [ReceivePdo(self.dictionary, number, self._route, holds=holds) for number in receiving]
         entry = self.dictionary
-        entry[0x1005, 0].guard = _check_sync_id
+        # Bit 30 would make the node a SYNC producer.
+        entry[0x1005, 0].guard = refusing(lambda value: value & ~0x7FF or not value & 0x7FF)
         entry[0x1005, 0].follower = lambda _: self._route()
         entry[0x1019, 0].guard = only(0, *range(2, 241))
-        entry[0x1016, 1].guard = _check_consumer
+        entry[0x1016, 1].guard = refusing(lambda value: value >> 23)
         entry[0x1016, 1].follower = lambda _: self._change_watch()
         entry[0x1017, 0].follower = lambda _: self._start_heartbeat()
         for index in (0x100C, 0x100D):
@@ -127,9 +129,9 @@ class DriveNode:
         """Initialises the communication from the dictionary, before the boot-up message."""
         self.nmt = NmtState.INITIALISING
         self._sdo.reset()
-        self._sdo_from_s = self._now_s + self.behaviour.sdo_delay_s
+        self._sdo_from_s = self.now_s + self.behaviour.sdo_delay_s
         self._take_period()
-        self._run_due_s = self._now_s + self._period_s
+        self._run_due_s = self.now_s + self.period_s
         for pdo in (*self._tpdos, *self._rpdos):
             pdo.compile()
         self._watch_heartbeat()
@@ -137,7 +139,7 @@ class DriveNode:
         self._stop_guarding()
         self._route()
         self._start_heartbeat()
-        self._due_s = self._now_s
+        self._due_s = self.now_s
 
     @property
     def node_id(self) -> int:
@@ -151,24 +153,20 @@ class DriveNode:
         self._enter(NmtState.PRE_OPERATIONAL)
 
     def _take_period(self) -> None:
-        self._period_s = self._own_period_s()
+        self.period_s = self._own_period_s()
+        """Period of 60C2h, or of SYNC if the drive measures it."""
         self._measures_period = (
             self.dictionary.value(0x60C2, 1) == 0
             or (0x60C2, 1) not in self.dictionary
             or self.behaviour.measures_period
         )
-        self._sync = SyncClock(self._period_s)
+        self._sync = SyncClock(self.period_s)
         self._sync_due_s = _NEVER
 
     def _own_period_s(self) -> float:
         """Returns the period in 60C2h; s."""
         value = self.dictionary.value
         return (value(0x60C2, 1) or 1) / 10.0 ** -value(0x60C2, 2)
-
-    @property
-    def now_s(self) -> float:
-        """Time of reception of the frame, or of the event, that is being processed; on the node's clock."""
-        return self._now_s
 
     @property
     def has_sync(self) -> bool:
@@ -178,12 +176,7 @@ class DriveNode:
     def sync_is_late(self, now_s: float) -> bool:
         """Returns True if SYNC is so late that the node runs on its own clock."""
         left = self.behaviour.sync_timeout_periods - 0.5
-        return self._sync_due_s - left * self._period_s <= now_s
-
-    @property
-    def period_s(self) -> float:
-        """Period of 60C2h, or of SYNC if the drive measures it."""
-        return self._period_s
+        return self._sync_due_s - left * self.period_s <= now_s
 
     @property
     def jitter_s(self) -> float:
@@ -220,8 +213,8 @@ class DriveNode:
 
     def _start_heartbeat(self) -> None:
         self._heartbeat_s = self.dictionary.value(0x1017) * 1e-3
-        self._heartbeat_due_s = self._now_s + self._heartbeat_s if self._heartbeat_s else _NEVER
-        self._due_s = self._now_s
+        self._heartbeat_due_s = self.now_s + self._heartbeat_s if self._heartbeat_s else _NEVER
+        self._due_s = self.now_s
 
     def _route(self) -> None:
         """Assigns frames and SYNC to the active PDOs."""
@@ -233,7 +226,7 @@ class DriveNode:
         self._sync_rpdos = [pdo for pdo in rpdos if pdo.is_synchronous]
         self._rpdo_by_id = {pdo.can_id: pdo for pdo in rpdos}
         self._rpdo_due_s = _NEVER
-        self._due_s = self._now_s
+        self._due_s = self.now_s
         self._listen()
 
     def _listen(self) -> None:
@@ -253,7 +246,7 @@ class DriveNode:
 
     def poll(self, now_s: float) -> None:
         """Receives and answers the waiting frames, and runs all events due until ``now_s``."""
-        self._now_s = now_s
+        self.now_s = now_s
         if self.nmt is _INITIALISING:
             self._boot()
         receive, now = self.bus.recv, self._clock.now
@@ -268,7 +261,7 @@ class DriveNode:
 
     def run_until(self, now_s: float) -> None:
         """Runs all events due until ``now_s`` without reading the bus, as the last step of ``poll``."""
-        self._now_s = now_s
+        self.now_s = now_s
         if self.nmt is _INITIALISING:
             self._boot()
         if self.faults.pending:
@@ -282,11 +275,11 @@ class DriveNode:
 
     def next_event_s(self) -> float:
         """Returns the time by which ``poll`` must be called, on the clock's scale."""
-        return self._now_s if self.faults.pending else self._due_s
+        return self.now_s if self.faults.pending else self._due_s
 
     def handle(self, message: can.Message, now_s: float) -> None:
         """Processes a frame received at ``now_s``; ignores all but data frames with 11-bit identifiers."""
-        self._now_s = now_s
+        self.now_s = now_s
         take = self._takers.get(message.arbitration_id)
         if take is None and message.is_remote_frame and message.arbitration_id == _HEARTBEAT + self.node_id:
             self._on_guarding(now_s)
@@ -316,7 +309,7 @@ class DriveNode:
         if self._measures_period:
             # A drive without object 60C2h, or with 0 in it, takes its period from SYNC.
             self._sync.take(now_s)
-            begins_s, self._period_s = self._sync.time_s, self._sync.period_s
+            begins_s, self.period_s = self._sync.time_s, self._sync.period_s
         if self.behaviour.rpdo_before_tpdo:
             self._apply_rpdos()
         tpdos: list[Outgoing] = []
@@ -333,9 +326,9 @@ class DriveNode:
         self._apply_rpdos()
         self.period_begins_s = begins_s
         self._advance()
-        self._run_due_s = now_s + 1.5 * self._period_s
+        self._run_due_s = now_s + 1.5 * self.period_s
         if self.behaviour.sync_timeout_periods:
-            self._sync_due_s = now_s + (1.0 + self.behaviour.sync_timeout_periods) * self._period_s
+            self._sync_due_s = now_s + (1.0 + self.behaviour.sync_timeout_periods) * self.period_s
             self.emergency.clear(ErrorCode.SYNC_LOST)
         self._due_s = self._next_due_s()
 
@@ -455,7 +448,7 @@ class DriveNode:
         motion, faults = self.firmware.motion, self.faults
         motion.load_jump_counts, motion.load_reading = faults.load_jump_counts, faults.load_reading
         motion.motor_jump_counts = faults.motor_jump_counts
-        self.firmware.advance(self._period_s)
+        self.firmware.advance(self.period_s)
 
     def _next_due_s(self) -> float:
         due_s = min(
@@ -463,14 +456,14 @@ class DriveNode:
             self._rpdo_due_s, self._sync_due_s,
         )  # fmt: skip
         for tpdo in self._event_tpdos:
-            due_s = min(due_s, tpdo.due_s(self._now_s))
+            due_s = min(due_s, tpdo.due_s(self.now_s))
         return due_s
 
     def _do_what_is_due(self, now_s: float) -> None:
         self._run_due_s = max(self._run_due_s, now_s - LONGEST_CATCH_UP_S)
         while self._run_due_s <= now_s:
             self.period_begins_s = self._run_due_s
-            self._run_due_s += self._period_s
+            self._run_due_s += self.period_s
             self._advance()
         if self._sync_due_s <= now_s:
             self._lose_sync()
@@ -516,7 +509,7 @@ class DriveNode:
         its own clock.
         """
         self._sync_due_s = _NEVER
-        self._period_s = self._own_period_s()
+        self.period_s = self._own_period_s()
         for rpdo in self._sync_rpdos:
             rpdo.pending = None
         if self.firmware.follows_the_bus:
@@ -539,13 +532,3 @@ class DriveNode:
         if self.firmware.follows_the_bus and watches:
             self.emergency.occur(ErrorCode.RPDO_TIMEOUT)
             self.firmware.connection_lost(ErrorCode.RPDO_TIMEOUT)
-
-
-def _check_sync_id(value: int) -> None:
-    if value & ~0x7FF or not value & 0x7FF:  # bit 30 would make the node a SYNC producer
-        raise SdoAbortError(Abort.RANGE)
-
-
-def _check_consumer(value: int) -> None:
-    if value >> 23:
-        raise SdoAbortError(Abort.RANGE)

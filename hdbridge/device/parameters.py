@@ -25,7 +25,7 @@ class StoredParameters:
         """``may_store`` returns True while the device may pause to store."""
         self._dictionary, self._file = dictionary, file
         self._stored: dict[tuple[int, int], int] = self._read()
-        for index, signature, act in ((0x1010, SAVE, self._save), (0x1011, LOAD, self._forget)):
+        for index, signature, act in ((0x1010, SAVE, self._save), (0x1011, LOAD, lambda: self._keep({}))):
             entry = dictionary[index, 1]
             if not entry.is_known:
                 continue
@@ -56,9 +56,6 @@ class StoredParameters:
         self._keep(
             {(each.index, each.sub): each.value for each in self._parameters() if each.value != each.default}
         )
-
-    def _forget(self) -> None:
-        self._keep({})
 
     def _keep(self, values: dict[tuple[int, int], int]) -> None:
         if self._file is not None:

@@ -11,7 +11,7 @@ from typing import Final
 
 from canopen.objectdictionary import ODVariable
 
-from hdbridge.device.dictionary import Abort, Dictionary, Entry, SdoAbortError
+from hdbridge.device.dictionary import Abort, Dictionary, Entry, SdoAbortError, refusing
 
 INVALID: Final = 1 << 31
 EXTENDED: Final = 1 << 29
@@ -52,7 +52,7 @@ class Pdo:
     def _install(self) -> None:
         guards: dict[int, Callable[[int], None] | None] = {
             1: self._check_can_id,
-            2: _check_type,
+            2: refusing(lambda value: value > SYNC_LAST and value not in EVENT_DRIVEN),
             3: partial(self._check_fixed, 3),
             5: None,
             6: partial(self._check_fixed, 6),
@@ -122,13 +122,10 @@ class Pdo:
         return entry
 
     def _check_can_id(self, value: int) -> None:
-        if self.valid and not value & INVALID and (value & ~INVALID) != self._communication_id():
+        if self.valid and not value & INVALID and (value & ~INVALID) != self._parameter(1) & ~INVALID:
             raise SdoAbortError(Abort.STATE)  # CiA 301: bits 0 to 29 are fixed while the PDO exists
         if value & EXTENDED or not (value & INVALID or 0x181 <= value & 0x7FF <= 0x57F):
             raise SdoAbortError(Abort.RANGE)
-
-    def _communication_id(self) -> int:
-        return self._dictionary.value(self._communication, 1) & ~INVALID
 
     def _check_fixed(self, sub: int, value: int) -> None:
         """Refuses a different value while the PDO exists; the current value is accepted, because some masters
@@ -281,8 +278,3 @@ def _packer(codec: struct.Struct, readers: Sequence[Callable[[], int]]) -> Calla
         f"lambda: pack({', '.join(f'{name}()' for name in called)})", {"pack": codec.pack, **called}
     )
     return pack
-
-
-def _check_type(value: int) -> None:
-    if value > SYNC_LAST and value not in EVENT_DRIVEN:
-        raise SdoAbortError(Abort.RANGE)

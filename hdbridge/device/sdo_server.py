@@ -128,12 +128,7 @@ class SdoServer:
             size = 4 - (command >> 2 & 3) if sized else own_size
             entry.write(data[:size])
         else:
-            self._expected_size = struct.unpack("<I", data)[0] if sized else None
-            if self._expected_size is not None:
-                entry.check_length(self._expected_size)
-            elif not entry.writable:
-                raise SdoAbortError(Abort.READ_ONLY)
-            self._begin(entry, uploading=False)
+            self._begin_download(entry, struct.unpack("<I", data)[0] if sized else None)
         return _HEAD.pack(0x60, *self._object) + bytes(4)
 
     def _download_segment(self, command: int, request: bytes) -> bytes:
@@ -158,12 +153,7 @@ class SdoServer:
         if command & 1:
             raise SdoAbortError(Abort.COMMAND)
         entry = self._open(request)
-        self._expected_size = struct.unpack_from("<I", request, 4)[0] if command & 2 else None
-        if self._expected_size is not None:
-            entry.check_length(self._expected_size)
-        elif not entry.writable:
-            raise SdoAbortError(Abort.READ_ONLY)
-        self._begin(entry, uploading=False)
+        self._begin_download(entry, struct.unpack_from("<I", request, 4)[0] if command & 2 else None)
         self._checks_crc = bool(command & 4)
         self._sequence, self._block = 0, _Block.SEGMENTS_IN
         return _HEAD.pack(0xA4, *self._object) + bytes((_MOST_SEGMENTS, 0, 0, 0))
@@ -213,18 +203,17 @@ class SdoServer:
         raise SdoAbortError(Abort.COMMAND)
 
     def _begin_block_upload(self, entry: Entry, block_size: int) -> bytes:
-        self._block_size = self._checked_size(block_size)
+        self._take_block_size(block_size)
         data = entry.read()
         self._begin(entry, uploading=True)
         self._buffer, self._sent = data, 0
         self._block = _Block.START_OUT
         return _HEAD.pack(0xC6, *self._object) + struct.pack("<I", len(data))
 
-    @staticmethod
-    def _checked_size(size: int) -> int:
+    def _take_block_size(self, size: int) -> None:
         if not 1 <= size <= _MOST_SEGMENTS:
             raise SdoAbortError(Abort.BLOCK_SIZE)
-        return size
+        self._block_size = size
 
     def _segments(self) -> list[bytes]:
         """Returns the segments of one block, starting at ``_sent``."""
@@ -239,7 +228,7 @@ class SdoServer:
         return frames
 
     def _acknowledged(self, number: int, block_size: int) -> list[bytes]:
-        self._block_size = self._checked_size(block_size)
+        self._take_block_size(block_size)
         if number > self._sequence:
             raise SdoAbortError(Abort.SEQUENCE)
         self._sent += 7 * number
@@ -249,6 +238,14 @@ class SdoServer:
         self._block = _Block.END_OUT
         empty = self._sent - len(data)
         return [struct.pack("<BH5x", 0xC1 | empty << 2, crc_hqx(data, 0))]
+
+    def _begin_download(self, entry: Entry, size: int | None) -> None:
+        self._expected_size = size
+        if size is not None:
+            entry.check_length(size)
+        elif not entry.writable:
+            raise SdoAbortError(Abort.READ_ONLY)
+        self._begin(entry, uploading=False)
 
     def _begin(self, entry: Entry, *, uploading: bool) -> None:
         self._entry, self._uploading, self._buffer, self._toggle = entry, uploading, b"", 0

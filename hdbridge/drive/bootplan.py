@@ -7,11 +7,11 @@ from canopen.objectdictionary import ObjectDictionary
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
-from hdbridge.drive.dictionary import dictionary_of, find, held, integer_type
+from hdbridge.drive.dictionary import dictionary_of, find, held, integer_type, permitted
 from hdbridge.drive.layout import cyclic_mode, layouts
 from hdbridge.drive.nameplate import mode_advice
 from hdbridge.drive.objects import Mode
-from hdbridge.drive.writes import PlannedWrite, permitted, rows
+from hdbridge.drive.writes import PlannedWrite, rows
 from hdbridge.errors import InputError
 
 

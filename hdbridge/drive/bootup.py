@@ -7,6 +7,7 @@ unless the object may be left to the drive.
 
 import logging
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Final
@@ -29,7 +30,7 @@ from hdbridge.drive.nameplate import (
     scaling_complaints,
     torque_notes,
 )
-from hdbridge.drive.objects import Address, Mode
+from hdbridge.drive.objects import Mode
 from hdbridge.drive.sdo import SdoAbortError, SdoClient
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.writes import PlannedWrite
@@ -135,7 +136,7 @@ class BootUp:
         return BootReport(
             node_id=self._axis.drive.node_id,
             identity=identity,
-            names=self._names(),
+            names=read_names(self._sdo),
             modes=modes,
             state=decode(self._sdo.fetch(objects.STATUSWORD)),
             held=tuple(self._held),
@@ -196,19 +197,11 @@ class BootUp:
         if first := next(iter(complaints), ""):
             raise IdentityError(first)
 
-    def _readings(self, addresses: Iterable[Address]) -> dict[Address, int]:
-        """Reads the objects, except those that the EDS lacks."""
-        return {each: self._sdo.fetch(each) for each in addresses if self._sdo.has(each.index, each.sub)}
-
     def _check_device_type(self) -> None:
         self._refuse(device_type_complaints(self._axis, self._sdo.fetch(objects.DEVICE_TYPE)))
 
     def _check_identity(self) -> dict[str, int]:
-        found: dict[str, int] = {}
-        for address, name in IDENTITY:
-            wanted = getattr(self._axis.drive.identity, name)
-            if wanted is not None or self._sdo.has(address.index, address.sub):
-                found[name] = self._sdo.fetch(address)
+        found = read_identity(self._axis, self._sdo)
         self._refuse(identity_complaints(self._axis, found))
         return found
 
@@ -221,19 +214,9 @@ class BootUp:
 
     def _check_scaling(self) -> None:
         """Compares counts per motor turn, from every object that defines them, with the axis file."""
-        self._refuse(scaling_complaints(self._axis, self._readings(scaling_addresses(self._axis))))
-        rated = self._readings((objects.RATED_TORQUE,))
+        self._refuse(scaling_complaints(self._axis, self._sdo.fetch_listed(scaling_addresses(self._axis))))
+        rated = self._sdo.fetch_listed((objects.RATED_TORQUE,))
         self._notes += torque_notes(self._axis, rated.get(objects.RATED_TORQUE))
-
-    def _names(self) -> dict[str, str]:
-        names = {}
-        for index, key in ((0x1008, "device"), (0x1009, "hardware"), (0x100A, "software")):
-            if self._sdo.has(index):
-                try:
-                    names[key] = self._sdo.read_text(index)
-                except SdoError:
-                    continue  # names are for display only
-        return names
 
     # -- configuration ------------------------------------------------------------------------------------
 
@@ -248,16 +231,13 @@ class BootUp:
         while state not in off:
             if self._link.now() >= deadline_s:
                 raise DriveError(
-                    f"{self._name(objects.STATUSWORD)}: the drive stays in '{state.value}' after 'disable "
+                    f"{self._sdo.describe(0x6041, 0)}: the drive stays in '{state.value}' after 'disable "
                     "voltage'; switch it off by its enable input and look at its error display"
                 )
-            self._pause(_POLL_S)
+            again_s = self._link.now() + _POLL_S
+            while self._receive_until(again_s):
+                pass
             state = decode(self._sdo.fetch(objects.STATUSWORD))
-
-    def _pause(self, duration_s: float) -> None:
-        deadline_s = self._link.now() + duration_s
-        while self._receive_until(deadline_s):
-            pass
 
     def _configure(self, rows: list[PlannedWrite]) -> None:
         """Configures a PDO unless it is already configured as planned, because a correct configuration may be
@@ -349,8 +329,26 @@ class BootUp:
     def _decides(self, row: PlannedWrite) -> str:
         return f"; {self._axis.where(row.field)} decides it" if row.field else ""
 
-    def _name(self, address: Address) -> str:
-        return self._sdo.describe(address.index, address.sub)
+
+def read_identity(axis: AxisConfig, sdo: SdoClient) -> dict[str, int]:
+    """Reads the identity objects that the EDS lists or the axis file states, by the keys of
+    ``drive.identity``.
+    """
+    return {
+        name: sdo.fetch(address)
+        for address, name in IDENTITY
+        if sdo.has(address.index, address.sub) or getattr(axis.drive.identity, name) is not None
+    }
+
+
+def read_names(sdo: SdoClient) -> dict[str, str]:
+    """Reads device name and versions, for display; omits those that the EDS or the node lacks."""
+    names = {}
+    for index, key in ((0x1008, "device"), (0x1009, "hardware"), (0x100A, "software")):
+        if sdo.has(index) or not sdo.od:
+            with suppress(SdoError):
+                names[key] = sdo.read_text(index)
+    return names
 
 
 def _maps(row: PlannedWrite) -> bool:

@@ -20,25 +20,9 @@ from hdbridge.errors import InputError
 
 MAXIMUM_LOAD: Final = 0.8
 """Maximum fraction of the cycle time occupied by frames. The rest is for retransmissions and other nodes."""
-_STUFFED: Final = 34
-_UNSTUFFED: Final = 13
-_LARGEST: Final = 8
-_SDO_BYTES: Final = 8
-_HEARTBEAT_BYTES: Final = 1
-
-
-def frame_bits(data_bytes: int) -> int:
-    """Returns the maximum length of a data frame with an 11-bit identifier, interframe space
-    included; bits.
-    """
-    if not 0 <= data_bytes <= _LARGEST:
-        raise InputError(f"a CAN frame has 0 to {_LARGEST} data bytes, not {data_bytes}")
-    stuffed = _STUFFED + 8 * data_bytes
-    return stuffed + _UNSTUFFED + (stuffed - 1) // 4
-
-
-FRAME_BITS: Final = tuple(frame_bits(length) for length in range(_LARGEST + 1))
-"""`frame_bits` indexed by the number of data bytes."""
+FRAME_BITS: Final = tuple(bits + 13 + (bits - 1) // 4 for bits in range(34, 34 + 8 * 8 + 1, 8))
+"""Maximum length of a data frame with an 11-bit identifier, interframe space included, by its number of data
+bytes; bits."""
 
 
 def cycle_bits(axes: Sequence[AxisConfig]) -> float:
@@ -47,12 +31,12 @@ def cycle_bits(axes: Sequence[AxisConfig]) -> float:
     Counts SYNC, the TPDOs and RPDOs of each axis, the optional channels at their rates, the heartbeats of the
     nodes and of the master, and one SDO request with its answer.
     """
-    bits = float(frame_bits(0) + 2 * frame_bits(_SDO_BYTES))
-    heartbeat = frame_bits(_HEARTBEAT_BYTES)
+    bits = float(FRAME_BITS[0] + 2 * FRAME_BITS[8])
+    heartbeat = FRAME_BITS[1]
     for axis in axes:
         pdos = layouts(axis)
         every = (*pdos.cyclic, *pdos.channels, *pdos.rpdos)
-        bits += sum(frame_bits(layout.codec.length) / layout.every for layout in every)
+        bits += sum(FRAME_BITS[layout.codec.length] / layout.every for layout in every)
         nodes = len({layout.node_id for layout in every})
         bits += nodes * heartbeat * axis.drive.cycle_ms / axis.drive.heartbeat_ms
     if axes:
@@ -98,11 +82,10 @@ def check_bus_load(axes: Sequence[AxisConfig], bitrate_bps: int | None = None) -
 
 def _load_at(axes: Sequence[AxisConfig], rate: int, cycle_s: float) -> float:
     """Returns the bus load of the axes at a given bit rate and cycle time."""
-    return cycle_bits([_with_cycle(axis, 1e3 * cycle_s) for axis in axes]) / (rate * cycle_s)
-
-
-def _with_cycle(axis: AxisConfig, cycle_ms: float) -> AxisConfig:
-    return axis.model_copy(update={"drive": axis.drive.model_copy(update={"cycle_ms": cycle_ms})})
+    given = {"cycle_ms": 1e3 * cycle_s}
+    drives = [axis.drive.model_copy(update=given) for axis in axes]
+    changed = [axis.model_copy(update={"drive": each}) for axis, each in zip(axes, drives, strict=True)]
+    return cycle_bits(changed) / (rate * cycle_s)
 
 
 def _common_cycle_s(axes: Sequence[AxisConfig]) -> float:

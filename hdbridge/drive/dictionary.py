@@ -48,3 +48,10 @@ def held(variable: ODVariable) -> int | None:
     """Returns the object's value in the EDS: its value in a DCF, else its default, else None."""
     value = variable.value if variable.value is not None else variable.default
     return value if isinstance(value, int) else None
+
+
+def permitted(variable: ODVariable, kind: IntegerType) -> tuple[int, int]:
+    """Returns the least and the greatest value of an object, by its type and its limits in the EDS."""
+    low = kind.minimum if variable.min is None else max(kind.minimum, variable.min)
+    high = kind.maximum if variable.max is None else min(kind.maximum, variable.max)
+    return low, high

@@ -415,6 +415,3 @@ class Drive:
                 f"({self.axis.where('limits.position_min_deg')}, position_max_deg); home it, or "
                 "turn it back by hand"
             )
-
-
-__all__ = ["BootReport", "Drive", "Positions", "ProcessImage"]

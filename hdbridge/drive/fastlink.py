@@ -45,8 +45,8 @@ class _MessageLink(Link):
     """Link that sends messages that are cheap to copy."""
 
     def send(self, can_id: int, data: bytes) -> None:
-        if self._down is not None:
-            raise BusError(self._down)
+        if self.down is not None:
+            raise BusError(self.down)
         try:
             self._send(DataFrame(can_id, data, self.mark))
         except (can.CanError, OSError) as error:
@@ -64,8 +64,8 @@ class _SocketLink(Link):
         self._sockets = [sock]
 
     def send(self, can_id: int, data: bytes) -> None:
-        if self._down is not None:
-            raise BusError(self._down)
+        if self.down is not None:
+            raise BusError(self.down)
         try:
             self._give(_FRAME.pack(can_id, len(data), data), _DONTWAIT)
         except BlockingIOError as error:
@@ -77,8 +77,8 @@ class _SocketLink(Link):
             raise self._failure("send", error) from error
 
     def recv(self, deadline_s: float) -> Frame | None:
-        if self._down is not None:
-            raise BusError(self._down)
+        if self.down is not None:
+            raise BusError(self.down)
         while True:
             try:
                 # A frame is usually waiting, and then this is the only system call.

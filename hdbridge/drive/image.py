@@ -75,7 +75,6 @@ class ProcessImage:
         self.cyclic = cyclic_mode(axis)
         self._enabling = self.cyclic.enabling
         self.tpdos, self.channel_tpdos, self.rpdos, absent = pdos or layouts(axis, od)
-        self.sync_id: int = objects.COB_SYNC
         self.heartbeat_id: int = objects.COB_HEARTBEAT + axis.drive.master_node_id
         """Identifier of the master's own heartbeat; its data is one byte 05h."""
         self.heartbeat_period_s: float = axis.drive.heartbeat_ms / 1000.0 / HEARTBEATS_PER_TIMEOUT
@@ -88,7 +87,11 @@ class ProcessImage:
         self.halt = False
         """True sets the halt bit of the controlword."""
 
-        self._motor, self._load = axis.motor_encoder.scale, axis.load_encoder.scale
+        self._motor = axis.motor_encoder.scale
+        self.motor_deg: Callable[[float], float] = self._motor.degrees
+        """Converts motor counts to the motor angle in degrees, with the encoder's direction."""
+        self.load_deg: Callable[[float], float] = axis.load_encoder.scale.degrees
+        """Converts load counts to the load angle in degrees, with the encoder's direction."""
         self.channels = tuple(
             ChannelFollower(key, channel, axis.drive.cycle_ms) for key, channel in axis.channels.items()
         )
@@ -213,12 +216,9 @@ class ProcessImage:
         return [
             layout.can_id
             for layout in self.channel_tpdos
-            if layout.every == 1 and not all(each.lost for each in self._followers_in(layout))
+            if layout.every == 1
+            and any(not each.lost for key, each in self._followers.items() if key in layout.codec.positions)
         ]
-
-    def _followers_in(self, layout: Layout) -> list[ChannelFollower]:
-        keys = [(entry.index, entry.sub) for entry in layout.codec.entries]
-        return [self._followers[key] for key in keys if key in self._followers]
 
     def step_channels(self) -> list[tuple[Fault, str]]:
         """Ends a cycle for the channels: updates ``readings`` and returns the channels' faults."""
@@ -329,14 +329,6 @@ class ProcessImage:
         self.load_counts = load_counts
         self.statusword = statusword
         self.power.observe(statusword)
-
-    def motor_deg(self, counts: float) -> float:
-        """Converts motor counts to the motor angle in degrees, with the encoder's direction."""
-        return self._motor.degrees(counts)
-
-    def load_deg(self, counts: float) -> float:
-        """Converts load counts to the load angle in degrees, with the encoder's direction."""
-        return self._load.degrees(counts)
 
     def target_counts_for(self, motor_deg: float) -> int:
         """Returns the nearest motor counts to a motor angle in degrees.

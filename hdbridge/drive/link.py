@@ -93,7 +93,8 @@ class Link:
         self.dropped = Dropped()
         self.private: bool = getattr(bus, "private", False)
         """True if the bus declares that only the drive and this link can be on it."""
-        self._down: str | None = None
+        self.down: str | None = None
+        """Reason for the permanent loss of the interface, or None."""
         self.mark = _mark(bus)
         """Channel name of own frames on a back end that echoes them, else None."""
         self._send = bus.send
@@ -105,19 +106,14 @@ class Link:
         self._recv = bus.recv
         self._matches = bus._matches_filters
 
-    @property
-    def down(self) -> str | None:
-        """Reason for the permanent loss of the interface, or None."""
-        return self._down
-
     def send(self, can_id: int, data: bytes) -> None:
         """Sends a data frame with an 11-bit identifier; returns when the interface has accepted it.
 
         Raises `TransmitBufferFull` if the frame was dropped because the queue is full, `BusError` if the
         interface failed.
         """
-        if self._down is not None:
-            raise BusError(self._down)
+        if self.down is not None:
+            raise BusError(self.down)
         try:
             self._send(can.Message(arbitration_id=can_id, is_extended_id=False, data=data, channel=self.mark))
         except (can.CanError, OSError) as error:
@@ -128,8 +124,8 @@ class Link:
 
         Raises `BusError` if the interface failed.
         """
-        if self._down is not None:
-            raise BusError(self._down)
+        if self.down is not None:
+            raise BusError(self.down)
         raw = self._raw_recv
         now = self.now
         while True:
@@ -171,10 +167,10 @@ class Link:
             self.dropped.error += 1
             if self.name.startswith("socketcan") and message.arbitration_id & _ERROR_FRAME_BUS_OFF:
                 # This frame is the only sign of bus-off, because sends still "succeed" and nothing arrives.
-                self._down = (
+                self.down = (
                     f"{self.name}: the CAN controller went bus-off; check wiring, bit rate and termination"
                 )
-                raise BusError(self._down)
+                raise BusError(self.down)
         elif message.is_remote_frame:
             self.dropped.remote += 1
         elif message.is_extended_id:
@@ -192,7 +188,7 @@ class Link:
             )
         message = f"{self.name}: cannot {doing}: {text}; check that the interface is up"
         if code in _GONE or "closed bus" in text.lower():
-            self._down = message
+            self.down = message
         return BusError(message)
 
 
@@ -249,12 +245,6 @@ def absent_interface(settings: BusConfig) -> str | None:
     return f"this computer has no network interface {channel!r}{hint}"
 
 
-def _lacking(interface: str) -> str | None:
-    """Returns the package required by a python-can interface; None if installed or unknown."""
-    module, package = _PACKAGES.get(interface, ("", ""))
-    return package if module and find_spec(module) is None else None
-
-
 @contextmanager
 def open_bus(settings: BusConfig, *, shared: bool = False) -> Iterator[can.BusABC]:
     """Opens the bus of an axis file; raises a one-line `BusError` on failure.
@@ -281,7 +271,8 @@ def _opened(settings: BusConfig) -> Iterator[can.BusABC]:
     try:
         bus = can.Bus(interface=settings.interface, channel=settings.channel, ignore_config=True, **options)
     except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as error:
-        if (package := _lacking(settings.interface)) is not None:
+        module, package = _PACKAGES.get(settings.interface, ("", ""))
+        if module and find_spec(module) is None:
             what = f"python-can needs the package {package} for it: python -m pip install {package}"
         else:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -50,7 +50,8 @@ class MasterDetector:
         sdo_servers: Container[int] = (),
     ) -> None:
         self._drives, self._masters, self._sdo_servers = drives, masters, sdo_servers
-        self._counts: Counter[int] = Counter()
+        self.counts: Counter[int] = Counter()
+        """Number of frames of another master by identifier."""
         self.nodes: set[int] = set()
         """Nodes whose heartbeat was heard."""
 
@@ -60,7 +61,7 @@ class MasterDetector:
         self._note(frame)
         if self._name(can_id) is None:
             return False
-        self._counts[can_id] += 1
+        self.counts[can_id] += 1
         return True
 
     def listen(self, link: Link, duration_s: float, then: Callable[[Frame], object] = lambda _: None) -> None:
@@ -85,11 +86,11 @@ class MasterDetector:
     def __str__(self) -> str:
         """For example ``26 SYNC (080h), 26 set-points of node 1 (201h)``; empty if nothing was heard."""
         return ", ".join(f"{count} {self._name(can_id)} ({can_id:03X}h)" for can_id, count in
-                         sorted(self._counts.items()))  # fmt: skip
+                         sorted(self.counts.items()))  # fmt: skip
 
     def raise_if_heard(self, bus: str, duration_s: float) -> None:
         """Raises `BusInUseError` if another master was heard."""
-        if self._counts:
+        if self.counts:
             raise BusInUseError(
                 f"{bus}: another master is on this bus: {self} in {duration_s:.2g} s; nothing was sent; "
                 "stop that master first (--force, in the library force=True, sends anyway)"

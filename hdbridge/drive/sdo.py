@@ -11,6 +11,7 @@ It must not be used in the control cycle.
 
 import logging
 import struct
+from collections.abc import Iterable
 from typing import Final
 
 from canopen.objectdictionary import ObjectDictionary
@@ -226,6 +227,10 @@ class SdoClient:
 
     def fetch(self, address: Address) -> int:
         return self.read(address.index, address.sub)
+
+    def fetch_listed(self, addresses: Iterable[Address]) -> dict[Address, int]:
+        """Reads the objects that the EDS lists."""
+        return {each: self.fetch(each) for each in addresses if self.has(each.index, each.sub)}
 
     def store(self, address: Address, value: int) -> None:
         self.write(address.index, address.sub, value)

@@ -199,8 +199,10 @@ class PowerWalk:
     """
 
     def __init__(self) -> None:
-        self._state = State.UNKNOWN
-        self._aim = State.SWITCH_ON_DISABLED
+        self.state = State.UNKNOWN
+        """State of the last statusword."""
+        self.aim = State.SWITCH_ON_DISABLED
+        """State to which the drive is to be taken."""
         self._reset = _NO_RESET
         self._was_enabled = False
         self.dropped: State | None = None
@@ -208,59 +210,44 @@ class PowerWalk:
 
         Kept until the next `go`, whatever the drive reports meanwhile."""
 
-    @property
-    def state(self) -> State:
-        """State of the last statusword."""
-        return self._state
-
-    @property
-    def aim(self) -> State:
-        """State to which the drive is to be taken."""
-        return self._aim
-
-    @property
-    def arrived(self) -> bool:
-        """True if the drive is in the target state."""
-        return self._state is self._aim
-
     def observe(self, statusword: int | None) -> State:
         """Takes a statusword and returns its state."""
         state = _DECODED[statusword & _STATE_BITS] if statusword is not None else State.UNKNOWN
-        self._state = state
+        self.state = state
         if state is _ENABLED:
             self._was_enabled = True
         elif self._was_enabled:
             self._was_enabled = False
-            if self._aim is State.OPERATION_ENABLED:
+            if self.aim is State.OPERATION_ENABLED:
                 # The drive dropped out on its own. It stays there until the next `go`.
                 self.dropped = state
                 blind = state in (State.QUICK_STOP_ACTIVE, State.UNKNOWN)
-                self._aim = State.QUICK_STOP_ACTIVE if blind else State.SWITCH_ON_DISABLED
+                self.aim = State.QUICK_STOP_ACTIVE if blind else State.SWITCH_ON_DISABLED
         if state is not _FAULT:
             self._reset = _NO_RESET
         return state
 
     def go(self, target: State) -> None:
         """Sets the target state; raises `TransitionError` if no path leads there from the current state."""
-        controlword_for(self._state, target)
-        self._aim = target
+        controlword_for(self.state, target)
+        self.aim = target
         self.dropped = None
-        self._was_enabled = self._state is State.OPERATION_ENABLED
+        self._was_enabled = self.state is State.OPERATION_ENABLED
 
     def quick_stop(self) -> None:
         """Stops now: quick stop if power is on, else disable voltage. Always allowed."""
-        self._aim = (
+        self.aim = (
             State.QUICK_STOP_ACTIVE
-            if self._state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.UNKNOWN)
+            if self.state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.UNKNOWN)
             else State.SWITCH_ON_DISABLED
         )
         self._reset = _NO_RESET
 
     def reset_fault(self) -> None:
         """Requests one fault reset; raises `TransitionError` unless the drive is in 'fault'."""
-        row_for(self._state, Command.FAULT_RESET)
+        row_for(self.state, Command.FAULT_RESET)
         self._reset = _RESET_LOW
-        self._aim = State.SWITCH_ON_DISABLED
+        self.aim = State.SWITCH_ON_DISABLED
 
     def controlword(self) -> int:
         """Returns the word to send now. Bits 4-6 and 8-15 are zero; the mode of operation sets them."""
@@ -270,10 +257,10 @@ class PowerWalk:
             return 0
         if self._reset == _RESET_HIGH:
             return Command.FAULT_RESET.word
-        if self._aim is _QUICK_STOP and self._state is not _QUICK_STOP:
+        if self.aim is _QUICK_STOP and self.state is not _QUICK_STOP:
             # Sent even if the drive's state is unknown: a quick stop does no harm in any state.
             return Command.QUICK_STOP.word
-        return _WORDS[self._state][self._aim]
+        return _WORDS[self.state][self.aim]
 
 
 def states_on_the_way(state: State, target: State) -> Iterator[State]:

@@ -4,13 +4,13 @@ import math
 import re
 import struct
 from dataclasses import dataclass
-from typing import Any
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
-from hdbridge.drive.dictionary import INTEGER_TYPES
+from hdbridge.drive.dictionary import INTEGER_TYPES, permitted
 from hdbridge.drive.objects import STANDARD, IntegerType
 from hdbridge.errors import InputError
+from hdbridge.files.edsfile import variables
 from hdbridge.files.expectation import nearest
 
 Value = int | float | bool | str
@@ -30,8 +30,8 @@ class Object:
     integer: IntegerType | None
     readable: bool = True
     writable: bool = True
-    lowest: int | None = None
-    highest: int | None = None
+    permitted: tuple[int, int] | None = None
+    """Least and greatest value of an integer; None for the range of its type."""
 
     @property
     def type_name(self) -> str:
@@ -99,8 +99,7 @@ class Object:
             raise self._wrong(text, "bytes in hexadecimal, such as '01 a0'") from None
 
     def _integer(self, text: str, kind: IntegerType) -> int:
-        low = kind.minimum if self.lowest is None else max(kind.minimum, self.lowest)
-        high = kind.maximum if self.highest is None else min(kind.maximum, self.highest)
+        low, high = self.permitted or (kind.minimum, kind.maximum)
         try:
             value = int(text, 16) if re.fullmatch(r"0[xX][0-9a-fA-F]+", text) else int(text)
         except ValueError:
@@ -119,7 +118,7 @@ def find_object(text: str, od: ObjectDictionary) -> Object:
     A sub-index is hexadecimal, as in manuals. Raises `InputError` for an unknown object.
     """
     number = re.fullmatch(r"(?:0[xX])?([0-9a-fA-F]{4})[hH]?(?:[:.](?:0[xX])?([0-9a-fA-F]{1,2})[hH]?)?", text)
-    known = {_name(each): each for each in _variables(od)}
+    known = {_name(each): each for each in variables(od)}
     if number is None:
         close = nearest(text, list(known))
         variable = next((each for name, each in known.items() if name.lower() == text.lower()), None)
@@ -143,24 +142,17 @@ def find_object(text: str, od: ObjectDictionary) -> Object:
 
 def _of(variable: ODVariable) -> Object:
     data_type = variable.data_type or 0
+    kind = INTEGER_TYPES.get(data_type)
     return Object(
         variable.index,
         variable.subindex,
         _name(variable),
         data_type,
-        INTEGER_TYPES.get(data_type),
+        kind,
         readable=variable.readable,
         writable=variable.writable,
-        lowest=variable.min,
-        highest=variable.max,
+        permitted=permitted(variable, kind) if kind is not None else None,
     )
-
-
-def _variables(od: ObjectDictionary) -> list[ODVariable]:
-    found: list[Any] = []
-    for entry in od.values():
-        found += entry.subindices.values() if hasattr(entry, "subindices") else [entry]
-    return found
 
 
 def _name(variable: ODVariable) -> str:

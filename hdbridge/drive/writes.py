@@ -9,13 +9,14 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from decimal import Decimal
+from functools import partial
 from typing import Final
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
-from hdbridge.drive.dictionary import find, held, integer_type
+from hdbridge.drive.dictionary import find, held, integer_type, permitted
 from hdbridge.drive.image import position_limits_counts
 from hdbridge.drive.layout import PDOS_PER_KIND, Layout, Layouts
 from hdbridge.drive.objects import PDO_INVALID, Address, IntegerType
@@ -215,19 +216,11 @@ def _pdo(layout: Layout, communication: int, mapping: int, fields: list[str]) ->
     communication += number - 1
     mapping += number - 1
 
-    def row(
-        index: int, sub: int, value: int, why: str, key: str, type_: IntegerType, **more: int
-    ) -> PlannedWrite:
-        compared, kept = more.get("compared", _EVERYTHING), more.get("kept", 0)
-        passing = bool(more.get("passing"))
-        return PlannedWrite(
-            node_id, index, sub, value, why, key, type_, compared, kept, pdo=communication, passing=passing
-        )
-
+    row = partial(PlannedWrite, node_id, pdo=communication)
     byte, word = IntegerType.UINT8, IntegerType.UINT32
     count = len(codec.entries)
     yield _invalid(node_id, communication, f"{name} is off while it is changed", field, pdo=communication)
-    yield row(mapping, 0, 0, f"{name} maps nothing while it is changed", "", byte, passing=1)
+    yield row(mapping, 0, 0, f"{name} maps nothing while it is changed", "", byte, passing=True)
     for place, (entry, chosen) in enumerate(zip(codec.entries, fields, strict=True), start=1):
         yield row(mapping, place, entry.mapping, f"{name} carries {entry}", chosen, word)
     yield row(mapping, 0, count, f"{name} maps {count} objects", field, byte)
@@ -283,13 +276,6 @@ def _period(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[int, int]:
     )
 
 
-def permitted(variable: ODVariable, kind: IntegerType) -> tuple[int, int]:
-    """Returns the least and the greatest value of an object, by its type and its limits in the EDS."""
-    low = kind.minimum if variable.min is None else max(kind.minimum, variable.min)
-    high = kind.maximum if variable.max is None else min(kind.maximum, variable.max)
-    return low, high
-
-
 def _takes(variable: ODVariable, value: int) -> bool:
     if not variable.writable:
         return held(variable) in (None, value)
@@ -335,36 +321,24 @@ def _limits(axis: AxisConfig) -> Iterator[PlannedWrite]:
     rpm = math.ceil((limits.velocity_deg_s + slew / ARCSEC_PER_DEG) * axis.gear.ratio / 6.0)
     ramp = motor_rate(axis, limits.acceleration_deg_s2)
     late = "time after which a following error counts"
-    yield _row(
-        axis, objects.LIMIT_MIN, least, f"lower end in motor counts ({margin})", ends[0],
-        without=f"lower end of travel; {alone}",
-    )  # fmt: skip
-    yield _row(
-        axis, objects.LIMIT_MAX, greatest, f"upper end in motor counts ({margin})", ends[1],
-        without=f"upper end of travel; {alone}",
-    )  # fmt: skip
-    yield _row(
-        axis, objects.MAX_MOTOR_SPEED, rpm,
-        f"speed limit in rpm of the motor (higher by the compensation's {slew:g} arcsec/s)",
-        "limits.velocity_deg_s",
-        without=f"speed limit; {alone}",
-    )  # fmt: skip
-    yield _row(
-        axis, objects.QUICK_STOP_DECELERATION, ramp, "ramp of a quick stop, motor counts/s2",
-        "limits.acceleration_deg_s2", without="ramp of a quick stop",
-    )  # fmt: skip
-    yield _row(
-        axis, objects.MAX_TORQUE, round(limits.torque_percent * 10.0),
-        "torque limit in per mille of the rated torque", "limits.torque_percent", without="torque limit",
-    )  # fmt: skip
-    yield _row(
-        axis, objects.FOLLOWING_WINDOW, window, "following error window, motor counts",
-        "drive.following_error_deg", without="following error window; hdbridge applies its own",
-    )  # fmt: skip
-    yield _row(
-        axis, objects.FOLLOWING_TIME, drive.following_error_time_ms, f"{late}, ms",
-        "drive.following_error_time_ms", without=late,
-    )  # fmt: skip
+    for address, value, why, field, without in (
+        (objects.LIMIT_MIN, least, f"lower end in motor counts ({margin})", ends[0],
+         f"lower end of travel; {alone}"),
+        (objects.LIMIT_MAX, greatest, f"upper end in motor counts ({margin})", ends[1],
+         f"upper end of travel; {alone}"),
+        (objects.MAX_MOTOR_SPEED, rpm,
+         f"speed limit in rpm of the motor (higher by the compensation's {slew:g} arcsec/s)",
+         "limits.velocity_deg_s", f"speed limit; {alone}"),
+        (objects.QUICK_STOP_DECELERATION, ramp, "ramp of a quick stop, motor counts/s2",
+         "limits.acceleration_deg_s2", "ramp of a quick stop"),
+        (objects.MAX_TORQUE, round(limits.torque_percent * 10.0),
+         "torque limit in per mille of the rated torque", "limits.torque_percent", "torque limit"),
+        (objects.FOLLOWING_WINDOW, window, "following error window, motor counts",
+         "drive.following_error_deg", "following error window; hdbridge applies its own"),
+        (objects.FOLLOWING_TIME, drive.following_error_time_ms, f"{late}, ms",
+         "drive.following_error_time_ms", late),
+    ):  # fmt: skip
+        yield _row(axis, address, value, why, field, without=without)
 
 
 def motor_rate(axis: AxisConfig, load_deg: float) -> int:

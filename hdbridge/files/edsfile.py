@@ -13,7 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple, Never
 
-from canopen.objectdictionary import ObjectDictionary, datatypes
+from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 from canopen.objectdictionary.eds import import_eds
 
 from hdbridge.errors import InputError
@@ -69,6 +69,12 @@ def read_eds(path: Path | str, node_id: int) -> Eds:
             f"{path}: cannot be read: {error.strerror or error}; expected the drive's EDS file"
         ) from error
     return _Reader(path, decode(data)).read(node_id)
+
+
+def variables(od: ObjectDictionary) -> Iterator[ODVariable]:
+    """Yields every entry of an object dictionary, including the members of arrays and records."""
+    for item in od.values():
+        yield from [item] if isinstance(item, ODVariable) else item.subindices.values()
 
 
 def shared_eds(path: Path | str, node_id: int) -> Eds:

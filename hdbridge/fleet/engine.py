@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import islice
 from multiprocessing.resource_tracker import ensure_running
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -180,22 +181,17 @@ def _is_new(file: Sequence[Source], stored: Stored) -> bool:
     return not stored.unchanged(file)
 
 
+@dataclass
 class _Run:
-    def __init__(
-        self,
-        clients: Callable[[], Client],
-        dataset: Dataset,
-        progress: Callable[[Progress], None],
-        interrupted: Callable[[], bool],
-        retried: Collection[str],
-    ) -> None:
-        self._clients = clients
-        """Function that returns the cluster's client; its first call starts the cluster."""
-        self._dataset = dataset
-        self._stored = dataset.stored()
-        self._notify = progress
-        self._interrupted = interrupted
-        self._retried = retried
+    clients: Callable[[], Client]
+    """Function that returns the cluster's client; its first call starts the cluster."""
+    dataset: Dataset
+    progress: Callable[[Progress], None]
+    interrupted: Callable[[], bool]
+    retried: Collection[str]
+
+    def __post_init__(self) -> None:
+        self._stored = self.dataset.stored()
         self._renewed: dict[tuple[str, str], Row] = {}
         self._rows: list[Row] = []
         self._present: list[tuple[str, str]] = []
@@ -230,15 +226,14 @@ class _Run:
                     self._take(row if row is not None else lost(task[1][0], KILLED))
         finally:
             self._write()
-            self._dataset.renew(self._renewed)
-            self._dataset.compact(self._present)
-        self._report()
-        return self._state()
+            self.dataset.renew(self._renewed)
+            self.dataset.compact(self._present)
+        return self._report()
 
     def _unchanged(self, source: Source) -> Mapping[str, Any] | None:
         """Returns the stored row of an unchanged recording, reusable if its model is the same; or None."""
         row = self._stored.row(source)
-        if row is None or source.stamp is None or row["reason"] in self._retried:
+        if row is None or source.stamp is None or row["reason"] in self.retried:
             return None
         return row if row["stamp"] == source.stamp and row["version"] == __version__ else None
 
@@ -251,7 +246,7 @@ class _Run:
                 flights[each.path].append(each)
         for path, described in [*flights.items()]:
             rows = self._stored.unchanged(described)
-            if rows and not any(row["reason"] in self._retried for row in rows):
+            if rows and not any(row["reason"] in self.retried for row in rows):
                 result += with_axes(path, sorted((row["axis"] for row in rows), key=str), described)
                 del flights[path]
         paths = list(flights)
@@ -277,7 +272,7 @@ class _Run:
             joints[each.joint or ""].append(each)
             if row is None or row["model_sha256"]:
                 fitting.add(each.joint or "")
-        folder = self._dataset.folder / "models"
+        folder = self.dataset.folder / "models"
         found: dict[str, Model] = {"": Model(reason="the joint is not known")}
         to_fit = []
         for joint in sorted(filter(None, joints)):
@@ -317,33 +312,23 @@ class _Run:
         tasks = list(tasks)
         if not tasks:
             return
-        client = self._clients()
+        client = self.clients()
         numbered = enumerate(tasks)
-        numbers: dict[Any, int] = {}
+        numbers: dict[str, int] = {}
+        """Numbers of the submitted tasks by the key of their future."""
         done = as_completed([], loop=client.loop)
-        more, waiting = True, 0
-
-        def submit() -> None:
-            nonlocal more, waiting
-            while more and waiting < AHEAD:
-                found = next(numbered, None)
-                if found is None:
-                    more = False
-                    return
-                number, (work, arguments) = found
+        seen_s = time.monotonic()
+        while True:
+            for number, (work, arguments) in islice(numbered, AHEAD - len(numbers)):
                 future = client.submit(work, *arguments, pure=False)
                 numbers[future.key] = number
                 done.add(future)
-                waiting += 1
-
-        submit()
-        seen_s = time.monotonic()
-        while waiting or more:
-            if self._interrupted():
+            if not numbers:
+                break
+            if self.interrupted():
                 raise KeyboardInterrupt
-            batch = done.next_batch(block=False) if waiting else []
+            batch = done.next_batch(block=False)
             for future in batch:
-                waiting -= 1
                 number = numbers.pop(future.key)
                 try:
                     result = future.result()
@@ -351,7 +336,6 @@ class _Run:
                     result = None
                 future.release()
                 yield number, result
-            submit()
             if time.monotonic() - seen_s > 5.0:
                 seen_s = time.monotonic()
                 self._measure(client)
@@ -380,12 +364,11 @@ class _Run:
         self._report()
 
     def _write(self) -> None:
-        self._dataset.add(self._rows)
+        self.dataset.add(self._rows)
         self._rows.clear()
         self._written_s = time.monotonic()
 
-    def _state(self) -> Progress:
-        return Progress(len(self._present), self._total, self._failed, self._known, self._memory)
-
-    def _report(self) -> None:
-        self._notify(self._state())
+    def _report(self) -> Progress:
+        state = Progress(len(self._present), self._total, self._failed, self._known, self._memory)
+        self.progress(state)
+        return state

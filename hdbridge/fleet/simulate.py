@@ -7,7 +7,6 @@ faults.
 
 import gzip
 import json
-import math
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -23,7 +22,6 @@ from hdbridge.records.record import Record
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
-from hdbridge.units import ARCSEC_PER_DEG
 
 YEAR_HOURS: Final = 8000.0
 BEGIN: Final = datetime(2026, 1, 5, 6, 0, tzinfo=UTC)
@@ -89,18 +87,6 @@ def _motor_order(data: dict[str, Any], size: float) -> None:
 
 def _loop(data: dict[str, Any], size: float) -> None:
     data["gear"]["hysteresis"]["offset_arcsec"] += size
-
-
-def peak_at_0_hours_arcsec(cause: str, arcsec_per_1000_hours: float, first_hours: float) -> float:
-    """Returns the peak of a cause as a diagnosis sees it, extrapolated along a straight line to 0 hours.
-
-    A model fitted to the first recording contains the motor orders and the loop of that recording, so only
-    their later growth is seen. The load friction of a joint with backlash winds up the gear, which looks like
-    additional backlash.
-    """
-    if cause in {"motor_order", "hysteresis_parameters"}:
-        return -arcsec_per_1000_hours * first_hours / 1000.0
-    return math.degrees(FRICTION_NM / STIFFNESS_NM_PER_RAD) * ARCSEC_PER_DEG if cause == "backlash" else 0.0
 
 
 CAUSES: Final[Mapping[str, Callable[[dict[str, Any], float], None]]] = {

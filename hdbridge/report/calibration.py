@@ -28,6 +28,7 @@ from hdbridge.report.page import (
     Table,
     figure,
     histogram,
+    parted,
     sentence,
     with_interval,
 )
@@ -40,8 +41,6 @@ Y_LABEL: Final = "error, arcsec"
 TURN_LABEL: Final = "motor angle within its turn, deg"
 LOAD_LABEL: Final = "load angle, deg"
 R_LABEL: Final = "residual, arcsec"
-PAUSE_STEPS: Final = 20.0
-"""Minimum pause between two runs, in median time steps."""
 HIGHEST_ORDER: Final = 16.0
 """Highest order in the spectrum chart."""
 BINS_PER_TURN: Final = 128
@@ -56,7 +55,13 @@ def calibration_page(result: Calibration) -> Page:
     if result.motion is not None:
         sections += motion_sections(result.motion)
     sections += [
-        Section("Parameters", _parameters_text(result), [*_parameters(result)]),
+        Section(
+            "Parameters",
+            ""
+            if all(each.identifiable for each in result.fit.intervals)
+            else "In brackets: not determined by these data.",
+            [*_parameters(result)],
+        ),
         Section(
             "Transmission error",
             "Load encoder angle minus motor angle divided by the ratio, without the zero offset; dots are "
@@ -83,7 +88,7 @@ def calibration_page(result: Calibration) -> Page:
         Section("Residual of the model", sentence(result.fit.held_out.text), [*_residual(result)]),
     ]
     if len(result.drift) > 1:
-        sections.append(Section("Reference pose", _drift_text(result), [_drift(result)]))
+        sections.append(_drift(result))
     sections.append(Section("Provenance", "", [_provenance(result)]))
     status, commands = _status(result)
     return Page(
@@ -165,9 +170,9 @@ def _both_ways(traces: Traces, x: FloatArray, y: FloatArray, chosen: BoolArray) 
 def _loops(traces: Traces) -> Iterator[Chart]:
     """Yields one chart for each sine or run of reversals, in the order of measurement."""
     for kind, words in (("sine", "Sine"), ("reversal", "Reversals")):
-        runs = [rows for rows in _runs(_of_kind(traces, kind)) if _is_loop(traces.motor_deg[rows])]
-        for number, rows in enumerate(runs, 1):
-            motor = traces.motor_deg[rows]
+        runs = [(rows, traces.motor_deg[rows]) for rows in _runs(_of_kind(traces, kind))]
+        runs = [each for each in runs if len(each[1]) >= 8 and np.ptp(each[1]) >= 1.0]
+        for number, (rows, motor) in enumerate(runs, 1):
             reach = 0.5 * float(np.ptp(motor))
             centre = float(np.min(motor)) + reach
             caption = f"{words} of \N{PLUS-MINUS SIGN}{reach:.0f} deg"
@@ -175,20 +180,10 @@ def _loops(traces: Traces) -> Iterator[Chart]:
                 caption += f", {number} of {len(runs)}"
             series = [
                 Series("measured", motor - centre, traces.error_arcsec[rows], Mark.POINTS),
-                Series("model", motor - centre, _parted(traces.predicted_arcsec[rows], traces.time_s[rows])),
+                Series("model", motor - centre, parted(traces.predicted_arcsec[rows], traces.time_s[rows])),
             ]
             label = f"motor angle \N{MINUS SIGN} {centre:.0f}, deg" if round(centre) else "motor angle, deg"
             yield Chart(caption, label.replace("\N{MINUS SIGN} -", "+ "), Y_LABEL, series, height_px=230)
-
-
-def _parted(y: FloatArray, time_s: FloatArray) -> FloatArray:
-    """Inserts a gap after each pause, so that no line is drawn across it."""
-    steps = np.diff(time_s, prepend=time_s[0])
-    return np.where(steps > PAUSE_STEPS * float(np.median(steps)), np.nan, y)
-
-
-def _is_loop(motor_deg: FloatArray) -> bool:
-    return len(motor_deg) >= 8 and float(np.ptp(motor_deg)) >= 1.0
 
 
 def _spectrum(result: Calibration) -> Chart:
@@ -276,12 +271,6 @@ def _residual(result: Calibration) -> Iterator[Block]:
         yield Facts([("note", each) for each in fit.warnings])
 
 
-def _parameters_text(result: Calibration) -> str:
-    if all(each.identifiable for each in result.fit.intervals):
-        return ""
-    return "In brackets: not determined by these data."
-
-
 def _parameters(result: Calibration) -> Iterator[Block]:
     changes = diff(result.active, result.model) if result.active is not None else []
     before = {(each.effect, each.parameter): each.before for each in changes}
@@ -326,18 +315,15 @@ def _change(change: float, parameter: str) -> str:
     return f"{change:+.3g}".replace("-", "\N{MINUS SIGN}")
 
 
-def _drift_text(result: Calibration) -> str:
-    errors = [error for _, error in result.drift]
-    return (
+def _drift(result: Calibration) -> Section:
+    times, errors = zip(*result.drift, strict=True)
+    text = (
         f"The axis returned to one pose {len(errors)} times, always from the same side: its zero position "
         f"moved by {max(errors) - min(errors):.2f} arcsec."
     )
-
-
-def _drift(result: Calibration) -> Chart:
-    times, errors = zip(*result.drift, strict=True)
     series = [Series("error at the pose", times, errors), Series("visits", times, errors, Mark.POINTS)]
-    return Chart("Error at the reference pose", "time, s", Y_LABEL, series, height_px=200)
+    chart = Chart("Error at the reference pose", "time, s", Y_LABEL, series, height_px=200)
+    return Section("Reference pose", text, [chart])
 
 
 def _provenance(result: Calibration) -> Facts:

@@ -74,7 +74,8 @@ def diagnosis_page(
     if offer is not None:
         status, commands = of_offer(offer)
     else:
-        status, commands = _status(diagnosis), _commands(diagnosis, command)
+        status = Status.FOUND if diagnosis.findings else Status.NOTHING_FOUND
+        commands = _commands(diagnosis, command)
     return Page(
         title=title,
         verdict=f"{sentence(offer.reason)} {verdict}" if offer is not None else verdict,
@@ -84,10 +85,6 @@ def diagnosis_page(
         footer=f"hdbridge {__version__}. Errors are arcseconds at the load; rms is the root mean square, "
         f"{SIGMA} three standard deviations; intervals are of 95 %.",
     )
-
-
-def _status(diagnosis: Diagnosis) -> Status:
-    return Status.FOUND if diagnosis.findings else Status.NOTHING_FOUND
 
 
 def _commands(diagnosis: Diagnosis, command: str) -> tuple[Command, ...]:

@@ -1,10 +1,11 @@
 """Report page of the motion test: ripple over speed, and the measured response."""
 
 import math
+from collections.abc import Sequence
 
 from hdbridge import __version__
 from hdbridge.axis.model.response import Response
-from hdbridge.commissioning.calibration.motion import MotionTest, Ripple
+from hdbridge.commissioning.calibration.motion import MotionTest, OrderRipple, Ripple
 from hdbridge.report.page import Chart, Grid, Mark, Page, Section, Series, Table
 
 RIPPLE_COLUMNS = ("deg/s", "none", "static", "removed", "filtered", "removed", "orders faded out")
@@ -65,16 +66,25 @@ def _verdict(result: MotionTest) -> str:
 
 
 def _ripple(result: MotionTest) -> Chart:
-    speeds = [each.speed_deg_s for each in result.ripples]
-    none = [each.none_arcsec for each in result.ripples]
-    series = [Series("without correction", speeds, none)]
+    series = _curves([each.speed_deg_s for each in result.ripples], result.ripples, Mark.LINE)
+    return Chart("Ripple of the load", "speed, deg/s", "rms, arcsec", series)
+
+
+def _spectrum(ripple: Ripple) -> Chart:
+    series = _curves([each.frequency_hz for each in ripple.orders], ripple.orders, Mark.POINTS)
+    return Chart(f"{ripple.speed_deg_s:g} deg/s", "frequency, Hz", "amplitude, arcsec", series)
+
+
+def _curves(x: list[float], errors: Sequence[Ripple] | Sequence[OrderRipple], mark: Mark) -> list[Series]:
+    """Returns the errors without and with each correction that was measured."""
+    series = [Series("without correction", x, [each.none_arcsec for each in errors], mark)]
     for name, values in (
-        ("static correction", [each.static_arcsec for each in result.ripples]),
-        ("filtered correction", [each.filtered_arcsec for each in result.ripples]),
+        ("static correction", [each.static_arcsec for each in errors]),
+        ("filtered correction", [each.filtered_arcsec for each in errors]),
     ):
         if any(each is not None for each in values):
-            series.append(Series(name, speeds, [math.nan if each is None else each for each in values]))
-    return Chart("Ripple of the load", "speed, deg/s", "rms, arcsec", series)
+            series.append(Series(name, x, [math.nan if each is None else each for each in values], mark))
+    return series
 
 
 def ripple_rows(result: MotionTest) -> list[list[str]]:
@@ -100,19 +110,6 @@ def figure(value: float | None) -> str:
 
 def _percent(value: float | None) -> str:
     return "" if value is None else f"{value:.0f} %"
-
-
-def _spectrum(ripple: Ripple) -> Chart:
-    hertz = [each.frequency_hz for each in ripple.orders]
-    series = [Series("without correction", hertz, [each.none_arcsec for each in ripple.orders], Mark.POINTS)]
-    for name, values in (
-        ("static correction", [each.static_arcsec for each in ripple.orders]),
-        ("filtered correction", [each.filtered_arcsec for each in ripple.orders]),
-    ):
-        known = [math.nan if each is None else each for each in values]
-        if not all(map(math.isnan, known)):
-            series.append(Series(name, hertz, known, Mark.POINTS))
-    return Chart(f"{ripple.speed_deg_s:g} deg/s", "frequency, Hz", "amplitude, arcsec", series)
 
 
 def path_rows(result: MotionTest) -> list[list[str]]:

@@ -46,12 +46,20 @@ def with_interval(value: float, half_width: float) -> tuple[str, str]:
     return _typeset(text), _typeset(half)
 
 
+def with_decimals(value: float) -> str:
+    """Formats a value with two decimals and a typographic minus sign, which a zero does not have."""
+    text = f"{value:.2f}"
+    return text.lstrip("-") if float(text) == 0.0 else _typeset(text)
+
+
 def _typeset(number: str) -> str:
     return number.replace("-", "\N{MINUS SIGN}")
 
 
 POINTS_MAXIMUM: Final = 4000
 """Maximum number of points of a series in a page; longer series are thinned to limit a page to a megabyte."""
+PAUSE_STEPS: Final = 20.0
+"""Minimum pause between two runs, in median time steps."""
 _FIGURE: Final = re.compile(r"\(?[-+\N{MINUS SIGN}\N{PLUS-MINUS SIGN}]?\d[\d,.]*(e[-+]\d+)?\)?( ?%)?$")
 DIGITS: Final = 5
 """Number of significant digits relative to a series' span. It resolves a hundredth of a screen pixel; more
@@ -246,6 +254,12 @@ def histogram(
     return Chart(caption, x_label, "number", series, height_px=height_px)
 
 
+def parted(y: FloatArray, time_s: FloatArray) -> FloatArray:
+    """Inserts a gap after each pause, so that no line is drawn across it."""
+    steps = np.diff(time_s, prepend=time_s[0])
+    return np.where(steps > PAUSE_STEPS * float(np.median(steps)), np.nan, y)
+
+
 def thinned(x: FloatArray, y: FloatArray, most: int = POINTS_MAXIMUM) -> tuple[FloatArray, FloatArray]:
     """Returns at most ``most`` points of a line, in order: those with minimum and maximum y in each interval.
 
@@ -347,8 +361,7 @@ def _text_of(cell: Cell) -> str:
         return cell
     if isinstance(cell, Link):
         return Markup('<a href="{}">{}</a>').format(cell.address, cell.text)
-    text = f"{cell:.2f}"
-    return text.lstrip("-") if float(text) == 0.0 else text.replace("-", "\N{MINUS SIGN}")
+    return with_decimals(cell)
 
 
 def _is_words(table: Table, column: int) -> bool:

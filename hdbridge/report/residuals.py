@@ -11,7 +11,7 @@ from hdbridge.analysis.views import ResidualViews, coordinates
 from hdbridge.axis.effects import CATALOGUE, BoolArray, Effect, FloatArray, IntArray, Part
 from hdbridge.axis.effects.coordinate import Coordinate, Spacing, time
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.report.page import Chart, Mark, Series, histogram, sampled, thinned
+from hdbridge.report.page import Chart, Mark, Series, histogram, parted, sampled, thinned
 
 LEAST_IN_BIN: Final = 3
 """Minimum number of points in a bin; bins with fewer points are not shown."""
@@ -167,8 +167,6 @@ FINER: Final = 3
 CLOSER_POINTS: Final = 400
 MORE_TURNS_DEG: Final = 540.0
 """Minimum load travel for a chart over position; with less, it adds little to that over the load angle."""
-PAUSE_STEPS: Final = 20.0
-"""Minimum pause between two runs, in median time steps."""
 BLUE: Final = 0
 ORANGE: Final = 1
 GREEN: Final = 2
@@ -278,9 +276,8 @@ def beside_charts(traces: Traces) -> Iterator[Chart]:
         stretches.append(("Closer: where the extended model gains most", whole[first : first + length]))
     for caption, rows in stretches:
         time = traces.time_s[rows]
-        gap = np.diff(time, prepend=time[0]) > PAUSE_STEPS * float(np.median(np.diff(time)))
         lines = [
-            Series(name, *thinned(time, np.where(gap, np.nan, values[rows]), LINE_POINTS), colour=colour)
+            Series(name, *thinned(time, parted(values[rows], time), LINE_POINTS), colour=colour)
             for name, colour, values in (
                 ("the model as given", ORANGE, traces.model_arcsec),
                 ("the extended model", BLUE, traces.extended_arcsec),

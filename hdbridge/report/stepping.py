@@ -26,6 +26,7 @@ from hdbridge.report.page import (
     Status,
     Table,
     histogram,
+    with_decimals,
 )
 
 X_LABEL: Final = "load target, deg"
@@ -195,8 +196,9 @@ def _verdict(results: Mapping[Scheme, Stepped], floor_arcsec: float) -> str:
     pooled = results[best].pooled
     text = (
         f"With {NAMES[best]}, the load's error at rest is {pooled.three_sigma_arcsec:.2f} arcsec ({SIGMA}) "
-        f"about a mean of {_signed(pooled.mean_arcsec)}: {pooled.three_sigma_arcsec / floor_arcsec:.2f} "
-        f"times the {floor_arcsec:.2f} that one motor count allows"
+        f"about a mean of {with_decimals(pooled.mean_arcsec)}: "
+        f"{pooled.three_sigma_arcsec / floor_arcsec:.2f} times the {floor_arcsec:.2f} that one motor count "
+        "allows"
     )
     if Scheme.NONE in results and best is not Scheme.NONE:
         before = results[Scheme.NONE].pooled.three_sigma_arcsec
@@ -208,7 +210,7 @@ def _errors(scheme: Scheme, result: Stepped, range_: tuple[float, float]) -> Cha
     pooled = result.pooled
     caption = (
         f"{NAMES[scheme].capitalize()}: {SIGMA} {pooled.three_sigma_arcsec:.1f} arcsec, "
-        f"mean {_signed(pooled.mean_arcsec)} arcsec"
+        f"mean {with_decimals(pooled.mean_arcsec)} arcsec"
     )
     return Chart(caption, X_LABEL, Y_LABEL, _ways(result), height_px=250, y_range=range_)
 
@@ -221,12 +223,6 @@ def _remaining(result: Stepped, floor_arcsec: float) -> list[Chart]:
         Chart("Error of each step", X_LABEL, Y_LABEL, ways, height_px=280, levels=levels),
         _histogram("Error histogram", ways, 280),
     ]
-
-
-def _signed(value: float) -> str:
-    """Formats a value with two decimals and a typographic minus sign, which a zero does not have."""
-    text = f"{value:.2f}"
-    return text.lstrip("-") if float(text) == 0.0 else text.replace("-", "\N{MINUS SIGN}")
 
 
 def _table(results: Mapping[Scheme, Stepped], with_article: bool) -> Table:

@@ -10,7 +10,6 @@ import numpy as np
 from hdbridge import __version__
 from hdbridge.axis.effects import FloatArray
 from hdbridge.report.page import (
-    Block,
     Chart,
     Command,
     Facts,
@@ -146,16 +145,10 @@ def verdict(report: TwinReport) -> str:
         if now is None or before is None:
             continue
         was = f" (before: {_figure(before.difference)})" if report.after is not None else ""
-        parts.append(f"{TITLES[name]} {_figure(now.difference)} {now.unit}{was}, {_times(now)}")
+        noisy = math.isfinite(now.in_noise)
+        times = f"{_figure(now.in_noise)} times the noise" if noisy else "without measurable noise"
+        parts.append(f"{TITLES[name]} {_figure(now.difference)} {now.unit}{was}, {times}")
     return f"The simulated drive differs from the axis by, rms: {'; '.join(parts)}." if parts else ""
-
-
-def _times(row: Row) -> str:
-    return (
-        f"{_figure(row.in_noise)} times the noise"
-        if math.isfinite(row.in_noise)
-        else "without measurable noise"
-    )
 
 
 def _figure(value: float) -> str:
@@ -211,25 +204,23 @@ def _pictures(name: str, report: TwinReport) -> Section:
     trace, before = report.now.traces[name], report.before.traces[name]
     label = f"{TITLES[name]}, {UNITS[name]}"
     worst = _worst(before)
-    charts: list[Block] = [
-        Grid(
-            [
-                _chart(f"{TITLES[name].capitalize()} over the whole record", label, trace, slice(None)),
-                _chart(
-                    "Largest deviation of the initial simulation"
-                    if report.after
-                    else "Largest deviation of the simulation",
-                    label,
-                    trace,
-                    worst,
-                    before if report.after else None,
-                ),
-                _difference(f"Difference, {label}", before, trace if report.after else None),
-                *_spectrum(name, report.now.spectra.get(name)),
-            ]
-        )
-    ]
-    return Section(TITLES[name].capitalize(), "", charts)
+    grid = Grid(
+        [
+            _chart(f"{TITLES[name].capitalize()} over the whole record", label, trace, slice(None)),
+            _chart(
+                "Largest deviation of the initial simulation"
+                if report.after
+                else "Largest deviation of the simulation",
+                label,
+                trace,
+                worst,
+                before if report.after else None,
+            ),
+            _difference(f"Difference, {label}", before, trace if report.after else None),
+            *_spectrum(name, report.now.spectra.get(name)),
+        ]
+    )
+    return Section(TITLES[name].capitalize(), "", [grid])
 
 
 def _chart(caption: str, label: str, trace: Trace, where: slice, before: Trace | None = None) -> Chart:

@@ -8,7 +8,7 @@ from support.exercised import booted
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.comparison import compare_schemes
+from hdbridge.commissioning.evaluation.comparison import Comparison, compare_schemes
 from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.drive import State
 from hdbridge.drive.supervision import Fault
@@ -57,7 +57,8 @@ def motor_deg(node, axis) -> float:
 def test_extended_compensation_reaches_the_noise_floor(axis, model, bench_on):
     drive, _ = bench_on
     schemes = (Scheme.NONE, Scheme.SYNCHRONOUS, Scheme.HYSTERESIS, Scheme.BOTH)
-    comparison = compare_schemes(drive, model, schemes, Stepping(count=33))
+    runs = dict(compare_schemes(drive, model, schemes, Stepping(count=33)))
+    comparison = Comparison.of(axis, runs)
     pooled = {scheme: result.pooled.three_sigma_arcsec for scheme, result in comparison.results.items()}
     # Without compensation: the loop's offset of +-40 arcsec and 35 arcsec of tooth error, together 125.
     assert 115 < pooled[Scheme.NONE] < 135

@@ -7,7 +7,7 @@ from support.exercised import booted
 from support.two_channels import CHANNELS, resumes, stops
 
 from hdbridge.axis import AxisConfig
-from hdbridge.commissioning.calibration import measure, start_journal
+from hdbridge.commissioning.calibration import Callbacks, measure, start_journal
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.sim.truth import Truth
 
@@ -34,7 +34,7 @@ def measured(cell, silent_cycles):
                 resumes(node)
             return False
 
-        measure(drive, journal, interrupted=each_cycle)
+        measure(drive, journal, Callbacks(interrupted=each_cycle))
     about = yaml.safe_load((cell.folder / "rec" / "recording.yaml").read_text())
     survived = {each["file"]: each["survived"] for each in about["notes"]["tasks"] if "survived" in each}
     return {each["file"]: each["lost"] for each in about["notes"]["tasks"] if "lost" in each}, survived

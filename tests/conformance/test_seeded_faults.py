@@ -244,8 +244,8 @@ NETWORK = (
 def at_once(watch: Method, node: DriveNode) -> Method:
     def more() -> None:
         if node._watched_s:
-            node._watch_due_s = node._now_s + node._watched_s
-            node._due_s = node._now_s
+            node._watch_due_s = node.now_s + node._watched_s
+            node._due_s = node.now_s
 
     return then(watch, more)
 
@@ -476,7 +476,7 @@ def oldest_first(patch: Any, node: DriveNode, bus: Spoiled) -> None:
 
 def restored_at_once(patch: Any, node: DriveNode, bus: Spoiled) -> None:
     parameters = node._parameters
-    node.dictionary[0x1011, 1].guard = lambda value: (parameters._forget(), parameters.restore())
+    node.dictionary[0x1011, 1].guard = lambda value: (parameters._keep({}), parameters.restore())
 
 
 def undeclared(patch: Any, node: DriveNode, bus: Spoiled) -> None:

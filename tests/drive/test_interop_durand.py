@@ -11,7 +11,7 @@ import pytest
 from support.foreign_slaves import NODE_ID, DurandDrive, durand_drive
 
 from hdbridge.axis import AxisConfig
-from hdbridge.drive import Drive, Mode, State, load_eds
+from hdbridge.drive import Drive, Mode, State, load_eds, objects
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def cycle(drive: Drive, clock: Any, target_counts: int | None) -> None:
     """Runs SYNC and its TPDOs, and sends the next set-point; None stands for the actual position."""
     image, link = drive.image, drive.link
     clock.sleep_until(clock.now() + drive.axis.drive.cycle_s)
-    link.send(image.sync_id, b"")
+    link.send(objects.COB_SYNC, b"")
     waited = set(image.tpdo_ids)
     deadline_s = clock.now() + 0.002
     while waited and (frame := link.recv(deadline_s)) is not None:

@@ -149,7 +149,7 @@ def enabled_walk() -> PowerWalk:
     walk.go(State.OPERATION_ENABLED)
     for word in (0x0040, 0x0021, 0x0023, 0x0027):
         walk.observe(word)
-    assert walk.arrived
+    assert walk.state is walk.aim
     return walk
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,9 @@ from hdbridge.analysis.probability import Prior, updated
 from hdbridge.analysis.scales import Scales
 from hdbridge.fleet.dataset import Dataset
 from hdbridge.fleet.prior import joint_prior, prior_rows
-from hdbridge.fleet.simulate import YEAR_HOURS, peak_at_0_hours_arcsec
+from hdbridge.fleet.simulate import FRICTION_NM, STIFFNESS_NM_PER_RAD, YEAR_HOURS
 from hdbridge.fleet.summary import own_recordings, summarise
+from hdbridge.units import ARCSEC_PER_DEG
 
 FOLDS = 5
 DETECTABLE = 2
@@ -54,7 +56,7 @@ def score(fleet: Path, out: Path, limit_arcsec: float) -> None:
             continue
         last = max(row["hours"] for row in rows if row["joint"] == name and row["reason"] is None)
         rate, own = joints[name]["arcsec_per_1000_hours"], joints[name]
-        begin = peak_at_0_hours_arcsec(own["cause"], rate, own["hours"][0])
+        begin = _peak_at_0_hours_arcsec(own["cause"], rate, own["hours"][0])
         true = max(1000.0 * (limit_arcsec - begin) / rate - last, 0.0)
         known += 1
         held += each.remaining.low <= true <= each.remaining.high
@@ -81,6 +83,18 @@ def score(fleet: Path, out: Path, limit_arcsec: float) -> None:
     print(f"copies: {len(found.duplicates)} of {len(copies)}")
 
 
+def _peak_at_0_hours_arcsec(cause: str, arcsec_per_1000_hours: float, first_hours: float) -> float:
+    """Returns the peak of a cause as a diagnosis sees it, extrapolated along a straight line to 0 hours.
+
+    A model fitted to the first recording contains the motor orders and the loop of that recording, so only
+    their later growth is seen. The load friction of a joint with backlash winds up the gear, which looks like
+    additional backlash.
+    """
+    if cause in {"motor_order", "hysteresis_parameters"}:
+        return -arcsec_per_1000_hours * first_hours / 1000.0
+    return math.degrees(FRICTION_NM / STIFFNESS_NM_PER_RAD) * ARCSEC_PER_DEG if cause == "backlash" else 0.0
+
+
 def _number(row: dict[str, Any], joints: dict[str, Any]) -> int:
     return int(np.argmin(np.abs(np.array(joints[row["joint"]]["hours"]) - row["hours"])))
 
@@ -93,7 +107,8 @@ def _detectable(joint: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
             limits = {each["cause"]: each["arcsec"] for each in row["limits"] or ()}
             rate = joint["arcsec_per_1000_hours"]
             size = (
-                peak_at_0_hours_arcsec(joint["cause"], rate, joint["hours"][0]) + rate * row["hours"] / 1000.0
+                _peak_at_0_hours_arcsec(joint["cause"], rate, joint["hours"][0])
+                + rate * row["hours"] / 1000.0
             )
             count += size > limits.get(joint["cause"], 1.0)
     return count >= DETECTABLE

@@ -44,6 +44,11 @@ def failed(measured: str, *remedies: str, **figures: Figure) -> Verdict:
     return Verdict(Outcome.FAIL, measured, remedies, figures)
 
 
+def judged(is_right: bool, measured: str, *remedies: str, **figures: Figure) -> Verdict:
+    """Returns a verdict of success, or of failure with the remedies."""
+    return passed(measured, **figures) if is_right else failed(measured, *remedies, **figures)
+
+
 def not_possible(why: str) -> Verdict:
     """Returns the verdict of a check that could not be performed."""
     return Verdict(Outcome.NOT_POSSIBLE, why)

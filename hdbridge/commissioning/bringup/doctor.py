@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.bringup.checks import Check, Verdict, failed, not_possible, passed
+from hdbridge.commissioning.bringup.checks import Check, Verdict, failed, judged, not_possible, passed
 from hdbridge.commissioning.bringup.judge import (
     LOAD_COUNTS,
     MOTOR_COUNTS,
@@ -24,13 +24,12 @@ from hdbridge.commissioning.bringup.scan import compare, scan_bus
 from hdbridge.commissioning.bringup.slow import BringUpContext, Silence, SlowAxis, TravelPlan, plan_travel
 from hdbridge.drive import objects
 from hdbridge.drive.bootplan import left_to_drive, plan
-from hdbridge.drive.bootup import await_sdo
+from hdbridge.drive.bootup import await_sdo, read_identity
 from hdbridge.drive.dictionary import load_eds
 from hdbridge.drive.emergencies import HEARTBEAT_LOST
 from hdbridge.drive.gains import changed_gains, read_gains
 from hdbridge.drive.layout import layouts
 from hdbridge.drive.nameplate import (
-    IDENTITY,
     device_type_complaints,
     identity_complaints,
     mode_complaints,
@@ -38,7 +37,7 @@ from hdbridge.drive.nameplate import (
     scaling_complaints,
     torque_notes,
 )
-from hdbridge.drive.objects import Address, IntegerType
+from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.sdo import ABSENT, SdoAbortError
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.supervision import Fault
@@ -99,17 +98,13 @@ def answers(context: BringUpContext) -> Verdict:
 def identity(context: BringUpContext) -> Verdict:
     """Checks that the drive's identity matches the axis file and that it supports the required mode."""
     axis, sdo = context.axis, context.drive.sdo
-    found = {
-        name: sdo.fetch(address)
-        for address, name in IDENTITY
-        if sdo.has(address.index, address.sub) or getattr(axis.drive.identity, name) is not None
-    }
+    found = read_identity(axis, sdo)
     remedies = [*identity_complaints(axis, found)]
     if sdo.has(objects.SUPPORTED_MODES.index, objects.SUPPORTED_MODES.sub):
         remedies += mode_complaints(axis, sdo.fetch(objects.SUPPORTED_MODES))
     text = ", ".join(f"{name.replace('_', ' ')} {value:#x}" for name, value in found.items())
     remedies += _retuned(context)
-    return failed(text, *remedies, **found) if remedies else passed(text, **found)
+    return judged(not remedies, text, *remedies, **found)
 
 
 def _retuned(context: BringUpContext) -> list[str]:
@@ -181,11 +176,7 @@ def _listed(context: BringUpContext) -> Iterator[tuple[int, int]]:
 def units(context: BringUpContext) -> Verdict:
     """Compares every object that defines the drive's scaling with the axis file."""
     axis, sdo = context.axis, context.drive.sdo
-
-    def read(*addresses: Address) -> dict[Address, int]:
-        return {each: sdo.fetch(each) for each in addresses if sdo.has(each.index, each.sub)}
-
-    readings = read(*scaling_addresses(axis))
+    readings = sdo.fetch_listed(scaling_addresses(axis))
     complaints = [*scaling_complaints(axis, readings)]
     said = ", ".join(f"{each.index:04X}h:{each.sub:02X} {value}" for each, value in readings.items())
     text = said or "the drive has no object that states its scaling"
@@ -199,7 +190,7 @@ def units(context: BringUpContext) -> Verdict:
     ):
         if known:
             context.confirmed.add(key)
-    notes = torque_notes(axis, read(objects.RATED_TORQUE).get(objects.RATED_TORQUE))
+    notes = torque_notes(axis, sdo.fetch_listed((objects.RATED_TORQUE,)).get(objects.RATED_TORQUE))
     return passed("; ".join((text, *notes)))
 
 
@@ -262,17 +253,15 @@ def hold(context: BringUpContext) -> Verdict:
 
 def nudge(context: BringUpContext) -> Verdict:
     """Moves the motor two degrees out and back, and checks that it follows."""
-    with context.interruptible() as interrupted:
-        slow = context.slow(interrupted)
-        with slow.enabled():
-            way = _plan(context, slow)
-            context.began_deg = slow.place_deg
-            step = NUDGE_DEG if way.span_deg > 0 else -NUDGE_DEG
-            begin, start_deg = slow.stand(), slow.place_deg
-            slow.travel(start_deg + step)
-            there = slow.stand()
-            slow.travel(start_deg)
-            back = slow.stand()
+    with context.moving() as slow:
+        way = _plan(context, slow)
+        context.began_deg = slow.place_deg
+        step = NUDGE_DEG if way.span_deg > 0 else -NUDGE_DEG
+        begin, start_deg = slow.stand(), slow.place_deg
+        slow.travel(start_deg + step)
+        there = slow.stand()
+        slow.travel(start_deg)
+        back = slow.stand()
     return judge_nudge(
         context.axis,
         context.axis.motor_encoder.counts(step),
@@ -283,20 +272,18 @@ def nudge(context: BringUpContext) -> Verdict:
 
 def turn(context: BringUpContext) -> Verdict:
     """Moves the motor about one turn each way, and compares direction and travel of both encoders."""
-    with context.interruptible() as interrupted:
-        slow = context.slow(interrupted)
-        with slow.enabled():
-            way, start_deg = _plan(context, slow), slow.place_deg
-            slow.travel(start_deg + way.lead_deg)
-            near = slow.stand()
-            context.out = slow.travel(start_deg + way.lead_deg + way.span_deg)
-            context.rest_begins = len(context.out)
-            context.out += slow.sit(SETTLE_S)
-            far = slow.stand()
-            slow.travel(start_deg + way.span_deg)
-            turned_back = slow.stand()
-            slow.travel(start_deg)
-            home = slow.stand()
+    with context.moving() as slow:
+        way, start_deg = _plan(context, slow), slow.place_deg
+        slow.travel(start_deg + way.lead_deg)
+        near = slow.stand()
+        context.out = slow.travel(start_deg + way.lead_deg + way.span_deg)
+        context.rest_begins = len(context.out)
+        context.out += slow.sit(SETTLE_S)
+        far = slow.stand()
+        slow.travel(start_deg + way.span_deg)
+        turned_back = slow.stand()
+        slow.travel(start_deg)
+        home = slow.stand()
     return judge_turn(
         context.axis, _between(near, far), _between(turned_back, home), frozenset(context.confirmed)
     )
@@ -329,11 +316,9 @@ def settling(context: BringUpContext) -> Verdict:
 
 def quick_stop(context: BringUpContext) -> Verdict:
     """Quick-stops a slow motion, and judges stopping distance, time and final state."""
-    with context.interruptible() as interrupted:
-        slow = context.slow(interrupted)
-        with slow.enabled():
-            speed, distance, time_s = slow.stop_on_the_way(_far_from(context, slow))
-            state = slow.image.power.state
+    with context.moving() as slow:
+        speed, distance, time_s = slow.stop_on_the_way(_far_from(context, slow))
+        state = slow.image.power.state
     axis = context.axis
     verdict = judge_stop(axis, speed, distance, time_s, f"'{state.value}'", 0.0)
     option = axis.drive.quick_stop_option
@@ -365,10 +350,8 @@ def heartbeat(context: BringUpContext) -> Verdict:
             f"{axis.where('drive.eds')} is not its EDS",
         )
     beat_s = axis.drive.heartbeat_ms / 1000.0
-    with context.interruptible() as interrupted:
-        slow = context.slow(interrupted)
-        with slow.enabled():
-            speed, silence = slow.lose_heartbeat(_far_from(context, slow), 3.0 * beat_s + 0.2)
+    with context.moving() as slow:
+        speed, silence = slow.lose_heartbeat(_far_from(context, slow), 3.0 * beat_s + 0.2)
     if silence.event is not None and silence.event.fault not in _DRIVES_DOING:
         return failed(f"disturbed: {silence.event}", "remove the cause and check again")
     return _judge_silence(
@@ -392,10 +375,8 @@ def set_points(context: BringUpContext) -> Verdict:
             "the drive has no RPDO event timer (1400h:05); its heartbeat consumer must suffice"
         )
     timer_s = sdo.read(timer, 5) / 1000.0
-    with context.interruptible() as interrupted:
-        slow = context.slow(interrupted)
-        with slow.enabled():
-            speed, silence = slow.lose_set_points(_far_from(context, slow), 3.0 * timer_s + 0.2)
+    with context.moving() as slow:
+        speed, silence = slow.lose_set_points(_far_from(context, slow), 3.0 * timer_s + 0.2)
     return _judge_silence(
         context,
         silence,
@@ -413,9 +394,8 @@ def switched_off(context: BringUpContext) -> Verdict:
     word = drive.sdo.fetch(objects.STATUSWORD)
     state = decode(word)
     text = f"boots again; '{state.value}' (statusword {word:04X}h)"
-    if state in _OFF:
-        return passed(text)
-    return failed(text, "switch the drive off by its enable input and look at its error display")
+    remedy = "switch the drive off by its enable input and look at its error display"
+    return judged(state in _OFF, text, remedy)
 
 
 def _timer(context: BringUpContext) -> int | None:
@@ -474,32 +454,17 @@ def _judge_silence(
             f"no {what}: it stopped on its own, and the master's own 'enable operation', which a dead master "
             f"does not send, restarted it (transition 16){said}"
         )
-        return judge_stop(
-            context.axis,
-            speed,
-            silence.distance_deg,
-            silence.noticed_after_s or 0.0,
-            what,
-            2.0 * after_s + 0.05,
-        )
-    if silence.noticed_after_s is None or still_on or not silence.stands:
+    elif silence.noticed_after_s is None or still_on or not silence.stands:
+        noticed = any(each.code == HEARTBEAT_LOST for each in silence.emergencies)
         return failed(
             f"no {what} in motion at {speed:.3g} motor deg/s: the drive continues{said}",
-            *(
-                [_noticed(context)]
-                if any(e.code == HEARTBEAT_LOST for e in silence.emergencies)
-                else [remedy]
-            ),
+            _noticed(context) if noticed else remedy,
             reacted=False,
         )
-    return judge_stop(
-        context.axis,
-        speed,
-        silence.distance_deg,
-        silence.noticed_after_s,
-        f"no {what}: '{state.value}' on its own",
-        2.0 * after_s + 0.05,
-    )
+    else:
+        what = f"no {what}: '{state.value}' on its own"
+    after, allowed_s = silence.noticed_after_s or 0.0, 2.0 * after_s + 0.05
+    return judge_stop(context.axis, speed, silence.distance_deg, after, what, allowed_s)
 
 
 CHECKS: Final[tuple[Check[BringUpContext], ...]] = (

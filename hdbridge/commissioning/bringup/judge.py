@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
-from hdbridge.commissioning.bringup.checks import Verdict, failed, passed
+from hdbridge.commissioning.bringup.checks import Verdict, failed, judged, passed
 from hdbridge.units import ARCSEC_PER_DEG
 
 if TYPE_CHECKING:
@@ -113,7 +113,12 @@ def judge_turn(
         )
     remedies = []
     if factor < 0:
-        remedies += _direction(axis)
+        load_way, motor_way = axis.load_encoder.direction, axis.motor_encoder.direction
+        remedies.append(
+            f"{axis.where('load_encoder.direction')}: found {load_way}, expected {-load_way} (the load "
+            "encoder counts the other way round); or, if the load turned to the wrong side, "
+            f"{axis.where('motor_encoder.direction')}: found {motor_way}, expected {-motor_way}"
+        )
     if abs(abs(factor) - 1.0) > tolerance:
         remedies += [each.text(axis) for each in suspect_entries(axis, abs(factor), tolerance, confirmed)]
     elif lost > 4.0 + 0.05 * abs(load) / 2.0:
@@ -124,16 +129,7 @@ def judge_turn(
     ratio = f"ratio {axis.gear.ratio / abs(factor):.4g} against {axis.gear.ratio:g}"
     sign = "" if factor > 0 else ", reversed"
     text += f"; {ratio}{sign} (within {100 * tolerance:.2g} %)" if not remedies else f"; {ratio}{sign}"
-    return failed(text, *remedies, **figures) if remedies else passed(text, **figures)
-
-
-def _direction(axis: AxisConfig) -> list[str]:
-    load, motor = axis.load_encoder.direction, axis.motor_encoder.direction
-    return [
-        f"{axis.where('load_encoder.direction')}: found {load}, expected {-load} (the load encoder counts "
-        f"the other way round); or, if the load turned to the wrong side, "
-        f"{axis.where('motor_encoder.direction')}: found {motor}, expected {-motor}"
-    ]
+    return judged(not remedies, text, *remedies, **figures)
 
 
 def suspect_entries(
@@ -247,7 +243,7 @@ def judge_rest(axis: AxisConfig, motor: Sequence[int], load: Sequence[int]) -> V
             f"{axis.where(SOURCE)}: the load encoder moves by {load_span * load_arcsec:.0f} arcsec while the "
             "power is off; check that the object is a position, and the encoder's shield and mounting"
         )
-    return failed(text, *remedies, **figures) if remedies else passed(text, **figures)
+    return judged(not remedies, text, *remedies, **figures)
 
 
 def judge_channels(
@@ -267,7 +263,7 @@ def judge_channels(
                 f"{axis.where(key)}: no plausible reading arrives (within {channel.scale.least:g} to "
                 f"{channel.scale.greatest:g} {BY_KEY[key].unit}); check the sensor, the object and its unit"
             )
-    return failed(text, *remedies, **figures) if remedies else passed(text, **figures)
+    return judged(not remedies, text, *remedies, **figures)
 
 
 def judge_hold(axis: AxisConfig, before: Turned, readings: Sequence[Turned]) -> Verdict:
@@ -278,14 +274,13 @@ def judge_hold(axis: AxisConfig, before: Turned, readings: Sequence[Turned]) -> 
     load_arcsec = load * axis.load_encoder.resolution_arcsec
     text = f"enabled at rest: motor within {motor:.0f} counts, load within {load_arcsec:.3g} arcsec"
     figures = {"motor_moved_counts": motor, "load_moved_arcsec": load_arcsec}
-    if motor > max(3.0, 0.5 / 360.0 * counts):
-        return failed(
-            text,
-            "the axis jumps when power is switched on: check the drive's commutation and tuning, and that "
-            "the brake opens only once the drive holds the axis",
-            **figures,
-        )
-    return passed(text, **figures)
+    return judged(
+        motor <= max(3.0, 0.5 / 360.0 * counts),
+        text,
+        "the axis jumps when power is switched on: check the drive's commutation and tuning, and that the "
+        "brake opens only once the drive holds the axis",
+        **figures,
+    )
 
 
 def judge_nudge(axis: AxisConfig, asked_counts: float, out_counts: float, back_counts: float) -> Verdict:
@@ -334,12 +329,11 @@ def judge_torque(axis: AxisConfig, torques_permille: Sequence[float], limit_perc
         "torque_nm": worst / 100.0 * axis.drive.rated_torque_nm,
         "limit_percent": limit_percent,
     }
-    if worst < 0.9 * limit_percent:
-        return passed(text, **figures)
-    return failed(
+    return judged(
+        worst < 0.9 * limit_percent,
         text,
-        "a slow move needs all of the permitted torque: check brake, load and lubrication; or allow "
-        f"more: --torque-percent, at most {axis.where('limits.torque_percent')}",
+        "a slow move needs all of the permitted torque: check brake, load and lubrication; or allow more: "
+        f"--torque-percent, at most {axis.where('limits.torque_percent')}",
         **figures,
     )
 
@@ -354,14 +348,14 @@ def judge_settling(
     late = [place for place, each in enumerate(load_counts) if abs(each - final) > band]
     settle_s = (late[-1] + 1) * period_s if late else 0.0
     band_arcsec = band * axis.load_encoder.resolution_arcsec
-    text = f"within {band_arcsec:.2g} arcsec {1e3 * settle_s:.0f} ms after the end of the move"
-    figures = {"settling_s": settle_s, "band_arcsec": band_arcsec}
-    if settle_s <= 0.7 * len(load_counts) * period_s:
-        return passed(text, **figures)
-    return failed(
-        f"not at rest within {band_arcsec:.2g} arcsec {1e3 * settle_s:.0f} ms after the end of the move",
+    settled = settle_s <= 0.7 * len(load_counts) * period_s
+    band_text = f"within {band_arcsec:.2g} arcsec {1e3 * settle_s:.0f} ms after the end of the move"
+    return judged(
+        settled,
+        band_text if settled else f"not at rest {band_text}",
         "the axis hunts or swings: tune the drive with its own software",
-        **figures,
+        settling_s=settle_s,
+        band_arcsec=band_arcsec,
     )
 
 
@@ -388,9 +382,8 @@ def judge_stop(
         f"{what}: from {speed_deg_s:.3g} motor deg/s in {distance_deg:.3g} deg and {1e3 * time_s:.0f} ms "
         f"(allowed {way_allowed_deg:.3g} deg, {1e3 * time_allowed_s:.0f} ms)"
     )
-    if distance_deg <= way_allowed_deg and time_s <= time_allowed_s:
-        return passed(text, **figures)
-    return failed(
+    return judged(
+        distance_deg <= way_allowed_deg and time_s <= time_allowed_s,
         text,
         f"the drive brakes more slowly than its ramp: {axis.where('drive.quick_stop_option')} (605Ah) "
         f"selects the ramp, {axis.where('limits.acceleration_deg_s2')} its slope (6085h); see the drive's "

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from hdbridge.axis import BusConfig
-from hdbridge.commissioning.bringup.scan import Node, axis_lines
+from hdbridge.commissioning.bringup.scan import Node, axis_sections
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_folder
 from hdbridge.files.profile import bundled_profile
@@ -58,7 +58,7 @@ def write_scanned(folder: Path, bus: BusConfig, node: Node, eds: Path | None) ->
 
 def axis_text(name: str, bus: BusConfig, node: Node, eds_name: str) -> str:
     """Returns the text of an axis file; values that only the user knows are marked ``fill in``."""
-    said = _sections(axis_lines(node))
+    said = axis_sections(node)
     for section, keys in _TO_FILL_IN.items():
         lines = said.setdefault(section, [])
         there = {each.split(":")[0].strip() for each in lines}
@@ -83,18 +83,6 @@ def axis_text(name: str, bus: BusConfig, node: Node, eds_name: str) -> str:
     order = ("drive", "motor_encoder", "load_encoder", "gear")
     body = [line for section in order for line in ("", f"{section}:", *said[section])]
     return "\n".join([*head, *body]) + "\n" + _TAIL
-
-
-def _sections(lines: list[str]) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {}
-    section = ""
-    for line in lines:
-        if line.startswith(" "):
-            found[section].append(line)
-        else:
-            section = line.split(":")[0]
-            found[section] = []
-    return found
 
 
 def _axis_name(folder: Path) -> str:

@@ -4,7 +4,8 @@ Only SDO read requests are sent (and an SDO abort after an unanswered request). 
 another SDO client is skipped, because a second client on the same channel would disrupt its transfer.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Final
@@ -13,6 +14,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.cia301 import NmtState
 from hdbridge.commissioning.bringup import ASK_TIMEOUT_S, LISTEN_S
 from hdbridge.drive import objects
+from hdbridge.drive.bootup import read_names
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.masterdetection import MasterDetector, listening_s
 from hdbridge.drive.monitor import NetworkMonitor
@@ -39,7 +41,6 @@ MODES: Final[dict[int, str]] = {
     0: "PP", 1: "VL", 2: "PV", 3: "TQ", 5: "HM", 6: "IP", 7: "CSP", 8: "CSV", 9: "CST",
 }  # fmt: skip
 """Modes of operation by their bit in 6502h."""
-_NAMES: Final = ((0x1008, "device"), (0x1009, "hardware"), (0x100A, "software"))
 _SCALING: Final = (
     objects.ENCODER_INCREMENTS,
     objects.ENCODER_REVOLUTIONS,
@@ -136,20 +137,14 @@ class _BusObserver:
         self.spoken: set[int] = set()
         """Nodes that have sent a frame."""
         self.busy: set[int] = set()
-        self.syncs = 0
-        self.commands = 0
         self.detector = MasterDetector(NODE_IDS)
 
     def take(self, frame: Frame) -> None:
         self.detector.take(frame)
-        can_id, node_id = frame.can_id, frame.can_id & 0x7F
-        function = can_id - node_id
+        node_id = frame.can_id & 0x7F
+        function = frame.can_id - node_id
         if self.monitor.dispatch(frame):
             self.spoken.add(node_id)
-        elif can_id == objects.COB_SYNC:
-            self.syncs += 1
-        elif can_id == objects.COB_NMT:
-            self.commands += 1
         elif function in (objects.COB_SDO_REQUEST, objects.COB_SDO_ANSWER) and node_id:
             self.busy.add(node_id)
 
@@ -162,13 +157,14 @@ class _BusObserver:
 
     def remarks(self) -> list[str]:
         remarks = []
-        if self.syncs:
+        counts = self.detector.counts
+        if syncs := counts[objects.COB_SYNC]:
             remarks.append(
-                f"{self.syncs} SYNC messages were heard: another master runs on this bus; stop it before you "
+                f"{syncs} SYNC messages were heard: another master runs on this bus; stop it before you "
                 "control an axis here"
             )
-        if self.commands:
-            remarks.append(f"{self.commands} NMT commands of another master were heard")
+        if commands := counts[objects.COB_NMT]:
+            remarks.append(f"{commands} NMT commands of another master were heard")
         if self.busy:
             who = ", ".join(map(str, sorted(self.busy)))
             remarks.append(
@@ -225,39 +221,31 @@ def _ask(observer: _BusObserver, node_id: int, timeout_s: float) -> Node:
         return node
     node.answers = True
     sdo = SdoClient(observer.link, observer.monitor, node_id, None, DETAIL_TIMEOUT_S, attempts=2)
-    for address, name in IDENTITY:
-        value = _fetch(sdo, address)
-        if value is not None:
-            node.identity[name] = value
-    for index, name in _NAMES:
-        try:
-            node.names[name] = sdo.read_text(index)
-        except SdoError:
-            continue
+    found = _fetched(sdo, dict(IDENTITY))
+    node.identity = {name: found[address] for address, name in IDENTITY if address in found}
+    node.names = read_names(sdo)
     wanted: tuple[Address, ...] = ()
     if node.profile == objects.DEVICE_PROFILE_402:
-        node.modes = _fetch(sdo, objects.SUPPORTED_MODES)
+        node.modes = _fetched(sdo, (objects.SUPPORTED_MODES,)).get(objects.SUPPORTED_MODES)
         wanted = _SCALING
     elif node.profile == 406:
         wanted = (ENCODER_UNITS_PER_TURN,)
-    for address in wanted:
-        value = _fetch(sdo, address)
-        if value is not None:
-            node.values[address] = value
+    node.values = _fetched(sdo, wanted)
     return node
 
 
-def _fetch(sdo: SdoClient, address: Address) -> int | None:
-    try:
-        return sdo.read(address.index, address.sub, address.type)
-    except SdoError:
-        return None  # optional object
+def _fetched(sdo: SdoClient, addresses: Iterable[Address]) -> dict[Address, int]:
+    """Reads optional objects; omits those that the node lacks."""
+    found = {}
+    for address in addresses:
+        with suppress(SdoError):
+            found[address] = sdo.read(address.index, address.sub, address.type)
+    return found
 
 
 def identity_matches(axis: AxisConfig, node: Node) -> bool:
     """Returns True if the node's identity is that of the axis file."""
-    wanted = axis.drive.identity.model_dump(exclude_none=True)
-    return all(node.identity.get(name) == value for name, value in wanted.items())
+    return not _identity_lines(axis, node)
 
 
 def compare(axis: AxisConfig, scan: Scan) -> tuple[bool, list[str]]:
@@ -303,44 +291,44 @@ def _identity_lines(axis: AxisConfig, node: Node) -> list[str]:
 
 
 def axis_lines(node: Node) -> list[str]:
-    """Returns the lines of an axis file that the node's own objects determine."""
+    """Returns the lines of `axis_sections`."""
+    return [line for name, own in axis_sections(node).items() for line in (f"{name}:", *own)]
+
+
+def axis_sections(node: Node) -> dict[str, list[str]]:
+    """Returns the lines for an axis file by section: the node's data; none for a node that is of no use."""
     if node.profile == 406:
-        return _encoder_lines(node)
+        units = node.values.get(ENCODER_UNITS_PER_TURN)
+        return {
+            "load_encoder": [
+                *([f"  counts_per_turn: {units}         # 6001h"] if units else []),
+                f"  source: {{index: 0x6004, subindex: 0, type: uint32, node: {node.node_id}}}",
+            ]
+        }
+    if not node.usable:
+        return {}
     identity = ", ".join(f"{name}: {value:#x}" for name, value in node.identity.items())
-    lines = [
-        "drive:",
+    drive = [
         f"  node_id: {node.node_id}",
         "  eds: FILE.eds                 # the EDS file of this drive, next to the axis file",
         f"  identity: {{{identity}}}",
     ]
     if node.cyclic == "ip":
-        lines.append("  mode: ip                      # 6502h: it has interpolated position, and not csp")
-    torque = node.values.get(objects.RATED_TORQUE)
-    if torque:
-        lines.append(f"  rated_torque_nm: {torque / 1000.0:g}        # 6076h")
-    counts = _ratio(node, objects.ENCODER_INCREMENTS, objects.ENCODER_REVOLUTIONS)
-    if counts is not None:
-        lines += ["motor_encoder:", f"  counts_per_turn: {_number(counts)}         # 608Fh"]
-    counts = _ratio(node, *objects.additional_resolution(1))
-    if counts is not None:
-        lines += [
-            "load_encoder:",
+        drive.append("  mode: ip                      # 6502h: it has interpolated position, and not csp")
+    if torque := node.values.get(objects.RATED_TORQUE):
+        drive.append(f"  rated_torque_nm: {torque / 1000.0:g}        # 6076h")
+    sections = {"drive": drive}
+    if counts := _ratio(node, objects.ENCODER_INCREMENTS, objects.ENCODER_REVOLUTIONS):
+        sections["motor_encoder"] = [f"  counts_per_turn: {_number(counts)}         # 608Fh"]
+    if counts := _ratio(node, *objects.additional_resolution(1)):
+        sections["load_encoder"] = [
             f"  counts_per_turn: {_number(counts)}         # 60E6h:01 over 60EBh:01; is it per load turn?",
             "  source: {index: 0x60E4, subindex: 1, type: int32}",
         ]
     ratio = _ratio(node, objects.GEAR_MOTOR, objects.GEAR_SHAFT)
     if ratio is not None and ratio != 1:
-        lines += ["gear:", f"  ratio: {_number(ratio)}                     # 6091h"]
-    return lines
-
-
-def _encoder_lines(node: Node) -> list[str]:
-    counts = node.values.get(ENCODER_UNITS_PER_TURN)
-    return [
-        "load_encoder:",
-        *([f"  counts_per_turn: {counts}         # 6001h"] if counts else []),
-        f"  source: {{index: 0x6004, subindex: 0, type: uint32, node: {node.node_id}}}",
-    ]
+        sections["gear"] = [f"  ratio: {_number(ratio)}                     # 6091h"]
+    return sections
 
 
 def _ratio(node: Node, above: objects.Address, below: objects.Address) -> Fraction | None:

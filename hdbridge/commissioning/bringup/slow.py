@@ -135,7 +135,8 @@ class SlowAxis:
         self.torque_percent = min(torque_percent, drive.axis.limits.torque_percent)
         self._drive = drive
         self._interrupted = interrupted
-        self._place_deg = 0.0
+        self.place_deg = 0.0
+        """Target motor angle, degrees."""
 
     # -- power --------------------------------------------------------------------------------------------
 
@@ -149,7 +150,7 @@ class SlowAxis:
         self.cycle.restart()
         try:
             feedback = until_enabled(lambda: self._tick(None), power, self.cycle.period_s)
-            self._place_deg = self.image.motor_deg(feedback.motor_counts)
+            self.place_deg = self.image.motor_deg(feedback.motor_counts)
             yield feedback
             self._rest()
         except BaseException:
@@ -182,18 +183,13 @@ class SlowAxis:
 
     # -- motion -------------------------------------------------------------------------------------------
 
-    @property
-    def place_deg(self) -> float:
-        """Target motor angle, degrees."""
-        return self._place_deg
-
     def sit(self, duration_s: float) -> list[Feedback]:
         """Runs cycles without motion, with or without power; returns their feedback."""
         return [self._tick(None) for _ in range(math.ceil(duration_s / self.cycle.period_s))]
 
-    def travel(self, motor_deg: float, least_s: float = 0.0) -> list[Feedback]:
+    def travel(self, motor_deg: float) -> list[Feedback]:
         """Moves slowly to a motor angle; returns the feedback of each cycle."""
-        return list(self._follow(motor_deg, least_s))
+        return list(self._follow(motor_deg))
 
     def stand(self, duration_s: float = 0.4) -> Turned:
         """Holds the position; returns the mean counts of both encoders over the last quarter of the time."""
@@ -203,30 +199,27 @@ class SlowAxis:
             fmean(each.motor_counts for each in tail), fmean(float(each.load_counts) for each in tail)
         )
 
-    def speed_deg_s(self, way_deg: float, least_s: float = 0.0) -> float:
-        """Returns the motor speed for a travel of ``way_deg`` that lasts at least ``least_s``, deg/s."""
-        limits = self.axis.limits
-        speed = min(MOTOR_SPEED_DEG_S, 0.25 * limits.velocity_deg_s * self.axis.gear.ratio)
-        return min(speed, abs(way_deg) / least_s) if least_s > 0.0 else speed
-
     def _path(self, motor_deg: float, least_s: float) -> Path:
+        """Returns the path to a motor angle, which lasts at least ``least_s``."""
         ratio, limits = self.axis.gear.ratio, self.axis.limits
-        speed = self.speed_deg_s(motor_deg - self._place_deg, least_s) / ratio
+        speed = min(MOTOR_SPEED_DEG_S, 0.25 * limits.velocity_deg_s * ratio)
+        if least_s > 0.0:
+            speed = min(speed, abs(motor_deg - self.place_deg) / least_s)
         slow = MotionLimits(
             limits.position_min_deg,
             limits.position_max_deg,
-            speed,
+            speed / ratio,
             0.5 * limits.acceleration_deg_s2,
             limits.jerk_deg_s3,
         )
-        return MoveTo(motor_deg / ratio).path(self._place_deg / ratio, slow)
+        return MoveTo(motor_deg / ratio).path(self.place_deg / ratio, slow)
 
     def _follow(self, motor_deg: float, least_s: float = 0.0) -> Iterator[Feedback]:
         path, period_s, ratio = self._path(motor_deg, least_s), self.cycle.period_s, self.axis.gear.ratio
         elapsed_s = 0.0
         while True:
-            self._place_deg = path.at(elapsed_s) * ratio
-            yield self._tick(self.image.target_counts_for(self._place_deg))
+            self.place_deg = path.at(elapsed_s) * ratio
+            yield self._tick(self.image.target_counts_for(self.place_deg))
             if elapsed_s >= path.duration_s:
                 return
             elapsed_s += period_s
@@ -311,11 +304,11 @@ class SlowAxis:
 
     def _half_way(self, moving: Iterator[Feedback], motor_deg: float) -> Sequence[Feedback]:
         """Runs the move up to the middle of its travel; the rest of ``moving`` can still be run."""
-        begin = self._place_deg
+        begin = self.place_deg
         seen: list[Feedback] = []
         for feedback in moving:
             seen.append(feedback)
-            if abs(self._place_deg - begin) >= 0.5 * abs(motor_deg - begin):
+            if abs(self.place_deg - begin) >= 0.5 * abs(motor_deg - begin):
                 break
         return seen
 
@@ -413,6 +406,14 @@ class BringUpContext(ExitStack):
         if report.state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
             self.drive.fault_reset()
         return self.drive
+
+    @contextmanager
+    def moving(self) -> Iterator[SlowAxis]:
+        """Yields the axis for slow motion, freshly booted and under power until the end of the block."""
+        with self.interruptible() as interrupted:
+            slow = self.slow(interrupted)
+            with slow.enabled():
+                yield slow
 
     def slow(self, interrupted: Callable[[], bool]) -> SlowAxis:
         """Returns the axis for slow motion, freshly booted and still switched off."""

@@ -10,12 +10,13 @@
 
 from hdbridge.commissioning.calibration.identification import identify, measured_of
 from hdbridge.commissioning.calibration.journal import Journal
-from hdbridge.commissioning.calibration.measure import measure, start_journal
+from hdbridge.commissioning.calibration.measure import Callbacks, measure, start_journal
 from hdbridge.commissioning.calibration.pipeline import Calibration, Offer, calibrate, concluded, fit
 from hdbridge.commissioning.calibration.validation import Validation, validate
 
 __all__ = [
     "Calibration",
+    "Callbacks",
     "Journal",
     "Offer",
     "Validation",

@@ -112,19 +112,13 @@ class Journal:
 
     def check_is_of(self, axis: AxisConfig, identity: Identity | None = None) -> None:
         """Raises InputError for a recording of another axis, gear or drive."""
-        for what, theirs, ours in (
-            ("axis", self._about.axis, axis.name),
-            ("gear ratio", self._about.ratio, axis.gear.ratio),
-            *(
-                (f"drive {name}", getattr(self._about.drive, name, None), getattr(identity, name, None))
-                for name in ("vendor_id", "product_code", "serial")
-            ),
-        ):
-            if theirs is not None and ours is not None and theirs != ours:
-                raise InputError(
-                    f"{self.folder / ABOUT_NAME}: this recording is of {what} {theirs}, but the {what} here "
-                    f"is {ours} ({axis.path}); resume it on the axis that was recorded, or start a new one"
-                )
+        check_is_of(
+            self._about,
+            axis,
+            self.folder / ABOUT_NAME,
+            "resume it on the axis that was recorded, or start a new one",
+            identity,
+        )
 
     @property
     def done(self) -> frozenset[str]:
@@ -186,10 +180,8 @@ class Journal:
             Segment(kind=each.kind, start_s=each.start_s + shift_s, end_s=each.end_s + shift_s)
             for each in legs
         )
-        before, tasks = (
-            self._about,
-            [each.model_dump(mode="json", exclude_defaults=True) for each in self._tasks],
-        )
+        before = self._about
+        tasks = [each.model_dump(mode="json", exclude_defaults=True) for each in self._tasks]
         changes = {
             "notes": {**before.notes, "tasks": tasks},
             "files": (*before.files, RecordedFile.of(self.folder / name, len(record))),
@@ -201,6 +193,25 @@ class Journal:
     def recording(self) -> Recording:
         """Loads everything measured so far."""
         return Recording.load(self.folder)
+
+
+def check_is_of(
+    about: RecordingFile | Recording,
+    axis: AxisConfig,
+    path: Path,
+    remedy: str,
+    identity: Identity | None = None,
+) -> None:
+    """Raises InputError with a remedy for a recording of another axis, gear or drive."""
+    pairs = [("axis", about.axis, axis.name), ("gear ratio", about.ratio, axis.gear.ratio)]
+    for name in ("vendor_id", "product_code", "serial") if identity is not None else ():
+        pairs.append((f"drive {name}", getattr(about.drive, name, None), getattr(identity, name)))
+    for what, theirs, ours in pairs:
+        if theirs is not None and ours is not None and theirs != ours:
+            raise InputError(
+                f"{path}: this recording is of {what} {theirs}, but the {what} here is {ours} ({axis.path}); "
+                f"{remedy}"
+            )
 
 
 def fault_notes_in(folders: Iterable[Path]) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.commissioning.calibration.journal import Journal
@@ -15,29 +15,36 @@ from hdbridge.drive.drive import Drive
 from hdbridge.errors import HdbridgeError, InputError, OutputError
 from hdbridge.files.atomic import make_folder
 from hdbridge.motion.procedures.plan import Plan, Task
-from hdbridge.motion.procedures.rehearsal import rehearse
+from hdbridge.motion.procedures.rehearsal import total_duration_s
 
 REPORT_CYCLES = 50
 """Number of cycles between two reports of progress."""
 
 
+@dataclass(frozen=True, slots=True)
+class Callbacks:
+    """Functions that a measurement calls."""
+
+    progress: Callable[[str, float, float], None] = lambda *_: None
+    """Receives the name of the current task, and the completed and total seconds."""
+    interrupted: Callable[[], bool] = lambda: False
+    """Called in each control cycle; the axis is stopped if it returns True."""
+    notify: Callable[[str], None] = lambda _: None
+    """Receives a line for each step of a workflow."""
+
+
+SILENT: Final = Callbacks()
+
+
 class Pace:
     """Progress of a measurement in control cycles; a bench calls `interrupted` once per cycle."""
 
-    def __init__(
-        self,
-        total_s: float,
-        period_s: float,
-        notify: Callable[[str, float, float], None],
-        interrupted: Callable[[], bool],
-    ) -> None:
-        """``notify`` receives the task's name, and the completed and total seconds."""
+    def __init__(self, total_s: float, period_s: float, callbacks: Callbacks) -> None:
         self.name = ""
         self.total_s = total_s
         self._done_s = 0.0
         self._period_s = period_s
-        self._notify = notify
-        self._interrupted = interrupted
+        self._callbacks = callbacks
         self._cycles = 0
 
     def begin(self, name: str) -> None:
@@ -46,16 +53,16 @@ class Pace:
         self._say()
 
     def interrupted(self) -> bool:
-        """Counts a cycle and reports progress; returns the caller's ``interrupted()``."""
+        """Counts a cycle and reports progress; returns True if the axis must stop."""
         self._cycles += 1
         if self._cycles >= REPORT_CYCLES:
             self._say()
-        return self._interrupted()
+        return self._callbacks.interrupted()
 
     def _say(self) -> None:
         self._done_s += self._cycles * self._period_s
         self._cycles = 0
-        self._notify(self.name, min(self._done_s, self.total_s), self.total_s)
+        self._callbacks.progress(self.name, min(self._done_s, self.total_s), self.total_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +80,7 @@ def remaining_plan(plan: Plan, axis: AxisConfig, done: Sequence[str] | frozenset
     view = axis_view(axis)
     fitted = plan.tasks(view)
     left = tuple(each for each in fitted.tasks if each.name not in set(done))
-    middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
-    return RemainingPlan(
-        left, sum(rehearse(each.procedure, view, middle).duration_s for each in left), fitted.notes
-    )
+    return RemainingPlan(left, total_duration_s((each.procedure for each in left), view), fitted.notes)
 
 
 def start_journal(
@@ -92,36 +96,24 @@ def start_journal(
     InputError if the axis has no encoder at its load.
     """
     axis.require_load_encoder()
-    shortened = remaining_plan(plan, axis).notes
-    return Journal.create(
-        folder,
-        axis,
-        plan,
-        date,
-        identity,
-        {**(notes or {}), **({"shortened": list(shortened)} if shortened else {})},
-    )
+    notes = dict(notes or {})
+    if shortened := remaining_plan(plan, axis).notes:
+        notes["shortened"] = list(shortened)
+    return Journal.create(folder, axis, plan, date, identity, notes)
 
 
-def measure(
-    drive: Drive | Rig,
-    journal: Journal,
-    *,
-    progress: Callable[[str, float, float], None] = lambda *_: None,
-    interrupted: Callable[[], bool] = lambda: False,
-) -> None:
+def measure(drive: Drive | Rig, journal: Journal, callbacks: Callbacks = SILENT) -> None:
     """Runs the remaining tasks of the journal's plan on a booted drive.
 
-    ``progress`` receives the task's name, and the completed and total seconds. If a task is stopped
-    (KeyboardInterrupt, `SafetyStop`, `DriveError`, `BusError`), its samples are kept before the error is
-    raised.
+    If a task is stopped (KeyboardInterrupt, `SafetyStop`, `DriveError`, `BusError`), its samples are kept
+    before the error is raised.
     """
     journal.check_is_of(drive.axis, drive.identity)
     left = remaining_plan(journal.plan, drive.axis, journal.done)
     if not left.tasks:
         return
     make_folder(journal.folder)  # fails on an unwritable disk before the axis moves
-    pace = Pace(left.duration_s, drive.axis.drive.cycle_s, progress, interrupted)
+    pace = Pace(left.duration_s, drive.axis.drive.cycle_s, callbacks)
     bench = bench_on(drive, interrupted=pace.interrupted)
     journal.begin_session()
     for task in left.tasks:

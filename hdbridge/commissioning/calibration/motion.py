@@ -30,7 +30,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import InertialWindup, Motion, Synchronous
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import Response
-from hdbridge.commissioning.calibration.measure import Pace
+from hdbridge.commissioning.calibration.measure import SILENT, Callbacks, Pace
 from hdbridge.commissioning.calibration.path import PathError, inertia_over_stiffness, path_errors
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.rig import Rig, bench_on
@@ -40,7 +40,7 @@ from hdbridge.errors import InputError
 from hdbridge.motion.procedures.even_speed import SHARES, EvenRun, EvenSpeed
 from hdbridge.motion.procedures.moves import Outcome, Procedure
 from hdbridge.motion.procedures.path_test import PathRun, PathTest
-from hdbridge.motion.procedures.rehearsal import rehearse
+from hdbridge.motion.procedures.rehearsal import total_duration_s
 from hdbridge.units import ARCSEC_PER_DEG
 
 CHANCE = 1.05
@@ -212,21 +212,15 @@ class MotionTest:
         return restored
 
 
-def motion_test_s(axis: AxisConfig, runs: int = 2 + TRIALS) -> float:
+def motion_test_s(axis: AxisConfig) -> float:
     """Returns the maximum duration of the motion test on an ideal axis, s."""
     view = axis_view(axis)
-    middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
-    paths_s = 4.0 * rehearse(PathTest(), view, middle).duration_s
-    return paths_s + runs * rehearse(EvenSpeed.spread(view), view, middle).duration_s
+    paths_s = 4.0 * total_duration_s([PathTest()], view)
+    return paths_s + (2 + TRIALS) * total_duration_s([EvenSpeed.spread(view)], view)
 
 
 def motion_test(
-    drive: Drive | Rig,
-    model: TransmissionModel,
-    *,
-    measure: bool = True,
-    progress: Callable[[str, float, float], None] = lambda *_: None,
-    interrupted: Callable[[], bool] = lambda: False,
+    drive: Drive | Rig, model: TransmissionModel, callbacks: Callbacks = SILENT, *, measure: bool = True
 ) -> MotionTest:
     """Runs a booted drive's axis at several speeds and on paths, without and with the model's correction.
 
@@ -236,7 +230,7 @@ def motion_test(
     tested was measured with a different cycle time. Without an encoder at the load, the ripple is that of the
     load angle predicted from the motor encoder, and no path is run.
     """
-    runner = _Runner(drive, model, progress, interrupted)
+    runner = _Runner(drive, model, callbacks)
     if not measure:
         compensation_for(drive.axis, model)  # rejects a response for a different cycle time before any motion
     gains = read_gains(drive.sdo) if isinstance(drive, Drive) else {}
@@ -344,7 +338,7 @@ def servo_check(
     """
     if model.response is None:
         raise InputError(f"{model.path}: has no response in motion; measure it: hdbridge motion --propose")
-    return _Runner(drive, model, lambda *_: None, interrupted, CHECKED).check(model)[1]
+    return _Runner(drive, model, Callbacks(interrupted=interrupted), CHECKED).check(model)[1]
 
 
 class _Runner:
@@ -354,8 +348,7 @@ class _Runner:
         self,
         drive: Drive | Rig,
         model: TransmissionModel,
-        progress: Callable[[str, float, float], None],
-        interrupted: Callable[[], bool],
+        callbacks: Callbacks,
         shares: Sequence[float] = SHARES,
     ) -> None:
         axis = self.axis = drive.axis
@@ -373,7 +366,7 @@ class _Runner:
         self._orders_only = TransmissionModel(model.ratio, (Synchronous(orders=tuple(self.motor_orders)),))
         self.ratio = model.ratio
         self._drive = drive
-        self._pace = Pace(motion_test_s(axis), axis.drive.cycle_s, progress, interrupted)
+        self._pace = Pace(motion_test_s(axis), axis.drive.cycle_s, callbacks)
 
     def run(self, name: str, model: TransmissionModel) -> tuple[Harmonics, ...]:
         """Runs the axis at all speeds with this model's correction; returns the harmonics of each run."""

@@ -16,7 +16,7 @@ from hdbridge.axis.model.difference import diff
 from hdbridge.axis.model.store import propose
 from hdbridge.commissioning.calibration.identification import identify, provenance, standings, with_provenance
 from hdbridge.commissioning.calibration.journal import Journal, fault_notes_in, tasks_of
-from hdbridge.commissioning.calibration.measure import measure
+from hdbridge.commissioning.calibration.measure import SILENT, Callbacks, measure
 from hdbridge.commissioning.calibration.motion import MotionTest, motion_test, wind_up_of
 from hdbridge.commissioning.calibration.validation import Validation, floor_of, validate
 from hdbridge.control.caps import cap_remark
@@ -140,7 +140,6 @@ def _number(value: float) -> float | None:
 RESULT_NAME = "calibration.json"
 MODEL_NAME = "model.yaml"
 ACTIVE_NAME = "active.yaml"
-Progress = Callable[[str, float, float], None]
 
 
 @suspended_realtime()  # fitting takes long; a bench resumes real-time priority for each motion
@@ -149,19 +148,15 @@ def calibrate(
     journal: Journal,
     profile: Path,
     date: datetime,
-    *,
-    progress: Progress = lambda *_: None,
-    interrupted: Callable[[], bool] = lambda: False,
-    notify: Callable[[str], None] = lambda _: None,
+    callbacks: Callbacks = SILENT,
 ) -> Calibration:
     """Measures the remaining tasks, fits, validates, and proposes the model to the profile.
 
-    ``profile`` is the folder of axis.yaml; ``notify`` receives a line for each step. A model that does not
-    improve on held-out data, or that worsens positioning, is saved in the recording's folder but not
-    proposed.
+    ``profile`` is the folder of axis.yaml. A model that does not improve on held-out data, or that worsens
+    positioning, is saved in the recording's folder but not proposed.
     """
-    axis = drive.axis
-    measure(drive, journal, progress=progress, interrupted=interrupted)
+    axis, notify = drive.axis, callbacks.notify
+    measure(drive, journal, callbacks)
     active = active_model(profile, axis, drive, notify)
     notify("fitting")
     recording = journal.recording()
@@ -180,23 +175,14 @@ def calibrate(
     if journal.plan.validation.motion:
         notify("measuring the response in motion")
         try:
-            tested = motion_test(drive, result.model, progress=progress, interrupted=interrupted)
+            tested = motion_test(drive, result.model, callbacks)
         except InputError as problem:
             notify(f"not tested in motion: {problem}")
         else:
             result = replace(result, model=tested.applied(result.model), motion=tested)
     notify("testing it on the axis, before and after")
     floor = floor_of(axis, recording)
-    checked, model = validate(
-        drive,
-        journal.plan,
-        active,
-        result.model,
-        floor,
-        journal.folder,
-        progress=progress,
-        interrupted=interrupted,
-    )
+    checked, model = validate(drive, journal.plan, active, result.model, floor, journal.folder, callbacks)
     for each in diff(result.model, model):
         if each.changed:
             notify(f"{each.effect}.{each.parameter} at rest: {each.after:.2f}; fitted {each.before:.2f}")
@@ -314,14 +300,23 @@ def active_model(
 
 
 def _kept(folder: Path, result: Calibration) -> Calibration:
-    """Saves the result, the new model and the active model next to the recording."""
-    with writing():
-        result.model.save(folder / MODEL_NAME)
-        if result.active:
-            result.active.save(folder / ACTIVE_NAME)
-        text = json.dumps(result.as_dict(), indent=1, allow_nan=False)
-        write_atomically(folder / RESULT_NAME, text + "\n")
+    save_result(folder / RESULT_NAME, result.as_dict(), result.model, result.active)
     return result
+
+
+def save_result(
+    path: Path,
+    document: dict[str, Any],
+    model: TransmissionModel | None,
+    active: TransmissionModel | None,
+) -> None:
+    """Saves a result, the new model and the active model in the folder of a recording."""
+    with writing():
+        if model:
+            model.save(path.with_name(MODEL_NAME))
+        if active:
+            active.save(path.with_name(ACTIVE_NAME))
+        write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 def fit(

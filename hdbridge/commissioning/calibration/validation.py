@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects.elastic_loop import ElasticLoop
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration.identification import resting
-from hdbridge.commissioning.calibration.measure import Pace
+from hdbridge.commissioning.calibration.measure import SILENT, Callbacks, Pace
 from hdbridge.commissioning.calibration.path import SETTLED_ARCSEC
 from hdbridge.commissioning.evaluation.accuracy import AxisAccuracy, axis_accuracy
 from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_floor_arcsec
@@ -170,9 +170,7 @@ def validate(
     after: TransmissionModel,
     floor: Floor,
     folder: Path,
-    *,
-    progress: Callable[[str, float, float], None] = lambda *_: None,
-    interrupted: Callable[[], bool] = lambda: False,
+    callbacks: Callbacks = SILENT,
 ) -> tuple[Validation, TransmissionModel]:
     """Runs the stepping and positioning tests with ``before`` (None: no compensation), then with ``after``.
 
@@ -182,7 +180,7 @@ def validate(
     axis = drive.axis
     stepping = plan.stepping(axis_view(axis))
     positioning = plan.positioning(axis_view(axis))
-    pace = Pace(validation_s(plan, axis), axis.drive.cycle_s, progress, interrupted)
+    pace = Pace(validation_s(plan, axis), axis.drive.cycle_s, callbacks)
     results: list[Stepped] = []
     accuracies: list[AxisAccuracy] = []
     notes: list[str] = []
@@ -200,7 +198,9 @@ def validate(
     ):
         bench, run = stepped(name, model)
         test = Stepped.of(words, run.outcome)
-        if name == "after" and _arrives_otherwise(test):
+        # The hysteresis at rest depends on the overshoot of the arriving motor. A compensated wind-up
+        # changes it: the means of the two directions differ then.
+        if name == "after" and _exceeds(test.pooled.three_sigma_arcsec, _within_directions(test), test):
             model = at_rest(model, run)
             bench, run = stepped(name, model)
             test = Stepped.of(words, run.outcome)
@@ -224,16 +224,7 @@ def validate(
         if name == "before":
             model = at_rest(after, run)
     accurate = (accuracies[0], accuracies[1]) if accuracies else (None, None)
-    validation = Validation(results[0], results[1], floor, accurate[0], accurate[1], tuple(notes))
-    return validation, model
-
-
-def _arrives_otherwise(test: Stepped) -> bool:
-    """Returns True if the directions differ in their means, significantly compared with their scatter.
-
-    The hysteresis at rest depends on the overshoot of the arriving motor. A compensated wind-up changes it.
-    """
-    return _exceeds(test.pooled.three_sigma_arcsec, _within_directions(test), test)
+    return Validation(results[0], results[1], floor, accurate[0], accurate[1], tuple(notes)), model
 
 
 def _within_directions(test: Stepped) -> float:

@@ -1,6 +1,6 @@
 """Stepping test under each compensation scheme, in sequence on one axis."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
@@ -67,25 +67,22 @@ def compare_schemes(
     *,
     progress: Callable[[Scheme, float], None] = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
-    finished: Callable[[Scheme, Run[SteppingOutcome]], None] = lambda *_: None,
     stopped: Callable[[Scheme, Record], None] = lambda *_: None,
-) -> Comparison:
-    """Runs the stepping test under each scheme on a booted drive, which is disabled after each test.
+) -> Iterator[tuple[Scheme, Run[SteppingOutcome]]]:
+    """Yields the stepping test under each scheme on a booted drive, which is disabled after each test.
 
-    ``progress`` receives the completed fraction of the current scheme, ``finished`` each completed run, and
-    ``stopped`` the measurements of an interrupted run, so that no measurement is lost.
+    ``progress`` receives the completed fraction of the current scheme, and ``stopped`` the measurements of an
+    interrupted run, so that no measurement is lost.
     """
     drive.axis.require_load_encoder()
     # All compensations first, so that an impossible one is refused before anything moves.
     compensations = {scheme: compensation_for(drive.axis, scheme.of(model)) for scheme in schemes}
-    runs: dict[Scheme, Run[SteppingOutcome]] = {}
     for scheme, compensation in compensations.items():
         bench = bench_on(drive, compensation, interrupted=interrupted)
         try:
-            runs[scheme] = bench.run(stepping, partial(progress, scheme))
+            run = bench.run(stepping, partial(progress, scheme))
         except BaseException:
             if len(record := bench.record()):
                 stopped(scheme, record)
             raise
-        finished(scheme, runs[scheme])
-    return Comparison.of(drive.axis, runs)
+        yield scheme, run

@@ -7,7 +7,7 @@ import numpy as np
 
 from hdbridge.analysis.findings import Diagnosis, Finding
 from hdbridge.analysis.gain import Gain
-from hdbridge.axis.effects import CATALOGUE, Channel, Effect, Wear
+from hdbridge.axis.effects import CATALOGUE, Channel, Wear
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.units import DEG_PER_TURN
 
@@ -60,11 +60,12 @@ def extension_of(
         for each in diagnosis.findings
         if each.effect is not None and (each.effect.is_compensable() or each.refusal())
     } - names
-    turns = _turns_run(diagnosis)
+    turns = float(np.sum(np.abs(np.diff(diagnosis.traces.motion.motor_deg)))) / DEG_PER_TURN
     kept = tuple(
         each.after(turns) if isinstance(each, Wear) else each
         for each in diagnosis.model.effects
-        if each.name in known or not (_of_its_time(each) or each.name in doubtful)
+        if each.name in known
+        or not (each.name in doubtful or (Channel.TIME in each.needs() and not each.is_compensable()))
     )
     uncertainty = {
         name: widths
@@ -84,15 +85,6 @@ def named(findings: Sequence[Finding]) -> str:
 def alternatives(finding: Finding) -> str:
     """Returns the cause of a finding with its aliases, as text."""
     return " or ".join((finding.cause, *finding.aliases))
-
-
-def _turns_run(diagnosis: Diagnosis) -> float:
-    """Returns the total motor travel of the record, in turns."""
-    return float(np.sum(np.abs(np.diff(diagnosis.traces.motion.motor_deg)))) / DEG_PER_TURN
-
-
-def _of_its_time(effect: Effect) -> bool:
-    return Channel.TIME in effect.needs() and not effect.is_compensable()
 
 
 def _why_not(finding: Finding, rivals: Sequence[str]) -> str:

@@ -10,7 +10,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.improvement.extension import alternatives
 from hdbridge.motion.procedures.moves import AxisView
 from hdbridge.motion.procedures.plan import Plan
-from hdbridge.motion.procedures.rehearsal import rehearse
+from hdbridge.motion.procedures.rehearsal import total_duration_s
 
 _CLOSER: Final = {
     "load angle": "two-load-turns",
@@ -143,7 +143,11 @@ def choose(
     experiment of the axis is of use.
     """
     menu = sorted(
-        ((_duration_s(plan, view), plan) for name, plan in machine_plans().items() if name not in done),
+        (
+            (total_duration_s((each.procedure for each in plan.tasks(view).tasks), view), plan)
+            for name, plan in machine_plans().items()
+            if name not in done
+        ),
         key=lambda each: each[0],
     )
     pairs = [
@@ -190,8 +194,3 @@ def _separates(report: dict[str, Any], one: str, other: str, peak_arcsec: float)
     if not seen["detectable"] or limit is None or limit > peak_arcsec:
         return False
     return other not in seen["aliases"] and one not in report[other]["aliases"]
-
-
-def _duration_s(plan: Plan, view: AxisView) -> float:
-    middle = 0.5 * (view.limits.position_min_deg + view.limits.position_max_deg)
-    return sum(rehearse(each.procedure, view, middle).duration_s for each in plan.tasks(view).tasks)

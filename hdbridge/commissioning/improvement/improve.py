@@ -1,7 +1,6 @@
 """Runs a complete improvement, from a booted drive to a pending model that positions better."""
 
-import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -9,12 +8,11 @@ from typing import Any
 
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
-from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration.identification import provenance, with_provenance
-from hdbridge.commissioning.calibration.journal import Journal, fault_notes_in, tasks_of
-from hdbridge.commissioning.calibration.measure import measure, start_journal
-from hdbridge.commissioning.calibration.pipeline import ACTIVE_NAME, MODEL_NAME, Offer, proposed
+from hdbridge.commissioning.calibration.journal import Journal, check_is_of, fault_notes_in, tasks_of
+from hdbridge.commissioning.calibration.measure import SILENT, Callbacks, measure, start_journal
+from hdbridge.commissioning.calibration.pipeline import Offer, proposed, save_result
 from hdbridge.commissioning.calibration.validation import floor_of
 from hdbridge.commissioning.improvement.extension import Extension, alternatives, extension_of, named
 from hdbridge.commissioning.improvement.further import Choice, advice, choose, unseparated
@@ -25,8 +23,6 @@ from hdbridge.control.realtime import suspended_realtime
 from hdbridge.control.rig import Rig
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
-from hdbridge.files.atomic import write_atomically
-from hdbridge.files.outputs import writing
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.records.recording import ABOUT_NAME, Recording
 
@@ -95,7 +91,6 @@ class Improvement:
 
 
 RESULT_NAME = "improvement.json"
-Progress = Callable[[str, float, float], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,22 +114,20 @@ def improve(
     profile: Path,
     active: TransmissionModel,
     date: datetime,
+    callbacks: Callbacks = SILENT,
     *,
     rounds: int = 0,
-    progress: Progress = lambda *_: None,
-    interrupted: Callable[[], bool] = lambda: False,
-    notify: Callable[[str], None] = lambda _: None,
 ) -> Improvement:
     """Diagnoses the axis, extends its model, steps with both, and proposes the better one to the profile.
 
-    ``profile`` is the folder of axis.yaml, ``active`` its model; ``notify`` receives a line for each step.
-    The axis runs up to ``rounds`` further experiments while causes remain to be separated. Nothing is
-    proposed without a finding that can be compensated, or without a gain both on held-out data and in
-    stepping. Raises `InputError` if model or recordings belong to another axis or drive.
+    ``profile`` is the folder of axis.yaml, ``active`` its model. The axis runs up to ``rounds`` further
+    experiments while causes remain to be separated. Nothing is proposed without a finding that can be
+    compensated, or without a gain both on held-out data and in stepping. Raises `InputError` if model or
+    recordings belong to another axis or drive.
     """
     active.check_bound_to(drive.axis, drive.identity)
     drive.axis.require_load_encoder()
-    bench = _Bench(drive, date, progress, interrupted)
+    bench, notify = _Bench(drive, date, callbacks), callbacks.notify
     earlier = source.journal is None or bool(source.journal.done)  # measured before the drive was booted
     recordings, apart = _begin(source, bench)
     notify("diagnosing")
@@ -175,7 +168,7 @@ def improve(
     )
     if diagnosis.findings:
         whole = Recording.joined(list(recordings.values()))
-        result = _concluded(result, bench, source, profile, whole, notify)
+        result = _concluded(result, bench, source, profile, whole)
     return _kept(source.folder, result)
 
 
@@ -185,12 +178,11 @@ class _Bench:
 
     drive: Drive | Rig
     date: datetime
-    progress: Progress
-    interrupted: Callable[[], bool]
+    callbacks: Callbacks
 
     def run(self, journal: Journal) -> bool:
         """Runs the missing measurements; returns True if an encoder may have lost its zero between tasks."""
-        measure(self.drive, journal, progress=self.progress, interrupted=self.interrupted)
+        measure(self.drive, journal, self.callbacks)
         return len({each.session for each in tasks_of(journal.recording())}) > 1
 
 
@@ -200,7 +192,8 @@ def _begin(source: Source, bench: _Bench) -> tuple[dict[Path, Recording], bool]:
         apart = bench.run(source.journal)
         return {source.journal.folder: source.journal.recording()}, apart
     for path, recording in source.given.items():
-        _check_is_of(recording, bench.drive.axis, path)
+        remedy = "run 'hdbridge improve' for the axis that was recorded"
+        check_is_of(recording, bench.drive.axis, path, remedy)
     return dict(source.given), source.independent_zeros
 
 
@@ -209,18 +202,6 @@ def _plans_of(source: Source, given: Iterable[Recording]) -> list[Plan]:
     if source.journal is not None:
         return [source.journal.plan]
     return [Plan.model_validate(each.notes["plan"]) for each in given if "plan" in each.notes]
-
-
-def _check_is_of(recording: Recording, axis: AxisConfig, path: Path) -> None:
-    for what, theirs, ours in (
-        ("axis", recording.axis, axis.name),
-        ("gear ratio", recording.ratio, axis.gear.ratio),
-    ):
-        if theirs is not None and theirs != ours:
-            raise InputError(
-                f"{path}: this recording is of {what} {theirs}, but the {what} here is {ours} ({axis.path}); "
-                "run 'hdbridge improve' for the axis that was recorded"
-            )
 
 
 def _journal(
@@ -248,15 +229,10 @@ def _journal(
 
 
 def _concluded(
-    result: Improvement,
-    bench: _Bench,
-    source: Source,
-    profile: Path,
-    recording: Recording,
-    notify: Callable[[str], None],
+    result: Improvement, bench: _Bench, source: Source, profile: Path, recording: Recording
 ) -> Improvement:
     """Returns the result with the trial, if the extended model may be offered, and with the offer."""
-    extension, drive = result.extension, bench.drive
+    extension, drive, notify = result.extension, bench.drive, bench.callbacks.notify
     if not extension.carried:
         return replace(result, offer=Offer(False, f"nothing proposed: {'; '.join(extension.left)}"))
     if not extension.improves:
@@ -267,16 +243,7 @@ def _concluded(
     notify("stepping with the active and the extended model alternately")
     floor = floor_of(drive.axis, recording)
     try:
-        trial = run_trial(
-            drive,
-            source.plan,
-            result.active,
-            model,
-            floor,
-            source.folder,
-            progress=bench.progress,
-            interrupted=bench.interrupted,
-        )
+        trial = run_trial(drive, source.plan, result.active, model, floor, source.folder, bench.callbacks)
     except InputError as problem:
         return replace(result, offer=Offer(False, f"not offered: {problem}"))
     result = replace(result, trial=trial)
@@ -322,10 +289,6 @@ def _provenance(result: Improvement, recording: Recording) -> dict[str, Any]:
 def _kept(folder: Path, result: Improvement) -> Improvement:
     """Saves result and models next to the recording, unless nothing new was measured."""
     if folder.is_dir() and any(folder.iterdir()):
-        with writing():
-            if result.diagnosis.findings:
-                result.extension.model.save(folder / MODEL_NAME)
-            result.active.save(folder / ACTIVE_NAME)
-            text = json.dumps(result.as_dict(), indent=1, allow_nan=False)
-            write_atomically(folder / RESULT_NAME, text + "\n")
+        model = result.extension.model if result.diagnosis.findings else None
+        save_result(folder / RESULT_NAME, result.as_dict(), model, result.active)
     return result

@@ -1,7 +1,7 @@
 """Trial of an extended model: stepping with both models alternately, to compare their positioning."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Hysteresis, HysteresisMemory
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.calibration.measure import Pace
+from hdbridge.commissioning.calibration.measure import Callbacks, Pace
 from hdbridge.commissioning.calibration.validation import (
     CHANCE,
     Floor,
@@ -26,7 +26,7 @@ from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
 from hdbridge.motion.procedures.moves import AxisView
 from hdbridge.motion.procedures.plan import Plan
-from hdbridge.motion.procedures.rehearsal import rehearse
+from hdbridge.motion.procedures.rehearsal import total_duration_s
 from hdbridge.motion.procedures.small_steps import SmallSteps
 from hdbridge.motion.procedures.stepping import Stepping, SteppingOutcome
 
@@ -85,9 +85,7 @@ def run_trial(
     model: TransmissionModel,
     floor: Floor,
     folder: Path,
-    *,
-    progress: Callable[[str, float, float], None] = lambda *_: None,
-    interrupted: Callable[[], bool] = lambda: False,
+    callbacks: Callbacks,
 ) -> Trial:
     """Steps a booted drive's axis with both models alternately, one part of the travel after the other.
 
@@ -97,7 +95,7 @@ def run_trial(
     axis = drive.axis
     compensations = [compensation_for(axis, each) for each in (active, model)]
     procedures = _procedures(plan, axis_view(axis), active)
-    pace = Pace(trial_s(plan, axis, active), axis.drive.cycle_s, progress, interrupted)
+    pace = Pace(trial_s(plan, axis, active), axis.drive.cycle_s, callbacks)
     outcomes: tuple[list[SteppingOutcome], list[SteppingOutcome]] = ([], [])
     fault_counts: list[tuple[str, tuple[FaultCount, ...]]] = []
     for number, (name, procedure) in enumerate(procedures):
@@ -118,9 +116,7 @@ def run_trial(
 def trial_s(plan: Plan, axis: AxisConfig, active: TransmissionModel) -> float:
     """Returns the duration of the trial on an ideal axis, s."""
     view = axis_view(axis)
-    middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
-    procedures = _procedures(plan, view, active)
-    return 2.0 * sum(rehearse(each, view, middle).duration_s for _, each in procedures)
+    return 2.0 * total_duration_s((each for _, each in _procedures(plan, view, active)), view)
 
 
 def _procedures(
@@ -140,9 +136,8 @@ def _procedures(
         for first in range(0, whole.count - count + 1, count)
     ]
     widths = [each.width_deg for each in active.effects if isinstance(each, Hysteresis | HysteresisMemory)]
-    limits = view.limits
     small = SmallSteps(
-        0.5 * (limits.position_min_deg + limits.position_max_deg),
+        view.limits.middle_deg,
         0.9 * min(*(widths or [DEFAULT_WIDTH_DEG]), plan.precondition_deg),
         min(SMALL_STEPS, 2 * whole.count),
         whole.precondition_deg,

@@ -63,7 +63,7 @@ class EvenSpeed:
     def moves(self, axis: AxisView) -> Steps[tuple[EvenRun, ...]]:
         """Yields a forward and a backward run at each speed."""
         runs: list[EvenRun] = []
-        middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
+        middle = axis.limits.middle_deg
         for speed in self.speeds_deg_s:
             half = 0.5 * self.travel_deg(axis, speed)
             yield MoveTo(middle - half)

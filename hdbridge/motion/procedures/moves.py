@@ -25,6 +25,11 @@ class MotionLimits:
     acceleration_deg_s2: float
     jerk_deg_s3: float
 
+    @property
+    def middle_deg(self) -> float:
+        """Middle of the travel."""
+        return 0.5 * (self.position_min_deg + self.position_max_deg)
+
     def check(self, load_deg: float) -> None:
         """Raises `InputError` for a load angle outside the limits."""
         if not self.position_min_deg <= load_deg <= self.position_max_deg:

@@ -291,7 +291,7 @@ class Room:
     def __init__(self, axis: AxisView, precondition_deg: float) -> None:
         limits = axis.limits
         self.ratio = axis.ratio
-        self.middle_deg = self.pose_deg = 0.5 * (limits.position_min_deg + limits.position_max_deg)
+        self.middle_deg = self.pose_deg = limits.middle_deg
         self.notes: list[str] = []
         self._axis = axis
         self._back_deg = precondition_deg / axis.ratio

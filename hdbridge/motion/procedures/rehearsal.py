@@ -1,6 +1,6 @@
 """Rehearses a procedure on an ideal axis before any motion: duration, travel range, number of legs."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from hdbridge.motion.procedures.moves import AxisView, Move, Path, Procedure, Sample
@@ -31,6 +31,11 @@ def rehearse(procedure: Procedure[object], axis: AxisView, start_deg: float = 0.
         duration += path.duration_s
         legs += 1
     return Rehearsal(duration, lowest, highest, legs)
+
+
+def total_duration_s(procedures: Iterable[Procedure[object]], axis: AxisView) -> float:
+    """Returns the duration of procedures on an ideal axis that starts in the middle of its travel, s."""
+    return sum(rehearse(each, axis, axis.limits.middle_deg).duration_s for each in procedures)
 
 
 def legs_of(
