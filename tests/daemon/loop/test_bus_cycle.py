@@ -15,7 +15,7 @@ from hdbridge.control.axiscycle import AxisCycle
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import EventKind, RelayedFrame, SampleFlag
-from hdbridge.drive.busload import bus_load, frame_bits
+from hdbridge.drive.busload import FRAME_BITS, bus_load
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.states import State
@@ -187,9 +187,9 @@ def test_bus_load_of_a_cycle_matches_its_frames(both: SteppedDaemon) -> None:
     with VirtualBus(both.intruder.channel_id) as witness:
         for _ in range(50):
             both.turn()
-            seen = sum(frame_bits(len(frame.data)) for frame in iter(lambda: witness.recv(0), None))
+            seen = sum(FRAME_BITS[len(frame.data)] for frame in iter(lambda: witness.recv(0), None))
             # A heartbeat that arrives after the end of a cycle counts in the next one.
-            assert cycle.bus_load * 4000 == pytest.approx(seen, abs=2 * frame_bits(1))
+            assert cycle.bus_load * 4000 == pytest.approx(seen, abs=2 * FRAME_BITS[1])
     most = bus_load([axis.config for axis in both.axes], 1_000_000)
     assert most is not None
     assert cycle.bus_load <= most
