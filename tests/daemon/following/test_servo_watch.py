@@ -20,8 +20,9 @@ from hdbridge.client import messages
 from hdbridge.daemon.following.adaptation import Proposal
 from hdbridge.daemon.following.follower import Follower
 from hdbridge.daemon.following.judging import Verdict
-from hdbridge.daemon.machinefile import AdaptationSettings, Mode
+from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import CommandKind
+from hdbridge.enums import AdaptationMode
 from hdbridge.sim.truth import Truth
 
 SPEEDS_DEG_S = (61.7, 43.3)
@@ -41,7 +42,9 @@ class Seen(NamedTuple):
     state: messages.AdaptationState
 
 
-def seen(profile: Path, mode: Mode = "on", stuck: bool = False, **servo: float) -> Seen:
+def seen(
+    profile: Path, mode: AdaptationMode = AdaptationMode.ON, stuck: bool = False, **servo: float
+) -> Seen:
     """Returns verdicts and proposals over moves in both directions, with these servo parameters."""
     axis = AxisConfig.load(profile)
     model = replace(TransmissionModel.load(profile / "model.yaml"), response=measured_response(profile))
@@ -103,12 +106,17 @@ def without_lag(response: Response) -> np.ndarray:
     return np.array(response.gain) * np.exp(1j * turned)
 
 
-@pytest.mark.parametrize(("mode", "stuck"), [("off", False), ("on", True), ("observe", False)])
-def test_refinement_needs_a_trusted_encoder_and_permission(profile: Path, mode: Mode, stuck: bool) -> None:
+@pytest.mark.parametrize(
+    ("mode", "stuck"),
+    [(AdaptationMode.OFF, False), (AdaptationMode.ON, True), (AdaptationMode.OBSERVE, False)],
+)
+def test_refinement_needs_a_trusted_encoder_and_permission(
+    profile: Path, mode: AdaptationMode, stuck: bool
+) -> None:
     found = seen(profile, mode, stuck, position_gain_per_s=130.0)
     assert Verdict.RETUNED in found.verdicts
     assert not any(each.apply for each in found.proposals)
-    assert len(found.proposals) == (mode == "observe")
+    assert len(found.proposals) == (mode is AdaptationMode.OBSERVE)
     assert ("load encoder" in (found.state.frozen or "")) == stuck
     assert found.state.response is None
 
