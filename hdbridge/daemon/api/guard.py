@@ -5,8 +5,8 @@ refused if its ``Host`` is not a name of this machine (DNS rebinding), or if its
 of the request (a foreign page). A token alone prevents neither.
 
 The guard checks host and origin, token, number of requests in progress, and the size and duration of a body.
- A stop from an authorised client is never refused: it is not counted, and the guard does not wait for
-its body. A refusal closes the connection, so the rest of a refused body is not read.
+A stop from an authorised client is never refused: it is not counted, and the guard does not wait for its
+body. A refusal closes the connection, so the rest of a refused body is not read.
 """
 
 import asyncio
