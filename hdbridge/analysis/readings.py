@@ -33,9 +33,12 @@ LEAST_NEAR = 20
 MOST_JITTER_DEG = 0.1
 """Largest plausible standard deviation of a motor reading: rounding at 1,000 counts per turn. Larger third
 differences are due to fast motion."""
-LEAST_BENT_SHARE = 0.1
-"""Minimum number of changes of speed, and of acceleration, relative to the changes in motion. Rounding bends
-the path at most samples, whereas an exact ramp or trapezoid is bent only at its corners."""
+NEAR_SAMPLES = 5
+"""Maximum distance of two changes of speed that are due to rounding or to one acceleration."""
+LEAST_BENDS = 6
+"""Minimum number of such changes."""
+LEAST_CURVED_SHARE = 0.2
+"""Minimum number of changes of acceleration relative to those of speed, for a rounded path."""
 _THIRD = np.sqrt(20.0)
 """Amplification of white noise by third differences: the square root of 1 + 9 + 9 + 1."""
 _MAD = 1.4826
@@ -147,10 +150,15 @@ def quantum_deg(angle_deg: FloatArray) -> float:
 
 
 def _is_rounded(angle_deg: FloatArray, count_deg: float) -> bool:
-    """Returns True if the path varies by whole counts in speed and acceleration, as after rounding."""
+    """Returns True if speed and acceleration vary by whole counts from sample to sample, as after rounding.
+
+    The speed of an exact ramp changes only at its corners, the acceleration of an exact trapezoid too.
+    """
     counts = np.round(np.diff(angle_deg) / count_deg)
-    least = LEAST_BENT_SHARE * np.count_nonzero(counts)
-    return all(np.count_nonzero(np.diff(counts, order)) > least for order in (1, 2))
+    bends = np.flatnonzero(np.diff(counts))
+    near = np.count_nonzero(np.diff(bends) <= NEAR_SAMPLES)
+    curved = np.count_nonzero(np.diff(counts, 2))
+    return near >= LEAST_BENDS and curved > LEAST_CURVED_SHARE * near
 
 
 def last_digit(angle_deg: FloatArray) -> float:

@@ -117,6 +117,17 @@ def test_a_rounded_path_has_its_count(
 
 
 @settings(deadline=None)
+@given(speed=st.integers(1, 200), rise=st.integers(60, 300), counts=st.sampled_from(COUNTS[:3]))
+def test_a_sweep_at_whole_counts_per_sample_has_its_count(speed: int, rise: int, counts: int) -> None:
+    """Only the beginnings and ends of the sweeps show the size of a count."""
+    count = 360.0 / counts
+    rising = speed * 0.5 * (1.0 - np.cos(np.pi * np.arange(rise) / rise))
+    sweep = np.concatenate([rising, np.full(2000, float(speed)), rising[::-1]])
+    true = np.cumsum(np.concatenate([sweep, -sweep, sweep]))
+    assert reading_of(np.round(true) * count).count_deg == pytest.approx(count, rel=1e-6)
+
+
+@settings(deadline=None)
 @given(
     amplitude=st.floats(3.0, 3000.0),
     period=st.integers(40, 2000),

@@ -50,7 +50,9 @@ def test_a_closed_standard_output_is_not_an_error(tmp_path):
     assert json.loads((tmp_path / "out.json").read_text())["axis"] == "article"
 
 
-@pytest.mark.parametrize(("slow", "arguments"), [("typer", ("--help",)), ("numpy", ("step", "--help"))])
+@pytest.mark.parametrize(
+    ("slow", "arguments"), [("typer", ("--help",)), ("numpy", ("step", "article", "--simulate"))]
+)
 def test_ctrl_c_during_start_up_prints_no_traceback(tmp_path, slow, arguments):
     """An import that never ends stands for a slow one."""
     (tmp_path / f"{slow}.py").write_text("import sys, time\nprint('loading', flush=True)\ntime.sleep(600)\n")

@@ -142,7 +142,7 @@ class Slave:
     def fail(self, code: int = 0x8611) -> None:
         """Puts the drive into fault, with an EMCY."""
         self.node.faults.raise_error(code)
-        self.node.poll(self.node._now_s)
+        self.node.poll(self.node.now_s)
 
 
 def holding(value: int) -> Answers:
