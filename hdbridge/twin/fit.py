@@ -29,7 +29,6 @@ from hdbridge.sim.truth.motor import TrueObserver
 from hdbridge.twin.misfit import (
     CHANNELS,
     FINE,
-    MOST_SCATTER,
     Data,
     Mask,
     Replays,
@@ -1096,19 +1095,15 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
     The fit must be near a minimum, because the alternatives are equally good until the other parameters are
     known.
     """
-    known, searched = expected(replays.data), False
-    least = least_deviation(replays.data) | {LOAD: expected(replays.rough.data).deviation[LOAD]}
+    few, noise = replays.rough, expected(replays.rough.data)
+    least = least_deviation(replays.data) | {LOAD: noise.deviation[LOAD]}
     while True:
         # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
         # the next substep increases the residuals too little for any channel to show it.
         places = [exchanged(best.truth), *neighbours(best.truth)]
-        excess = any(best.scales.deviation[name] > EXCESS_RATIO * least[name] for name in CHANNELS)
-        if excess or best.scatter > MOST_SCATTER:
-            # With the expected scales, which are larger than those of the residuals, the misfit is smoother.
-            places.append(continued(replays, best, STEPS, known=known, near=best, linear=False).truth)
-            if not searched:
-                places.append(_farther(replays.rough, best, begun))
-                searched = True
+        if any(best.scales.deviation[name] > EXCESS_RATIO * least[name] for name in CHANNELS):
+            tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
+            places.append(by_halving(few, tried, noise).truth)
         last = best
         for place in places:
             other = continued(replays, best, MORE_STEPS, place)
@@ -1116,12 +1111,6 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
                 best = _ended(replays, other)
         if best is last:
             return best
-
-
-def _farther(few: Replays, best: Fitted, begun: Truth) -> Truth:
-    """Returns the best place that a few legs show from the alternative start values."""
-    tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
-    return by_halving(few, tried, expected(few.data)).truth
 
 
 def _ended(replays: Replays, near: Fitted) -> Fitted:
