@@ -411,7 +411,7 @@ def _describe_limits(state: State, lines: Sequence[Line], warnings: list[str]) -
     if outliers.swinging:
         warnings.append(
             f"{outliers.swinging} samples ({outliers.swinging / len(samples):.2%}) in or just after fast "
-            "accelerations stand out and have no weight: the load swings on its spring there"
+            "accelerations stand out and have no weight: the load oscillates on its spring there"
         )
     if others := outliers.samples - outliers.swinging:
         warnings.append(

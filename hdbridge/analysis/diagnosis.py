@@ -116,8 +116,8 @@ def diagnose(
     swing = visible_swing(base, between, scales)
     search, found = _searched(data, model, scales, between, swing)
     if swing is None or not between.names:  # a larger cause may mask them
-        # Inertial wind-up is the slow part of the swing and of the motion between samples, so the base
-        # excludes it.
+        # Inertial wind-up is the slow part of the load oscillation and of the motion between samples, so the
+        # base excludes it.
         lawful = search.estimator.lawful(found).hypothesis
         others = [each for each in lawful.effects if each.channels != {Channel.ACCELERATION}]
         base, before = Base.of(data, others), (between.names, swing)
@@ -133,7 +133,7 @@ def diagnose(
 def _searched(
     data: Observed, model: TransmissionModel, scales: Scales, between: Nuisances, swing: Swing | None
 ) -> tuple[Search, Fitted]:
-    """Returns the search and its result, for the data after subtraction of the load's swing."""
+    """Returns the search and its result, for the data after subtraction of the load oscillation."""
     if swing is not None:
         data = without(data, swing)
     soft = swing is not None and swing.soft

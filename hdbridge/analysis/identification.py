@@ -73,7 +73,7 @@ class Outliers:
     swinging: int
     """Number of outliers in or just after high acceleration, while the load oscillates on its spring."""
     longest_run: int
-    """Length of the longest run of consecutive outliers other than swinging ones, samples."""
+    """Length of the longest run of consecutive outliers other than those counted in ``swinging``, samples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,7 +299,7 @@ def oscillation(measured: Measured, samples: Samples) -> str:
     """Returns a warning if the motor oscillates about its command in slow motion, else an empty text.
 
     Such a motor reverses where the command does not, so the state of the hysteresis loop is unknown. The
-    deviation is a median, because a motor may swing after a start or a reversal.
+    deviation is a median, because a motor may oscillate after a start or a reversal.
     """
     target, position = measured.record.motor_target_deg, measured.record.motor_position_deg
     if target is None or not samples.commanded:

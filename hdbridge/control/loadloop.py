@@ -46,7 +46,7 @@ _SIGMA_OF_MEAN_DEVIATION: Final = math.sqrt(math.pi / 2.0)
 _LEAST_SHARE: Final = 0.5
 """Minimum ratio of the loop's bound to the mean error; below it, the loop does not act."""
 _OUTLIERS: Final = 2
-"""Number of consecutive unexplained readings that count as a move of the load encoder."""
+"""Number of consecutive unexplained readings after which the load encoder counts as displaced."""
 _AGREEMENT: Final = 1.0 / 3.0
 """Fraction of the greatest disagreement below which the encoders count as agreeing again."""
 _MODEL_ERROR: Final = 0.25

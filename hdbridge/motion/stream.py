@@ -196,7 +196,7 @@ class Stream:
             )
         if not (bounds.lower_deg <= lowest and highest <= bounds.upper_deg):
             raise InputError(
-                f"{where} leads through {lowest:.9g} to {highest:.9g} deg; the position limits are "
+                f"{where} covers {lowest:.9g} to {highest:.9g} deg; the position limits are "
                 f"{bounds.lower_deg:g} and {bounds.upper_deg:g} deg"
             )
         left_deg = (bounds.upper_deg if velocity_deg_s > 0.0 else bounds.lower_deg) - position_deg

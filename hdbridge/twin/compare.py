@@ -168,7 +168,7 @@ LEAST_SAMPLES: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One figure of both records for one kind of motion."""
+    """One metric, compared between the two records for one kind of motion."""
 
     channel: str
     """A signal, `settling_time`, `overshoot`, or `noise_at_rest:` and `noise_in_motion:` with a signal."""
@@ -182,7 +182,7 @@ class Row:
     difference: float
     """Rms difference of samples or stops; for a noise, the absolute difference."""
     noise: float
-    """Expected difference between two identical axes: the noise of the measured channel or of the figure."""
+    """Expected difference between two identical axes: the noise of the measured channel or of the metric."""
     count: int
     """Number of samples or stops."""
 
@@ -207,7 +207,7 @@ class Comparison:
     spectra: Mapping[str, Spectrum]
 
     def row(self, channel: str, kind: str = ALL) -> Row | None:
-        """Returns the figure of a channel; None if the records lack it."""
+        """Returns the metric of a channel; None if the records lack it."""
         return next((each for each in self.rows if (each.channel, each.kind) == (channel, kind)), None)
 
     def as_dict(self) -> dict[str, Any]:

@@ -599,10 +599,10 @@ REJECTIONS: Final = ("speed", "position", "observer")
 """Alternatives for the block that compensates friction and load torque: the integral of the speed error (PI
 velocity loop) or of the position error (PIV), or a disturbance observer."""
 INTEGRAL: Final = 3.0
-"""Integral time times the bandwidth of the velocity loop (symmetric optimum: 2 to 4)."""
+"""Product of integral time and velocity-loop bandwidth (symmetric optimum: 2 to 4)."""
 SLOW_INTEGRAL: Final = 30.0
-"""Integral time times the bandwidth of the velocity loop if there is an observer, which leaves little to the
-integral."""
+"""Product of integral time and velocity-loop bandwidth if there is an observer, because the observer leaves
+little for the integral term to correct."""
 OBSERVED: Final = 0.9
 """Start value of the fraction of the disturbance that the observer compensates: nearly all."""
 FILTER_MS: Final = 0.5

@@ -139,7 +139,7 @@ def test_a_later_first_knot_delays_the_start():
         ((20.0, 119.0, 30.0), "could not brake"),
         ((20.0, 119.0, 25.0), "could not brake"),
         ((100.0, 120.0, 5.0), "could not brake"),
-        ((100.0, 120.0, -5.0), "leads through"),
+        ((100.0, 120.0, -5.0), "covers"),
     ],
 )
 def test_a_knot_beyond_the_limits_is_refused_and_the_stream_continues(knot, message):

@@ -196,7 +196,7 @@ class AmplitudeDrift(Modulating, Warmed):
         )
 
     def needs(self) -> frozenset[Channel]:
-        """Returns the channels of the warmth, and the torque channel if the orders grow with torque."""
+        """Returns the channels that determine warmth; also the torque channel if orders grow with torque."""
         load = self.under_load
         return super().needs() | (frozenset() if load is None else {Channel(load.torque)})
 

@@ -70,7 +70,7 @@ class Rate(NamedTuple):
 
 
 class Displacement(NamedTuple):
-    """Change of the zero since it was learned, in the middle of the longest span."""
+    """Change of the zero since it was learned, evaluated at the middle of the observations."""
 
     arcsec: float
     error: float

@@ -238,11 +238,11 @@ class OuterCell(IntEnum):
     RESETS_DONE = 4
     """Service: number of completed fault resets, with or without success."""
     PERIOD_NS = 5
-    """Gateway: period of the outer SYNC; 0 without SYNC."""
+    """Gateway: period of the SYNC on the outer bus; 0 without SYNC."""
     HELD = 6
     """Service: 1 while the outer master holds the lease."""
     JITTER_NS = 7
-    """Gateway: mean deviation of the outer SYNC from its regular time."""
+    """Gateway: mean deviation of the SYNC on the outer bus from its nominal time."""
     NODE_ID = 8
     """Gateway: node id in use; 255 if LSS removed it."""
     VIEW = 9

@@ -140,7 +140,7 @@ class Message:
                     else rows[each.name]
                     for each in self._fields
                 }
-        raise InputError(f"its {self._short} messages are of another release of hdbridge")
+        raise InputError(f"its {self._short} messages come from another release of hdbridge")
 
 
 def _varint(value: int) -> bytes:

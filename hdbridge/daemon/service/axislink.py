@@ -191,5 +191,5 @@ def stop_hint(stopped: Event, axis: str) -> str:
 
 
 def reset_hint(axis: str) -> str:
-    """Returns the advice for a stop by command."""
+    """Returns advice on how to recover from a commanded stop."""
     return f"reset it when the axis may move again: hdbridge ctl reset {axis}"

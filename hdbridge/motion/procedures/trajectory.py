@@ -51,11 +51,11 @@ class Trajectory:
         object.__setattr__(self, "load_deg", points)
         if points.ndim != 1 or len(points) < 2:
             raise InputError(
-                f"a trajectory of shape {points.shape}; expected at least two load angles, shape (n,)"
+                f"the trajectory has shape {points.shape}; expected at least two load angles, shape (n,)"
             )
         if not (math.isfinite(self.period_s) and self.period_s > 0.0):
             raise InputError(
-                f"a trajectory with {self.period_s!r} s between two angles; expected more than 0"
+                f"the time between two angles of the trajectory is {self.period_s!r} s; expected more than 0"
             )
         bad = np.flatnonzero(~np.isfinite(points))
         if len(bad):
