@@ -101,7 +101,7 @@ SURE = 3.0
 WORTH_ARCSEC = 0.3
 """Smallest deviation that fails a test. A smaller one passes even if it is significant."""
 LEAST_REPORTED_ARCSEC = 0.005
-"""Smallest deviation mentioned in the text; a smaller one would be printed as 0.00."""
+"""Smallest deviation stated in the text; a smaller deviation would be printed as 0.00."""
 
 
 def residual_tests(

@@ -474,7 +474,7 @@ class _Judge:
         estimator = self.estimator
         points, direction = estimator.data.points, direction_of(estimator.motion)[estimator.index]
         masks = {name: points.of_kind(name)[estimator.index] for name in points.kinds}
-        if len(masks) == 1:  # a record without legs is divided into standing, slow and fast
+        if len(masks) == 1:  # a record without legs is divided into rest, slow motion and fast motion
             speed = np.abs(points.speed_deg_s)
             slow = speed <= np.median(speed[speed > 0.0]) if np.any(speed) else speed <= 1.0
             either = {"standing": speed == 0.0, "slow": (speed > 0.0) & slow, "fast": ~slow}

@@ -276,8 +276,8 @@ class Inverse:
 
 
 def _gentle(effects: tuple[Effect, ...], start: Start, steepest: float) -> tuple[list[Tracker], float]:
-    """Returns trackers of the effects, and a bound on the steepest fall of their sum, arcsec per motor
-    degree.
+    """Returns trackers of the effects, and a bound on the steepest negative slope of their sum, arcsec per
+    motor degree.
 
     The load rests while the motor crosses backlash. The error then falls as fast as the motor angle divided
     by the ratio rises, or faster if noise made the fitted backlash too narrow. If the sum would fall more

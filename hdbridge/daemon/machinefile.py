@@ -198,7 +198,7 @@ class MachineFile(Strict):
 
 
 def read_token(path: Path) -> str:
-    """Returns the token in a file; raises InputError if it is invalid, or if others can read the file."""
+    """Reads the token from ``path``; raises InputError if it is invalid, or if others can read the file."""
     try:
         content, mode = path.read_text(encoding="ascii").strip(), path.stat().st_mode
     except (OSError, UnicodeDecodeError) as problem:

@@ -103,8 +103,8 @@ def repeats(named: Sequence[Sequence[bool]]) -> Repeats:
     order.
 
     Recordings of a joint without the cause have findings at a constant rate; those of a joint with it, at a
-    higher rate from an unknown onset on. Shares and rates are estimated from the fleet by expectation
-    maximisation with weak priors.
+    higher rate from an unknown onset on. Prevalence and rates are estimated from the fleet by
+    expectation maximisation with weak priors.
     """
     share, often, rarely = 0.05, 0.8, 0.02
     lengths = np.array([len(each) for each in named], dtype=int)

@@ -78,7 +78,7 @@ class SetPoint:
 
     @property
     def at_rest(self) -> bool:
-        """True if the set-point stands still and will do so until it receives further input."""
+        """True if the set-point is at rest and remains so until it receives further input."""
         if self._stream is not None:
             return self._stream.waiting
         if self._pursuit is not None:

@@ -155,7 +155,7 @@ TITLES: Final[Mapping[str, str]] = {
 }  # fmt: skip
 
 STAND_S: Final = 0.2
-"""Minimum time for which the command stands still after a motion for the stop to be evaluated."""
+"""Minimum time for which the command must be at rest after a motion for the stop to be evaluated."""
 MAX_SETTLING_S: Final = 1.0
 """Maximum time after a stop in which settling is evaluated; servo axes of this kind settle in tenths of a
 second."""
@@ -180,7 +180,7 @@ class Row:
     level."""
     simulated: float
     difference: float
-    """Rms difference of samples or stops; for a noise, the absolute difference."""
+    """Rms difference of samples or stops; for a noise level, the absolute difference."""
     noise: float
     """Expected difference between two identical axes: the noise of the measured channel or of the metric."""
     count: int

@@ -246,9 +246,9 @@ def sandwich(slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], sprea
 def scatter(slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], spread: FloatArray) -> float:
     """Returns the variance of the fit between legs, relative to that of independent residuals.
 
-    The mean over the principal directions that the residuals determine; NaN if there are none. It is about
-    one if the simulated drive can do what the axis does. If it cannot, each leg has parameters of its own,
-    however small the residuals are (information matrix test, White, Econometrica 50, 1982).
+    The ratio is averaged over the principal directions that the residuals determine; NaN if there are none.
+    It is about 1 if the simulated drive can represent the axis. If it cannot, the parameters differ between
+    legs, however small the residuals are (information matrix test, White, Econometrica 50, 1982).
     """
     squares, white = _jackknife(slopes, left, legs, spread)
     shown = squares[eigen(slopes, spread)[0] > DETERMINED]
@@ -1119,7 +1119,7 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
 
 
 def _farther(few: Replays, best: Fitted, begun: Truth) -> Truth:
-    """Returns the best place that a few legs show from the alternative start values."""
+    """Returns the best result of fits to a few legs from alternative start values."""
     tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
     return by_halving(few, tried, expected(few.data)).truth
 

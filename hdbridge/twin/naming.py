@@ -267,10 +267,10 @@ def finding(
     *,
     ratio: bool = False,
 ) -> Finding:
-    """Returns the finding of one cause: the parameters with a relevant change, or the one with the largest.
+    """Returns the finding of one cause: its parameters with relevant changes, or the one that changed most.
 
-    The causes ``instead`` may have changed in their place. With ``ratio``, changes are given as ratios,
-    because neither value is the axis's, but as differences for a parameter that may be zero.
+    ``instead`` lists causes that may have changed in place of this one. With ``ratio``, changes are given as
+    ratios, because neither value is the axis's, but as differences for a parameter that may be zero.
     """
     off = np.subtract(coordinates(after, parameters), coordinates(before, parameters))
     sizes = np.abs(off) / [each.least_change for each in parameters]

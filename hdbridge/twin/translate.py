@@ -584,7 +584,7 @@ def _lagging(effect: effects.Hysteresis | effects.HysteresisMemory, draft: Draft
     """Sets presliding friction at the load, which winds up the gear's spring, so that the load lags.
 
     Over a branch the motor moves by x and the load's lag grows by 2 offset g(x / width). The rest of x is the
-    load's travel, over which the friction grows. If nothing remains, the load stands still.
+    load's travel, over which the friction grows. If nothing remains, the load does not move.
     """
     offset, stiffness = -effect.offset_arcsec, draft.stiffness_nm_per_rad / ARCSEC_PER_RAD
     xi, height = branch(effect.exponent, 4 * NODES)

@@ -289,7 +289,7 @@ def test_points_on_a_straight_line_are_passed_in_motion_and_corners_at_rest():
     ("points", "message"),
     [
         ([], "at least one"),
-        ([{}], "without an axis"),
+        ([{}], "has no axis"),
         ([{"x": 1.0}], "no axis 'x'"),
         ([{"a": 121.0}], "axis 'a': a target of 121.0 deg"),
         ([{"a": math.nan}], "axis 'a'"),

@@ -39,7 +39,7 @@ _MORE: Final = 0x80
 
 
 class Field(NamedTuple):
-    """Field of a message; its number is its place in the table, from 1."""
+    """Field of a message; its number is its position in the table, from 1."""
 
     name: str
     kind: str
