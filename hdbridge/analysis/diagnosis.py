@@ -283,7 +283,7 @@ class _Judge:
         lost = [(each, UNWRITTEN) for each in missing if not each.within]
         if lost:
             return as_reported, findings, extended, lost
-        # The model's own part stays as it was given.
+        # The model's own part remains as given.
         self.considered.extend(f"{each.cause}: {UNWRITTEN}" for each in missing)
         findings = [each for each in findings if each not in missing]
         findings = self._with_gains(as_reported, findings, chosen)
@@ -389,7 +389,7 @@ class _Judge:
         findings += changes.findings(self.search, self.model, fitted, plain, precise, spread)
         findings.sort(key=lambda each: -each.robust)
         excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
-        # A model cannot contain a free-form loop, so the figures exclude it.
+        # A model cannot contain a free-form loop, so the results exclude it.
         whole, fitted = fitted, plain
         left = rest(estimator, fitted)
         unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None

@@ -409,7 +409,7 @@ class Compensation:
         return self.weight * self._inverse.error_at(motor, moment)
 
     def _solved(self, load_deg: float, moment: Moment) -> float:
-        """Advances the ramps by one cycle; returns the wanted motor angle."""
+        """Advances the ramps by one cycle; returns the required motor angle, degrees, before the limits."""
         weight = self.weight
         if weight != self._target:
             step = self.ramp_step

@@ -198,7 +198,7 @@ def _kind(path: str, reason: str) -> str:
 
 
 def _words(name: str) -> str:
-    """Formats the name of a cause or a figure: `hysteresis.width_deg` is "hysteresis width, deg"."""
+    """Formats the name of a cause or a quantity: `hysteresis.width_deg` is "hysteresis width, deg"."""
     with_unit = re.sub(r"_(deg|arcsec)\b", r", \1", name)
     return re.sub(r"(?<=[a-z])\.|\.(?=[a-z])|_", " ", with_unit)
 

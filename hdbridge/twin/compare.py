@@ -199,7 +199,7 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Figures, traces and spectra of a measured and a simulated record."""
+    """Metrics, traces and spectra of a measured and a simulated record."""
 
     rows: tuple[Row, ...]
     traces: Mapping[str, Trace]
@@ -211,7 +211,7 @@ class Comparison:
         return next((each for each in self.rows if (each.channel, each.kind) == (channel, kind)), None)
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns the figures for JSON."""
+        """Returns the metrics for JSON."""
         return {"figures": [asdict(each) for each in self.rows]}
 
 
@@ -416,5 +416,5 @@ def _of_stops(kind: str, stops: Sequence[_Stop], time_s: FloatArray) -> Iterator
 
 
 def rms(values: FloatArray) -> float:
-    """Returns the root of the mean square; 0 for no values."""
+    """Returns the root mean square; 0 for an empty array."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0

@@ -301,7 +301,7 @@ STEPS_PER_ROUND = 4
 BOUND_MARGIN = 1e-6
 """Minimum distance to the bounds, in spreads, as required by `scipy.optimize.least_squares`."""
 MIN_COST_DECREASE = 1.0
-"""A fit ends when half the sum of squares decreases by less than this in a round."""
+"""Decrease of half the sum of squares in a round below which a fit ends."""
 HUBER_THRESHOLD = 4.0
 """Residuals above this multiple of their scale are down-weighted, because a motor that breaks away at a
 different position is not evidence."""
@@ -606,11 +606,12 @@ little for the integral term to correct."""
 OBSERVED: Final = 0.9
 """Start value of the fraction of the disturbance that the observer compensates: nearly all."""
 FILTER_MS: Final = 0.5
-"""Start value of the speed and torque filters: half to twice the period of common velocity loops."""
+"""Start value of the time constant of the speed and torque filters: half to twice the period of common
+velocity loops."""
 SHORT_MS: Final = 0.1
 """Time constant of a negligible command filter: a fifth of a substep."""
 VELOCITY_FEEDFORWARD: Final = 0.9
-"""Start value, between no feed-forward (rare) and feed-forward of the full speed."""
+"""Start value of the speed feed-forward, between none (rare) and the full speed."""
 FEW_STEPS = 3
 """Maximum number of steps for each start between two halvings."""
 MAX_COST_RATIO: Final = 2.0

@@ -95,9 +95,9 @@ additional cause."""
 STEPS = 8
 """Maximum number of steps of a fit."""
 SIZES = (2.5, 6.0)
-"""Changes of each parameter, in both directions, at which a fit may start, in units of its least change. Even
-a small change puts the ringing of a load out of phase, and a fit that starts from the unchanged value does
-not recover from that."""
+"""Changes of each parameter, in both directions, at which a fit may start, in units of its smallest relevant
+change. Even a small change puts the ringing of a load out of phase, and a fit that starts from the unchanged
+value does not recover from that."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Pure functions that judge measured figures."""
+"""Pure functions that judge measured values."""
 
 from __future__ import annotations
 

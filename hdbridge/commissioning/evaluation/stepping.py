@@ -1,4 +1,4 @@
-"""Figures of a stepping test: scatter and mean per direction and pooled, and the quantisation floor."""
+"""Results of a stepping test: scatter and mean per direction and pooled, and the quantisation floor."""
 
 from __future__ import annotations
 

@@ -60,14 +60,14 @@ class Trajectory:
         bad = np.flatnonzero(~np.isfinite(points))
         if len(bad):
             raise InputError(
-                f"a trajectory with {points[bad[0]]} at {bad[0] * self.period_s:g} s; expected finite angles"
+                f"the trajectory has {points[bad[0]]} at {bad[0] * self.period_s:g} s; expected finite angles"
             )
 
     @classmethod
     def of(cls, load_deg: Callable[[float], float], duration_s: float) -> Self:
-        """Samples a function of time, in seconds after the start, that returns the load angle in degrees."""
+        """Samples ``load_deg``, which returns the load angle, degrees, at a time after the start, s."""
         if not (math.isfinite(duration_s) and duration_s > 0.0):
-            raise InputError(f"a trajectory of {duration_s!r} s; expected a duration above 0")
+            raise InputError(f"the duration of the trajectory is {duration_s!r} s; expected more than 0")
         count = min(math.ceil(duration_s / GRID_S), MOST_POINTS)
         period_s = duration_s / count
         return cls(np.array([load_deg(number * period_s) for number in range(count + 1)]), period_s)
