@@ -152,7 +152,7 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
     rates = sorted(summary.rates.items(), key=lambda each: -each[1][0])
     yield from _table(
         "Findings by cause",
-        "Estimated from the fleet: the share of joints with the cause, and the rates of findings in "
+        "Estimated from the fleet: the fraction of joints with the cause, and the rates of findings in "
         "recordings of joints with and without it. A finding that is as frequent without the cause is not "
         "informative.",
         ["cause", Heading("share", "of joints"), Heading("named with it", "of recordings"),
