@@ -11,7 +11,7 @@
     ├── SafetyStop        5   the supervision stopped the axis while it ran (quick stop, latched)
     ├── OutputError       6   a result could not be written (a full disk); the measured figures were printed
     └── DaemonError       7   the daemon cannot be reached, or refuses this client now
-        ├── LeaseError        the client does not hold the right to move
+        ├── LeaseError        the client does not hold the lease, the right to move
         └── RefusedError      the axis is in the wrong state for the request, or busy
 
 A message says what is wrong, where (file:line:column, node and object), what was expected, and what to do.
@@ -88,7 +88,7 @@ class DaemonError(HdbridgeError):
 
 
 class LeaseError(DaemonError):
-    """The client does not hold the right to move."""
+    """The client does not hold the lease, the right to move."""
 
 
 class RefusedError(DaemonError):

@@ -41,7 +41,7 @@ Row = dict[str, Any]
 
 
 def fitted(terms: np.ndarray, right: np.ndarray, names: list[str]) -> np.ndarray:
-    """Returns the fitted coefficients of the logistic formula, shape (terms,)."""
+    """Returns the fitted coefficients of the logistic regression, shape (terms,)."""
     bounds = [
         (None, None) if each in FREE else ((None, 0) if each in AGAINST else (0, None)) for each in names
     ]

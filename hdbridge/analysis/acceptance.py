@@ -156,7 +156,7 @@ def law_discrepancies(estimator: Estimator, hypothesis: Hypothesis) -> FloatArra
 
 
 def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:
-    """Returns True if each component of a finding exceeds the noise and the law errors of larger ones."""
+    """Returns True if each component of a finding exceeds the noise and the law errors of larger effects."""
     effect = fitted.hypothesis.effects[place]
     pieces = range(len(effect.coefficients()))
     if not effect.inexact or len(pieces) != len(effect.pieces()):

@@ -28,7 +28,7 @@ FINE_DEG = 0.4
 """Scale of the block length after a reversal. The length of a block is a twentieth of the sum of this angle
 and the travel since the reversal."""
 REST_DEG_S = 0.05
-"""Maximum motor speed at which an axis counts as resting."""
+"""Maximum motor speed at which an axis counts as being at rest."""
 AVERAGED_COUNTS_S = 200.0
 """Count rate, counts/s, above which rounding averages out, because a servo passes several counts before it
 responds."""

@@ -249,7 +249,7 @@ def _freed(
 
 
 def _change(estimator: Estimator, fitted: Fitted, place: int, given: Effect) -> FloatArray:
-    """Returns the fitted contribution of a part less that of the ``given`` part, arcsec, shape (m,)."""
+    """Returns the contribution of the fitted part minus that of the ``given`` part, arcsec, shape (m,)."""
     start, now = fitted.hypothesis.start, fitted.hypothesis.effects[place]
     after = estimator.columns(now, start) @ now.coefficients()
     return np.asarray(after - estimator.columns(given, start) @ given.coefficients())

@@ -32,7 +32,7 @@ more turns the minimum is smaller, because a chance repetition explains less."""
 LEAST_REPEATS_SHARE = 0.1
 """Lower bound of the required repeating fraction, reached in records of many turns."""
 FOLLOWS_SHARE = 0.1
-"""Maximum ratio of the deviation between command and motor after unwrapping the command to that before."""
+"""Maximum ratio of the deviations between command and motor after and before unwrapping of the command."""
 
 
 def check_records(records: Mapping[Path, Record], ratio: float) -> None:

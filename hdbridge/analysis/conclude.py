@@ -101,7 +101,7 @@ SURE = 3.0
 WORTH_ARCSEC = 0.3
 """Smallest deviation that fails a test. A smaller one passes even if it is significant."""
 LEAST_REPORTED_ARCSEC = 0.005
-"""Smallest deviation mentioned in the text; a smaller one would be printed as 0.00."""
+"""Smallest deviation stated in the text; a smaller deviation would be printed as 0.00."""
 
 
 def residual_tests(
@@ -411,7 +411,7 @@ def _describe_limits(state: State, lines: Sequence[Line], warnings: list[str]) -
     if outliers.swinging:
         warnings.append(
             f"{outliers.swinging} samples ({outliers.swinging / len(samples):.2%}) in or just after fast "
-            "accelerations stand out and have no weight: the load swings on its spring there"
+            "accelerations stand out and have no weight: the load oscillates on its spring there"
         )
     if others := outliers.samples - outliers.swinging:
         warnings.append(

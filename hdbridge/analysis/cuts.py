@@ -119,7 +119,7 @@ def jumps(motor_deg: FloatArray, time_s: FloatArray) -> IntArray:
 
 
 def _misread(record: Record, ratio: float) -> BoolArray:
-    """Returns a mask of the samples at which an angle jumps away, to return within `MISREAD_ROWS`."""
+    """Returns a mask of misread samples: one of the angles jumps away and returns within `MISREAD_ROWS`."""
     window = 2 * MISREAD_ROWS + 1
     found = np.zeros(len(record), dtype=np.bool_)
     if len(record) <= 2 * window:

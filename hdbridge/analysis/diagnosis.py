@@ -116,8 +116,8 @@ def diagnose(
     swing = visible_swing(base, between, scales)
     search, found = _searched(data, model, scales, between, swing)
     if swing is None or not between.names:  # a larger cause may mask them
-        # Inertial wind-up is the slow part of the swing and of the motion between samples, so the base
-        # excludes it.
+        # Inertial wind-up is the slow part of the load oscillation and of the motion between samples, so the
+        # base excludes it.
         lawful = search.estimator.lawful(found).hypothesis
         others = [each for each in lawful.effects if each.channels != {Channel.ACCELERATION}]
         base, before = Base.of(data, others), (between.names, swing)
@@ -133,7 +133,7 @@ def diagnose(
 def _searched(
     data: Observed, model: TransmissionModel, scales: Scales, between: Nuisances, swing: Swing | None
 ) -> tuple[Search, Fitted]:
-    """Returns the search and its result, for the data after subtraction of the load's swing."""
+    """Returns the search and its result, for the data after subtraction of the load oscillation."""
     if swing is not None:
         data = without(data, swing)
     soft = swing is not None and swing.soft
@@ -283,7 +283,7 @@ class _Judge:
         lost = [(each, UNWRITTEN) for each in missing if not each.within]
         if lost:
             return as_reported, findings, extended, lost
-        # The model's own part stays as it was given.
+        # The model's own part remains as given.
         self.considered.extend(f"{each.cause}: {UNWRITTEN}" for each in missing)
         findings = [each for each in findings if each not in missing]
         findings = self._with_gains(as_reported, findings, chosen)
@@ -389,7 +389,7 @@ class _Judge:
         findings += changes.findings(self.search, self.model, fitted, plain, precise, spread)
         findings.sort(key=lambda each: -each.robust)
         excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
-        # A model cannot contain a free-form loop, so the figures exclude it.
+        # A model cannot contain a free-form loop, so the results exclude it.
         whole, fitted = fitted, plain
         left = rest(estimator, fitted)
         unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
@@ -474,7 +474,7 @@ class _Judge:
         estimator = self.estimator
         points, direction = estimator.data.points, direction_of(estimator.motion)[estimator.index]
         masks = {name: points.of_kind(name)[estimator.index] for name in points.kinds}
-        if len(masks) == 1:  # a record without legs is divided into standing, slow and fast
+        if len(masks) == 1:  # a record without legs is divided into rest, slow motion and fast motion
             speed = np.abs(points.speed_deg_s)
             slow = speed <= np.median(speed[speed > 0.0]) if np.any(speed) else speed <= 1.0
             either = {"standing": speed == 0.0, "slow": (speed > 0.0) & slow, "fast": ~slow}

@@ -183,10 +183,10 @@ def _driving(
 
 
 def _fitted(columns: FloatArray, lag: FloatArray, count: float, window: int) -> FloatArray:
-    """Returns the combination of the columns, (n, m), that fits a counted lag, (n,).
+    """Returns the combination of the columns (n, m) that fits a lag (n,) measured in whole counts.
 
-    Readings are rounded. A motor that follows at a constant speed stays at one fraction of a count behind its
-    set-points, so all its readings have the same rounding error. A run of equal lags is therefore a single
+    Readings are rounded. A motor that follows at a constant speed lags its set-points by a constant fraction
+    of a count, so all its readings have the same rounding error. A run of equal lags is therefore a single
     observation. The misfit of the columns, for example in accelerations, is correlated over the window.
     """
     edges = np.flatnonzero(np.abs(np.diff(lag, prepend=np.inf, append=np.inf)) > ROUNDED_DEG)
@@ -230,7 +230,7 @@ def _rests(resting: BoolArray) -> Iterator[tuple[int, int]]:
 
 
 def _after_last(mask: BoolArray) -> int:
-    """Returns the index after the last True value; 0 without one."""
+    """Returns the index after the last True value; 0 if no value is True."""
     return int(np.flatnonzero(mask)[-1]) + 1 if np.any(mask) else 0
 
 

@@ -131,7 +131,7 @@ class Finding:
     peak_arcsec: float
     """Half the peak-to-peak contribution of the finding in this record."""
     robust: float = 0.0
-    """Fall in chi square due to the finding."""
+    """Decrease in chi square due to the finding."""
     left_arcsec: float = 0.0
     """Rms of an unexplained residual beyond the noise."""
     left_alone: bool = False

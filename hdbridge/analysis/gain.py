@@ -1,4 +1,4 @@
-"""Gain of a model on held-out data: the fall of its prediction error."""
+"""Gain of a model on held-out data: the decrease in its prediction error."""
 
 from __future__ import annotations
 
@@ -45,8 +45,9 @@ class Gain:
     after_arcsec2: FloatArray
     """Sum of squared errors with the tested part."""
     weighted_fall: FloatArray | None = None
-    """Fall of the squared error of each stretch, each sample weighted by one over its noise variance; None if
-    all samples have the same noise. The figures in arcsec are not weighted, but all decisions are."""
+    """Decrease in the squared error of each stretch, with each sample weighted by the inverse of its noise
+    variance; None if all samples have the same noise. Errors in arcsec are not weighted, but all
+    decisions are."""
 
     @property
     def before_arcsec(self) -> float:
@@ -70,7 +71,7 @@ class Gain:
 
     @property
     def sure(self) -> bool:
-        """True if the fall of the squared error is significant, judged by its scatter between stretches."""
+        """True if the decrease in squared error is significant, judged by its scatter between stretches."""
         fall = self._fall
         if len(fall) < 2:
             return False
@@ -83,10 +84,10 @@ class Gain:
 
     @property
     def predicts(self) -> bool:
-        """True if the held-out error falls, in nearly all recordings or in more than one stretch.
+        """True if the held-out error decreases in nearly all recordings, or in more than one stretch.
 
-        The effective number of stretches that contribute is the squared sum of their falls divided by the sum
-        of the squared falls.
+        The effective number of stretches that contribute is the squared sum of their decreases divided by
+        the sum of the squared decreases.
         """
         fall = self._fall
         shared = float(np.sum(fall)) ** 2 > SHARED * float(fall @ fall)
@@ -179,7 +180,7 @@ class _Parts:
     """Number of each point's repetition, shape (m,)."""
     over: str
     weight: FloatArray
-    """Weight of each point's squared residual, one over its noise variance; the mean is one, shape (m,)."""
+    """Weight of each point's squared residual: inverse noise variance, scaled to a mean of 1, (m,)."""
 
     @classmethod
     def of(cls, estimator: Estimator, parameters: int) -> _Parts | None:

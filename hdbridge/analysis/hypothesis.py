@@ -113,7 +113,7 @@ class Fitted:
 
     @property
     def information(self) -> FloatArray:
-        """Prior information (one over the variance) of each parameter, shape (p,)."""
+        """Prior information (inverse variance) of each parameter, shape (p,)."""
         return self.linearised.known[:, 0]
 
     def count(self) -> int:

@@ -143,7 +143,10 @@ def _examples(
 
 
 def _columns(estimator: Estimator, candidate: Effect, base: Sequence[Effect], start: Start) -> FloatArray:
-    """Returns a candidate's columns, arcsec, (m, p); for a changed part, one column with its change."""
+    """Returns a candidate's columns in arcsec, shape (m, p).
+
+    If the candidate is the change of a part, returns a single column, the change in the part's error.
+    """
     columns = estimator.columns(candidate, start)
     if candidate.changes is None:
         return columns
@@ -158,7 +161,7 @@ def _columns(estimator: Estimator, candidate: Effect, base: Sequence[Effect], st
 
 
 def _before(estimator: Estimator, candidate: Effect, base: Sequence[Effect], start: Start) -> FloatArray:
-    """Returns the changes of a candidate's columns due to other initial elastic states, shape (m, k)."""
+    """Returns the changes in a candidate's columns with different initial elastic states, shape (m, k)."""
     own = _columns(estimator, candidate, base, start)
     others = [_columns(estimator, candidate, base, each) - own for each in Start if each is not start]
     return side_by_side(others, len(estimator.index))

@@ -38,10 +38,10 @@ from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 WORTH = 0.01
-"""Minimum relative fall of the held-out rms error for an improvement.
+"""Minimum relative decrease in the held-out rms error for an improvement.
 
-A smaller fall does not affect any stepping test and can be due to noise alone: a second calibration of the
-unchanged demo axis lowers the rms by 0.8 %."""
+A smaller decrease does not affect any stepping test and can be due to noise alone: a second calibration of
+the unchanged demo axis lowers the rms by 0.8 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class Outliers:
     swinging: int
     """Number of outliers in or just after high acceleration, while the load oscillates on its spring."""
     longest_run: int
-    """Length of the longest run of consecutive outliers other than swinging ones, samples."""
+    """Length of the longest run of consecutive outliers other than those counted in ``swinging``, samples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,7 +299,7 @@ def oscillation(measured: Measured, samples: Samples) -> str:
     """Returns a warning if the motor oscillates about its command in slow motion, else an empty text.
 
     Such a motor reverses where the command does not, so the state of the hysteresis loop is unknown. The
-    deviation is a median, because a motor may swing after a start or a reversal.
+    deviation is a median, because a motor may oscillate after a start or a reversal.
     """
     target, position = measured.record.motor_target_deg, measured.record.motor_position_deg
     if target is None or not samples.commanded:
@@ -333,7 +333,7 @@ SETTLE_SHARE = 0.2
 """Maximum fraction of the time to the next turning point that is dropped after a turning point, where the
 hysteresis changes too steeply for a load on a spring to follow."""
 STANDING_DEG_S = 1e-3
-"""Maximum load speed at which an axis counts as standing."""
+"""Maximum load speed at which an axis counts as being at rest, deg/s."""
 GENTLE_DEG_S2 = 40.0
 """Maximum load acceleration of usable samples in motion of unknown kind."""
 RESTING = ("reference", "standstill")

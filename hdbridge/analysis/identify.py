@@ -194,14 +194,14 @@ def _settle(state: State) -> tuple[State, Solution, System]:
             break
     solution = state.fitted()
     if _value(solution, SWING) < 0.0:
-        # Below its resonance a load amplifies the error. A negative swing therefore has a different
-        # speed-dependent cause.
+        # Below its resonance a load amplifies the error. A negative coefficient therefore has a
+        # different speed-dependent cause.
         state = state._replace(nuisances=tuple(each for each in state.nuisances if each != SWING))
         solution = state.fitted()
         system = state.information()
     state = state.after(solution)
     if len(state.columns().names) != len(solution.nuisances):
-        # Swing columns of newly selected orders, or newly relevant turning points, were added.
+        # Oscillation columns of newly selected orders, or newly relevant turning points, were added.
         solution = state.fitted()
         system = state.information()
     return state, solution, system

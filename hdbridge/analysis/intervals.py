@@ -123,7 +123,7 @@ def _label(part: Any, number: int) -> int:
 
 
 def joined(path: str, key: str) -> str:
-    """Appends a key to a path (see `leaves`)."""
+    """Returns ``path`` with ``key`` appended, in the notation of `leaves`."""
     return f"{path}.{key}" if path and key else path or key
 
 
@@ -137,7 +137,7 @@ def labelled(parameters: Any, path: Iterable[str | int]) -> str:
 
 
 def difference(name: str, low: float, high: float) -> float:
-    """Returns ``high`` minus ``low`` for the parameter at a path (see `leaves`); phases are wrapped."""
+    """Returns ``high`` minus ``low`` for the parameter at path ``name`` (see `leaves`); wraps phases."""
     if re.search(r"phase_deg$", name):
         return (high - low + 180.0) % 360.0 - 180.0
     return high - low

@@ -150,7 +150,7 @@ class Prior(NamedTuple):
 
     mean: float
     information: float
-    """One over the variance. A negative value compensates for the apparent information of noisy columns."""
+    """Inverse variance. A negative value compensates for the apparent information of noisy columns."""
 
 
 FREE = Prior(0.0, 0.0)
@@ -174,12 +174,12 @@ class Effort:
 
     steps: int = 25
     converged: float = 1e-4
-    """Fall in chi square, predicted or actual, below which the fit ends."""
+    """Decrease in chi square, predicted or actual, below which the fit ends."""
     roughly: float = 0.0
     """Tolerance relative to chi square, because a large residual requires little accuracy."""
 
     def enough(self, chi_square: float) -> float:
-        """Returns the fall in chi square below which the fit ends."""
+        """Returns the decrease in chi square below which the fit ends."""
         return max(self.converged, self.roughly * chi_square)
 
 
@@ -279,7 +279,7 @@ class Linearised:
         return Linearised(self.columns[:, places], self.residual, self.known[places])
 
     def left(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Returns Gram matrix (k, k) and moment (k,) of other columns (m, k), less what the fit explains."""
+        """Returns the Gram matrix (k, k) and moment (k,) of columns (m, k), less the fit's contribution."""
         shadow = self.basis.T @ columns
         return columns.T @ columns - shadow.T @ shadow, columns.T @ self.residual - shadow.T @ self.slack
 

@@ -2,7 +2,7 @@
 
 The noise has five parts:
 
-- white noise, which may differ between standing and moving;
+- white noise, which may differ between rest and motion;
 - a drift in time;
 - a drift over the motor's *travel*, because an axis rests anywhere within a count of its encoder; this error
   is constant during a stop, and different at the next one;
@@ -74,7 +74,7 @@ class White:
     """Inverse covariance of independent noise."""
 
     def __init__(self, weight: FloatArray) -> None:
-        """``weight`` is one over the standard deviation of each row, shape (m,)."""
+        """``weight`` is the inverse standard deviation of each row, shape (m,)."""
         self._precision = weight**2
 
     def apply(self, columns: FloatArray) -> FloatArray:

@@ -9,8 +9,8 @@ Turning points: each is known only to within a count and the travel between two 
 or steep hysteresis is known only as accurately as its turning points. The coefficient of a turning point's
 column is a bounded fraction of its reach. With fine encoders and fast sampling these columns vanish.
 
-Swing: the load on the gear's spring amplifies the error that excites it, more at higher speed. The swing is
-separable from the orders if there are two speeds. At a single speed the amplitudes are less certain.
+Load oscillation: the load on the gear's spring amplifies the error that excites it, more at higher speed. It
+is separable from the orders if there are two speeds. At a single speed the amplitudes are less certain.
 """
 
 from __future__ import annotations
@@ -34,16 +34,17 @@ SWING_LAG = "swing_ms3"
 TEXTS = {
     DELAY: "delay of the load encoder's samples relative to the motor encoder's",
     ROUNDING: "lag of the motor behind its reading at rest, in the direction of its last motion",
-    SWING: "swing of the load beyond the error that excites it, per acceleration of the load",
+    SWING: "oscillation of the load beyond the error that excites it, per acceleration of the load",
 }
 UNITS = {DELAY: "ms", ROUNDING: "counts", SWING: "ms\N{SUPERSCRIPT TWO}"}
 SWING_MS2 = 25.0
-"""Prior standard deviation of the swing: 1 / (2 pi f)^2 for a load with natural frequency f = 32 Hz."""
+"""Prior standard deviation of the load oscillation: 1 / (2 pi f)^2 for a load with natural frequency
+f = 32 Hz."""
 SWING_MS3 = 50.0
-"""Prior standard deviation of the swing's damping term, 2 z / (2 pi f)^3, with damping ratio z."""
+"""Prior standard deviation of the oscillation's damping term, 2 z / (2 pi f)^3, with damping ratio z."""
 SWING_COUNT_ARCSEC = 2.0
-"""Upper limit of a motor count, referred to the load, for which swing is fitted. The sawtooth error of a
-coarser encoder also depends on speed and looks like swing."""
+"""Upper limit of a motor count, referred to the load, for which the load oscillation is fitted. The sawtooth
+error of a coarser encoder also depends on speed and looks like an oscillation."""
 MOST_TURNS = 80
 SMALLEST_TURN = 1e-3
 COUNTS = 0.29
@@ -124,7 +125,7 @@ def swing(
     waves: Iterable[tuple[float, FloatArray, FloatArray]],
     mean: Callable[[FloatArray], FloatArray] = lambda columns: columns,
 ) -> Nuisances:
-    """Returns two columns of the load's swing beyond the waves that excite it, arcsec/ms^2 and arcsec/ms^3.
+    """Returns two columns of the load oscillation beyond its exciting waves, arcsec/ms^2 and arcsec/ms^3.
 
     ``rate`` (n,) is the motor speed, radians per second. ``waves`` contains, for each order, the order, its
     contribution (n,), and its contribution a quarter period later. ``mean`` averages columns (n, 2) like the
@@ -141,7 +142,7 @@ def swing(
 
 
 def speeds_differ(speed_deg_s: FloatArray, count: FloatArray) -> bool:
-    """Returns True if the speeds differ enough to separate swing from the orders that excite it.
+    """Returns True if the speeds differ enough to separate the load oscillation from the exciting orders.
 
     More than the fraction `SHARE` of the squared speed's sum of squares must remain after a fit of its mean.
     ``count`` (n,) weights the speeds.

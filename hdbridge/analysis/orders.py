@@ -107,17 +107,17 @@ class Line:
 
     @property
     def fall_in_chi_square(self) -> float:
-        """Fall in chi square due to the order."""
+        """Decrease in chi square due to the order."""
         return (self.amplitude_arcsec / max(self.standard_error_arcsec, 1e-12)) ** 2
 
     @property
     def threshold(self) -> float:
-        """Fall in chi square that corresponds to `threshold_arcsec`."""
+        """Decrease in chi square that corresponds to `threshold_arcsec`."""
         return (self.threshold_arcsec / max(self.standard_error_arcsec, 1e-12)) ** 2
 
 
 def threshold(candidates: int, family_wise: float) -> float:
-    """Returns the fall in chi square that the best of the candidates exceeds by chance.
+    """Returns the decrease in chi square that the best of the candidates exceeds by chance.
 
     ``family_wise`` is the probability of this chance. Each candidate has two coefficients.
     """
@@ -130,7 +130,7 @@ class _Left(NamedTuple):
     share: float
     """Fraction of the order's information that remains."""
     fall: float
-    """Fall in chi square due to the order."""
+    """Decrease in chi square due to the order."""
     cosine: float
     sine: float
     error: float

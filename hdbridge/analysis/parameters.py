@@ -101,13 +101,13 @@ def _alike(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[tuple[E
         yield other, estimator.weighted(columns * typical), noise
 
 
-# Final fit of the parameters, including the swing of the load.
+# Final fit of the parameters, including the load oscillation.
 
 
 def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
-    """Refits a hypothesis with the load swing that its waves excite, and with more shapes free (`FOUND`).
+    """Refits a hypothesis with the load oscillation due to its waves, and with more shapes free (`FOUND`).
 
-    At a single speed the swing is omitted, because it is not separable from the orders.
+    At a single speed the oscillation is omitted, because it is not separable from the orders.
     """
     plain = estimator.fit(replace(fitted.hypothesis, nuisances=_shaken(estimator, fitted)))
     found = estimator.fit(plain.hypothesis, moves=FOUND)
@@ -117,7 +117,8 @@ def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
 
 
 def _shaken(estimator: Estimator, fitted: Fitted) -> Nuisances | None:
-    """Returns two columns of the load's swing: in phase with frequency squared, and lagging with its cube.
+    """Returns two columns of the load oscillation: an in-phase one that grows with frequency squared, and a
+    lagging one that grows with its cube.
 
     The lagging column changes sign with the direction of motion. Returns None without orders, or at a single
     speed.

@@ -74,7 +74,7 @@ def features(
 ) -> dict[str, float]:
     """Returns the terms of the formula by name.
 
-    ``rank`` is the finding's fall in chi square relative to that of the largest finding.
+    ``rank`` is the finding's decrease in chi square relative to that of the largest finding.
     """
     return {
         "constant": 1.0,

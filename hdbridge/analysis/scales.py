@@ -47,11 +47,13 @@ class Scales:
     large: float = _scale(4.0, "chi square per point", 1.0, "twice the noise")
     slow: float = _scale(
         0.8,
-        "share of a large residual that one cause more than `few` may leave",
+        "fraction of a large residual that one cause more than `few` may leave",
         math.inf,
         "the fourth partial of a sawtooth leaves 0.78 of what the first three leave",
     )
-    leftover: float = _scale(2e-5, "share of the largest one's chi square", 0.0, "error of a linearisation")
+    leftover: float = _scale(
+        2e-5, "fraction of the largest one's chi square", 0.0, "error of a linearisation"
+    )
     extrapolated: float = _scale(
         2.0,
         "largest piece over the observed peak",
@@ -60,7 +62,7 @@ class Scales:
     )
     wave_share_left: float = _scale(
         0.03,
-        "share of a wave's squares",
+        "fraction of a wave's squares",
         0.0,
         "a wave that other causes explain to 97 % is not a cause of its own",
     )
@@ -71,14 +73,16 @@ class Scales:
         "a slope that bends is another effect",
     )
     alias: float = _scale(
-        0.01, "share of the chi square of a cause", 0.0, "a real law differs from its formula by some 7 %"
+        0.01, "fraction of the chi square of a cause", 0.0, "a real law differs from its formula by some 7 %"
     )
 
     # Loops of a different shape, and changes of the model's parts.
-    calibrated: float = _scale(0.04, "share of a coefficient", 0.04, "typical change by temperature and age")
+    calibrated: float = _scale(
+        0.04, "fraction of a coefficient", 0.04, "typical change by temperature and age"
+    )
     calibrated_shape: float = _scale(
         0.06,
-        "share of a width, of an exponent above one",
+        "fraction of a width, of an exponent above one",
         0.06,
         "typical change, and a shape is harder to see",
     )
@@ -89,14 +93,17 @@ class Scales:
 
     # Aliases.
     in_step: float = _scale(
-        0.85, "share of a wave's squares", 2.0, "waves a fifth of a period apart explain 0.87 of each other"
+        0.85,
+        "fraction of a wave's squares",
+        2.0,
+        "waves a fifth of a period apart explain 0.87 of each other",
     )
     noisy: float = _scale(1.5, "times what a channel's noise costs", 0.0, "that cost is itself estimated")
     # Unexplained residual.
     plain_arcsec: float = _scale(1.0, "arcsec", math.inf, "twice the floor, for a residual without a name")
     near: float = _scale(
         0.4,
-        "share of the largest piece",
+        "fraction of the largest piece",
         math.inf,
         "sidebands of a full modulation are a half each, the third partial of a sawtooth is a third",
     )
@@ -108,7 +115,7 @@ class Scales:
     odds_size: float = _scale(1.22, "log odds per log of peak over residual", 0.0, FITTED)
     odds_excess: float = _scale(-1.19, "log odds per log of chi square per point", 0.0, FITTED)
     odds_unexplained: float = _scale(-1.30, "log odds", 0.0, FITTED)
-    right: float = _scale(115 / 128, "share of the names that the formula is fitted to", 0.5, FITTED)
+    right: float = _scale(115 / 128, "fraction of the names that the formula is fitted to", 0.5, FITTED)
     strong: float = _scale(
         12.0,
         "times the needed evidence",

@@ -1,9 +1,9 @@
 """Screens all candidates: scores them on the residual, with the current hypothesis projected out.
 
-The score is the predicted fall in chi square. With Q an orthonormal basis of the hypothesis's tangent and C a
-candidate's columns, C'C - (Q'C)'(Q'C) is the remaining Gram matrix. One matrix product serves all columns, so
-a grid of hundreds of shapes takes no longer than one fit. A direction whose remaining fraction is below
-`SHARE_LEFT` is not visible in the record.
+The score is the predicted decrease in chi square. With Q an orthonormal basis of the hypothesis's tangent and
+C a candidate's columns, C'C - (Q'C)'(Q'C) is the remaining Gram matrix. One matrix product serves all
+columns, so a grid of hundreds of shapes takes no longer than one fit. A direction whose remaining fraction is
+below `SHARE_LEFT` is not visible in the record.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Score:
 
     effect: Effect
     gain: float
-    """Predicted fall in chi square, from the linearised fit."""
+    """Predicted decrease in chi square, from the linearised fit."""
     freedom: int
     """Number of directions of the candidate's columns that the hypothesis does not span."""
     share: float

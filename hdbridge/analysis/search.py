@@ -81,7 +81,7 @@ class Search:
         return self.with_best_law(self.eliminated(fitted, self._least, []))
 
     def instead(self, fitted: Fitted, stopped: Iterable[str]) -> Fitted:
-        """Adds other causes in place of those in ``stopped``, which failed a test of the result."""
+        """Replaces the causes in ``stopped``, which failed a test of the result, by other causes."""
         self._stopped.update(stopped)
         while len(fitted.hypothesis.effects) < self.base + MOST:
             found = self._best_addition(fitted)
@@ -236,7 +236,7 @@ class Search:
         return None
 
     def _gain(self, fitted: Fitted, trial: Fitted, cause: str) -> float:
-        """Returns the fall in chi square due to the last effect with the name ``cause`` in ``trial``."""
+        """Returns the decrease in chi square due to the last effect with the name ``cause`` in ``trial``."""
         place = _last(trial, cause)
         incidental = trial.hypothesis.effects[place].incidental
         lacking = self._lacking(trial, place).chi_square if incidental else math.inf
@@ -556,7 +556,7 @@ def _share_in(effect: Effect, orders: Container[float]) -> float:
 def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:
     """Chooses the one of several equivalent parametrisations that keeps the ``given`` model.
 
-    Returns ``fitted`` unchanged without an equivalent one. See `Effect.reparametrised`.
+    Returns ``fitted`` unchanged if there is no equivalent one. See `Effect.reparametrised`.
     """
     effects = fitted.hypothesis.effects
     for place in range(len(given), len(effects)):

@@ -394,7 +394,7 @@ class Separable:
         system: tuple[FloatArray, FloatArray],
         damping: float,
     ) -> tuple[FloatArray, float]:
-        """Returns the damped step of the shapes within their ranges, and the predicted fall in chi square."""
+        """Returns the damped step of the shapes in their ranges, and its predicted chi-square decrease."""
         inner, slope = system
         free = np.ones(len(where), dtype=np.bool_)
         step = np.zeros(len(where))

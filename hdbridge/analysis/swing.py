@@ -1,9 +1,9 @@
-"""Swing of the load on the gear's spring: wind-up during acceleration and ringing after a stop.
+"""Oscillation of the load on the gear's spring: wind-up during acceleration and ringing after a stop.
 
 The load follows the motor and the gear's error as a mass on a damped spring follows its base. Every axis has
-this swing, and it is not a fault. A calibration moves too slowly to show it. Its frequency and damping are
-therefore fitted to the residual of the given model, before any part of the model is free to imitate it, and
-the swing is subtracted. Samples in which the uncertainty of the swing is too large are omitted.
+this oscillation, and it is not a fault. A calibration moves too slowly to show it. Its frequency and damping
+are therefore fitted to the residual of the given model, before any part of the model is free to imitate it,
+and the oscillation is subtracted. Samples in which its uncertainty is too large are omitted.
 """
 
 from __future__ import annotations
@@ -50,34 +50,35 @@ frequency f = 60 Hz."""
 UNEVEN = 0.3
 """Maximum relative deviation of a time step from the median for its second differences to be used."""
 LEAST_SEEN = 0.1
-"""Minimum fraction of a residual's sum of squares that a swing must explain, because any oscillation explains
-a little."""
+"""Minimum fraction of a residual's sum of squares that a load oscillation must explain, because a chance fit
+also explains a small fraction."""
 SURE = 3.0
 """Margin by which noise must be overestimated to be reduced, standard deviations of chi square."""
 CALMEST = 0.05
-"""Minimum fraction of the samples that are used, those with the smallest uncertainty of the swing."""
+"""Minimum fraction of the samples that are used, those with the least uncertain load oscillation."""
 RESOLVED = 4.0
 """Number of samples per period above which a spline begins to follow a wave. From twice this number on, the
 spline follows it fully."""
 REFINED = 40
 """Maximum number of function evaluations of the refinement."""
 LONGEST = 20_000
-"""Maximum number of consecutive samples to which a swing is fitted: those with the highest accelerations."""
+"""Maximum number of consecutive samples to which a load oscillation is fitted: those with the highest
+accelerations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Swing:
-    """Swing of the load relative to its base."""
+    """Oscillation of the load relative to its base, the unloaded output of the gear."""
 
     frequency_hz: float
     damping: float
     contribution_arcsec: FloatArray
-    """Transmission error due to the swing in each sample, shape (n,)."""
+    """Transmission error due to the oscillation in each sample, shape (n,)."""
     waves_arcsec2: FloatArray
-    """Squared amplitude of the swing due to waves that are too fast for the sampling, shape (n,)."""
+    """Squared amplitude of the oscillation due to waves that are too fast for the sampling, shape (n,)."""
 
     def wind_up_arcsec(self, full: Samples) -> FloatArray:
-        """Returns the slow part of the swing, the wind-up due to the motor's acceleration, shape (n,)."""
+        """Returns the wind-up due to motor acceleration, the slow part of the oscillation, arcsec (n,)."""
         acceleration = full.motion.motor_acceleration_deg_s2
         assert acceleration is not None
         return -acceleration * ARCSEC_PER_DEG / full.ratio / (math.tau * self.frequency_hz) ** 2
@@ -88,9 +89,9 @@ class Swing:
         return self.frequency_hz <= ORDINARY_HZ
 
     def remark(self) -> str:
-        """Describes the swing for the report."""
+        """Describes the load oscillation for the report."""
         return (
-            f"the load swings on its spring at {self.frequency_hz:.0f} Hz (damping ratio "
+            f"the load oscillates on its spring at {self.frequency_hz:.0f} Hz (damping ratio "
             f"{self.damping:.2f}) by up to {np.max(np.abs(self.contribution_arcsec)):.2g} arcsec: "
             + ("its ringing is allowed for" if self.soft else "ordinary dynamics, which are allowed for")
         )
@@ -175,7 +176,7 @@ class Base:
 
 
 def between_samples(base: Base, scales: Scales) -> Nuisances:
-    """Returns columns of the swing that is due to motion between samples, arcsec, shape (n, k).
+    """Returns columns of the load oscillation due to motion between samples, arcsec, shape (n, k).
 
     A drive may follow its command in straight lines, or with a ripple of its own. Its acceleration between
     samples is then not visible in a spline through them. The load's response is modelled as a filter of the
@@ -233,9 +234,9 @@ def _seen(whole: float, rest: float, parameters: int, scales: Scales) -> bool:
 
 
 def visible_swing(base: Base, between: Nuisances, scales: Scales) -> Swing | None:
-    """Fits the swing to the residual of the base's effects; returns None if no swing is visible.
+    """Fits the load oscillation to the residual of the base's effects; returns None if none is visible.
 
-    The swing must improve on a fit of ``between``, the columns of the motion between samples.
+    The oscillation must improve on a fit of ``between``, the columns of the motion between samples.
     """
     full, residual = base.full, base.residual_arcsec
     step_s, parts = np.maximum(np.diff(full.time_s), 1e-9), [each.rows for each in full.chains]
@@ -305,7 +306,7 @@ def _fast_waves(full: Samples, effects: Sequence[Effect], period_s: float) -> It
 
 
 def without(data: Observed, found: Swing) -> Observed:
-    """Returns the data after subtraction of the swing; a soft load's wind-up remains, as a cause to find."""
+    """Subtracts the load oscillation from the data; a soft load's wind-up remains, as a cause to find."""
     full = data.full
     contribution = (
         found.contribution_arcsec - found.wind_up_arcsec(full) if found.soft else found.contribution_arcsec
@@ -314,9 +315,9 @@ def without(data: Observed, found: Swing) -> Observed:
 
 
 def settled(estimator: Estimator, fitted: Fitted, effects: Sequence[Effect], found: Swing | None) -> Observed:
-    """Excludes samples in which the uncertainty of the swing is too large, and increases the others' noise.
+    """Excludes samples with too uncertain a load oscillation, and increases the noise of the others.
 
-    The error of a ``found`` swing is proportional to the wind-up and to waves that are too fast for the
+    The error of a ``found`` oscillation is proportional to the wind-up and to waves that are too fast for the
     sampling. The factor is found by regression on the squared residuals in motion. The noise of each sample
     is increased by this error and by that of the turning points. The latter is computed with the given
     ``effects``, because the ``fitted`` loop may have changed to imitate it. The calmest samples are always
@@ -344,7 +345,7 @@ def noise_bounded(estimator: Estimator, fitted: Fitted) -> Observed:
     """Returns the data with less noise if the residual of a fit is certainly smaller than the stated noise.
 
     A residual contains all the noise. Differences of neighbouring samples may contain more, if the axis never
-    rests, and so may the uncertainty of the swing.
+    rests, and so may the uncertainty of the oscillation.
     """
     data, freedom = estimator.data, max(len(fitted.residual) - fitted.free(), 1)
     most = fitted.chi_square / freedom * (1.0 + SURE * math.sqrt(2.0 / freedom))

@@ -64,7 +64,7 @@ class _View(NamedTuple):
     """Dependence of the residual on one coordinate."""
 
     gain: float
-    """Fall in chi square due to ``predicted_arcsec``."""
+    """Decrease in chi square due to ``predicted_arcsec``."""
     name: str
     predicted_arcsec: FloatArray
     """Prediction of each stretch of time from all others, shape (m,)."""
@@ -167,7 +167,10 @@ def _angle_step_arcsec(estimator: Estimator) -> float:
 
 
 def near_reversals(estimator: Estimator, fitted: Fitted) -> BoolArray:
-    """Returns a mask (m,) of the points within a loop's memory of the last reversal; all True without any."""
+    """Returns a mask (m,) of the points within a loop's memory of the last reversal.
+
+    All points are True if no point is that near.
+    """
     memory_deg = max((each.tracker().memory_deg for each in fitted.hypothesis.effects), default=0.0)
     near = (since_reversal(estimator.motion).values <= TAIL * memory_deg)[estimator.index]
     return np.asarray(near if np.any(near) else np.ones_like(near))

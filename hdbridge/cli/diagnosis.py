@@ -234,7 +234,7 @@ def _print_shares(shares: dict[str, dict[str, float]]) -> None:
         for name, each in sorted(shares.items(), key=lambda each: -each[1]["share_of_baseline"])
         if max(each.values()) >= WORTH_PRINTING
     ]
-    print_table(("", "as given", "extended"), rows, "share of the difference explained by")
+    print_table(("", "as given", "extended"), rows, "fraction of the difference explained by")
 
 
 def _title(recording: Recording, records: Sequence[Path]) -> str:

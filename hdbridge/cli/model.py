@@ -127,7 +127,7 @@ def _rows(before: Any, after: Any) -> list[Difference]:
 
 
 def _folder(profile: str) -> Path:
-    """Returns the folder of an axis's models, even with an invalid axis file; InputError without one."""
+    """Returns the folder of an axis's models; InputError without an axis file, which may be invalid."""
     axis = Profile.find(profile).axis
     data = read_yaml(axis).data
     if not (isinstance(data, dict) and str(data.get("schema")).startswith("hdbridge.axis/")):

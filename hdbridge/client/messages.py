@@ -216,7 +216,7 @@ class Coordinated(Request):
         examples=[{"joint-1": 30.0, "joint-2": -12.5}],
     )
     speed: Annotated[Real, Field(gt=0, le=1)] = Field(
-        1.0, description="share of each axis's limits of speed and acceleration", examples=[0.5]
+        1.0, description="fraction of each axis's limits of speed and acceleration", examples=[0.5]
     )
     wait: bool = Field(True, strict=True, description="answer when all rest; else at once")
 
@@ -410,7 +410,7 @@ class Samples(Report):
     cycle: list[int]
     late_us: list[float]
     busy_us: list[float]
-    bus_load: _Column = Field(description="share of the bus in use; None without a bit rate")
+    bus_load: _Column = Field(description="fraction of the bus in use; None without a bit rate")
     skipped: list[int] = Field(description="periods left out since the loop began")
     axes: dict[Name, AxisColumns]
     events: list[Event] = Field(default=[], description="events since the last batch")
@@ -592,7 +592,7 @@ class AxisState(Report):
     compensating: bool = Field(description="True if the correction is in the target now")
     correction_arcsec: float | None = Field(None, description="in the target now")
     predicted_arcsec: float | None = Field(None, description="transmission error by the model, now")
-    weight: float | None = Field(None, description="share of the correction that is ramped in, 0 to 1")
+    weight: float | None = Field(None, description="fraction of the correction that is ramped in, 0 to 1")
     limited: bool = Field(False, description="the correction is at its limit or changes as fast as it may")
     changing: bool = Field(False, description="a change of model or scheme is being ramped")
     memory_known: bool = Field(
@@ -623,7 +623,7 @@ class BusState(Report):
     up: bool
     lent_to: str | None = Field(None, description="program that has borrowed the bus; the axes are disabled")
     lent_s: float | None = Field(None, ge=0, description="since it was lent, seconds", examples=[63.0])
-    load: float | None = Field(None, description="share of the bus's time that is in use", examples=[0.31])
+    load: float | None = Field(None, description="fraction of the bus's time that is in use", examples=[0.31])
 
 
 class CycleState(Report):

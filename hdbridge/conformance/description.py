@@ -59,7 +59,7 @@ def _outcome(code: int) -> str:
 
 
 def _parameters(t: NodeTester, attribute: str = "index") -> Iterator[ODVariable]:
-    """Yields the node's integer parameters that may be written without side effects and have an attribute."""
+    """Yields the node's integer parameters with this attribute that can be written without side effects."""
     for each in _entries(t):
         if each.access_type != "rw" or each.data_type not in _INTEGERS or each.index in _COMMANDS:
             continue

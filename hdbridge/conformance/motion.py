@@ -397,7 +397,7 @@ def _short_of(t: NodeTester, target: int) -> None:
 
 
 def _limited(t: NodeTester, here: int, side: int, distance: int) -> Callable[[int], None]:
-    """Sets the software limits (607Dh) to ``distance`` ahead and three test distances behind a position.
+    """Sets the software limits (607Dh) to ``distance`` ahead of ``here`` and three test distances behind it.
 
     Returns a function that fails for a position beyond the limit.
     """

@@ -6,7 +6,7 @@ next RPDOs; it neither waits nor sends. An axis is
 * *silent*: it receives no RPDO. TPDOs are accepted when they arrive, and nothing is judged as a fault. This
   is the state before `AxisCycle.begin`, after `AxisCycle.silence`, and after a reaction of `Reaction.LATCH`.
 * *speaking*: it receives an RPDO in every period, its TPDOs are awaited, and every fault is judged.
-* *stopped*: speaking, with a latched quick stop. The quick stop is sent until the motor stands still, while
+* *stopped*: speaking, with a latched quick stop. The quick stop is sent until the motor is at rest, while
   the other axes continue. After that, or after its time-out, its TPDOs are no longer awaited.
 """
 

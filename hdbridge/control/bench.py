@@ -247,7 +247,7 @@ class Bench:
         try:
             outcome = run_moves(procedure, self.view, rehearsal, progress, lambda: self._place, self._leg)
         except SafetyStop:
-            raise  # the drive stands still, or stops on its own; the latch stays
+            raise  # the drive is at rest, or stops on its own; the latch remains
         except BaseException:
             with suppress(HdbridgeError):
                 self._image.power.quick_stop()
@@ -370,7 +370,7 @@ class Bench:
                 self._legs.append(_Leg(move.kind, samples[0].time_s, samples[-1].time_s))
 
     def _rest(self) -> None:
-        """Waits until the drive stands still with power off or in quick stop, then disables it."""
+        """Waits until the drive is at rest with power off or in quick stop, then disables it."""
         power = self._image.power
         for _ in range(math.ceil(STOP_TIMEOUT_S / self.cycle.period_s)):
             before = self._image.motor_counts

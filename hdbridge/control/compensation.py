@@ -276,8 +276,8 @@ class Inverse:
 
 
 def _gentle(effects: tuple[Effect, ...], start: Start, steepest: float) -> tuple[list[Tracker], float]:
-    """Returns trackers of the effects, and a bound on the steepest fall of their sum, arcsec per motor
-    degree.
+    """Returns trackers of the effects, and a bound on the steepest negative slope of their sum, arcsec per
+    motor degree.
 
     The load rests while the motor crosses backlash. The error then falls as fast as the motor angle divided
     by the ratio rises, or faster if noise made the fitted backlash too narrow. If the sum would fall more
@@ -409,7 +409,7 @@ class Compensation:
         return self.weight * self._inverse.error_at(motor, moment)
 
     def _solved(self, load_deg: float, moment: Moment) -> float:
-        """Advances the ramps by one cycle; returns the wanted motor angle."""
+        """Advances the ramps by one cycle; returns the required motor angle, degrees, before the limits."""
         weight = self.weight
         if weight != self._target:
             step = self.ramp_step

@@ -84,7 +84,7 @@ class Cycle:
         is the actual position, so that enabling causes no motion.
 
         Raises `SafetyStop` if the fault table requires it, and again at each call until
-        ``supervision.reset()``. By then, the drive has reported the quick stop and the motor stands still,
+        ``supervision.reset()``. By then, the drive has reported the quick stop and the motor is at rest,
         the quick stop has timed out, or no RPDO is sent any more (`Reaction.LATCH`). Errors of ``command``
         other than `InputError` propagate; the caller must then stop the axis.
         """

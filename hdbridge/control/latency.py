@@ -68,7 +68,7 @@ class Histogram:
         It is the upper end of a bin, so it is never too small and at most 3 % too large.
         """
         if not 0.0 <= percent <= 100.0:
-            raise ValueError(f"a percentile lies in 0 .. 100, not at {percent}")
+            raise ValueError(f"percentile is {percent}; expected 0 to 100")
         wanted = math.ceil(self.total * percent / 100.0)
         seen = 0
         for index, count in enumerate(self._counts):

@@ -46,9 +46,9 @@ _SIGMA_OF_MEAN_DEVIATION: Final = math.sqrt(math.pi / 2.0)
 _LEAST_SHARE: Final = 0.5
 """Minimum ratio of the loop's bound to the mean error; below it, the loop does not act."""
 _OUTLIERS: Final = 2
-"""Number of consecutive unexplained readings that count as a move of the load encoder."""
+"""Number of consecutive unexplained readings after which the load encoder counts as displaced."""
 _AGREEMENT: Final = 1.0 / 3.0
-"""Fraction of the greatest disagreement below which the encoders count as agreeing again."""
+"""Fraction of the greatest disagreement between the encoders below which they agree again."""
 _MODEL_ERROR: Final = 0.25
 """Assumed maximum relative error of a model's hysteresis."""
 _PLACES: Final = 24
@@ -139,10 +139,10 @@ class LoadLoop:
         self._beyond = False
         """True if the doubt is about the size of the error rather than the encoder."""
         self._jumped = self._jumped_most = self._off = 0.0
-        """During a doubt about the encoder: sum of the load encoder's moves at rest, the greatest such sum,
-        and the greatest disagreement between the encoders."""
+        """During a doubt about the encoder: sum of the load encoder's displacements at rest, the greatest
+        such sum, and the greatest disagreement between the encoders."""
         self._agreeing = 0
-        """Number of readings since the sum of the load encoder's moves at rest became small."""
+        """Number of readings since the sum of the load encoder's displacements at rest became small."""
         self._agreed = frozenset[int]()
         """Directions of motion after which the encoders have agreed again."""
 

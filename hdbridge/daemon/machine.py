@@ -90,7 +90,7 @@ class Machine:
 
     name: str
     path: Path
-    """Path of the machine file, or of the axis file without one."""
+    """Path of the machine file, or of the axis file if there is no machine file."""
     axes: tuple[Axis, ...]
     bus: BusConfig
     realtime: RealtimeConfig
@@ -220,7 +220,7 @@ def _axis(file: MachineFile, number: int, places: _Places) -> Axis:
 
 
 def _given(environment: Mapping[str, str]) -> Path | None:
-    """Returns the state folder created by the service manager; None without one."""
+    """Returns the state folder created by the service manager; None if it created none."""
     text = environment.get("STATE_DIRECTORY", "").split(":")[0]
     return Path(text) if text else None
 

@@ -66,7 +66,7 @@ class AdaptationSettings(Strict):
         60.0, gt=0, le=36_000, description="fastest plausible change of the zero (reported, never applied)"
     )
     bound_share: float = Field(
-        0.5, gt=0, le=1, description="largest deviation of a coefficient, as a share of the committed one"
+        0.5, gt=0, le=1, description="largest deviation of a coefficient, as a fraction of the committed one"
     )
     least_bound_arcsec: float = Field(
         5.0, ge=0, le=3600, description="largest deviation, if that share is smaller"
@@ -93,7 +93,7 @@ class AdaptationSettings(Strict):
 class LoadLoopSettings(Strict):
     """Load loop: a slow integral of the error at the load encoder, in addition to the model."""
 
-    gain_1_s: float = Field(0.5, gt=0, le=5, description="share of the error removed per second")
+    gain_1_s: float = Field(0.5, gt=0, le=5, description="fraction of the error removed per second")
     maximum_arcsec: float = Field(30.0, gt=0, le=3600, description="largest correction, at the load")
     slew_arcsec_s: float = Field(
         20.0, gt=0, le=10_000, description="fastest change of the correction, at the load"
@@ -198,7 +198,7 @@ class MachineFile(Strict):
 
 
 def read_token(path: Path) -> str:
-    """Returns the token in a file; raises InputError if it is invalid, or if others can read the file."""
+    """Reads the token from ``path``; raises InputError if it is invalid, or if others can read the file."""
     try:
         content, mode = path.read_text(encoding="ascii").strip(), path.stat().st_mode
     except (OSError, UnicodeDecodeError) as problem:

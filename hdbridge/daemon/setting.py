@@ -20,9 +20,9 @@ class CompensationSetting:
     model: TransmissionModel
     scheme: Scheme
     version: int | None = None
-    """Number of the model in the profile's history; None without one."""
+    """Number of the model in the profile's history; None if it is not in the history."""
     file: Path | None = None
-    """File of the model; None without one."""
+    """File of the model; None if it was not read from a file."""
     load_loop: bool = False
     """True if the load loop is on."""
     adapted: TransmissionModel | None = None

@@ -33,7 +33,7 @@ from hdbridge.device.syncclock import SyncClock
 
 PDO_COUNT: Final = 512
 LONGEST_CATCH_UP_S: Final = 1.0
-"""Maximum delay that a late poll makes up for; s."""
+"""Maximum delay of a poll that the node catches up with; s."""
 
 FRAMES_PER_POLL: Final = 64
 
@@ -174,7 +174,7 @@ class DriveNode:
         return self._sync_due_s < _NEVER
 
     def sync_is_late(self, now_s: float) -> bool:
-        """Returns True if SYNC is so late that the node runs on its own clock."""
+        """Returns True if SYNC is overdue by so much that the node runs on its own clock."""
         left = self.behaviour.sync_timeout_periods - 0.5
         return self._sync_due_s - left * self.period_s <= now_s
 

@@ -111,7 +111,7 @@ def user_name(uid: int) -> str:
 
 
 def _holder(path: Path) -> int:
-    """Returns the id of the process that has locked a file; 0 if unlocked or hidden by the system."""
+    """Returns the id of the process that has locked ``path``; 0 if none has or the system hides it."""
     inode = path.stat().st_ino
     with suppress(OSError, ValueError):
         for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():

@@ -64,7 +64,7 @@ class PlannedWrite:
     """True if the object has the value only while its PDO is being changed."""
 
     def __str__(self) -> str:
-        """For example ``605Ah:00 = 6 (6h): what a quick stop does [drive.quick_stop_option]``."""
+        """Describes the write: ``605Ah:00 = 6 (6h): what a quick stop does [drive.quick_stop_option]``."""
         source = f" [{self.field}]" if self.field else ""
         return f"{self.index:04X}h:{self.sub:02X} = {self.value} ({self.value:X}h): {self.why}{source}"
 

@@ -231,7 +231,7 @@ class _Run:
         return self._report()
 
     def _unchanged(self, source: Source) -> Mapping[str, Any] | None:
-        """Returns the stored row of an unchanged recording, reusable if its model is the same; or None."""
+        """Returns the stored row if the recording is unchanged, else None; the model may still differ."""
         row = self._stored.row(source)
         if row is None or source.stamp is None or row["reason"] in self.retried:
             return None

@@ -152,7 +152,7 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
     rates = sorted(summary.rates.items(), key=lambda each: -each[1][0])
     yield from _table(
         "Findings by cause",
-        "Estimated from the fleet: the share of joints with the cause, and the rates of findings in "
+        "Estimated from the fleet: the fraction of joints with the cause, and the rates of findings in "
         "recordings of joints with and without it. A finding that is as frequent without the cause is not "
         "informative.",
         ["cause", Heading("share", "of joints"), Heading("named with it", "of recordings"),
@@ -198,7 +198,7 @@ def _kind(path: str, reason: str) -> str:
 
 
 def _words(name: str) -> str:
-    """Formats the name of a cause or a figure: `hysteresis.width_deg` is "hysteresis width, deg"."""
+    """Formats the name of a cause or a quantity: `hysteresis.width_deg` is "hysteresis width, deg"."""
     with_unit = re.sub(r"_(deg|arcsec)\b", r", \1", name)
     return re.sub(r"(?<=[a-z])\.|\.(?=[a-z])|_", " ", with_unit)
 

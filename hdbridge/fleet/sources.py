@@ -92,7 +92,7 @@ class Source:
 
 
 class Stored:
-    """Rows of a data set without their figures, used to find the recordings that need not be read again."""
+    """Rows of a data set without their results, used to find the recordings that need not be read again."""
 
     def __init__(self, rows: Iterable[Mapping[str, Any]] = ()) -> None:
         self._rows: dict[str, dict[str | None, Mapping[str, Any]]] = defaultdict(dict)
@@ -100,7 +100,7 @@ class Stored:
             self._rows[row["path"]][row["axis"]] = row
 
     def row(self, source: Source) -> Mapping[str, Any] | None:
-        """Returns the stored row of a source, even if the recording has changed since; None without one."""
+        """Returns the stored row of a source, even if the recording has changed since; None if not stored."""
         return self._rows[source.path].get(source.axis) if source.path in self._rows else None
 
     def unchanged(self, sources: Sequence[Source]) -> list[Mapping[str, Any]]:

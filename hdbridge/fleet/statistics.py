@@ -29,7 +29,7 @@ INTERVAL: Final = (0.05, 0.95)
 SCATTER_SERIES: Final = 200
 """Maximum number of series used to estimate the common scatter; its error is then 5 % or less."""
 OWN_SCATTER: Final = 1e-3
-"""Prior fraction of joints whose figure does not follow a line, for example because of a repair."""
+"""Prior fraction of joints whose values do not follow a line, for example because of a repair."""
 PHASE_STEP_DEG: Final = 0.25
 EVERYDAY_SHARE: Final = 0.05
 """Normal relative difference of an order's amplitude between two recordings of one joint."""
@@ -103,8 +103,8 @@ def repeats(named: Sequence[Sequence[bool]]) -> Repeats:
     order.
 
     Recordings of a joint without the cause have findings at a constant rate; those of a joint with it, at a
-    higher rate from an unknown onset on. Shares and rates are estimated from the fleet by expectation
-    maximisation with weak priors.
+    higher rate from an unknown onset on. Prevalence and rates are estimated from the fleet by
+    expectation maximisation with weak priors.
     """
     share, often, rarely = 0.05, 0.8, 0.02
     lengths = np.array([len(each) for each in named], dtype=int)
@@ -178,7 +178,7 @@ def outliers(values: FloatArray, rate: float = 0.05) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One figure of one joint over its operating hours; arrays of shape (n,)."""
+    """Values of one quantity of one joint over its operating hours; arrays of shape (n,)."""
 
     hours: FloatArray
     value: FloatArray
@@ -189,7 +189,7 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """Trend of a figure: the fitted line, and the distribution of the fleet's slopes as its prior."""
+    """Trend of a quantity: the fitted line, with the distribution of the fleet's slopes as its prior."""
 
     line: FloatArray
     """Level at the last recording, and slope per 1000 hours."""
@@ -258,7 +258,7 @@ class Trend:
 
 
 def trends(series: Sequence[Series]) -> list[Trend | None]:
-    """Fits the trend of one figure in every joint; None for a joint without two different operating hours.
+    """Fits the trend of one quantity in every joint; None for a joint without two different operating hours.
 
     The trends are straight lines; the errors are those of the values plus a scatter between recordings that
     is common to all joints. The prior of the slopes is a normal mixture of joints that change and joints that

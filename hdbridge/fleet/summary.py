@@ -70,7 +70,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Outlier:
-    """Figure of a joint outside the normal range of its gear type."""
+    """Quantity of a joint that is outside the normal range of its gear type."""
 
     joint: str
     gear: str
@@ -165,7 +165,7 @@ def summarise(rows: Sequence[Row], limit_arcsec: float) -> Summary:
 
 
 def own_recordings(rows: Sequence[Row]) -> tuple[dict[str, list[Row]], tuple[MismatchedRecording, ...]]:
-    """Returns each joint's own diagnosed recordings in time order, without copies; and the mistaken ones."""
+    """Returns each joint's own diagnosed recordings in time order, without duplicates, and mistaken ones."""
     good = [row for row in rows if row["reason"] is None and row["duplicate_of"] is None]
     good.sort(key=_when)
     mistaken, foreign = _mistaken(good)
@@ -390,7 +390,7 @@ def _prevalence(
 
 
 def _odd(joints: Mapping[str, Sequence[Row]]) -> tuple[Outlier, ...]:
-    """Returns the figures whose median over a joint's recordings is outside the gear type's normal range."""
+    """Returns the quantities with a median over a joint's recordings outside its gear type's normal range."""
     table: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for name, rows in joints.items():
         for row in rows:

@@ -57,9 +57,9 @@ def coordinated(
     plan longer than an hour.
     """
     if not points_deg:
-        raise InputError("a coordinated move without a point; expected at least one")
+        raise InputError("the coordinated move has no point; expected at least one")
     if not (0.0 < share <= 1.0 and 0.0 < period_s < math.inf):
-        raise InputError(f"a share of {share!r} of the limits; expected more than 0 and at most 1")
+        raise InputError(f"the fraction of the limits is {share!r}; expected more than 0 and at most 1")
     names = [each for each in starts_deg if any(each in point for point in points_deg)]
     for point in points_deg:
         for name in point:
@@ -69,7 +69,7 @@ def coordinated(
                 )
             _check_inside(name, point[name], limits[name])
     if not names:
-        raise InputError("a coordinated move without an axis; expected a target for at least one")
+        raise InputError("the coordinated move has no axis; expected a target for at least one")
     here = np.array([starts_deg[each] for each in names])
     if not np.isfinite(here).all():
         raise InputError(f"the coordinated move begins at {here.tolist()} deg; expected finite angles")

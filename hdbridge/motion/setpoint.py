@@ -78,7 +78,7 @@ class SetPoint:
 
     @property
     def at_rest(self) -> bool:
-        """True if the set-point stands still and will do so until it receives further input."""
+        """True if the set-point is at rest and remains so until it receives further input."""
         if self._stream is not None:
             return self._stream.waiting
         if self._pursuit is not None:
@@ -131,8 +131,8 @@ class SetPoint:
         """Moves at a velocity (up to the axis's limit) until the time-out; a velocity of zero brakes.
 
         Call it again before the time-out to continue the motion. The axis brakes before a position limit and
-        waits there. Raises `InputError` for invalid numbers, including a time-out that is not above 0 and up
-        to `MOST_TIMEOUT_S`.
+        waits there. Raises `InputError` for an invalid number, for example a time-out that is not greater
+        than 0 s or exceeds `MOST_TIMEOUT_S`.
         """
         _check_finite("velocity", velocity_deg_s)
         timeout = self._timeout(timeout_s)
@@ -355,5 +355,5 @@ def _positive(name: str, value: float | None) -> float:
     if value is None:
         return math.inf
     if not (math.isfinite(value) and value > 0.0):
-        raise InputError(f"a {name} of {value!r} for this move; expected a finite number above 0")
+        raise InputError(f"the {name} of this move is {value!r}; expected a finite number above 0")
     return value

@@ -141,7 +141,7 @@ class Stream:
         """Adds a knot; if it is not acceptable, raises `InputError` and leaves the stream unchanged."""
         if not (math.isfinite(time_s) and math.isfinite(position_deg) and math.isfinite(velocity_deg_s)):
             raise InputError(
-                f"a knot of {position_deg!r} deg and {velocity_deg_s!r} deg/s at {time_s!r} s; expected "
+                f"the knot is {position_deg!r} deg and {velocity_deg_s!r} deg/s at {time_s!r} s; expected "
                 "finite numbers"
             )
         if not self.room:
@@ -166,7 +166,7 @@ class Stream:
     def _add_first(self, time_s: float, position_deg: float, velocity_deg_s: float) -> None:
         begin_deg = self._begin_deg
         if time_s < 0.0:
-            raise InputError(f"a first knot at {time_s:g} s; a stream's time begins at 0")
+            raise InputError(f"the first knot is at {time_s:g} s; the time of a stream begins at 0")
         if abs(position_deg - begin_deg) > BEGIN_DEG or velocity_deg_s:
             raise InputError(
                 f"a stream begins at {position_deg:.9g} deg with {velocity_deg_s:g} deg/s, but the axis "
@@ -196,7 +196,7 @@ class Stream:
             )
         if not (bounds.lower_deg <= lowest and highest <= bounds.upper_deg):
             raise InputError(
-                f"{where} leads through {lowest:.9g} to {highest:.9g} deg; the position limits are "
+                f"{where} covers {lowest:.9g} to {highest:.9g} deg; the position limits are "
                 f"{bounds.lower_deg:g} and {bounds.upper_deg:g} deg"
             )
         left_deg = (bounds.upper_deg if velocity_deg_s > 0.0 else bounds.lower_deg) - position_deg

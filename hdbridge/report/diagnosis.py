@@ -180,7 +180,7 @@ def _found(diagnosis: Diagnosis) -> Section:
         "What was found",
         "Size: half the span of its contribution to this record. Held out: residual (rms) of the given model "
         "with the other findings, and of the written model, on stretches of time left out of the fit. "
-        "Gain: the share of the mean square removed. "
+        "Gain: the fraction of the mean square removed. "
         "Offered: an improvement of the model may contain it; if not, the reason.",
         [Table(header, rows)],
     )
@@ -287,7 +287,7 @@ def _over(seen: ResidualViews) -> Section:
     return Section(
         "Residuals over all coordinates",
         "Measurement minus model; lines are means over bins, grey dots readings minus the model as given, "
-        "all charts to one scale, the most informative first.\n\nThe table lists the share of the mean "
+        "all charts to one scale, the most informative first.\n\nThe table lists the fraction of the mean "
         "square that such means predict on other stretches of time.",
         [
             Grid([*residual_charts(seen)]),

@@ -100,7 +100,7 @@ class Exercise:
     def lead(
         self, way: Callable[[Floats], Floats], duration_s: float, distance_deg: float | None = None
     ) -> None:
-        """Follows ``way`` (distance as a function of time) for a duration.
+        """Follows ``way`` (distance as a function of time) for ``duration_s``.
 
         The motion ends exactly at ``distance_deg`` if given.
         """

@@ -41,7 +41,7 @@ class Piece(Protocol):
 
     @property
     def by_motor_only(self) -> bool:
-        """True if the piece cannot change while the motor stands still."""
+        """True if the piece cannot change while the motor is at rest."""
         ...
 
     def arcsec(self, now: Conditions) -> float:
@@ -268,7 +268,7 @@ class Gear:
         self._ratio = truth.gear.ratio
         self._pieces = tuple(pieces)
         self.by_motor_only = all(piece.by_motor_only for piece in pieces)
-        """True if the output cannot change while the motor stands still."""
+        """True if the output cannot change while the motor is at rest."""
 
     def turned_deg(self, now: Conditions) -> float:
         """Returns the angle to which the output would turn an unloaded shaft."""

@@ -1,7 +1,7 @@
 """Virtual clock that never runs ahead of real time, for simulated drives that a user watches.
 
-If the computer is late, virtual time is equally late. No event is skipped, and a long delay is not made up
-for. A stall of the computer is therefore not a fault on a simulated bus.
+If the computer lags, virtual time lags by the same amount. No event is skipped, and a long delay is not made
+up for. A stall of the computer is therefore not a fault on a simulated bus.
 """
 
 import math

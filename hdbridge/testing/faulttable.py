@@ -121,7 +121,7 @@ class Row:
         try:
             return self.make(reach, **arguments)
         except can.CanError as error:
-            raise BusError(f"fault '{self.name}' cannot be made on {reach.bus}: {error}") from error
+            raise BusError(f"fault '{self.name}' cannot be injected on {reach.bus}: {error}") from error
 
     def checked(self, given: Mapping[str, Any]) -> dict[str, Value]:
         """Returns the arguments completed with defaults; raises `InputError` with the valid arguments."""

@@ -48,7 +48,7 @@ class Check:
 
     @property
     def sentence(self) -> str:
-        """Summary in words: the changes, channels with increased misfit, and causes that cannot show."""
+        """Summary in words: changes, channels with increased misfit, and causes that would not be visible."""
         causes = ", ".join(self.unseen)
         found = [f"This recording would not show a change in: {causes}"] if causes else []
         if self.changes:

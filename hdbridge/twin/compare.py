@@ -155,7 +155,7 @@ TITLES: Final[Mapping[str, str]] = {
 }  # fmt: skip
 
 STAND_S: Final = 0.2
-"""Minimum time for which the command stands still after a motion for the stop to be evaluated."""
+"""Minimum time for which the command must be at rest after a motion for the stop to be evaluated."""
 MAX_SETTLING_S: Final = 1.0
 """Maximum time after a stop in which settling is evaluated; servo axes of this kind settle in tenths of a
 second."""
@@ -168,7 +168,7 @@ LEAST_SAMPLES: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One figure of both records for one kind of motion."""
+    """One metric, compared between the two records for one kind of motion."""
 
     channel: str
     """A signal, `settling_time`, `overshoot`, or `noise_at_rest:` and `noise_in_motion:` with a signal."""
@@ -180,9 +180,9 @@ class Row:
     level."""
     simulated: float
     difference: float
-    """Rms difference of samples or stops; for a noise, the absolute difference."""
+    """Rms difference of samples or stops; for a noise level, the absolute difference."""
     noise: float
-    """Expected difference between two identical axes: the noise of the measured channel or of the figure."""
+    """Expected difference between two identical axes: the noise of the measured channel or of the metric."""
     count: int
     """Number of samples or stops."""
 
@@ -199,7 +199,7 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Figures, traces and spectra of a measured and a simulated record."""
+    """Metrics, traces and spectra of a measured and a simulated record."""
 
     rows: tuple[Row, ...]
     traces: Mapping[str, Trace]
@@ -207,11 +207,11 @@ class Comparison:
     spectra: Mapping[str, Spectrum]
 
     def row(self, channel: str, kind: str = ALL) -> Row | None:
-        """Returns the figure of a channel; None if the records lack it."""
+        """Returns the metric of a channel; None if the records lack it."""
         return next((each for each in self.rows if (each.channel, each.kind) == (channel, kind)), None)
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns the figures for JSON."""
+        """Returns the metrics for JSON."""
         return {"figures": [asdict(each) for each in self.rows]}
 
 
@@ -416,5 +416,5 @@ def _of_stops(kind: str, stops: Sequence[_Stop], time_s: FloatArray) -> Iterator
 
 
 def rms(values: FloatArray) -> float:
-    """Returns the root of the mean square; 0 for no values."""
+    """Returns the root mean square; 0 for an empty array."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0

@@ -245,9 +245,9 @@ def sandwich(slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], sprea
 def scatter(slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], spread: FloatArray) -> float:
     """Returns the variance of the fit between legs, relative to that of independent residuals.
 
-    The mean over the principal directions that the residuals determine; NaN if there are none. It is about
-    one if the simulated drive can do what the axis does. If it cannot, each leg has parameters of its own,
-    however small the residuals are (information matrix test, White, Econometrica 50, 1982).
+    The ratio is averaged over the principal directions that the residuals determine; NaN if there are none.
+    It is about 1 if the simulated drive can represent the axis. If it cannot, the parameters differ between
+    legs, however small the residuals are (information matrix test, White, Econometrica 50, 1982).
     """
     squares, white = _jackknife(slopes, left, legs, spread)
     shown = squares[eigen(slopes, spread)[0] > DETERMINED]
@@ -300,7 +300,7 @@ STEPS_PER_ROUND = 4
 BOUND_MARGIN = 1e-6
 """Minimum distance to the bounds, in spreads, as required by `scipy.optimize.least_squares`."""
 MIN_COST_DECREASE = 1.0
-"""A fit ends when half the sum of squares decreases by less than this in a round."""
+"""Decrease of half the sum of squares in a round below which a fit ends."""
 HUBER_THRESHOLD = 4.0
 """Residuals above this multiple of their scale are down-weighted, because a motor that breaks away at a
 different position is not evidence."""
@@ -598,18 +598,19 @@ REJECTIONS: Final = ("speed", "position", "observer")
 """Alternatives for the block that compensates friction and load torque: the integral of the speed error (PI
 velocity loop) or of the position error (PIV), or a disturbance observer."""
 INTEGRAL: Final = 3.0
-"""Integral time times the bandwidth of the velocity loop (symmetric optimum: 2 to 4)."""
+"""Product of integral time and velocity-loop bandwidth (symmetric optimum: 2 to 4)."""
 SLOW_INTEGRAL: Final = 30.0
-"""Integral time times the bandwidth of the velocity loop if there is an observer, which leaves little to the
-integral."""
+"""Product of integral time and velocity-loop bandwidth if there is an observer, because the observer leaves
+little for the integral term to correct."""
 OBSERVED: Final = 0.9
 """Start value of the fraction of the disturbance that the observer compensates: nearly all."""
 FILTER_MS: Final = 0.5
-"""Start value of the speed and torque filters: half to twice the period of common velocity loops."""
+"""Start value of the time constant of the speed and torque filters: half to twice the period of common
+velocity loops."""
 SHORT_MS: Final = 0.1
 """Time constant of a negligible command filter: a fifth of a substep."""
 VELOCITY_FEEDFORWARD: Final = 0.9
-"""Start value, between no feed-forward (rare) and feed-forward of the full speed."""
+"""Start value of the speed feed-forward, between none (rare) and the full speed."""
 FEW_STEPS = 3
 """Maximum number of steps for each start between two halvings."""
 MAX_COST_RATIO: Final = 2.0

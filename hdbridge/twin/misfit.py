@@ -228,10 +228,10 @@ def beyond(values: FloatArray, least: float) -> FloatArray:
 
 
 def _without_motor_part(data: Data, following: FloatArray, load: FloatArray) -> FloatArray:
-    """Returns the load's residuals without the part due to the motor, about their median in each piece.
+    """Returns the load's residuals without the part due to the motor, relative to the median of each piece.
 
-    The motor's residuals enter with a regression coefficient between 0 and 1, which is one if the loops are
-    wrong and both shafts are late. The motor encoder's rounding is excluded.
+    The motor's residuals, without its encoder's rounding, are multiplied by a regression coefficient between
+    0 and 1 and subtracted. The coefficient is 1 if the loops are wrong and both shafts lag.
     """
     ahead = -beyond(following, 0.5 * rounding(data.axis)[FOLLOWING]) * ARCSEC_PER_DEG / data.axis.gear.ratio
     motor, shaft = (_about(np.mean, each, data) for each in (ahead, load))
@@ -522,7 +522,7 @@ def _torque_noise_nm(truth: Truth, off_rad: float) -> float:
 
 
 def scales(data: Data, found: Mapping[str, FloatArray]) -> Scales:
-    """Estimates the scales of the residuals in motion, at least the error of a smooth replay.
+    """Estimates the scales of the residuals in motion; the error of a smooth replay is their lower bound.
 
     Residuals at rest are excluded, because they would dominate a recording that rests half of the time.
     """

@@ -95,9 +95,9 @@ additional cause."""
 STEPS = 8
 """Maximum number of steps of a fit."""
 SIZES = (2.5, 6.0)
-"""Changes of each parameter, in both directions, at which a fit may start, in units of its least change. Even
-a small change puts the ringing of a load out of phase, and a fit that starts from the unchanged value does
-not recover from that."""
+"""Changes of each parameter, in both directions, at which a fit may start, in units of its smallest relevant
+change. Even a small change puts the ringing of a load out of phase, and a fit that starts from the unchanged
+value does not recover from that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,10 +267,10 @@ def finding(
     *,
     ratio: bool = False,
 ) -> Finding:
-    """Returns the finding of one cause: the parameters with a relevant change, or the one with the largest.
+    """Returns the finding of one cause: its parameters with relevant changes, or the one that changed most.
 
-    The causes ``instead`` may have changed in their place. With ``ratio``, changes are given as ratios,
-    because neither value is the axis's, but as differences for a parameter that may be zero.
+    ``instead`` lists causes that may have changed in place of this one. With ``ratio``, changes are given as
+    ratios, because neither value is the axis's, but as differences for a parameter that may be zero.
     """
     off = np.subtract(coordinates(after, parameters), coordinates(before, parameters))
     sizes = np.abs(off) / [each.least_change for each in parameters]

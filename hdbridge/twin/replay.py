@@ -43,7 +43,7 @@ LONG_S = 30.0
 GAP_S = 0.5
 """Maximum gap between two consecutive parts, such as two consecutive tasks of a master."""
 SAME_DEG = 1e-6
-"""Maximum change of the command that counts as unchanged; motor degrees."""
+"""Maximum difference between commands that count as equal; motor degrees."""
 STOPPED_DEG = 5.0
 """Maximum motor travel from the last row of a procedure to standstill."""
 IDLE = 0.002
@@ -189,9 +189,10 @@ SETTLING_S = 0.75
 UNEVEN = 0.25
 """Maximum deviation of a sample's time from the grid, cycles."""
 MOSTLY = 0.95
-"""Minimum fraction of samples within `UNEVEN`; a few late time stamps do not imply late commands."""
+"""Minimum fraction of samples within `UNEVEN`; a few delayed time stamps do not imply
+delayed commands."""
 REST_S = 0.1
-"""Minimum time for which the command stands still between two legs; used if the recording does not mark its
+"""Minimum time for which the command is at rest between two legs; used if the recording does not mark its
 legs."""
 RINGS_S = 1.0
 """Time from the end of a leg's motion to the end of the leg; a longer standstill is not part of any leg."""
@@ -204,7 +205,7 @@ wrong."""
 TORQUE_MARGIN = 1.5
 """Ratio of a torque to the axis's limit above which its unit counts as wrong."""
 AHEAD_CYCLES = 0.5
-"""Lead of the motor over its command, in cycles, above which the command counts as logged late."""
+"""Lead of the motor over its command, in cycles, above which the command counts as logged with a delay."""
 MOVING_DEG_S = 5.0
 """Motor speed above which the direction of friction is certain."""
 OFF_AFTER, ON_BEFORE = 2, 1
@@ -356,7 +357,8 @@ def _approach(
 def counted_cycles(time_s: FloatArray, cycle_s: float) -> FloatArray:
     """Returns the cycle number of each row, from zero; fractional if the rows do not follow the cycle.
 
-    Rows are counted, because a late time stamp does not imply a late command. Gaps count as whole cycles.
+    Rows are counted, because a delayed time stamp does not imply a delayed command. Gaps count as whole
+    cycles.
     """
     cycles: FloatArray = (time_s - time_s[0]) / cycle_s
     counted: FloatArray = np.concatenate([[0.0], np.cumsum(np.maximum(np.round(np.diff(cycles)), 1.0))])

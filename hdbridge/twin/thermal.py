@@ -183,7 +183,7 @@ def _values(place: FloatArray) -> list[float]:
 
 
 def _scaled(truth: Truth) -> list[Parameter]:
-    """Returns `THERMAL` with the spread of the copper loss scaled to the truth's thermal resistance."""
+    """Returns `THERMAL` with the copper loss's prior spread scaled to the truth's thermal resistance."""
     k_per_w = max(truth.temperature.resistance_k_per_w, RESISTANCE.least)
     copper = replace(COPPER_LOSS, spread=RISE_K / k_per_w, least_change=MATTERS_K / k_per_w)
     return [AMBIENT, RESISTANCE, TIME_CONSTANT, copper]

@@ -46,7 +46,7 @@ class Draft:
     data: dict[str, Any]
     axis: AxisConfig
     sets_servo: bool
-    """True if the drive's feed-forward is set to the written load, as after commissioning."""
+    """True if the drive's feed-forward is set for the load in the truth file, as after commissioning."""
     place: str | None = None
     """Path, in the truth file, of the counterpart of the effect being translated; None if the plant has
     none."""
@@ -584,7 +584,7 @@ def _lagging(effect: effects.Hysteresis | effects.HysteresisMemory, draft: Draft
     """Sets presliding friction at the load, which winds up the gear's spring, so that the load lags.
 
     Over a branch the motor moves by x and the load's lag grows by 2 offset g(x / width). The rest of x is the
-    load's travel, over which the friction grows. If nothing remains, the load stands still.
+    load's travel, over which the friction grows. If nothing remains, the load does not move.
     """
     offset, stiffness = -effect.offset_arcsec, draft.stiffness_nm_per_rad / ARCSEC_PER_RAD
     xi, height = branch(effect.exponent, 4 * NODES)
@@ -715,7 +715,7 @@ class Entry(NamedTuple):
 
 TABLE: Final[Mapping[str, Entry]] = MappingProxyType(
     {
-        # In the order of writing: the spring comes first, because torques are derived from it.
+        # In the order of writing: the spring is first, because torques are derived from it.
         "ratio_error": Entry("gear.ratio", ratio_error),
         "compliance": Entry("gear.stiffness_nm_per_rad, gear.stiffening", compliance),
         "inertial_windup": Entry("gear.stiffness_nm_per_rad or load.inertia_kg_m2", inertial_windup),

@@ -135,7 +135,7 @@ def test_a_sweep_at_whole_counts_per_sample_has_its_count(speed: int, rise: int,
     counts=st.sampled_from(COUNTS[:3]),
 )
 def test_a_rounded_sine_has_its_count(amplitude: float, period: int, phase: float, counts: int) -> None:
-    """Its period is not a whole number of samples, after which the same few changes would be repeated."""
+    """The sine's period is not a whole number of samples; otherwise, the same few changes would repeat."""
     count = 360.0 / counts
     sine = amplitude * np.sin(2.0 * np.pi * np.arange(4000) / (period + 0.3719) + phase)
     assert reading_of(np.round(sine) * count).count_deg == pytest.approx(count, rel=1e-6)

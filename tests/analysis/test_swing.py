@@ -106,5 +106,5 @@ def test_fast_moves_of_a_healthy_axis_yield_a_remark_only(
     found = diagnose(record, model)
     assert np.max(np.abs(lags)) > 5.0
     assert not found.findings
-    assert any("swings on its spring at 5" in each for each in found.remarks)
+    assert any("oscillates on its spring at 5" in each for each in found.remarks)
     assert len(found.traces.rows) == len(rows)  # no sample is left out

@@ -60,7 +60,8 @@ def test_extended_compensation_reaches_the_noise_floor(axis, model, bench_on):
     runs = dict(compare_schemes(drive, model, schemes, Stepping(count=33)))
     comparison = Comparison.of(axis, runs)
     pooled = {scheme: result.pooled.three_sigma_arcsec for scheme, result in comparison.results.items()}
-    # Without compensation: the loop's offset of +-40 arcsec and 35 arcsec of tooth error, together 125.
+    # Three sigma without compensation: 120 arcsec due to the loop's offset of +-40 arcsec, and 35 arcsec due
+    # to the tooth error; the root of the sum of squares is 125 arcsec.
     assert 115 < pooled[Scheme.NONE] < 135
     assert 115 < pooled[Scheme.SYNCHRONOUS] < 125
     assert 30 < pooled[Scheme.HYSTERESIS] < 40

@@ -149,7 +149,7 @@ def test_a_refusal_names_client_user_and_process_with_working_advice(ctl, machin
     user = pwd.getpwuid(os.getuid()).pw_name
     with Client(place.socket, name="cell controller") as other, other.lease():
         said = ctl("move", "joint-1", 1, status=7)
-        assert f"'cell controller ({user}, process {os.getpid()})' holds the right to move" in said
+        assert f"'cell controller ({user}, process {os.getpid()})' holds the lease" in said
         assert "repeat the command with --force" in said
         ctl("move", "joint-1", 1, "--force")
     assert machine.moved == [("joint-1", "move", 1.0, None)]

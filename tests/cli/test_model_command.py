@@ -24,7 +24,7 @@ provenance:
 
 @pytest.fixture
 def propose(profile):
-    """A function that leaves a pending model with an offset in the profile."""
+    """Returns a function that writes a pending model with the given offset to the profile."""
     (profile.folder / "model.yaml").unlink()
 
     def propose(offset: float):

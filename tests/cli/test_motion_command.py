@@ -53,7 +53,7 @@ def test_measures_and_proposes_the_response_and_the_committed_model_uses_it(hdbr
         assert abs(each["filtered"]["rest_arcsec"]) < abs(each["static"]["rest_arcsec"]) + 0.5
         assert each["wind_up"]["delayed_arcsec"] < 0.6 * each["filtered"]["delayed_arcsec"], each
         assert abs(each["wind_up"]["rest_arcsec"]) < abs(each["static"]["rest_arcsec"]) + 0.5
-    # The article's load on its spring: 0.225 kg m2 on 16,000 Nm/rad.
+    # Load inertia 0.225 kg m2 and gear stiffness 16,000 Nm/rad of the article.
     assert result["wind_up"]["inertia_over_stiffness_s2"] == pytest.approx(0.225 / 16000.0, rel=0.1)
     page = (tmp_path / "out.html").read_text()
     assert all(word in page and word in done.stdout for word in (*PATH_COLUMNS, "wind-up compensated"))

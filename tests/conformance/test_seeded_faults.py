@@ -87,7 +87,7 @@ def wraps_pdos(check: str, text: str, kind: str, name: str, make: Callable[[Meth
 
 
 def entry(check: str, text: str, index: int, sub: int, **changes: Any) -> Fault:
-    """Changes the value or the guard of a dictionary entry."""
+    """Changes attributes of a dictionary entry, for example its value or the guard that checks new values."""
 
     def seed(patch: Any, node: DriveNode, bus: Spoiled) -> None:
         for name, value in changes.items():

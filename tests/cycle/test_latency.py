@@ -128,5 +128,5 @@ def test_a_computer_sustaining_no_cycle_is_reported() -> None:
 
 
 def test_a_percentile_outside_its_range_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"0 \.\. 100"):
+    with pytest.raises(ValueError, match="expected 0 to 100"):
         Histogram().percentile_us(101.0)

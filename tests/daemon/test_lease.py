@@ -42,7 +42,7 @@ def test_tokens_cannot_be_guessed(time: Time) -> None:
 def test_a_second_client_learns_the_holder_and_the_remaining_time(lease: Lease, time: Time) -> None:
     lease.take("page")
     time.s = 4.0
-    with pytest.raises(LeaseError, match=r"'page' holds the right to move; it runs out in 6\.0 s"):
+    with pytest.raises(LeaseError, match=r"'page' holds the lease; it runs out in 6\.0 s"):
         lease.take("script")
     lease.doing = lambda: "axis 'a' is in motion (jog)"
     with pytest.raises(LeaseError, match=r"renewed; axis 'a' is in motion \(jog\); wait, or repeat"):

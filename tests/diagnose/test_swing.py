@@ -73,7 +73,7 @@ def seen(plant: ModuleType, model: TransmissionModel):
 def test_an_ordinary_load_is_silent(seen) -> None:
     found = seen(45.0)
     assert not found.findings
-    assert any("swings on its spring at 4" in each for each in found.remarks)
+    assert any("oscillates on its spring at 4" in each for each in found.remarks)
 
 
 def test_set_points_joined_by_straight_lines_are_silent(seen) -> None:
@@ -91,4 +91,4 @@ def test_the_wind_up_of_a_soft_load_is_named_without_its_ringing(seen) -> None:
 def test_a_larger_cause_does_not_hide_the_swing(seen) -> None:
     found = seen(45.0, lost_arcsec=60.0)
     assert [each.cause for each in found.findings] == ["count_loss"]
-    assert any(re.search(r"swings on its spring at [45]\d Hz", each) for each in found.remarks)
+    assert any(re.search(r"oscillates on its spring at [45]\d Hz", each) for each in found.remarks)

@@ -31,7 +31,7 @@ TORQUE = """load_torque:
 
 @dataclass(frozen=True)
 class ForeignBench:
-    """A foreign axis on the bus."""
+    """Test bench with a foreign axis: a servo that the simulated drive does not have."""
 
     bus: LockstepBus
     clock: VirtualClock

@@ -78,12 +78,12 @@ class Mechanics:
 
     @property
     def held_hz(self) -> float:
-        """Frequency of the load on the spring while the motor is held."""
+        """Natural frequency of the load on the spring while the motor is held."""
         return math.sqrt(self.stiffness_nm_per_rad / self.load_inertia_kg_m2) / math.tau
 
     @property
     def free_hz(self) -> float:
-        """Frequency of motor against load."""
+        """Natural frequency of the motor oscillating against the load, both free to move."""
         return self.held_hz * math.sqrt(self.inertia_kg_m2 / self.motor_inertia_kg_m2)
 
 

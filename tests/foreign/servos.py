@@ -64,7 +64,7 @@ class Observed:
     speed_filter_ms: float
     observer_hz: float
     observer_gain: float
-    """Supplied share of the estimated disturbance. Below 1 the observer does not integrate at rest."""
+    """Supplied fraction of the estimated disturbance. Below 1 the observer does not integrate at rest."""
     nominal_inertia_kg_m2: float
     tracking_time_ms: float
     """Time constant of the back-calculation at the torque limit."""

@@ -75,7 +75,7 @@ def test_on_a_stiff_axis_the_steps_are_those_of_the_textbook():
     overshoot = math.exp(-math.pi * damping / math.sqrt(1.0 - damping**2))
     assert got.max() - 1.0 == pytest.approx(overshoot, abs=0.01)
 
-    # With the right inertia fed forward the motor is the critically damped reference model.
+    # If the correct inertia is fed forward, the motor follows the critically damped reference model exactly.
     law = StateFeedback(10.0, 1.0, 1.0, 8.0, 1.0, 40.0, inertia)
     rate = math.tau * law.reference_hz
     expected = 1.0 - (1.0 + rate * time_s) * np.exp(-rate * time_s)

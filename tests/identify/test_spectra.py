@@ -115,7 +115,7 @@ def test_a_long_standstill_hides_no_order():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_no_order_is_replaced_by_a_column_that_a_prior_limits(seed):
-    """At one speed, the swing of the load excited by the other orders resembles the largest fast order."""
+    """At one speed, the load oscillation excited by the other orders resembles the largest fast order."""
     rng = np.random.default_rng(seed)
     motor = np.sort(rng.uniform(0.0, 3600.0, 2000))
     orders = motor_orders(8)

@@ -139,7 +139,7 @@ def test_a_later_first_knot_delays_the_start():
         ((20.0, 119.0, 30.0), "could not brake"),
         ((20.0, 119.0, 25.0), "could not brake"),
         ((100.0, 120.0, 5.0), "could not brake"),
-        ((100.0, 120.0, -5.0), "leads through"),
+        ((100.0, 120.0, -5.0), "covers"),
     ],
 )
 def test_a_knot_beyond_the_limits_is_refused_and_the_stream_continues(knot, message):
@@ -289,7 +289,7 @@ def test_points_on_a_straight_line_are_passed_in_motion_and_corners_at_rest():
     ("points", "message"),
     [
         ([], "at least one"),
-        ([{}], "without an axis"),
+        ([{}], "has no axis"),
         ([{"x": 1.0}], "no axis 'x'"),
         ([{"a": 121.0}], "axis 'a': a target of 121.0 deg"),
         ([{"a": math.nan}], "axis 'a'"),

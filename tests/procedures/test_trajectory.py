@@ -55,7 +55,7 @@ def test_set_points_are_met():
         (lambda: Trajectory([0.0, math.nan, 1.0], 0.1), "nan at 0.1 s; expected finite"),
         (lambda: Trajectory([0.0], 0.1), "at least two load angles"),
         (lambda: Trajectory([0.0, 1.0], 0.0), "expected more than 0"),
-        (lambda: Trajectory.of(rounded, -1.0), "expected a duration above 0"),
+        (lambda: Trajectory.of(rounded, -1.0), "duration of the trajectory is"),
     ],
 )
 def test_an_invalid_trajectory_is_refused_before_anything_moves(trajectory, complaint):

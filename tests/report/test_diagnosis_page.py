@@ -76,7 +76,7 @@ WITHIN = {
     "count_loss": CountLoss(steps=(Step(time_s=60.0, size_arcsec=4.0),)),
     "vibration": Vibration(frequency_hz=3.3, amplitude_arcsec=4.0, phase_deg=0.0),
 }
-"""Effects for causes whose default candidates have no effect within this record."""
+"""Effects that replace the default candidates of causes if those would not change this record."""
 
 
 def finding(cause="load_order", size=4.0, **more):

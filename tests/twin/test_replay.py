@@ -170,7 +170,7 @@ def test_commands_at_uneven_times_are_met_to_the_last_row() -> None:
 
 
 def test_a_late_stamp_changes_no_simulated_signal() -> None:
-    """The clock of a log is occasionally late; the drive's cycles are not."""
+    """Time stamps of a log are occasionally delayed; the drive's cycles are not."""
     axis, truth = demo()
     recording = benched(axis, truth, Stepping(2, start_deg=0.0))
     time_s = recording.record.time_s.copy()

@@ -97,7 +97,7 @@ class Case:
     parts: tuple[effects.Effect, ...]
     lead: Callable[[Exercise], None] = to_and_fro
     left: float = 0.03
-    """Permitted rms residual, as a share of the effect's own signal, if the plant's law has a different
+    """Permitted rms residual, as a fraction of the effect's own signal, if the plant's law has a different
     shape.
     """
     floor_arcsec: float = 0.5

@@ -184,9 +184,13 @@ def calibrated(drive: Drive, folder: Path) -> Calibration:
 
 
 def figures(drive: Drive, model: TransmissionModel) -> dict[str, Any]:
-    """Returns the rms of ripple and of slow orders, arcsec, per speed: without, with static, with filtered
-    correction.
+    (
+        """Returns the rms of the ripple and of the slow orders, arcsec, for each speed.
+
+    Each has three values: without correction, with static correction, and with filtered correction.
     """
+        ""
+    )
     axis = drive.axis
     limit = axis.limits.velocity_deg_s
     speeds = (SLOWEST_DEG_S, *(round(share * limit, 3) for share in SHARES))

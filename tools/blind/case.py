@@ -70,16 +70,20 @@ TWINS = (
 
 @dataclass(frozen=True)
 class Case:
-    """A case to be made."""
+    """A case to be made.
+
+    A bench case is one long record of a bench plan. An everyday case is a record of ordinary work, or of a
+    bench plan if `bench` is set, and has the model of a calibration of its axis.
+    """
 
     name: str
     kind: str
     causes: tuple[str, ...] = ()
     axis: str = ""
-    """Axis of an everyday case, with its calibration."""
+    """Name of the axis and its calibration, in an everyday case; empty in a bench case."""
     law: str = "rolling_friction"
     bench: bool = False
-    """True if an everyday case uses a plan of the bench, not everyday work."""
+    """True if an everyday case runs a bench plan instead of everyday work."""
     pair: str = ""
     """Cases with the same pair share their random draws."""
 
@@ -173,7 +177,7 @@ def seal(folder: Path, seed: int, secret: Mapping[str, Any]) -> None:
 
 
 def unsealed(folder: Path) -> dict[str, Any]:
-    """Reads the secret of a case."""
+    """Returns the sealed truth of a case."""
     packed = json.loads((folder / "sealed.json").read_text(encoding="utf-8"))["sealed"]
     return dict(json.loads(zlib.decompress(base64.b64decode(packed))))
 

@@ -196,7 +196,7 @@ class AmplitudeDrift(Modulating, Warmed):
         )
 
     def needs(self) -> frozenset[Channel]:
-        """Returns the channels of the warmth, and the torque channel if the orders grow with torque."""
+        """Returns the channels that determine warmth; also the torque channel if orders grow with torque."""
         load = self.under_load
         return super().needs() | (frozenset() if load is None else {Channel(load.torque)})
 
@@ -230,7 +230,7 @@ class AmplitudeDrift(Modulating, Warmed):
         return 0.01 * self.limit_k * (ripple + abs(self.friction_percent_per_k * self.loop.offset_arcsec))
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Returns the steepest fall of the ripple, arcsec per motor degree; infinity if the loop changes.
+        """Returns the steepest negative ripple slope, arcsec per motor degree; infinity if the loop changes.
 
         A reduction of the loop falls as steeply as the loop rises. It removes only a fraction of the model's
         loop, so the sum of both does not fall (`combine.fall_bound`).
@@ -238,7 +238,7 @@ class AmplitudeDrift(Modulating, Warmed):
         return self.ripple_fall() if not self.friction_percent_per_k else math.inf
 
     def ripple_fall(self) -> float:
-        """Returns the steepest fall of the ripple alone, arcsec per motor degree."""
+        """Returns the steepest negative slope of the ripple alone, arcsec per motor degree."""
         slope = sum(each.order * each.amplitude_arcsec for each in self.orders)
         return 0.01 * self.limit_k * RAD_PER_DEG * abs(self.ripple_percent_per_k) * slope * self._most()
 

@@ -19,7 +19,7 @@ _SOFTNESS = 1.25
 class Backlash(Linear):
     """-gap / 2 times the stop operator of the motor angle: the load lags by half the gap in either direction.
 
-    In an ideal gap the load stands still while the motor crosses ``gap N / 3600`` degrees. The load angle
+    In an ideal gap the load is at rest while the motor crosses ``gap N / 3600`` degrees. The load angle
     then has no inverse, because many motor angles correspond to one load angle. `crossing_deg` may be larger
     (a soft contact). If a gap is too steep to invert, the compensation treats it as a softer gap
     (`gentle_tracker`), and makes the motor jump across most of the gap at once.

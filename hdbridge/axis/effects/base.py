@@ -81,7 +81,7 @@ class Law(Strict, ABC):
 
     @abstractmethod
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns this effect with other coefficients and, if given, other shape parameters."""
+        """Returns this effect with new coefficients and, if given, new shape parameters."""
 
     @abstractmethod
     def bound_arcsec(self) -> float:
@@ -140,7 +140,7 @@ class Effect(Law):
     """Form of the matched filter that finds initial shape parameters, for effects with too many possible
     locations for a grid."""
     ordinary_arcsec: ClassVar[float] = 0.0
-    """Peak error that this cause, or an indistinguishable one, has on a healthy axis."""
+    """Peak error of this cause, or of one indistinguishable from it, on a healthy axis."""
     incidental: ClassVar[frozenset[str]] = frozenset()
     """Names of coefficients that are not evidence of the cause, because they can be non-zero without it."""
     inexact: ClassVar[float] = 0.0
@@ -333,7 +333,7 @@ class Linear(Effect):
         return tuple(Coefficient(each, (i,), (each,)) for i, each in enumerate(self.linear))
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns the effect with other linear parameters and, if given, other shape parameters."""
+        """Returns the effect with new linear parameters and, if given, new shape parameters."""
         values = dict(zip(self.linear, map(float, coefficients), strict=True))
         return self.model_copy(update={**values, **dict(shape or {})})
 

@@ -90,7 +90,7 @@ def compensable(effects: Iterable[Effect]) -> tuple[Effect, ...]:
 
 
 def fall_bound(effects: Iterable[Effect]) -> float:
-    """Returns an upper bound of the fall of the *sum* of effects, arcsec per motor degree.
+    """Returns an upper bound of the negative slope of the *sum* of effects, arcsec per motor degree.
 
     It is the sum of the effects' own bounds, with one exception. An effect that removes a fraction of the
     model's loop falls as steeply as the loop rises. The sum of both still rises if no more than the whole

@@ -121,7 +121,7 @@ class Compliance(Angleless, Linear):
         return signed
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns the effect with other compliances.
+        """Returns the effect with new compliances.
 
         If the compliances have a negative sum, the sense is reversed instead, because the sign of a torque is
         a convention.

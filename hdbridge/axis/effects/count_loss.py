@@ -117,7 +117,7 @@ class CountLoss(Angleless):
         return np.array([each.size_arcsec for each in self.steps])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns the effect with other step sizes; ``time_s`` in ``shape`` is the time of the last step."""
+        """Returns the effect with new step sizes; ``time_s`` in ``shape`` is the time of the last step."""
         times = [each.time_s for each in self.steps]
         if shape and "time_s" in shape:
             times[-1] = float(shape["time_s"])

@@ -139,7 +139,7 @@ class Creep(Effect):
         return np.array([each.amplitude_arcsec for each in self.parts])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns the effect with other amplitudes and, if given, other time constants and build-up.
+        """Returns the effect with new amplitudes and, if given, new time constants and build-up.
 
         ``tau_s`` scales all time constants.
         """

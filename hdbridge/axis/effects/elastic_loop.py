@@ -4,7 +4,7 @@ The error is the offset times a loop of unit offset (`_unit`), in which the laws
 
 If the offset is positive, the load leads in the direction of motion, and the error rises along the path. If
 it is negative, the load lags, as it does with friction at the load, and the error falls along the path. After
-a reversal a lagging load stands still until the gear has wound up in the other direction, so the error falls
+a reversal a lagging load is at rest until the gear has wound up in the other direction, so the error falls
 by no more than the gear's own slope, 3600 / N arcsec per motor degree. Just after a reversal the formula is
 steeper. The inverse therefore uses a smaller slope there (`gentle_tracker`).
 """

@@ -87,7 +87,7 @@ class HysteresisParameters(Effect):
         return np.array([self.offset_arcsec, -self.base.offset_arcsec])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns the effect with other offsets and, if given, other values of the new width and exponent."""
+        """Returns the effect with new offsets and, if given, a new width and exponent of the changed loop."""
         base = self.base.model_copy(update={"offset_arcsec": -float(coefficients[1])})
         update = {"offset_arcsec": float(coefficients[0]), "base": base, **dict(shape or {})}
         return self.model_copy(update=update)

@@ -17,7 +17,7 @@ IntArray = NDArray[np.intp]
 
 
 class Channel(Enum):
-    """Quantity that effects use in addition to the motor angle; the value is its column in a record.
+    """Quantity that effects use in addition to the motor angle; its value is the name of a record's column.
 
     This is the only table of measured channels. A channel added here is read from the drive, recorded, passed
     to effects and used by diagnoses without further changes of the code.

@@ -146,7 +146,7 @@ class _Tracker(Tracker):
         return half * self._value
 
     def _at(self, motor_deg: float) -> tuple[float, float, float]:
-        """Returns the distance run, half the loop's height and the stop operator's value at an angle."""
+        """Returns the distance run, half the loop's height and the stop operator's value at ``motor_deg``."""
         step = 0.0 if self._angle is None else motor_deg - self._angle
         distance = self._distance + abs(step)
         half = self._half(min(self._before + distance / DEG_PER_TURN, self._limit))

@@ -198,7 +198,7 @@ class Store(Generic[K]):
         return number
 
     def discard(self, profile: Path) -> None:
-        """Deletes the pending version; raises `InputError` without one."""
+        """Deletes the pending version; raises `InputError` if there is none."""
         with _locked(profile):
             try:
                 (profile / self.pending).unlink()

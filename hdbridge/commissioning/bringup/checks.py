@@ -25,11 +25,11 @@ class Verdict:
 
     outcome: Outcome
     measured: str
-    """Measured result as text, with figures and units."""
+    """Measured result as text, with values and units."""
     remedies: tuple[str, ...] = ()
     """On failure: lines of the axis file to change, or actions, most likely first."""
     figures: Mapping[str, Figure] = field(default_factory=dict)
-    """Measured figures as data, with units in the names."""
+    """Measured values as data, with units in the names."""
     error: type[HdbridgeError] = DriveError
     """Error class of the failure, which determines the exit status."""
 

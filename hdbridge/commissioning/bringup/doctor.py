@@ -208,7 +208,7 @@ def boot(context: BringUpContext) -> Verdict:
 
 
 def rest(context: BringUpContext) -> Verdict:
-    """Checks that both encoders stand still without power and that the additional channels are plausible."""
+    """Checks that the encoder readings are constant without power, and that other channels are plausible."""
     drive = context.drive
     with context.interruptible() as interrupted:
         positions = drive.read_positions()

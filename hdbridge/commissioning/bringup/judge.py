@@ -1,4 +1,4 @@
-"""Pure functions that judge measured figures."""
+"""Pure functions that judge measured values."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ def _plain(value: float) -> str:
 
 
 def judge_rest(axis: AxisConfig, motor: Sequence[int], load: Sequence[int]) -> Verdict:
-    """Checks that both encoders stand still without power, and measures their noise."""
+    """Checks that both encoder readings are constant without power, and measures their noise."""
     motor_deg = 360.0 / axis.motor_encoder.counts_per_turn
     load_arcsec = axis.load_encoder.resolution_arcsec
     motor_span, load_span = max(motor) - min(motor), max(load) - min(load)

@@ -167,7 +167,7 @@ class SlowAxis:
             self.stop()
 
     def stop(self) -> list[Feedback]:
-        """Quick-stops the axis and runs cycles until the motor stands still; returns their feedback."""
+        """Quick-stops the axis and runs cycles until the motor is at rest; returns their feedback."""
         power = self.image.power
         power.quick_stop()
         seen: list[Feedback] = []

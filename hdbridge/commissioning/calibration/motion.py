@@ -180,7 +180,7 @@ class MotionTest:
 
     @property
     def remaining(self) -> float:
-        """Mean fraction of the ripple that remains with the filtered correction; 1 without one."""
+        """Mean fraction of the ripple that remains with the filtered correction; 1 if there is no filter."""
         shares = [
             1.0 if each.filtered_arcsec is None else each.filtered_arcsec / each.none_arcsec
             for each in self.ripples

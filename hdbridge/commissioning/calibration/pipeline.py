@@ -204,7 +204,7 @@ def calibrate(
 def proposed(
     profile: Path, model: TransmissionModel, reason: str, date: datetime, drive: Drive | Rig
 ) -> Offer:
-    """Makes the model pending; if its file cannot be written, the offer's reason still states the figures."""
+    """Makes the model pending; if its file cannot be written, the offer's reason still states the results."""
     try:
         return Offer(True, reason, propose(profile, model, reason, date, drive.identity))
     except OutputError as problem:

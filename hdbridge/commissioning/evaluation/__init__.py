@@ -1,1 +1,1 @@
-"""Evaluation of tests: figures of a stepping test, comparison of schemes, accuracy by ISO 230-2."""
+"""Evaluation of tests: results of a stepping test, comparison of schemes, accuracy by ISO 230-2."""

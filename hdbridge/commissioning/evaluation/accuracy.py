@@ -20,7 +20,7 @@ MINIMUM_RUNS = 2
 
 @dataclass(frozen=True, slots=True)
 class AxisAccuracy:
-    """Figures of a rotary axis by ISO 230-2:2014; all in arcsec."""
+    """Accuracy and repeatability of a rotary axis as defined by ISO 230-2:2014; angles in arcsec."""
 
     accuracy: float
     """A, bi-directional: largest of mean + 2 s minus smallest of mean - 2 s, over both directions."""
@@ -48,10 +48,10 @@ class AxisAccuracy:
     """M: largest minus smallest of the bi-directional means (mean of both directions) of the targets."""
     targets: int
     runs: int
-    """Number of approaches to each target from each direction (the minimum)."""
+    """Minimum number of approaches to a target from either direction."""
 
     def as_dict(self) -> dict[str, float]:
-        """Returns the figures for JSON, with units in the names."""
+        """Returns the values for JSON, with units in the names."""
         counts = {"targets", "runs"}
         return {
             each.name if each.name in counts else f"{each.name}_arcsec": getattr(self, each.name)
@@ -65,7 +65,7 @@ def axis_accuracy(
     forward: Sequence[bool] | np.ndarray[tuple[int], np.dtype[np.bool_]],
     same_deg: float = 1e-6,
 ) -> AxisAccuracy:
-    """Computes the figures from any number of approaches in any order; the arrays have shape (approaches,).
+    """Computes the values from any number of approaches in any order; the arrays have shape (approaches,).
 
     ``deviation_arcsec`` is the actual position minus the target, ``forward`` is True for approaches in the
     positive direction. Targets closer than ``same_deg`` count as one. Raises `InputError` if a target was

@@ -1,4 +1,4 @@
-"""Figures of a stepping test: scatter and mean per direction and pooled, and the quantisation floor."""
+"""Results of a stepping test: scatter and mean per direction and pooled, and the quantisation floor."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Stepped:
 
     @property
     def scatter(self) -> dict[str, dict[str, float]]:
-        """Three sigma and mean of each direction and of both, as data."""
+        """Three sigma and mean, arcsec, of each direction and of both directions pooled."""
         return {name: asdict(getattr(self, name)) for name in ("cw", "ccw", "pooled")}
 
     def as_dict(self) -> dict[str, Any]:

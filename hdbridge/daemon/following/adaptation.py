@@ -60,7 +60,7 @@ class Freeze:
     """Reason for suspended learning."""
 
     reason: str
-    """Reason in words, with figures."""
+    """Reason in words, with the measured values."""
     lasting: bool = False
     """True if the freeze does not end automatically, but only with a new zero or by command."""
 
@@ -74,7 +74,7 @@ class Proposal:
     apply: bool
     """False if the model is only reported (``observe``)."""
     time_s: float
-    """Axis time."""
+    """Time of the proposal on the clock of the axis's samples, s."""
 
 
 class Learned(Strict):

@@ -68,7 +68,7 @@ class Estimator:
     ) -> None:
         """Updates the estimate with a batch: rows (n, p), observed (n,), noise standard deviation.
 
-        ``retention`` is the share of the old information that remains along excited directions (1 without
+        ``retention`` is the fraction of the old information that remains along excited directions (1 without
         forgetting). Parameters in ``held`` (p,) do not change.
         """
         free = np.ones(len(self.estimate), dtype=bool) if held is None else ~held
@@ -114,8 +114,8 @@ def calibrated_estimator(drift: DriftModel, settings: AdaptationSettings) -> Est
 def bounds_arcsec(drift: DriftModel, settings: AdaptationSettings) -> FloatArray:
     """Returns the largest permitted deviation of each coefficient from the committed value, (zero,).
 
-    The share refers to the largest coefficient of the effect, so that a sine that happens to be zero may
-    grow.
+    The relative bound refers to the largest coefficient of the effect, so that a sine that happens to be zero
+    may grow.
     """
     bounds = np.empty(drift.zero)
     for each in drift.terms:

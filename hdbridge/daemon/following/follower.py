@@ -73,7 +73,7 @@ class Follower:
         index: int = 0,
         settings: AdaptationSettings | None = None,
     ) -> None:
-        """``index`` is the place of the axis in a sample; there is no adaptation before `adapt`."""
+        """``index`` is the index of the axis in a sample; there is no adaptation before `adapt`."""
         self.model = model
         self.health = EncoderHealth(axis, model, index)
         self.adaptation: Adaptation | None = None

@@ -280,7 +280,7 @@ class EncoderHealth:
     """Monitors the load encoder of one axis in the loop's samples."""
 
     def __init__(self, axis: AxisConfig, model: TransmissionModel, index: int = 0) -> None:
-        """``index`` is the place of the axis in a sample; ``model`` predicts the errors in the samples."""
+        """``index`` is the index of the axis in a sample; ``model`` predicts the errors in the samples."""
         self.status = EncoderStatus()
         """State after the last samples taken."""
         self._index = index

@@ -99,7 +99,7 @@ class RaisedVerdict(NamedTuple):
 
     verdict: Verdict
     evidence: str
-    """Evidence in words with figures."""
+    """Evidence in words, with the measured values."""
 
     @property
     def text(self) -> str:
@@ -146,7 +146,7 @@ class Evidence:
 
     @property
     def text(self) -> str:
-        """Result in words with figures."""
+        """Result in words, with the measured values."""
         changes = "; ".join(each.text for each in self.changes) or "no part of the model changed"
         return (
             f"{changes}. At {self.places} places the load deviates from the model by {self.rms_arcsec:.2f} "

@@ -58,7 +58,7 @@ class AdaptationFiles:
         """Last error of `write`; empty after success."""
 
     def load(self) -> Learned | None:
-        """Returns the stored state of this model; None without one.
+        """Returns the stored state of this model; None if none is stored.
 
         If the file cannot be read, this is noted in the history and the result is None. Raises OutputError if
         the history cannot be written.

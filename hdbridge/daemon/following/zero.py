@@ -4,7 +4,7 @@ The zero is the difference of the two encoders' zeros. A gear cannot make it ste
 move it slowly and not far. A faster or larger change comes from the load encoder or its coupling. One fit to
 the recent observations serves all three users:
 
-    error = columns @ change + zero + rate * time + load encoder disc + share of the speed + noise
+    error = columns @ change + zero + rate * time + load encoder disc + term proportional to speed + noise
 
 The columns and the range of their changes are those of the adaptation, so wear of the gear is not mistaken
 for motion of the zero, however few places the axis visits. The error refers to the committed model, so a
@@ -56,25 +56,25 @@ MAX_STEP_TO_DRIFT_RATIO: Final = 0.6
 
 
 class Rate(NamedTuple):
-    """Rate of the zero over a span up to now."""
+    """Rate of change of the zero over a span that ends at the newest observation."""
 
     arcsec_min: float
     error: float
-    """Standard error of the rate."""
+    """Standard error of the rate, arcsec per minute."""
     minutes: float
-    """Length of the span."""
+    """Length of the span, minutes."""
 
     def exceeds(self, limit_arcsec_min: float) -> bool:
-        """Returns True if the rate exceeds a limit by more than its error allows."""
+        """Returns True if the rate exceeds ``limit_arcsec_min`` by more than `SIGMAS` standard errors."""
         return abs(self.arcsec_min) - SIGMAS * self.error > limit_arcsec_min
 
 
 class Displacement(NamedTuple):
-    """Change of the zero since it was learned, in the middle of the longest span."""
+    """Change of the zero since it was learned, evaluated at the middle of the observations."""
 
     arcsec: float
     error: float
-    """Standard error."""
+    """Standard error, arcsec."""
 
 
 class Zero:

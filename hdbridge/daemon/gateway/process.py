@@ -36,7 +36,7 @@ ALIVE_S: Final = 0.1
 class SimulatedClock:
     """Virtual clock of simulated drives: time of the control loop's last cycle, plus the time since then.
 
-    It waits for a late control loop, but not for one whose process has ended.
+    It waits for a control loop that lags, but not for one whose process has ended.
     """
 
     def __init__(self, memory: Memory, speed: float) -> None:
@@ -58,7 +58,7 @@ class SimulatedClock:
         return self._latest_s
 
     def sleep_until(self, deadline_s: float) -> None:
-        """Sleeps until a time of this clock."""
+        """Sleeps until ``deadline_s`` on this clock."""
         while (left_s := deadline_s - self.now()) > 0.0:
             time.sleep(min(left_s / self._speed, self._period_s))
 

@@ -166,7 +166,7 @@ class LoadAxis(PowerStage):
         if was_on and not self.is_on:
             if sample["state"] == AxisState.ENABLED:
                 return IN_USE_BY_OTHER
-            # If this process was scheduled late, the set-points end before SYNC is overdue.
+            # If this process was scheduled with a delay, the set-points end before SYNC is overdue.
             node = self.node
             outer = node is not None and node.firmware.follows_the_bus and node.sync_is_late(now_s)
             return ErrorCode.SYNC_LOST if outer else NOT_POWERED

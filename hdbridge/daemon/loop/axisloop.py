@@ -52,7 +52,7 @@ class AxisLoop:
         report: Report,
         due_s: Callable[[], float],
     ) -> None:
-        """``index`` is its place in ``memory``; ``due_s`` returns the due time of the current cycle."""
+        """``index`` is its index in ``memory``; ``due_s`` returns the due time of the current cycle."""
         self.index = index
         self.config = config
         self.state = AxisState.UNVERIFIED
@@ -286,7 +286,7 @@ class AxisLoop:
         self.cycle.command = self._follow_gateway
 
     def _follow_gateway(self, feedback: Feedback) -> int | None:
-        """Follows the gateway's set-points one period late, because the newest may not have arrived yet."""
+        """Follows the gateway's set-points one period delayed, because the newest may not have arrived."""
         if self.set_point.mode is MotionMode.FOLLOW:
             aim = self._outer.at(self._due_s() - self._period_s)
             if aim is None:

@@ -30,7 +30,7 @@ class KnotFeed:
     def __init__(self, knots: Queue[Knot], set_point: SetPoint) -> None:
         self._knots, self._set_point = knots, set_point
         self._stream = 0
-        """Number of the current stream or, without one, of the last stream."""
+        """Number of the current stream; between streams, that of the last one."""
         self._following = False
         self._ending = False
 
@@ -83,7 +83,7 @@ class KnotFeed:
 class OuterFeed:
     """Set-points of the outer master for one axis, with linear motion between them (CiA 402).
 
-    A late set-point is bridged at the speed of the last two, because the gateway process has no real-time
+    A delayed set-point is bridged at the speed of the last two, because the gateway process has no real-time
     priority. At rest the axis waits longer. Set-points of another series are dropped, so none from before an
     interruption takes effect.
     """
@@ -105,7 +105,7 @@ class OuterFeed:
         """Time at which the set-points end."""
 
     def at(self, time_s: float) -> float | None:
-        """Returns the position at a time, which must not decrease; None once the set-points have ended."""
+        """Returns the position at ``time_s``, which must not decrease; None after the last set-point."""
         for _ in range(OUTER_KNOTS_PER_TURN):
             if self._last_s >= time_s:
                 break

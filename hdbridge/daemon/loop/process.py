@@ -90,7 +90,7 @@ def run(start: Start) -> None:
         axes = [(axis.config, axis.load_loop) for axis in machine.axes]
         controller = Controller(cycle, axes, memory, reopen)
         status = memory.status
-        # A simulation has no real-time priority, because a late one never sleeps and would starve its CPU.
+        # A simulation has no real-time priority, because one that lags never sleeps and would starve its CPU.
         real = interface is not None
         with prepare_realtime(realtime.priority, realtime.cpus) if real else nullcontext() as conditions:
             log_once(

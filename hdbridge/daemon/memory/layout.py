@@ -238,11 +238,11 @@ class OuterCell(IntEnum):
     RESETS_DONE = 4
     """Service: number of completed fault resets, with or without success."""
     PERIOD_NS = 5
-    """Gateway: period of the outer SYNC; 0 without SYNC."""
+    """Gateway: period of the SYNC on the outer bus; 0 without SYNC."""
     HELD = 6
     """Service: 1 while the outer master holds the lease."""
     JITTER_NS = 7
-    """Gateway: mean deviation of the outer SYNC from its regular time."""
+    """Gateway: mean deviation of the SYNC on the outer bus from its nominal time."""
     NODE_ID = 8
     """Gateway: node id in use; 255 if LSS removed it."""
     VIEW = 9
@@ -277,7 +277,7 @@ class Axis(NamedTuple):
     issued_deg: float
     """Target sent in this cycle (607Ah) in motor degrees; NaN if none was sent."""
     outer_received_s: float
-    """Time of reception of the other master's newest set-point in this target; NaN without one."""
+    """Time of reception of the other master's newest set-point in this target; NaN if there is none."""
     outer_target_deg: float
     """Load angle requested by the other master (607Ah; 60C1h in IP mode); NaN without a gateway."""
     outer_controlword: int
@@ -316,7 +316,7 @@ def sample_struct(axes: int) -> struct.Struct:
 def sample_dtype(axes: int) -> np.dtype[Any]:
     """Returns the dtype of samples: ``sequence, cycle, time_ns, late_us, busy_us, bus_load, skipped, axes``.
 
-    ``time_ns`` is the monotonic clock at SYNC (virtual time on a virtual clock), ``bus_load`` a share,
+    ``time_ns`` is the monotonic clock at SYNC (virtual time on a virtual clock), ``bus_load`` a fraction,
     ``axes`` an array of `AXIS_SAMPLE`, shape (axes,). The fields after ``axes`` belong to the slot.
     """
     return np.dtype([*SAMPLE_HEAD, ("axes", AXIS_SAMPLE, (axes,)), *_TAIL])

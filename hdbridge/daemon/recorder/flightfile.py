@@ -293,7 +293,7 @@ class FlightFile:
         self._stream.commit()
 
     def finish(self) -> None:
-        """Writes the index and renames the file. After an OSError, it stays a part that can be mended."""
+        """Writes the index and renames the file. After an OSError, it remains a part that can be repaired."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         try:
             self._stream.commit()

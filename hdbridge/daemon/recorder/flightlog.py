@@ -103,10 +103,10 @@ class FlightLog:
         folder.mkdir(parents=True, exist_ok=True)
 
     def mend(self) -> None:
-        """Mends the files of a dead process, and keeps those that contain a fault."""
+        """Repairs the files of a process that has died, and keeps those that contain a fault."""
         for path in mend_folder(self.folder, self._notify):
             self._notify(
-                f"{path.name}: was unfinished; it has been mended and is complete up to its last second"
+                f"{path.name}: was unfinished; it has been repaired and is complete up to its last second"
             )
             with suppress(InputError, OSError):
                 if any(each.kind in _KEPT_NAMES for each in overview(path).events):

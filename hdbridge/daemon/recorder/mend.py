@@ -1,4 +1,4 @@
-"""Mending of unfinished files: rewrites them up to their last complete chunk, with an index."""
+"""Repair of unfinished files: rewrites them up to their last complete chunk, with an index."""
 
 import fcntl
 import os
@@ -18,9 +18,9 @@ CHUNK_BYTES: Final = 1 << 20
 
 
 def mend_folder(folder: Path, say: Callable[[str], None] = lambda _: None) -> list[Path]:
-    """Mends every unfinished file of a folder that is not being written; returns the mended files.
+    """Repairs every unfinished file of a folder that is not being written; returns the repaired files.
 
-    Removes files without a complete chunk. Reports files that cannot be mended, without changing them.
+    Removes files without a complete chunk. Reports files that cannot be repaired, without changing them.
     """
     mended = []
     for leftover in sorted(folder.glob(f".*{MENDING}")):
@@ -39,7 +39,7 @@ def mend_folder(folder: Path, say: Callable[[str], None] = lambda _: None) -> li
 
 
 def mend(path: Path) -> Path | None:
-    """Mends one file; returns its new name, or None if it had no complete chunk and was removed.
+    """Repairs one file; returns its new name, or None if it had no complete chunk and was removed.
 
     Does not change a finished file. Raises InputError if the file is being written, `GoneError` if it no
     longer exists, OutputError if there is no space.
@@ -75,7 +75,7 @@ def mend(path: Path) -> Path | None:
     except OSError as problem:
         aside.unlink(missing_ok=True)
         raise OutputError(
-            f"{path}: cannot be mended: {problem.strerror}; free some space, then mend it again"
+            f"{path}: cannot be repaired: {problem.strerror}; free some space, then repair it again"
         ) from None
     return target
 

@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 
 class FlightRecorder:
-    """Sink that passes everything to its thread; another thread mends files of earlier processes.
+    """Sink that passes everything to its thread; another thread repairs files of earlier processes.
 
     If the folder cannot be created, it records nothing and reports the failure.
     """
@@ -57,7 +57,8 @@ class FlightRecorder:
             self._notify(f"{folder}: cannot create this folder: {problem.strerror}; nothing is recorded")
             return
         self.flight = flight
-        # Mending may take long or be killed, because each file is mended completely or not at all.
+        # Repair may take a long time. It can be killed safely, because each file is repaired completely or
+        # not at all.
         for name, run in (("recorder", self._run), ("recorder-mend", self._mend)):
             thread = threading.Thread(target=run, args=(flight,), name=name, daemon=True)
             thread.start()
@@ -112,7 +113,7 @@ class FlightRecorder:
         try:
             flight.mend()
         except Exception:
-            _log.exception("unfinished recordings could not be mended")
+            _log.exception("unfinished recordings could not be repaired")
 
     def _run(self, flight: FlightLog) -> None:
         begun_s, reported, ended = time.monotonic(), 0, False

@@ -39,7 +39,7 @@ _MORE: Final = 0x80
 
 
 class Field(NamedTuple):
-    """Field of a message; its number is its place in the table, from 1."""
+    """Field of a message; its number is its position in the table, from 1."""
 
     name: str
     kind: str
@@ -140,7 +140,7 @@ class Message:
                     else rows[each.name]
                     for each in self._fields
                 }
-        raise InputError(f"its {self._short} messages are of another release of hdbridge")
+        raise InputError(f"its {self._short} messages come from another release of hdbridge")
 
 
 def _varint(value: int) -> bytes:

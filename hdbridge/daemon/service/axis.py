@@ -69,7 +69,7 @@ class ServiceAxis:
         self._work = core.timing.work
         self._changing = asyncio.Lock()
         self._doing = ""
-        """Client request with exclusive use of the drive, in words; empty without one."""
+        """Client request with exclusive use of the drive, in words; empty if there is none."""
         self._drive = asyncio.Lock()
         """Held during exclusive use of the drive, also by the service's own work, for which clients wait."""
 
@@ -278,7 +278,7 @@ class ServiceAxis:
             await self._use(await self._work(self.models.with_adapted, model))
 
     def following_for(self, holder: str) -> Following:
-        """Returns the adaptation, for a change by ``holder``; raises InputError for an axis without one."""
+        """Returns the adaptation, for a change by ``holder``; raises InputError if the axis has none."""
         self.core.lease.check(holder)
         if self.following is None:
             raise InputError(f"{self.name}: this axis has no adaptation; configure one in the machine file")

@@ -35,7 +35,7 @@ ENDS_WITH_LEASE = frozenset({Kind.JOG, Kind.QUEUE, Kind.STREAM})
 
 @dataclass(slots=True, eq=False)
 class Activity:
-    """One activity; it is over when it has completed or been replaced."""
+    """One activity, in progress until it completes or is replaced."""
 
     kind: Kind
     holder: str
@@ -45,7 +45,7 @@ class Activity:
     since: int = 0
     """Number of the newest log entry before the activity; later entries report its outcome."""
     over: str = ""
-    """Reason for the end; empty while the activity lasts."""
+    """Reason for the end; empty while the activity is in progress."""
 
     def end(self, why: str) -> None:
         """Ends the activity; only the first reason counts."""
@@ -53,7 +53,7 @@ class Activity:
 
 
 class AxisLink:
-    """Connection to one axis; ``index`` is its place in the shared memory."""
+    """Connection to one axis; ``index`` is its index in the shared memory."""
 
     def __init__(self, core: Core, index: int, config: AxisConfig) -> None:
         self.core = core
@@ -183,7 +183,7 @@ class AxisLink:
 
 
 def stop_hint(stopped: Event, axis: str) -> str:
-    """Returns the advice for a stop."""
+    """Returns advice on how to recover from a stop."""
     fault = fault_of(stopped.code)
     if stopped.id:
         return EXPLAINED_HINT
@@ -191,5 +191,5 @@ def stop_hint(stopped: Event, axis: str) -> str:
 
 
 def reset_hint(axis: str) -> str:
-    """Returns the advice for a stop by command."""
+    """Returns advice on how to recover from a commanded stop."""
     return f"reset it when the axis may move again: hdbridge ctl reset {axis}"

@@ -240,7 +240,7 @@ class ServiceBridge:
         )
 
     def _outer(self, index: int) -> messages.OuterState | None:
-        """Returns the state of an axis as seen by the outer master; None without one."""
+        """Returns the state of an axis as seen by the outer master; None if it has no node in a gateway."""
         gateway, memory = self.machine.gateway, self.core.memory
         node_id = gateway.nodes.get(self._names[index]) if gateway is not None else None
         if node_id is None:

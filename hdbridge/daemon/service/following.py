@@ -46,7 +46,7 @@ class Following:
         recorder: FlightRecorder | None = None,
         diagnosis: AutoDiagnosis | None = None,
     ) -> None:
-        """``index`` is the place of the axis in a sample; ``folder`` contains the files of its adaptation.
+        """``index`` is the index of the axis in a sample; ``folder`` contains the files of its adaptation.
 
         ``worker`` has one thread. Verdicts are noted in ``recorder``; those in `DIAGNOSED` start
         ``diagnosis``.

@@ -68,8 +68,7 @@ class Lease:
             if math.isinf(left_s):
                 until, advice = " as long as the gateway runs", "to stop its axes and take it, repeat"
             raise LeaseError(
-                f"'{holder.client}' holds the right to move{until}{self._doing()}; {advice} the command with "
-                "--force"
+                f"'{holder.client}' holds the lease{until}{self._doing()}; {advice} the command with --force"
             )
         expires_s = math.inf if lasts else now_s + self.timeout_s
         self._holder = Holder(client, now_s, expires_s, secrets.token_urlsafe(TOKEN_BYTES))
@@ -86,9 +85,7 @@ class Lease:
         if holder is None:
             raise LeaseError("the lease is free or has expired: take it first")
         if not compare_digest(token.encode(), holder.token.encode()):
-            raise LeaseError(
-                f"'{holder.client}' holds the right to move{self._doing()}; take the lease first"
-            )
+            raise LeaseError(f"'{holder.client}' holds the lease{self._doing()}; take it first")
         if math.isfinite(holder.expires_s):
             self._holder = replace(holder, expires_s=self._now() + self.timeout_s)
 

@@ -36,7 +36,7 @@ class AxisMotion:
     """Current motion of one axis and its queue. Every method that begins a motion requires the lease."""
 
     def __init__(self, link: AxisLink, check: Callable[[str], None]) -> None:
-        """``check`` raises if the holder of a token may not move the axis."""
+        """``check`` raises LeaseError if a token is not that of the lease's current holder."""
         self._link, self._check = link, check
         self.activity: Activity | None = None
         self._points: deque[QueueItem] = deque()
@@ -54,7 +54,7 @@ class AxisMotion:
         return activity if activity is not None and not activity.over and activity.kind in kinds else None
 
     def replace(self, activity: Activity | None, why: str) -> None:
-        """Replaces the current activity by another or by none, and clears the queue."""
+        """Ends the current activity, clears the queue, and makes ``activity`` (if any) the current one."""
         if self.activity is not None:
             self.activity.end(why)
         self._points.clear()

@@ -29,7 +29,7 @@ SHORTEST_WAIT_S: Final = 0.001
 class SimulatedClock:
     """Clock of a service with simulated drives: no faster than their control loop, nor than real time.
 
-    On a busy computer the loop of simulated drives is late, and so is its virtual time. Time-outs on this
+    On a busy computer the loop of simulated drives lags, and so does its virtual time. Time-outs on this
     clock are delayed equally, so they do not expire early. Thread-safe.
     """
 

@@ -51,23 +51,23 @@ class Trajectory:
         object.__setattr__(self, "load_deg", points)
         if points.ndim != 1 or len(points) < 2:
             raise InputError(
-                f"a trajectory of shape {points.shape}; expected at least two load angles, shape (n,)"
+                f"the trajectory has shape {points.shape}; expected at least two load angles, shape (n,)"
             )
         if not (math.isfinite(self.period_s) and self.period_s > 0.0):
             raise InputError(
-                f"a trajectory with {self.period_s!r} s between two angles; expected more than 0"
+                f"the time between two angles of the trajectory is {self.period_s!r} s; expected more than 0"
             )
         bad = np.flatnonzero(~np.isfinite(points))
         if len(bad):
             raise InputError(
-                f"a trajectory with {points[bad[0]]} at {bad[0] * self.period_s:g} s; expected finite angles"
+                f"the trajectory has {points[bad[0]]} at {bad[0] * self.period_s:g} s; expected finite angles"
             )
 
     @classmethod
     def of(cls, load_deg: Callable[[float], float], duration_s: float) -> Self:
-        """Samples a function of time, in seconds after the start, that returns the load angle in degrees."""
+        """Samples ``load_deg``, which returns the load angle, degrees, at a time after the start, s."""
         if not (math.isfinite(duration_s) and duration_s > 0.0):
-            raise InputError(f"a trajectory of {duration_s!r} s; expected a duration above 0")
+            raise InputError(f"the duration of the trajectory is {duration_s!r} s; expected more than 0")
         count = min(math.ceil(duration_s / GRID_S), MOST_POINTS)
         period_s = duration_s / count
         return cls(np.array([load_deg(number * period_s) for number in range(count + 1)]), period_s)

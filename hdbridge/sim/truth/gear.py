@@ -140,7 +140,7 @@ class TrueGear(Strict):
         0.0,
         ge=0,
         le=1,
-        description="share of the hysteresis that displaces the output and reacts by its slope; "
+        description="fraction of the hysteresis that displaces the output and reacts by its slope; "
         "the rest is a friction torque",
     )
     rate_dependence: TrueRate | None = Field(None, description="hysteresis by speed; without it: none")

@@ -139,7 +139,7 @@ class Truth(Strict):
         if fastest * self.substep_s > 1.0:
             raise wrong(
                 f"{self.substep_ms:g} ms is too long for a resonance of {fastest / math.tau:.0f} Hz; "
-                f"expected at most {1000.0 / fastest:.2g}, or less stiffness",
+                f"expected at most {1000.0 / fastest:.2g} ms, or a lower stiffness",
                 "substep_ms",
             )
         return self

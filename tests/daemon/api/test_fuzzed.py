@@ -33,7 +33,7 @@ fewer = settings(max_examples=most, phases=[Phase.generate])
 
 
 def machine(case) -> str:
-    """Enables both axes and directs the request to an existing one; returns the token of the held lease."""
+    """Enables all axes and directs the request to an axis that exists; returns the token of the lease."""
     BRIDGE.__init__()
     token = BRIDGE.lease.take("the holder")
     for each in BRIDGE.axes.values():

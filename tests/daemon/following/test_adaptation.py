@@ -24,7 +24,7 @@ class Axis(WorkingAxis):
 
     @property
     def frozen(self) -> str:
-        """Reason of the freeze; empty without one."""
+        """Reason for the freeze; empty if not frozen."""
         return self.adaptation.freeze_reason.reason if self.adaptation.freeze_reason else ""
 
     @property

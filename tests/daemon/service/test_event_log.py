@@ -37,7 +37,7 @@ def test_routine_events_do_not_displace_stops() -> None:
     assert ended is not None
     assert (ended.kind, ended.code) == (EventKind.MOTION_ENDED, MotionMode.GOTO)
     assert log.public(2) == log.public(99) == []
-    # The service itself sees all.
+    # The service itself reads all events, public or not.
     assert log.newest == 2 * ENTRIES_KEPT + 2
     assert len(log.since(0)) == ENTRIES_KEPT
     assert [each.sequence for each in log.since(2 * ENTRIES_KEPT)] == [log.newest - 1, log.newest]

@@ -33,7 +33,7 @@ async def get_events(
         int, Query(ge=0, le=2**53, description="number of the newest event that is known already")
     ] = 0,
 ) -> messages.Events:
-    """Report the events after a number; 0 for all that are kept."""
+    """Report the events after the event number ``since``; 0 for all events that are kept."""
     return bridge.events(since)
 
 

@@ -28,7 +28,7 @@ async def _bridge(connection: HTTPConnection) -> ServiceBridge:
 
 
 Bridge = Annotated[ServiceBridge, Depends(_bridge)]
-"""Machine of the application."""
+"""Service of the machine, from the state of the application."""
 Holder = Annotated[
     str,
     Header(
@@ -81,7 +81,7 @@ async def _found(bridge: Bridge, axis: AxisName) -> ServiceAxis:
 
 
 FoundAxis = Annotated[ServiceAxis, Depends(_found)]
-"""Axis in the path."""
+"""Axis named in the path of the request."""
 
 
 async def _kept(bridge: Bridge, request: Request, holder: Holder = "") -> AsyncIterator[str]:
