@@ -158,7 +158,7 @@ def _is_rounded(angle_deg: FloatArray, count_deg: float) -> bool:
     bends = np.flatnonzero(np.diff(counts))
     near = np.count_nonzero(np.diff(bends) <= NEAR_SAMPLES)
     curved = np.count_nonzero(np.diff(counts, 2))
-    return near >= LEAST_BENDS and curved > LEAST_CURVED_SHARE * near
+    return bool(near >= LEAST_BENDS and curved > LEAST_CURVED_SHARE * near)
 
 
 def last_digit(angle_deg: FloatArray) -> float:
