@@ -332,6 +332,8 @@ class Fitted:
     """Variance of the parameters between legs, relative to that of independent residuals (`scatter`)."""
     interrupted: bool = False
     """True if the fit was ended before it reached a minimum."""
+    rough: bool = False
+    """True if the fit minimises `misfit`, so that its values are not the most likely ones."""
 
     @property
     def cost(self) -> float:
@@ -1049,11 +1051,14 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
     whole = solve(replays, best.truth, best.parameters, STEPS, known=scale, linear=False)
     if polished is not None and misfit(data, polished.residuals) <= misfit(data, whole.residuals):
         return polished
-    return _linearised(replays, whole)
+    rough = replace(_linearised(replays, whole), rough=True)
+    return rough if polished is None else replace(rough, scatter=polished.scatter)
 
 
 def values_in(data: Data, fitted: Fitted) -> Values:
     """Returns the origin of the values of a fit: the axis if its residuals and its legs allow this."""
+    if fitted.interrupted or fitted.rough:
+        return Values.REPLAY
     return values_of(channel_residuals(data, fitted.residuals, noise_in_motion(data)), fitted.scatter)
 
 

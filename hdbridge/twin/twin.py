@@ -38,7 +38,16 @@ from hdbridge.twin.compare import (
     Comparison,
     compare,
 )
-from hdbridge.twin.fit import FIT_S, MOST_DEAD_CYCLES, Fitted, by_law_of, fit, fitted_rows, legs_of_rows
+from hdbridge.twin.fit import (
+    FIT_S,
+    MOST_DEAD_CYCLES,
+    Fitted,
+    by_law_of,
+    fit,
+    fitted_rows,
+    legs_of_rows,
+    values_in,
+)
 from hdbridge.twin.misfit import (
     CHANNELS,
     MOST_SCATTER,
@@ -54,7 +63,6 @@ from hdbridge.twin.misfit import (
     noise_floor,
     noise_in_motion,
     prepare,
-    values_of,
     with_load_noise,
 )
 from hdbridge.twin.naming import Finding, InseparableSet, explain, findings, inseparable_sets, scales_by_kind
@@ -359,7 +367,7 @@ def fit_twin(
         noise = noise_in_motion(data)
         fitted = fit(replays, lambda share: progress(0.9 * share))
         remaining = channel_residuals(data, fitted.residuals, noise)
-        values = Values.REPLAY if fitted.interrupted else values_of(remaining, fitted.scatter)
+        values = values_in(data, fitted)
         if values is Values.REPLAY and not fitted.interrupted:
             fitted = with_response(replays, fitted)
             remaining = channel_residuals(data, fitted.residuals, noise)
