@@ -725,4 +725,4 @@ def values_of(left: Sequence[ChannelResidual], scatter: float) -> Values:
     the parameters, else a replay.
     """
     explained = all(each.explained for each in left)
-    return Values.AXIS if explained and not scatter > MOST_SCATTER else Values.REPLAY
+    return Values.AXIS if explained and scatter <= MOST_SCATTER else Values.REPLAY

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -18,7 +19,9 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import FOLLOWING_ERROR, LOAD_ERROR, compare
 from hdbridge.twin.misfit import (
     CHANNELS,
+    ChannelResidual,
     Data,
+    Values,
     channel_residuals,
     has_memory,
     noise_floor,
@@ -26,6 +29,7 @@ from hdbridge.twin.misfit import (
     prepare,
     residuals,
     scales,
+    values_of,
 )
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, free_value, with_values
 from hdbridge.twin.replay import replay
@@ -221,3 +225,18 @@ def test_residuals_within_motion_noise_are_explained() -> None:
     assert {each.channel for each in every if each.explained} == set(CHANNELS)
     some = channel_residuals(data, left, noise_floor(data))
     assert {each.channel for each in some if not each.explained} == set(CHANNELS)
+
+
+@pytest.mark.parametrize(
+    ("times_noise", "scatter", "values"),
+    [
+        (0.9, 1.5, Values.AXIS),
+        (0.9, 9.0, Values.REPLAY),
+        (0.9, math.nan, Values.REPLAY),
+        (4.0, 1.5, Values.REPLAY),
+    ],
+)
+def test_values_are_the_axis_only_if_explained_and_agreed_by_the_legs(
+    times_noise: float, scatter: float, values: Values
+) -> None:
+    assert values_of([ChannelResidual("motor torque", 0.01, times_noise, "step")], scatter) is values
