@@ -240,8 +240,8 @@ def test_an_axis_outside_its_limits_moves_inwards_only():
     [
         ((math.nan,), "finite"),
         ((120.1,), "position limits are -90 and 120 deg"),
-        ((10.0, 0.0), "velocity of 0.0"),
-        ((10.0, None, math.inf), "acceleration of inf"),
+        ((10.0, 0.0), "velocity of this move is 0.0"),
+        ((10.0, None, math.inf), "acceleration of this move is inf"),
     ],
 )
 def test_a_refused_move_gives_the_reason(arguments, message):
