@@ -29,6 +29,7 @@ from hdbridge.sim.truth.motor import TrueObserver
 from hdbridge.twin.misfit import (
     CHANNELS,
     FINE,
+    ChannelResidual,
     Data,
     Mask,
     Replays,
@@ -223,51 +224,68 @@ def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
     return np.asarray(spread[:, None] * directions / np.sqrt(information), dtype=np.float64)
 
 
-def sandwich(slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], spread: FloatArray) -> FloatArray:
-    """Returns the covariance of the coordinates for correlated residuals within independent legs, (p, p).
+@dataclass(frozen=True, eq=False)
+class Jackknife:
+    """Jackknife over legs: the shift of the fit when one leg is left out.
 
-    It is a jackknife over legs: the shift of the fit when one leg is left out (Bell and McCaffrey, Survey
-    Methodology 28, 2002). A leg that a replay cannot follow shifts the fit in every direction that the other
-    legs leave undetermined, although its own residuals stay small.
+    A leg that a replay cannot follow shifts the fit in every direction that the other legs leave
+    undetermined, although its own residuals stay small (Bell and McCaffrey, Survey Methodology 28, 2002).
 
     Only one variance per principal direction is estimated, because a few legs do not determine the full
-    covariance. Each variance is at least that of independent residuals of the same size, and at most that of
-    the prior. The part of the residuals that the slopes can still explain is removed first, because it is not
-    scatter between legs.
+    covariance.
     """
-    along = principal(slopes, spread)
-    squares, white = _jackknife(slopes, left, legs, spread)
-    before = 1.0 / np.sum(np.square(along / spread[:, None]), axis=0)
-    times = np.minimum(np.maximum(squares, white), before)
-    return np.asarray(along * times @ along.T, dtype=np.float64)
 
+    along: FloatArray
+    """Principal directions as columns, shape (p, p)."""
+    between: FloatArray
+    """Variance between legs of each principal direction, shape (p,)."""
+    independent: float
+    """Variance of each principal direction if the residuals were independent."""
+    information: FloatArray
+    """Information about each principal direction, relative to the prior's, shape (p,)."""
 
-def scatter(slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], spread: FloatArray) -> float:
-    """Returns the variance of the fit between legs, relative to that of independent residuals.
+    @classmethod
+    def over(
+        cls, legs: NDArray[np.intp], slopes: FloatArray, left: FloatArray, spread: FloatArray
+    ) -> Jackknife:
+        """Estimates the variances from the residuals ``left`` (n,), with the number of the leg of each.
 
-    The ratio is averaged over the principal directions that the residuals determine; NaN if there are none.
-    It is about 1 if the simulated drive can represent the axis. If it cannot, the parameters differ between
-    legs, however small the residuals are (information matrix test, White, Econometrica 50, 1982).
-    """
-    squares, white = _jackknife(slopes, left, legs, spread)
-    shown = squares[eigen(slopes, spread)[0] > DETERMINED]
-    return float(np.mean(shown)) / white if len(shown) else math.nan
+        The part of the residuals that the slopes (n, p) can still explain is removed first, because it is not
+        scatter between legs.
+        """
+        along = principal(slopes, spread)
+        rows = slopes @ along
+        left = left - slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
+        numbers = numbered(legs)
+        order = np.argsort(numbers, kind="stable")
+        drawn = []
+        for leg in np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1):
+            others = (1.0 + JACKKNIFE_RIDGE) * np.eye(len(spread)) - rows[leg].T @ rows[leg]
+            drawn.append(np.linalg.solve(others, rows[leg].T @ left[leg]))
+        between = np.sum(np.square(drawn), axis=0) * (1.0 - 1.0 / len(drawn))
+        independent = max(1.0, float(left @ left) / max(len(left) - len(spread), 1))
+        return cls(along, between, independent, 1.0 / np.sum(np.square(along / spread[:, None]), axis=0))
 
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the coordinates, shape (p, p).
 
-def _jackknife(
-    slopes: FloatArray, left: FloatArray, legs: NDArray[np.intp], spread: FloatArray
-) -> tuple[FloatArray, float]:
-    """Returns the variance of each principal direction between legs, (p,), and that of the residuals."""
-    rows = slopes @ principal(slopes, spread)
-    left = left - slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
-    numbers = numbered(legs)
-    order = np.argsort(numbers, kind="stable")
-    drawn = []
-    for leg in np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1):
-        others = (1.0 + JACKKNIFE_RIDGE) * np.eye(len(spread)) - rows[leg].T @ rows[leg]
-        drawn.append(np.linalg.solve(others, rows[leg].T @ left[leg]))
-    squares = np.sum(np.square(drawn), axis=0) * (1.0 - 1.0 / len(drawn))
-    return squares, max(1.0, float(left @ left) / max(len(left) - len(spread), 1))
+        Each variance is at least that of independent residuals of the same size, and at most that of the
+        prior.
+        """
+        times = np.minimum(np.maximum(self.between, self.independent), self.information)
+        return np.asarray(self.along * times @ self.along.T, dtype=np.float64)
+
+    @property
+    def scatter(self) -> float:
+        """Variance between legs relative to that of independent residuals; NaN if nothing is determined.
+
+        It is the mean over the determined principal directions, and about 1 if the simulated drive can
+        represent the axis. If it cannot, the parameters differ between legs, however small the residuals are
+        (information matrix test, White, Econometrica 50, 1982).
+        """
+        shown = self.between[self.information > DETERMINED]
+        return float(np.mean(shown)) / self.independent if len(shown) else math.nan
 
 
 def eigen(slopes: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -329,7 +347,7 @@ class Fitted:
     jacobian: FloatArray
     """Derivatives of `vector` with respect to the coordinates, shape (n, p)."""
     scatter: float = math.nan
-    """Variance of the parameters between legs, relative to that of independent residuals (`scatter`)."""
+    """Variance between legs relative to that of independent residuals (`Jackknife.scatter`)."""
     interrupted: bool = False
     """True if the fit was ended before it reached a minimum."""
     rough: bool = False
@@ -488,14 +506,14 @@ def solve(
     found = problem.found(place)
     problem.scale = known or scales(data, found)
     left = softened(found, problem.scale, rows)
-    slopes, covariance, between = problem.along, np.diag(problem.spread**2), math.nan
+    slopes, covariance, scatter = problem.along, np.diag(problem.spread**2), math.nan
     if linear or slopes is None:
-        slopes, legs = problem.slopes(place, wide=wide), legs_of_rows(data, rows)
-        covariance = sandwich(slopes, left, legs, problem.spread)
-        between = scatter(slopes, left, legs, problem.spread)
+        slopes = problem.slopes(place, wide=wide)
+        jackknife = Jackknife.over(legs_of_rows(data, rows), slopes, left, problem.spread)
+        covariance, scatter = jackknife.covariance, jackknife.scatter
     truth = at_coordinates(start, parameters, place.tolist())
     return Fitted(
-        truth, parameters, prior, place, covariance, problem.scale, found, rows, left, slopes, between
+        truth, parameters, prior, place, covariance, problem.scale, found, rows, left, slopes, scatter
     )
 
 
@@ -1035,10 +1053,10 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
         others = starts(begun, 1e3 * data.pieces[0].commands.cycle_s)
         best = in_best_structure(few, best, others, keep)
     progress(0.5)
-    polished = None
+    polished, in_motion = None, noise_in_motion(data)
     while near(best):
         polished, before = _polished(replays, best, begun, keep), polished
-        if values_in(data, polished) is Values.AXIS:
+        if values_in(polished, channel_residuals(data, polished.residuals, in_motion)) is Values.AXIS:
             return polished
         if before is not None and misfit(data, before.residuals) <= misfit(data, polished.residuals):
             polished = before
@@ -1055,11 +1073,9 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
     return rough if polished is None else replace(rough, scatter=polished.scatter)
 
 
-def values_in(data: Data, fitted: Fitted) -> Values:
-    """Returns the origin of the values of a fit: the axis if its residuals and its legs allow this."""
-    if fitted.interrupted or fitted.rough:
-        return Values.REPLAY
-    return values_of(channel_residuals(data, fitted.residuals, noise_in_motion(data)), fitted.scatter)
+def values_in(fitted: Fitted, left: Sequence[ChannelResidual]) -> Values:
+    """Returns the origin of the values of a fit from its residuals and the scatter of its legs."""
+    return Values.REPLAY if fitted.interrupted or fitted.rough else values_of(left, fitted.scatter)
 
 
 def _polished(replays: Replays, near: Fitted, begun: Truth, keep: Callable[[Fitted], None]) -> Fitted:

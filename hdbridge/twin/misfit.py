@@ -717,7 +717,7 @@ def channel_residuals(
 
 MOST_SCATTER: Final = 4.0
 """Maximum variance of the parameters between legs, relative to that of independent residuals
-(`fit.scatter`)."""
+(`fit.Jackknife`)."""
 
 
 def values_of(left: Sequence[ChannelResidual], scatter: float) -> Values:

@@ -25,7 +25,7 @@ from hdbridge.axis.effects.recurrence import recurrence
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import least_change
-from hdbridge.twin.fit import Fitted, intervals_of, sandwich
+from hdbridge.twin.fit import Fitted, Jackknife, intervals_of
 from hdbridge.twin.misfit import held_out_legs
 from hdbridge.twin.naming import FALSE_ALARM, Finding, finding
 from hdbridge.twin.parameters import BY_NAME, Parameter, coordinates
@@ -174,7 +174,7 @@ def _fit(
         number = (STEP_S * each.rows[each.firsts] // correlation_s).astype(np.intp)
         numbers.append(goes_on + number)
         goes_on += int(number[-1]) + 1
-    covariance = sandwich(slopes, off, np.concatenate(numbers), spread)
+    covariance = Jackknife.over(np.concatenate(numbers), slopes, off, spread).covariance
     return place[:count], covariance[:count, :count]
 
 

@@ -96,7 +96,7 @@ class Twin:
     after: Comparison
     """Comparison of the recordings with the twin."""
     scatter: float = math.nan
-    """Variance of the parameters between legs, relative to that of independent residuals (`fit.scatter`)."""
+    """Variance between legs relative to that of independent residuals (`fit.Jackknife.scatter`)."""
     impossible: tuple[str, ...] = ()
     """Implausible values, each in a sentence; only for a twin whose values are not the axis's."""
 
@@ -367,7 +367,7 @@ def fit_twin(
         noise = noise_in_motion(data)
         fitted = fit(replays, lambda share: progress(0.9 * share))
         remaining = channel_residuals(data, fitted.residuals, noise)
-        values = values_in(data, fitted)
+        values = values_in(fitted, remaining)
         if values is Values.REPLAY and not fitted.interrupted:
             fitted = with_response(replays, fitted)
             remaining = channel_residuals(data, fitted.residuals, noise)

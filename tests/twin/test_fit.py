@@ -19,6 +19,7 @@ from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import (
+    Jackknife,
     by_halving,
     continued,
     delays,
@@ -29,8 +30,6 @@ from hdbridge.twin.fit import (
     lags,
     neighbours,
     principal,
-    sandwich,
-    scatter,
     slopes_at,
     solve,
     springs,
@@ -45,7 +44,7 @@ def test_remaining_descent_is_not_scatter_of_the_legs() -> None:
     spread, legs = np.full(3, 0.7), np.repeat([0, 1], 300)
     white = rng.standard_normal(600)
     for left in (white, white + 5.0 * slopes[:, 0]):
-        covariance = sandwich(slopes, left, legs, spread)
+        covariance = Jackknife.over(legs, slopes, left, spread).covariance
         least = np.linalg.inv(slopes.T @ slopes + np.diag(spread**-2.0))
         times = np.linalg.eigvals(covariance @ np.linalg.inv(least)).real
         assert np.all(times > 0.9), "never better than by independent residuals"
@@ -63,7 +62,8 @@ def test_intervals_cover_the_truth_with_a_dominant_leg() -> None:
         own = rng.standard_normal(8)
         seen = slopes[:, 0] * own[legs] + rng.standard_normal(400)
         found = np.linalg.lstsq(slopes, seen, rcond=None)[0]
-        covariance = sandwich(slopes, seen - slopes @ found, legs, np.full(1, 10.0))
+        left = seen - slopes @ found
+        covariance = Jackknife.over(legs, slopes, left, np.full(1, 10.0)).covariance
         off.append(float(found[0]) / float(np.sqrt(covariance[0, 0])))
     assert 0.88 <= np.mean(np.abs(off) < 1.96) <= 0.98
 
@@ -79,7 +79,7 @@ def test_legs_agree_about_the_parameters_of_a_right_simulation_only(
     bends = np.concatenate([np.sin(np.pi * frequency * place) for frequency in rng.uniform(0.3, 2.0, 20)])
     seen = rng.standard_normal(4000) + size * bends
     left = seen - slopes @ np.linalg.lstsq(slopes, seen, rcond=None)[0]
-    between = scatter(slopes, left, legs, np.full(3, 10.0))
+    between = Jackknife.over(legs, slopes, left, np.full(3, 10.0)).scatter
     assert np.sqrt(np.mean(np.square(left))) < 1.3
     assert low < between < high
 
