@@ -205,19 +205,13 @@ def _orders(
         return None  # a record over part of a motor turn does not limit the amplitudes of orders
     # The uncertainty of the old value is that of its calibration.
     apart = spread[np.ix_(own, own)] + np.diag(np.concatenate(known))
+    others = search.alternatives_to_change(fitted, place, given)
     return _Change(
         causes[0],
         difference.bound_arcsec(),
         named_parameters(difference, [Column(0, str(i)) for i in range(len(own))], apart),
         "orders of the model have changed, or were wrong: its synchronous part absorbs the change",
-        tuple(
-            dict.fromkeys(
-                (
-                    *(each.name for each in causes[1:]),
-                    *search.alternatives_to_change(fitted, place, given),
-                )
-            )
-        ),
+        tuple(dict.fromkeys((*(each.name for each in causes[1:]), *others))),
     )
 
 

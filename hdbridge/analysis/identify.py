@@ -86,7 +86,8 @@ def fit(measured: Measured, ratio: float, options: FitOptions | None = None) -> 
         warnings.append(
             f"only {usable} of {len(samples)} samples were used: what is fast or accelerates is left out"
         )
-    warnings += filter(None, [oscillation(measured, samples)])
+    if sway := oscillation(measured, samples):
+        warnings.append(sway)
     state = _prepare(samples, options, warnings)
     state, solution, system = _with_best_law(*_settle(_search(state, warnings)))
     solution, cov = _hold_what_is_unknown(state, solution, warnings)
