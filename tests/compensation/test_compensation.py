@@ -205,15 +205,19 @@ def test_switching_at_rest_moves_the_axis_only_along_the_ramp(on):
     )
 
 
-def test_the_slew_limit_holds_through_a_reversal():
-    limits = CompensationLimits(slew_arcsec_s=500.0)
+def there_and_back(limits):
+    """Yields compensation, load target and motor target of each cycle of a motion there and back."""
     compensation = Compensation(model(), limits, PERIOD)
     compensation.reset(0.0)
     compensation.engage()
-    before = 0.0
     there = travel(2.0)
     for load in there + there[::-1]:
-        compensation.command(load)
+        yield compensation, load, compensation.command(load)
+
+
+def test_the_slew_limit_holds_through_a_reversal():
+    before = 0.0
+    for compensation, _, _ in there_and_back(CompensationLimits(slew_arcsec_s=500.0)):
         assert abs(compensation.correction_arcsec - before) <= 500.0 * PERIOD + 1e-9
         before = compensation.correction_arcsec
     assert compensation.limited > 0
@@ -223,13 +227,9 @@ def test_the_slew_limit_holds_through_a_reversal():
     "limits", [CompensationLimits(slew_arcsec_s=500.0), CompensationLimits(maximum_arcsec=8.0, ramp_s=0.0)]
 )
 def test_the_motor_target_contains_the_limited_correction(limits):
-    compensation = Compensation(model(), limits, PERIOD)
-    compensation.reset(0.0)
-    compensation.engage()
     before = 0.0
-    there = travel(2.0)
-    for load in there + there[::-1]:
-        correction = 3600.0 * (load - compensation.command(load) / 50.0)
+    for compensation, load, motor in there_and_back(limits):
+        correction = 3600.0 * (load - motor / 50.0)
         assert correction == pytest.approx(compensation.correction_arcsec, abs=1e-6)
         assert abs(correction) <= limits.maximum_arcsec + 1e-6
         assert abs(correction - before) <= limits.slew_arcsec_s * PERIOD + 1e-6
