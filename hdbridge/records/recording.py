@@ -254,7 +254,7 @@ Given = Record | Recording | Sequence[Record | Recording] | Mapping[Path, Record
 
 
 def by_name(given: Given) -> dict[Path, Recording]:
-    """Returns the recordings by their name in messages (file or number); `InputError` if there are none."""
+    """Returns the recordings by their name in messages (file or number); `InputError` without a recording."""
     if isinstance(given, Mapping):
         named = dict(given)
     else:

@@ -198,7 +198,7 @@ class Store(Generic[K]):
         return number
 
     def discard(self, profile: Path) -> None:
-        """Deletes the pending version; raises `InputError` if there is none."""
+        """Deletes the pending version; raises `InputError` if nothing is pending."""
         with _locked(profile):
             try:
                 (profile / self.pending).unlink()

@@ -277,7 +277,7 @@ class Axis(NamedTuple):
     issued_deg: float
     """Target sent in this cycle (607Ah) in motor degrees; NaN if none was sent."""
     outer_received_s: float
-    """Time of reception of the other master's newest set-point in this target; NaN if there is none."""
+    """Time of reception of the other master's newest set-point in this target; NaN before the first one."""
     outer_target_deg: float
     """Load angle requested by the other master (607Ah; 60C1h in IP mode); NaN without a gateway."""
     outer_controlword: int

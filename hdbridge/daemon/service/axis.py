@@ -69,7 +69,7 @@ class ServiceAxis:
         self._work = core.timing.work
         self._changing = asyncio.Lock()
         self._doing = ""
-        """Client request with exclusive use of the drive, in words; empty if there is none."""
+        """Client request with exclusive use of the drive, in words; empty if no request has it."""
         self._drive = asyncio.Lock()
         """Held during exclusive use of the drive, also by the service's own work, for which clients wait."""
 
