@@ -439,9 +439,10 @@ class _Judge:
         many = many_of_one(findings, scales)
         if many is None and not is_unexplained(self.estimator, left):
             return findings
-        size, lives = left.peak_arcsec, left.lives_in
+        size, rms, lives = left.peak_arcsec, max(left.arcsec, left.fast_arcsec), left.lives_in
         if many is not None:
             size = max(each.peak_arcsec for each in many)
+            rms = max(rms, *(each.explained_arcsec for each in many))
             effect = many[0].effect
             if effect is not None and effect.waves():
                 lives = effect.coordinate(self.estimator.motion, self.estimator.data.ratio).name
@@ -467,8 +468,8 @@ class _Judge:
             return [noted if each is loops[0] else each for each in findings]
         if size < self.estimator.floor_arcsec:
             return findings
-        largest = max((each.peak_arcsec for each in findings), default=0.0)
-        return [*findings, unknown] if largest > size else [unknown, *findings]
+        largest = max((each.explained_arcsec for each in findings), default=0.0)
+        return [*findings, unknown] if largest > rms else [unknown, *findings]
 
     def _by_kind(self, given: FloatArray, after: FloatArray) -> dict[str, tuple[Figures, Figures]]:
         estimator = self.estimator

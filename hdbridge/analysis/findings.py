@@ -174,6 +174,12 @@ class Finding:
         return self.gain is not None and self.gain.predicts and not self.left_alone
 
     @property
+    def explained_arcsec(self) -> float:
+        """Rms of the held-out error that the finding accounts for; 0 without a gain."""
+        gain = self.gain
+        return 0.0 if gain is None else math.sqrt(max(gain.before_arcsec**2 - gain.after_arcsec**2, 0.0))
+
+    @property
     def refuted(self) -> bool:
         """True if the cause does not predict held-out data."""
         return self.gain is not None and not (self.within or self.gain.predicts)

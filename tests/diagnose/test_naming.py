@@ -242,10 +242,17 @@ def test_a_lagging_load_is_a_loop_of_the_opposite_sign(
     "effects",
     [
         {"motor_order": {"orders": [(each, 2.0, 37.0 * each) for each in (5, 7, 9, 10, 11, 12)]}},
-        {"unknown": {"kind": "bursts", "size": 5.0}, "load_order": {"orders": [(2, 4.0, 30.0)]}},
+        {"unknown": {"kind": "bursts", "size": 5.0}, "load_order": {"orders": [(2, 1.0, 30.0)]}},
     ],
-    ids=["more equal orders than one cause has", "bursts beside an order of the load"],
+    ids=["more equal orders than one cause has", "bursts beside a small order of the load"],
 )
 def test_an_unexplained_residual_leads_the_list(diagnosed: Diagnosed, effects: dict[str, Any]) -> None:
-    """Without `Scales.near`, the orders count as one cause; the bursts are larger than the load order."""
+    """Without `Scales.near`, the orders count as one cause; the bursts have a larger rms than the order."""
     assert names(diagnosed(effects))[0] == "unexplained"
+
+
+def test_a_cause_of_most_of_the_error_precedes_an_unexplained_peak(diagnosed: Diagnosed) -> None:
+    found = names(
+        diagnosed({"unknown": {"kind": "bursts", "size": 5.0}, "load_order": {"orders": [(2, 4.0, 30.0)]}})
+    )
+    assert found == ["load_order", "unexplained"]
