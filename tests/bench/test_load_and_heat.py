@@ -14,12 +14,10 @@ from hdbridge.axis.effects import AmplitudeDrift, Compliance, TorqueModulation
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_floor_arcsec
 from hdbridge.control.bench import Bench, compensation_for
-from hdbridge.drive.drive import Drive
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import DriveError, InputError
 from hdbridge.motion.procedures.moves import Dwell, MoveTo
 from hdbridge.motion.procedures.stepping import Stepping
-from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
@@ -243,11 +241,7 @@ def test_the_motor_torque_has_the_sign_of_the_axis():
     )  # fmt: skip
     found = {}
     for axis, text in ((axis_with(""), (PROFILE / "truth.yaml").read_text()), (reversed_axis, truth)):
-        with (
-            simulated_bench(Truth.from_text(text), axis.eds_path, 1, 1) as (bus, clock, _),
-            Drive(bus, axis, clock) as drive,
-        ):
-            drive.boot()
+        with booted(axis, Truth.from_text(text), 1) as (drive, _):
             record = Bench(drive).run(Moves(MoveTo(5.0))).record
             found[axis.motor_encoder.direction] = record.columns["motor_torque_nm"]
     assert found[1].max() > 0.05

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hdbridge import Drive
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import Response
 from hdbridge.commissioning.calibration.motion import motion_test
-from hdbridge.sim.lockstep import simulated_bench
+from support.exercised import booted
 
 ARTICLE = Path(__file__).resolve().parents[2] / "profiles" / "article"
 RAISED = {
@@ -71,11 +70,7 @@ def measured_response(profile: Path) -> Response:
 
 def _measure(profile: Path) -> Response:
     axis = AxisConfig.load(profile)
-    with (
-        simulated_bench(profile / "truth.yaml", axis.eds_path) as (bus, clock, _),
-        Drive(bus, axis, clock) as drive,
-    ):
-        drive.boot()
+    with booted(axis, profile / "truth.yaml") as (drive, _):
         response = motion_test(drive, TransmissionModel.load(profile / "model.yaml")).response
     assert response is not None
     return response
