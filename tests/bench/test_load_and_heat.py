@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.exercised import booted
+from support.moves import Moves
 from support.two_channels import CHANNELS, resumes, stops
 
 from hdbridge.axis import AxisConfig
@@ -50,17 +51,6 @@ def loaded(axis: AxisConfig, more: str = "", gear: str = ""):
     text = text.replace("gear:\n", "gear:\n" + gear)
     with booted(axis, Truth.from_text(text), 1) as (drive, node):
         yield drive, node
-
-
-class Moves:
-    """A procedure made of given moves."""
-
-    def __init__(self, *moves):
-        self._moves = moves
-
-    def moves(self, axis):
-        for move in self._moves:  # noqa: UP028 - 'yield from' would send the samples to the tuple
-            yield move
 
 
 class Script:
