@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.exercised import booted
+from support.moves import Moves
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
@@ -18,19 +19,6 @@ from hdbridge.motion.procedures.moves import Dwell, MoveTo
 from hdbridge.motion.procedures.stepping import Stepping
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
-
-
-class Moves:
-    """A procedure made of given moves."""
-
-    def __init__(self, *moves):
-        self._moves = moves
-
-    def moves(self, axis):
-        counts = []
-        for move in self._moves:
-            counts.append(len((yield move)))
-        return counts
 
 
 @pytest.fixture(scope="module")

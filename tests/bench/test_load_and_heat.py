@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.exercised import booted
+from support.moves import Moves
 from support.two_channels import CHANNELS, resumes, stops
 
 from hdbridge.axis import AxisConfig
@@ -14,12 +15,10 @@ from hdbridge.axis.effects import AmplitudeDrift, Compliance, TorqueModulation
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_floor_arcsec
 from hdbridge.control.bench import Bench, compensation_for
-from hdbridge.drive.drive import Drive
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import DriveError, InputError
 from hdbridge.motion.procedures.moves import Dwell, MoveTo
 from hdbridge.motion.procedures.stepping import Stepping
-from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
@@ -52,17 +51,6 @@ def loaded(axis: AxisConfig, more: str = "", gear: str = ""):
     text = text.replace("gear:\n", "gear:\n" + gear)
     with booted(axis, Truth.from_text(text), 1) as (drive, node):
         yield drive, node
-
-
-class Moves:
-    """A procedure made of given moves."""
-
-    def __init__(self, *moves):
-        self._moves = moves
-
-    def moves(self, axis):
-        for move in self._moves:  # noqa: UP028 - 'yield from' would send the samples to the tuple
-            yield move
 
 
 class Script:
@@ -243,11 +231,7 @@ def test_the_motor_torque_has_the_sign_of_the_axis():
     )  # fmt: skip
     found = {}
     for axis, text in ((axis_with(""), (PROFILE / "truth.yaml").read_text()), (reversed_axis, truth)):
-        with (
-            simulated_bench(Truth.from_text(text), axis.eds_path, 1, 1) as (bus, clock, _),
-            Drive(bus, axis, clock) as drive,
-        ):
-            drive.boot()
+        with booted(axis, Truth.from_text(text), 1) as (drive, _):
             record = Bench(drive).run(Moves(MoveTo(5.0))).record
             found[axis.motor_encoder.direction] = record.columns["motor_torque_nm"]
     assert found[1].max() > 0.05

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from support.bare_axis import truth
 from support.exercised import booted, moved, record_of
+from support.moves import Moves
 from support.torque import check_torque, directed
 
 from hdbridge.axis import AxisConfig
@@ -15,24 +16,16 @@ from hdbridge.sim.machine import Machine
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 
 
-class There:
-    """Procedure that moves to a load angle, and rests."""
-
-    def __init__(self, *angles_deg: float) -> None:
-        self._angles_deg = angles_deg
-
-    def moves(self, axis):
-        for angle_deg in self._angles_deg:
-            yield MoveTo(angle_deg)
-            yield Dwell(0.2)
-
-
 @pytest.mark.parametrize("direction", [1, -1])
 def test_a_record_of_the_bench_has_the_torque_that_accelerates_the_motor(direction: int) -> None:
     known = truth(motor__encoder__direction=direction)
     axis = directed(AxisConfig.load(PROFILE), direction)
     with booted(axis, known) as (drive, _):
-        record = Bench(drive).run(There(20.0, 0.0, -20.0)).record
+        record = (
+            Bench(drive)
+            .run(Moves(MoveTo(20.0), Dwell(0.2), MoveTo(0.0), Dwell(0.2), MoveTo(-20.0), Dwell(0.2)))
+            .record
+        )
     check_torque(known, record)
 
 

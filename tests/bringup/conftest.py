@@ -47,7 +47,6 @@ class Case:
     spoil: Callable[[DriveNode], None] = lambda node: None
     rows: dict[str, Row[BringUpContext]] = field(default_factory=dict)
     node: DriveNode | None = None
-    motor_counts_seen: set[int] = field(default_factory=set)
 
     def prepare(self) -> AxisConfig:
         text = edited((ARTICLE / "axis.yaml").read_text(), self.axis)

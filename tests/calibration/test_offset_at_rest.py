@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from support.exercised import booted
 from support.raised import ARTICLE
 
-from hdbridge import Drive
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Effect, Hysteresis, InertialWindup, Motion, MotorOrder, Synchronous
 from hdbridge.axis.model import TransmissionModel
@@ -19,7 +19,6 @@ from hdbridge.motion.procedures.plan import Plan
 from hdbridge.motion.procedures.stepping import Standing, SteppingOutcome
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment
-from hdbridge.sim.lockstep import simulated_bench
 
 RATIO, STEPS, SAMPLES = 50.0, 10, 20
 ORDERS = Synchronous(orders=(MotorOrder(order=2, amplitude_arcsec=9.0, phase_deg=20.0),))
@@ -72,11 +71,7 @@ def validated(folder: Path, load_kg_m2: float, stiffness: float, servo: dict, *m
     (folder / "plan.yaml").write_text(PLAN, encoding="utf-8")
     axis, gear = AxisConfig.load(ARTICLE), TransmissionModel.load(ARTICLE / "model.yaml")
     model = replace(gear, effects=(*gear.effects, *more))
-    with (
-        simulated_bench(folder / "truth.yaml", axis.eds_path) as (bus, clock, _),
-        Drive(bus, axis, clock) as drive,
-    ):
-        drive.boot()
+    with booted(axis, folder / "truth.yaml") as (drive, _):
         plan = Plan.load(str(folder / "plan.yaml"))
         return validate(drive, plan, None, model, Floor(2.8, 0.4), folder)[0]
 

@@ -11,6 +11,17 @@ from support.command import run_apart, run_here
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 
 
+def refused(done, status: int, *texts: str) -> None:
+    """One line on standard error, with these words, and this status."""
+    lines = [line for line in done.stderr.splitlines() if line.startswith("hdbridge: ")]
+    assert done.returncode == status, done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(lines) == 1, done.stderr
+    for text in texts:
+        assert text in lines[0]
+    assert done.stdout == ""
+
+
 @pytest.fixture
 def hdbridge(tmp_path):
     """Run `hdbridge ARGS...` in an empty folder."""

@@ -2,16 +2,7 @@
 
 import pytest
 
-
-def refused(done, status: int, *texts: str) -> None:
-    """One line on standard error, with these words, and this status."""
-    lines = [line for line in done.stderr.splitlines() if line.startswith("hdbridge: ")]
-    assert done.returncode == status, done.stderr
-    assert "Traceback" not in done.stderr
-    assert len(lines) == 1, done.stderr
-    for text in texts:
-        assert text in lines[0]
-    assert done.stdout == ""
+from tests.cli.conftest import refused
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pytest
 
 from hdbridge.axis.effects import Hysteresis, Motion, MotorOrder, Start, Synchronous
 from hdbridge.axis.model import TransmissionModel
+from tests.cli.conftest import refused
 
 RATIO = 50.0
 GEAR = TransmissionModel(
@@ -80,36 +81,32 @@ def test_a_record_without_reversals_reports_its_limits(hdbridge, tmp_path):
     assert [each.name for each in model.effects] == ["synchronous"]
 
 
-def refused(done, *texts: str) -> None:
-    lines = [line for line in done.stderr.splitlines() if line.startswith("hdbridge: ")]
-    assert done.returncode == 2, done.stderr
-    assert len(lines) == 1, done.stderr
-    for text in texts:
-        assert text in lines[0]
-    assert done.stdout == ""
-
-
 def test_records_that_cannot_be_used_are_refused(hdbridge, tmp_path):
     name = write(tmp_path / "theirs.csv", motor_path(*BOTH_WAYS))
-    refused(hdbridge("fit", name), name, "--ratio")
-    refused(hdbridge("fit", name, "--ratio", 80, "--out", "model.yaml"), name, "80", "ratio")
-    refused(hdbridge("fit", name, "--ratio", 80, "--axis", "article"), "50", "80")
+    refused(hdbridge("fit", name), 2, name, "--ratio")
+    refused(hdbridge("fit", name, "--ratio", 80, "--out", "model.yaml"), 2, name, "80", "ratio")
+    refused(hdbridge("fit", name, "--ratio", 80, "--axis", "article"), 2, "50", "80")
     short = write(tmp_path / "short.csv", motor_path(0, 9))
-    refused(hdbridge("fit", short, "--ratio", 50), "short.csv", "expected at least")
+    refused(hdbridge("fit", short, "--ratio", 50), 2, "short.csv", "expected at least")
     lacking = write(tmp_path / "lacking.csv", motor_path(0, 90), columns=("time_s", "motor_position_deg"))
-    refused(hdbridge("fit", lacking, "--ratio", 50), "lacking.csv", "load_position_deg")
+    refused(hdbridge("fit", lacking, "--ratio", 50), 2, "lacking.csv", "load_position_deg")
     assert not (tmp_path / "model.yaml").exists()
 
 
 def test_plans_that_cannot_be_run_are_refused_before_anything_moves(hdbridge, profile, tmp_path):
     refused(
-        hdbridge("calibrate", profile.folder, "--simulate", "--plan", "quik"), "quik", "did you mean 'quick'"
+        hdbridge("calibrate", profile.folder, "--simulate", "--plan", "quik"),
+        2,
+        "quik",
+        "did you mean 'quick'",
     )
     (tmp_path / "own.yaml").write_text(
         "schema: hdbridge.plan/1\nname: own\nprocedures:\n  - {procedure: dance}\n"
     )
-    refused(hdbridge("calibrate", profile.folder, "--simulate", "--plan", "own.yaml"), "own.yaml:4", "sweep")
-    refused(hdbridge("calibrate", profile.folder, "--simulate", "--resume", "nowhere"), "nowhere")
+    refused(
+        hdbridge("calibrate", profile.folder, "--simulate", "--plan", "own.yaml"), 2, "own.yaml:4", "sweep"
+    )
+    refused(hdbridge("calibrate", profile.folder, "--simulate", "--resume", "nowhere"), 2, "nowhere")
     assert not (tmp_path / "recordings").exists()
 
 

@@ -5,16 +5,15 @@ import re
 from dataclasses import replace
 
 import pytest
+from support.exercised import booted
 from support.raised import raised_profile
 
-from hdbridge import Drive
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.commissioning.calibration.motion import motion_test
 from hdbridge.errors import InputError
 from hdbridge.report.motion import PATH_COLUMNS
-from hdbridge.sim.lockstep import simulated_bench
 
 OF_ANOTHER_CYCLE = Response(
     cycle_ms=3.0, following_lag_ms=5.0, known_to_hz=10.0,
@@ -118,11 +117,8 @@ def test_a_model_without_orders_and_a_proposal_without_a_measurement_are_refused
 def test_a_response_of_another_cycle_is_refused_before_anything_moves(fast):
     axis = AxisConfig.load(fast)
     model = replace(TransmissionModel.load(fast / "model.yaml"), response=OF_ANOTHER_CYCLE)
-    with (
-        simulated_bench(fast / "truth.yaml", axis.eds_path) as (bus, clock, _),
-        Drive(bus, axis, clock) as drive,
-    ):
-        drive.boot()
+    with booted(axis, fast / "truth.yaml") as (drive, _):
+        clock = drive.link.clock
         booted_s = clock.now()
         with pytest.raises(InputError, match="measured with a cycle of 3 ms"):
             motion_test(drive, model, measure=False)

@@ -2,8 +2,9 @@
 
 The invariants (`support.daemonlaws`) are checked on every frame that leaves the loop: no target outside the
 limits, stale at enable, or farther from the previous target than the limits of velocity and slew allow; no
-power without an ENABLE command since power was last removed; no RPDO to an axis that is not verified; each
-command answered once.
+set-point beyond the limits of speed, acceleration and jerk, not even across interruptions; no power without
+an ENABLE command since power was last removed; no RPDO to an axis that is not verified; each command answered
+once.
 """
 
 import errno
@@ -18,16 +19,21 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
-from support.daemon import SteppedDaemon, article_axes, stepped_daemon
+from support.characters import AWKWARD, FRIENDLY, INTERPOLATED, Character
+from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
 from support.daemonlaws import Laws
+from support.keys import changed
 
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Knot, MailboxFullError, RelayedFrame
 from hdbridge.drive.objects import Mode
 from hdbridge.enums import Scheme
 from hdbridge.errors import HdbridgeError
+from hdbridge.sim.truth import Truth
 
 K = CommandKind
+COUNTS_PER_TURN = 1 << 20
+"""Of the motor encoder; high, so that the rounding of targets hides no jump."""
 TRAVEL_DEG = 3.0
 """Short, so that the limits are reached often."""
 KINDS = list(K)
@@ -47,7 +53,8 @@ def machine_axes():
         limits = axis.limits.model_copy(
             update={"position_min_deg": -TRAVEL_DEG, "position_max_deg": TRAVEL_DEG}
         )
-        made.append(axis.model_copy(update={"limits": limits}))
+        encoder = axis.motor_encoder.model_copy(update={"counts_per_turn": COUNTS_PER_TURN})
+        made.append(axis.model_copy(update={"limits": limits, "motor_encoder": encoder}))
     return made
 
 
@@ -75,7 +82,13 @@ class Disorder(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.stack = ExitStack()
-        self.daemon: SteppedDaemon = self.stack.enter_context(stepped_daemon(machine_axes()))
+
+    @initialize(character=st.sampled_from([FRIENDLY, AWKWARD, INTERPOLATED]))
+    def boot(self, character: Character) -> None:
+        truth = changed(Truth.load(PROFILE), motor__encoder__counts_per_turn=COUNTS_PER_TURN)
+        self.daemon: SteppedDaemon = self.stack.enter_context(
+            stepped_daemon(machine_axes(), truth=truth, character=character)
+        )
         self.laws = Laws(self.daemon)
         self.stream = 0
         self.booted = [False, False]
@@ -84,9 +97,6 @@ class Disorder(RuleBasedStateMachine):
             for axis in range(2)
             for scheme in (Scheme.EXTENDED, Scheme.SYNCHRONOUS, Scheme.NONE)
         ]
-
-    @initialize()
-    def boot(self) -> None:
         for axis in range(2):
             self._boot(axis)
 
@@ -272,6 +282,15 @@ class Disorder(RuleBasedStateMachine):
     def drive_fault(self, axis: int, code: int) -> None:
         self.daemon.nodes[axis].faults.raise_error(code)
 
+    @event(axis=axes, code=st.sampled_from([0x8130, 0x8250]), says=st.booleans())
+    def lose_master(self, axis: int, code: int, says: bool) -> None:
+        faults = self.daemon.nodes[axis].faults
+        (faults.miss_master if says else faults.lose_master)(code)
+
+    @event(axis=axes)
+    def leave_operational(self, axis: int) -> None:
+        self.daemon.nodes[axis].faults.leave_operational()
+
     @event(axis=axes, jump=st.integers(-200_000, 200_000))
     def jump(self, axis: int, jump: int) -> None:
         self.daemon.nodes[axis].faults.load_jump_counts = jump
@@ -305,6 +324,10 @@ class Disorder(RuleBasedStateMachine):
     @event(duration=st.sampled_from([0.001, 0.003, 0.006, 0.02, 0.3]))
     def hang(self, duration: float) -> None:
         self.daemon.hang(duration)
+
+    @event()
+    def restart_loop(self) -> None:
+        self.laws.begin_again()
 
     @event(st.integers(1, 60))
     def pass_time(self) -> None:

@@ -19,33 +19,24 @@ def test_without_sync_the_axis_runs_on_the_clock(master, motor):
     assert motor.elapsed_s - before == pytest.approx(1.0, abs=0.005)
 
 
-def test_with_sync_the_axis_runs_one_period_each(master, motor):
+@pytest.mark.parametrize(
+    ("period", "gaps_s", "expected_s"),
+    [
+        ((4, -3), [0.0035] * 100, pytest.approx(0.4)),
+        ((4, -3), [0.008, *[0.004] * 9] * 10, pytest.approx(0.44)),
+        ((13, -4), [0.0013] * 1000, pytest.approx(1.3, abs=0.0005)),
+    ],
+    ids=["each SYNC is one period", "a missed SYNC is bridged by the clock", "odd periods add up"],
+)
+def test_the_time_of_the_axis_with_sync(master, motor, period, gaps_s, expected_s):
+    for sub, value in enumerate(period, 1):
+        master.put(0x60C2, sub, value, 1)
     master.nmt(1)
-    master.cycle()
+    master.cycle(period_s=period[0] * 10.0 ** period[1])
     before = motor.elapsed_s
-    for _ in range(100):
-        master.cycle(0x00, 0, period_s=0.0035)
-    assert motor.elapsed_s - before == pytest.approx(0.4)
-
-
-def test_a_missed_sync_is_bridged_by_the_clock(master, motor):
-    master.nmt(1)
-    master.cycle()
-    before = motor.elapsed_s
-    for k in range(100):
-        master.cycle(0x00, 0, period_s=0.008 if k % 10 == 0 else 0.004)
-    assert motor.elapsed_s - before == pytest.approx(0.44)
-
-
-def test_odd_periods_add_up(master, motor):
-    master.put(0x60C2, 1, 13, 1)
-    master.put(0x60C2, 2, -4, 1)
-    master.nmt(1)
-    master.cycle(period_s=0.0013)
-    before = motor.elapsed_s
-    for _ in range(1000):
-        master.cycle(0x00, 0, period_s=0.0013)
-    assert motor.elapsed_s - before == pytest.approx(1.3, abs=0.0005)
+    for gap_s in gaps_s:
+        master.cycle(0x00, 0, period_s=gap_s)
+    assert motor.elapsed_s - before == expected_s
 
 
 def test_a_stalled_process_does_not_catch_up_hours(master, motor):

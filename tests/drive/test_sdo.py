@@ -1,6 +1,7 @@
 """The SDO client against nodes that answer late, wrongly, too much, or not at all."""
 
 import struct
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -109,16 +110,21 @@ def test_an_abort_is_reported_with_a_remedy_and_not_retried(
     assert len(calls) == 1
 
 
-@pytest.mark.parametrize("length", [0, 1, 4, 7])
-def test_a_short_frame_is_an_error_not_a_crash(client: SdoClient, slave: Any, length: int) -> None:
-    slave.scripts[0x6064, 0] = lambda request: [expedited(request, b"\1\2\3\4")[:length]]
-    with pytest.raises(SdoError, match=f"the answer has {length} bytes"):
-        client.read(0x6064)
-
-
-def test_too_few_bytes_for_the_type(client: SdoClient, slave: Any) -> None:
-    slave.scripts[0x6064, 0] = lambda request: [expedited(request, b"\1\2")]
-    with pytest.raises(SdoError, match="answered 2 bytes, but int32 has 4"):
+@pytest.mark.parametrize(
+    ("answer", "text"),
+    [
+        *((lambda request, size=size: expedited(request, b"\1\2\3\4")[:size], f"the answer has {size} bytes")
+          for size in (0, 1, 4, 7)),
+        (lambda request: expedited(request, b"\1\2"), "answered 2 bytes, but int32 has 4"),
+        (lambda request: b"\x60" + request[1:4] + bytes(4), "Unexpected response 0x60"),
+    ],
+    ids=["0 bytes", "1 byte", "4 bytes", "7 bytes", "too few for the type", "of a download"],
+)  # fmt: skip
+def test_an_invalid_answer_is_an_error_not_a_crash(
+    client: SdoClient, slave: Any, answer: Callable[[bytes], bytes], text: str
+) -> None:
+    slave.scripts[0x6064, 0] = lambda request: [answer(request)]
+    with pytest.raises(SdoError, match=text):
         client.read(0x6064)
 
 
@@ -229,12 +235,6 @@ def test_types_without_an_eds(bus: Any, clock: Any, slave: Any) -> None:
 def test_a_non_integer_object_is_refused(client: SdoClient) -> None:
     with pytest.raises(SdoError, match="not an integer in the EDS"):
         client.read(0x1008)
-
-
-def test_an_answer_of_the_wrong_kind_is_refused(client: SdoClient, slave: Any) -> None:
-    slave.scripts[0x6064, 0] = lambda request: [b"\x60" + request[1:4] + bytes(4)]
-    with pytest.raises(SdoError, match="Unexpected response 0x60"):
-        client.read(0x6064)
 
 
 def test_an_old_answer_for_the_same_object_is_ignored(client: SdoClient, slave: Any) -> None:

@@ -14,7 +14,6 @@ from hdbridge.device.behaviour import Behaviour
 from hdbridge.device.node import DriveNode
 from hdbridge.drive import Drive, Mode, State
 from hdbridge.errors import DriveError
-from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
@@ -101,11 +100,8 @@ def test_an_enabled_drive_stays_so_while_the_master_waits_and_stops_while_it_sle
 def test_a_drive_that_stops_in_a_move_is_not_set_in_motion_again(delay_ms: float) -> None:
     holding = AXIS.model_copy(update={"drive": AXIS.drive.model_copy(update={"quick_stop_option": 6})})
     truth = Truth.load(PROFILE).model_copy(update={"firmware": Behaviour(status_delay_ms=delay_ms)})
-    with (
-        simulated_bench(truth, AXIS.eds_path, AXIS.drive.node_id) as (bus, clock, node),
-        Drive(bus, holding, clock) as drive,
-    ):
-        drive.boot()
+    with booted(holding, truth) as (drive, node):
+        clock = drive.link.clock
         drive.enable(Mode.PP)
         moving = node.firmware._mode
         step = moving.step

@@ -28,7 +28,6 @@ STATUSWORDS = {
     State.FAULT_REACTION_ACTIVE: 0x000F,
     State.FAULT: 0x0008,
 }
-LEGAL = {(row.source, row.command) for row in TRANSITIONS if row.command}
 # Copied independently from CiA 402-2, so that an error in the table is detected.
 EXPECTED_LEGAL = {
     (State.SWITCH_ON_DISABLED, Command.SHUTDOWN): State.READY_TO_SWITCH_ON,

@@ -4,8 +4,9 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
 from typing import Final
 
 import pytest
@@ -47,10 +48,6 @@ def _bus_goes(
     return "latch; opened again, verified, disabled, in the same processes", cycles, NOTICED
 
 
-def _goes_down(bench: DaemonBench) -> tuple[str, int, int]:
-    return _bus_goes(bench, bench.cable.down, bench.cable.up)
-
-
 def _is_deleted(bench: DaemonBench) -> tuple[str, int, int]:
     def made_again() -> None:
         bench.cable.plug()
@@ -65,7 +62,7 @@ def _bus_off(bench: DaemonBench) -> tuple[str, int, int]:
     )
 
 
-def _stops(bench: DaemonBench, fault: str, end: str, *how: str) -> tuple[str, int, int]:
+def _stops(bench: DaemonBench, fault: str, end: str, how: Sequence[str]) -> tuple[str, int, int]:
     """Disturbs the frames that leave an end of the cable until the axis has stopped."""
     with ExitStack() as spoilt:
         made = bench.made(lambda: spoilt.enter_context(bench.cable.spoilt(end, *how)))
@@ -75,22 +72,14 @@ def _stops(bench: DaemonBench, fault: str, end: str, *how: str) -> tuple[str, in
     return "quick stop, latched", cycles, NOTICED
 
 
-def _all_lost(bench: DaemonBench) -> tuple[str, int, int]:
-    return _stops(bench, "LOST_TPDO", THEIRS, "loss", "100%")
-
-
 def _pulled(bench: DaemonBench) -> tuple[str, int, int]:
     with bench.cable.spoilt(OURS, "loss", "100%"):
-        return _stops(bench, "LOST_TPDO", THEIRS, "loss", "100%")
+        return _stops(bench, "LOST_TPDO", THEIRS, ("loss", "100%"))
 
 
 def _delayed(bench: DaemonBench) -> tuple[str, int, int]:
     # Frames arrive after the window and before the next SYNC; later ones would count for the next SYNC.
-    return _stops(bench, "LOST_TPDO", THEIRS, "delay", f"{900 * bench.period_s:.0f}ms")
-
-
-def _queue_full(bench: DaemonBench) -> tuple[str, int, int]:
-    return _stops(bench, "TRANSMIT_FULL", OURS, "delay", "100s", "limit", "1")
+    return _stops(bench, "LOST_TPDO", THEIRS, ("delay", f"{900 * bench.period_s:.0f}ms"))
 
 
 def _doubled(bench: DaemonBench) -> tuple[str, int, int]:
@@ -217,14 +206,6 @@ def _control_goes(bench: DaemonBench, number: signal.Signals) -> tuple[str, int,
     return "the drive stops on its own; another control process, disabled", cycles, allowed
 
 
-def _control_killed(bench: DaemonBench) -> tuple[str, int, int]:
-    return _control_goes(bench, signal.SIGKILL)
-
-
-def _control_hangs(bench: DaemonBench) -> tuple[str, int, int]:
-    return _control_goes(bench, signal.SIGSTOP)
-
-
 def _jog_runs_out(bench: DaemonBench, number: signal.Signals) -> tuple[int, int]:
     daemon = bench.daemon
     daemon.ask("stop")
@@ -303,16 +284,19 @@ _SAME: Final = "latch; verified again, disabled, no restart"
 _BY_ITSELF: Final = "the drive stops on its own; another process, disabled"
 
 DAEMON_ROWS: Final = (
-    DaemonRow("the interface goes down, and up again", _SAME, f"{NOTICED}", _goes_down),
+    DaemonRow("the interface goes down, and up again", _SAME, f"{NOTICED}",
+        lambda bench: _bus_goes(bench, bench.cable.down, bench.cable.up)),
     DaemonRow("the interface is deleted, and made again", _SAME, f"{NOTICED}", _is_deleted),
     DaemonRow("the controller goes bus-off (its error frame)", _SAME, f"{NOTICED}", _bus_off),
     DaemonRow("the cable is pulled, and plugged again", "quick stop, latched", f"{NOTICED}", _pulled),
-    DaemonRow("every frame of the drive is lost", "quick stop, latched", f"{NOTICED}", _all_lost, slow=True),
+    DaemonRow("every frame of the drive is lost", "quick stop, latched", f"{NOTICED}",
+        partial(_stops, fault="LOST_TPDO", end=THEIRS, how=("loss", "100%")), slow=True),
     DaemonRow("every frame of the drive comes after its window", "quick stop, latched", f"{NOTICED}",
         _delayed),
     DaemonRow("every frame of the drive comes twice", "continue, count", f"{NOTICED}", _doubled, slow=True),
     DaemonRow("the drive's frames swap places within the cycle", "continue", "0", _reordered),
-    DaemonRow("the transmit queue is full (ENOBUFS)", "quick stop, latched", f"{NOTICED}", _queue_full),
+    DaemonRow("the transmit queue is full (ENOBUFS)", "quick stop, latched", f"{NOTICED}",
+        partial(_stops, fault="TRANSMIT_FULL", end=OURS, how=("delay", "100s", "limit", "1"))),
     DaemonRow("SYNC of a second master", "quick stop, latched", f"{NOTICED}", _second_master, slow=True),
     DaemonRow("NMT reset of the drive by a second master", "quick stop, latch; verified again, disabled",
         f"{NOTICED}", _node_reset, slow=True),
@@ -323,8 +307,10 @@ DAEMON_ROWS: Final = (
         slow=True),
     DaemonRow("clients silent or sending garbage", "the loop continues; no cycle is missed", "0", _hostile,
         slow=True),
-    DaemonRow("the control process is killed (-9)", _BY_ITSELF, "two heartbeats", _control_killed),
-    DaemonRow("the control process hangs (SIGSTOP)", _BY_ITSELF, "two heartbeats", _control_hangs,
+    DaemonRow("the control process is killed (-9)", _BY_ITSELF, "two heartbeats",
+        partial(_control_goes, number=signal.SIGKILL)),
+    DaemonRow("the control process hangs (SIGSTOP)", _BY_ITSELF, "two heartbeats",
+        partial(_control_goes, number=signal.SIGSTOP),
         slow=True),
     DaemonRow("the service is killed (-9) in a jog", "the loop continues, the jog runs out; another service",
         "the jog's time-out", _service_killed),

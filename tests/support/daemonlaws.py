@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from hdbridge.daemon.loop.states import MAY_MOVE, AxisState
 from hdbridge.daemon.memory import CommandKind, Event, EventKind
 from hdbridge.drive.image import position_limits_counts
+from hdbridge.motion import MotionMode
 from hdbridge.units import ARCSEC_PER_DEG
 
 if TYPE_CHECKING:
@@ -21,9 +22,12 @@ ENABLE_OPERATION = 0x0F
 PRE_OPERATIONAL = (0x000, 0x80)
 """NMT command that the loop itself sends to each node when the bus has been opened again."""
 SILENT = frozenset({AxisState.UNVERIFIED, AxisState.LENT, AxisState.LATCHED})
+DRIVEN = frozenset({AxisState.ENABLED, AxisState.STOPPING})
 LATCHES = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
-STANDING_COUNTS = 4
-"""Maximum motion of an axis at rest since its last TPDO, motor counts."""
+STANDING_DEG = 0.01
+"""Maximum motion of an axis at rest since its last TPDO, degrees at the load."""
+INTERPOLATED = 0x10
+"""Bit of the controlword that enables interpolation in interpolated position mode."""
 
 
 class AxisLaws:
@@ -32,8 +36,10 @@ class AxisLaws:
     def __init__(self, daemon: SteppedDaemon, index: int) -> None:
         self.axis = daemon.axes[index]
         self.machine = daemon.nodes[index].firmware.motion.machine
-        self.least, self.greatest = position_limits_counts(self.axis.config)
-        self.most = most_counts(self.axis.config)
+        config = self.axis.config
+        self.least, self.greatest = position_limits_counts(config)
+        self.most = most_counts(config)
+        self.deg_per_count = config.motor_encoder.degrees(1) / config.gear.ratio
         self.allowed = False
         """True if an ENABLE command was given since power was last removed."""
         self.begun = False
@@ -43,9 +49,15 @@ class AxisLaws:
         self.word = 0
         self.target = 0
         self.enabled = 0
+        self.place_deg: float | None = None
+        """Set-point at the last RPDO (target without correction), degrees at the load; None if not driven."""
+        self.velocity = self.acceleration = 0.0
+        self.streamed = False
+        """True from the begin of a stream until rest; near a position limit, its stop has no jerk limit."""
 
     def take(self, data: bytes) -> None:
         word, target = struct.unpack("<Hi", data)
+        word &= ~INTERPOLATED
         name = self.axis.config.name
         assert self.axis.state not in SILENT, f"{name}: an RPDO while it is {self.axis.state.name}"
         if word in POWERLESS:
@@ -62,10 +74,31 @@ class AxisLaws:
                 step = abs(target - self.target)
                 assert step <= self.most, f"{name}: target jumps by {step} counts, at most {self.most} may be"
             else:
-                away = abs(target - self.machine.motor_counts)
-                assert away <= STANDING_COUNTS, f"{name}: enabled {away} counts from where it stands"
+                away_deg = abs(target - self.machine.motor_counts) * self.deg_per_count
+                assert away_deg <= STANDING_DEG, f"{name}: enabled {away_deg} deg from where it stands"
             self.enabled += 1
+        self._follow(target, driven=word == ENABLE_OPERATION and self.axis.state in DRIVEN)
         self.word, self.target = word, target
+
+    def _follow(self, target: int, *, driven: bool) -> None:
+        """Checks that speed, acceleration and jerk of the set-point are within the limits of the axis."""
+        limits, period_s = self.axis.config.limits, self.axis.config.drive.cycle_s
+        rounding = self.deg_per_count / period_s
+        correction_deg = self.axis.follower.correction.correction_arcsec / ARCSEC_PER_DEG
+        mode, place_deg = self.axis.set_point.mode, target * self.deg_per_count + correction_deg
+        before_deg, self.place_deg = self.place_deg, place_deg if driven else None
+        if before_deg is None or not driven:
+            self.velocity = self.acceleration = 0.0
+            return
+        velocity = (place_deg - before_deg) / period_s
+        acceleration = (velocity - self.velocity) / period_s
+        assert abs(velocity) <= limits.velocity_deg_s + 2 * rounding
+        assert abs(acceleration) <= limits.acceleration_deg_s2 * 1.001 + 4 * rounding / period_s, mode
+        self.streamed = mode is MotionMode.STREAM or (self.streamed and mode is MotionMode.STOP)
+        if not self.streamed:
+            jerk = (acceleration - self.acceleration) / period_s
+            assert abs(jerk) <= limits.jerk_deg_s3 * 1.001 + 8 * rounding / period_s**2, mode
+        self.velocity, self.acceleration = velocity, acceleration
 
 
 def most_counts(config: AxisConfig) -> int:
@@ -106,6 +139,14 @@ class Laws:
             assert nodes <= set(self.axes)
         else:
             assert can_id in (0x080, 0x77F), f"{can_id:03X}h was sent"
+
+    def begin_again(self) -> None:
+        """Restarts the control process, which discards the commands not taken yet."""
+        self.daemon.begin_again()
+        self.asked.clear()
+        for axis in self.daemon.axes:
+            laws = self.axes[axis.config.drive.node_id]
+            laws.axis, laws.latched, laws.allowed = axis, False, False
 
     def turn(self) -> None:
         """Runs one cycle and checks that it relays at most one frame."""

@@ -54,14 +54,6 @@ def pause(duration_s: float) -> Callable[[GatewayBench], None]:
     return happens
 
 
-def silence(bench: GatewayBench) -> None:
-    bench.plc.cycling = False
-
-
-def speak(bench: GatewayBench) -> None:
-    bench.plc.begin()
-
-
 def jitter(bench: GatewayBench) -> None:
     bench.plc.late_s = lambda cycle: 0.3 * bench.plc.period_s * (cycle % 3)
 
@@ -70,29 +62,14 @@ def nmt(command: int) -> Callable[[GatewayBench], None]:
     return lambda bench: bench.plc.send(0, bytes((command, NODE)))
 
 
-def one_heartbeat(bench: GatewayBench) -> None:
-    bench.plc.send(0x77F, b"\x05")
+def writes(*objects: tuple[int, int, int, int]) -> Callable[[GatewayBench], Awaitable[None]]:
+    """Returns a configuration that writes objects: index, sub-index, value and size."""
 
+    async def prepares(bench: GatewayBench) -> None:
+        for each in objects:
+            await bench.write(*each)
 
-async def watch_heartbeat(bench: GatewayBench) -> None:
-    await bench.write(0x1016, 1, 127 << 16 | 100, 4)
-
-
-async def guard_life(bench: GatewayBench) -> None:
-    await bench.write(0x100C, 0, 50, 2)
-    await bench.write(0x100D, 0, 2, 1)
-
-
-async def watch_rpdo(bench: GatewayBench) -> None:
-    await bench.write(0x1400, 5, 20, 2)
-
-
-def guard(bench: GatewayBench) -> None:
-    bench.plc.send(0x700 + NODE, is_remote_frame=True)
-
-
-def no_targets(bench: GatewayBench) -> None:
-    bench.plc.sends_targets = False
+    return prepares
 
 
 def rpdos_of(length: int) -> Callable[[GatewayBench], None]:
@@ -136,24 +113,14 @@ def babble(can_id: int, data: bytes = b"") -> Callable[[GatewayBench], None]:
     return happens
 
 
-def outer_down(bench: GatewayBench) -> None:
-    bench.bus.down = errno.ENETDOWN
+def interfaces(down: int | None, *, both: bool = False) -> Callable[[GatewayBench], None]:
+    """Takes the outer interface, or both, down with this error number; up without one."""
 
+    def happens(bench: GatewayBench) -> None:
+        for bus in (bench.bus, bench.daemon.bus) if both else (bench.bus,):
+            bus.down = down
 
-def outer_up(bench: GatewayBench) -> None:
-    bench.bus.down = None
-
-
-def both_down(bench: GatewayBench) -> None:
-    bench.bus.down = bench.daemon.bus.down = errno.ENETDOWN
-
-
-def both_up(bench: GatewayBench) -> None:
-    bench.bus.down = bench.daemon.bus.down = None
-
-
-def kill_gateway(bench: GatewayBench) -> None:
-    bench.kill_gateway()
+    return happens
 
 
 def start_gateway(bench: GatewayBench) -> None:
@@ -196,20 +163,35 @@ ROWS = (
     OuterFault("one SYNC lost", pause(0.004)),
     OuterFault("two SYNCs lost", pause(0.008)),
     OuterFault("SYNC late by up to 0.6 periods", jitter),
-    OuterFault("SYNC and targets end", silence, (0x8700,), 0.016 + BRAKING_S, ends=speak),
     OuterFault(
-        "only the targets end (1400h:05 = 20 ms)", no_targets, (0x8250,), 0.02 + BRAKING_S, watch_rpdo
+        "SYNC and targets end",
+        lambda bench: setattr(bench.plc, "cycling", False),
+        (0x8700,),
+        0.016 + BRAKING_S,
+        ends=lambda bench: bench.plc.begin(),
+    ),
+    OuterFault(
+        "only the targets end (1400h:05 = 20 ms)",
+        lambda bench: setattr(bench.plc, "sends_targets", False),
+        (0x8250,),
+        0.02 + BRAKING_S,
+        writes((0x1400, 5, 20, 2)),
     ),
     OuterFault(
         "heartbeat of the master lost (1016h: 100 ms)",
-        one_heartbeat,
+        lambda bench: bench.plc.send(0x77F, b"\x05"),
         (0x8130,),
         0.1 + BRAKING_S,
-        watch_heartbeat,
+        writes((0x1016, 1, 127 << 16 | 100, 4)),
         nmt(1),
     ),
     OuterFault(
-        "node guarding lost (life time 100 ms)", guard, (0x8130,), 0.1 + BRAKING_S, guard_life, nmt(1)
+        "node guarding lost (life time 100 ms)",
+        lambda bench: bench.plc.send(0x700 + NODE, is_remote_frame=True),
+        (0x8130,),
+        0.1 + BRAKING_S,
+        writes((0x100C, 0, 50, 2), (0x100D, 0, 2, 1)),
+        nmt(1),
     ),
     OuterFault("RPDOs one byte too short: the last target remains", rpdos_of(5), (0x8210,), 2 * BRAKING_S),
     OuterFault("RPDOs one byte too long", rpdos_of(7), (0x8220,)),
@@ -219,9 +201,17 @@ ROWS = (
     OuterFault("NMT reset communication", nmt(130), (0x8100,), BRAKING_S, ends=nmt(1)),
     OuterFault("a node floods the bus: 0.3 s of frames without a pause", babble(0x001, bytes(8))),
     OuterFault("a node floods the bus with SYNC for 0.3 s", babble(0x080)),
-    OuterFault("outer interface down or bus off", outer_down, (), BRAKING_S, ends=outer_up),
-    OuterFault("both interfaces down", both_down, (), 0.06, ends=both_up),
-    OuterFault("gateway process killed", kill_gateway, (), BRAKING_S, ends=start_gateway),
+    OuterFault(
+        "outer interface down or bus off", interfaces(errno.ENETDOWN), (), BRAKING_S, ends=interfaces(None)
+    ),
+    OuterFault(
+        "both interfaces down",
+        interfaces(errno.ENETDOWN, both=True),
+        (),
+        0.06,
+        ends=interfaces(None, both=True),
+    ),
+    OuterFault("gateway process killed", GatewayBench.kill_gateway, (), BRAKING_S, ends=start_gateway),
     OuterFault("control process killed", kill_control, (0x6010, 0x7500), 0.06),
     OuterFault("keeper killed", kill_keeper, (), BRAKING_S, ends=start_daemon),
     OuterFault("all processes killed", kill_daemon, (), 0.06, ends=start_gateway),

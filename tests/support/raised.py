@@ -7,13 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hdbridge import Bench, Drive
-from hdbridge.analysis.response import Harmonics, Limits, Trial, harmonics, motor_orders, response_of
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import Response
-from hdbridge.motion.procedures.even_speed import EvenSpeed
-from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.commissioning.calibration.motion import motion_test
+from support.exercised import booted
 
 ARTICLE = Path(__file__).resolve().parents[2] / "profiles" / "article"
 RAISED = {
@@ -30,8 +28,6 @@ REMOVED = {
     "{index: 0x60E4, subindex: 1": "{index: 0x6064, subindex: 0",
 }
 """Edits of the axis file that make the motor encoder, at 50 motor turns per load turn, the load encoder."""
-
-RUNS = EvenSpeed((123.5, 104.0, 83.2, 65.0, 49.4, 36.4, 23.4), window_s=1.2)
 
 
 def raised_axis() -> str:
@@ -65,7 +61,7 @@ _measured: dict[tuple[bytes, ...], Response] = {}
 
 
 def measured_response(profile: Path) -> Response:
-    """Measures the response of the profile's axis on a bench, as the motion test does."""
+    """Measures the response of the profile's axis by the motion test."""
     content = tuple((profile / name).read_bytes() for name in ("axis.yaml", "model.yaml", "truth.yaml"))
     if content not in _measured:
         _measured[content] = _measure(profile)
@@ -74,25 +70,9 @@ def measured_response(profile: Path) -> Response:
 
 def _measure(profile: Path) -> Response:
     axis = AxisConfig.load(profile)
-    model = TransmissionModel.load(profile / "model.yaml")
-    orders = motor_orders(model)
-    numbers = [each.order for each in orders]
-    limits, cycle_s = Limits.of(axis, model), axis.drive.cycle_s
-    with (
-        simulated_bench(profile / "truth.yaml", axis.eds_path) as (bus, clock, _),
-        Drive(bus, axis, clock) as drive,
-    ):
-        drive.boot()
-
-        def runs(used: TransmissionModel | None) -> tuple[Harmonics, ...]:
-            outcome = Bench(drive, used).run(RUNS).outcome
-            return tuple(harmonics(each, numbers, model.ratio) for each in outcome)
-
-        none, trials = runs(None), [Trial(runs(model))]
-        for explore in (True, False, False):
-            response = response_of(none, trials, orders, model.ratio, cycle_s, limits, explore=explore)
-            assert response is not None
-            trials.append(Trial(runs(replace(model, response=response)), response.filter))
+    with booted(axis, profile / "truth.yaml") as (drive, _):
+        response = motion_test(drive, TransmissionModel.load(profile / "model.yaml")).response
+    assert response is not None
     return response
 
 
