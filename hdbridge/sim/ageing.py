@@ -16,9 +16,6 @@ from hdbridge.sim.truth.gear import TrueAgeing
 class Age:
     """Completed fraction of the ageing, which rises from 0 at switch-on to 1 and stays there."""
 
-    _share: float
-    _step: float
-
     def __init__(self, truth: TrueAgeing, dt_s: float) -> None:
         self._step = dt_s / truth.duration_s
         self._share = 0.0
@@ -34,7 +31,6 @@ class AgeFactor:
     """Factor that multiplies the elastic hysteresis and grows with age."""
 
     _age: Age
-    _growth: float
 
     def __init__(self, truth: TrueAgeing, dt_s: float) -> None:
         self._age = Age(truth, dt_s)

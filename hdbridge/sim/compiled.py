@@ -1,6 +1,6 @@
 """Axis compiled to machine code from the Python classes, with identical results.
 
-An object of the classes that `hdbridge.sim.state` declares is laid out as a numpy record, attribute by
+An object of the classes marked by `hdbridge.sim.state` is laid out as a numpy record, attribute by
 attribute, and numba compiles the classes' methods for such records. The physics is therefore written only
 once. If an attribute may belong to one of several classes (a hysteresis law, a cause of transmission error),
 its record has space for each of these classes, and a field for the actual class.
@@ -10,14 +10,16 @@ similar functions are those of the C library that Python uses. An axis that cann
 (`Uncompilable`) runs in Python.
 """
 
+import ast
 import hashlib
 import inspect
 import math
+import sys
 import threading
 from collections.abc import Callable, Iterable
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, ClassVar, Final, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, Final, NamedTuple, get_args, get_origin, get_type_hints
 
 import numba
 import numpy as np
@@ -96,7 +98,7 @@ class CompiledAxis:
         """Lays out the axis; raises `Uncompilable` if that is not possible."""
         if getattr(numba.config, "USING_SVML", False):
             raise Uncompilable("numba would take sine and exponential from Intel's library")
-        plant: Any = type(axis.loops.plant)
+        plant: Any = type(axis.plant)
         room = _room(axis)
         self._record = np.zeros(1, _layout_of(plant, room))
         _fill(self._record[0], axis)
@@ -215,9 +217,29 @@ def _version() -> int:
 
 @cache
 def _attributes(cls: Any) -> dict[str, Any]:
-    """Returns the declared attributes of a state class and its ancestors."""
+    """Returns the attributes of a state class and its ancestors with their types, ``float`` by default."""
     hints = get_type_hints(cls)
-    return {name: hint for name, hint in hints.items() if get_origin(hint) is not ClassVar}
+    family = [each for each in reversed(cls.__mro__) if each in STATES]
+    assigned = [name for each in family for name in _assigned(each.__module__)[each.__name__]]
+    return {name: hints.get(name, float) for name in assigned}
+
+
+@cache
+def _assigned(module: str) -> dict[str, list[str]]:
+    """Returns the attributes that the methods of each class of a module assign."""
+    tree = ast.parse(inspect.getsource(sys.modules[module]))
+    return {
+        cls.name: [
+            each.attr
+            for each in ast.walk(cls)
+            if isinstance(each, ast.Attribute)
+            and isinstance(each.ctx, ast.Store)
+            and isinstance(each.value, ast.Name)
+            and each.value.id == "self"
+        ]
+        for cls in tree.body
+        if isinstance(cls, ast.ClassDef)
+    }
 
 
 class Members(NamedTuple):

@@ -40,11 +40,6 @@ class Disc:
     a)``, about e/R sin a.
     """
 
-    _eccentric_rad: float
-    _oval: float
-    _oval_rad: float
-    _relative: float
-
     def __init__(self, truth: TrueDisc) -> None:
         self._relative = truth.eccentricity_um / 1000.0 / truth.radius_mm
         self._eccentric_rad = math.radians(truth.eccentric_at_deg)
@@ -65,13 +60,6 @@ class Signals:
     Offsets cause an error once per line, unequal amplitudes or phases twice, third harmonics four times.
     """
 
-    _cosine_offset: float
-    _gain: float
-    _lines: float
-    _phase_rad: float
-    _sine_offset: float
-    _third: float
-
     def __init__(self, truth: TrueSignals) -> None:
         self._lines = float(truth.lines_per_turn)
         self._sine_offset = truth.sine_offset
@@ -91,12 +79,7 @@ class Signals:
 class Cable:
     """Cable that is taut beyond an angle; it then twists the encoder's body, which reduces the reading."""
 
-    _drag: float
-    _from_deg: float
-    _last_deg: float
     _led: bool
-    _per_deg: float
-    _way: float
 
     def __init__(self, truth: TrueCable) -> None:
         self._from_deg = truth.taut_from_deg
@@ -122,13 +105,7 @@ class SensorWarming:
     lag.
     """
 
-    _exponent: float
-    _goal: float
-    _interval_s: float
-    _last_deg: float
     _led: bool
-    _nearer: float
-    _shift_deg: float
 
     def __init__(self, truth: TrueSensorWarming, interval_s: float) -> None:
         self._goal = truth.arcsec_at_10_deg_s / 100.0 / ARCSEC_PER_DEG
@@ -155,7 +132,6 @@ class Losses:
 
     _counts: tuple[float, ...]
     _count: int
-    _lost: float
     _past: int
     """Number of losses so far."""
     _times_s: tuple[float, ...]
@@ -185,7 +161,6 @@ class Late:
     """Angles since the delayed one, in a ring buffer that starts at ``_oldest``."""
     _kept: int
     _oldest: int
-    _part: float
 
     def __init__(self, late_s: float, dt_s: float, start_deg: float) -> None:
         whole, self._part = divmod(late_s / dt_s, 1.0)

@@ -60,10 +60,7 @@ class MotorOrders:
     _factors: tuple[Factor, ...]
     _flank: Flank
     _flanked: bool
-    _growth_per_nm: float
     _orders: Orders
-    _rad_per_deg: float
-    _turns: float
 
     def __init__(
         self,
@@ -117,11 +114,8 @@ class ElasticHysteresis:
     by_motor_only: bool
     _factors: tuple[Factor, ...]
     _law: Law
-    _loop_arcsec: float
-    _loop_deg: float
     _loop_slope: float
     """Slope of the loop over the last travel of the motor, arcsec per radian."""
-    _reaction: float
 
     def __init__(self, law: Law, factors: tuple[Factor, ...], reaction: float) -> None:
         self._law = law
@@ -149,8 +143,6 @@ class ZeroDrift:
     """Shift of the output proportional to the temperature above ambient."""
 
     by_motor_only: ClassVar[bool] = False
-    _ambient_c: float
-    _arcsec_per_k: float
 
     def __init__(self, ambient_c: float, arcsec_per_k: float) -> None:
         self._ambient_c = ambient_c
@@ -167,10 +159,6 @@ class SlowZeroDrift:
     """
 
     by_motor_only: ClassVar[bool] = False
-    _ambient_c: float
-    _arcsec_per_k: float
-    _housing_c: float
-    _nearer: float
 
     def __init__(self, ambient_c: float, arcsec_per_k: float, start_c: float, nearer: float) -> None:
         self._ambient_c = ambient_c
@@ -261,7 +249,6 @@ class Gear:
 
     by_motor_only: bool
     _pieces: tuple[Piece, ...]
-    _ratio: float
 
     def __init__(self, truth: Truth) -> None:
         pieces = pieces_of(truth)

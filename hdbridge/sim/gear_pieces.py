@@ -29,11 +29,6 @@ SLIDING_DEG_S: Final = 0.5
 class Flank:
     """Loaded flank of the teeth, from -1 to 1, which changes with the motor's travel."""
 
-    _last_deg: float
-    _share: float
-    _shift_deg: float
-    _travel_deg: float
-
     def __init__(self, truth: TrueFlank) -> None:
         self._shift_deg = truth.shift_deg
         self._travel_deg = truth.travel_deg
@@ -51,13 +46,6 @@ class Flank:
 @state
 class SpeedFactor:
     """Factor for rolling friction that grows with the logarithm of the motor speed, with a lag."""
-
-    _dt: float
-    _from_deg_s: float
-    _gain: float
-    _last_deg: float
-    _nearer: float
-    _now: float
 
     def __init__(self, truth: TrueRate, dt_s: float) -> None:
         self._gain = truth.growth_per_decade
@@ -79,9 +67,6 @@ class SpeedFactor:
 class WarmthFactor:
     """Factor that grows linearly with the temperature; at least 0.05."""
 
-    _per_k: float
-    _reference_c: float
-
     def __init__(self, per_k: float, reference_c: float) -> None:
         self._per_k = per_k
         self._reference_c = reference_c
@@ -98,12 +83,6 @@ class Wear:
     """Lost motion between the teeth: the output lags in either direction, and the lag grows with wear."""
 
     by_motor_only: ClassVar[bool] = True
-    _exponent: float
-    _follower_deg: float
-    _last_deg: float
-    _per_1000: float
-    _ratio: float
-    _turns: float
 
     def __init__(self, truth: TrueWear, ratio: float) -> None:
         self._per_1000 = truth.arcsec_per_1000_turns
@@ -133,8 +112,6 @@ class Creep:
 
     by_motor_only: ClassVar[bool] = False
     _amplitudes: tuple[float, ...]
-    _dt: float
-    _last_deg: float
     _nearer: tuple[float, ...]
     _per_nm: tuple[float, ...]
     _states: list[float]
@@ -166,12 +143,10 @@ class Jumps:
     """Tooth jumps, each spread over its duration."""
 
     by_motor_only: ClassVar[bool] = False
-    _dt: float
     _duration_s: tuple[float, ...]
     _step: int
     _teeth: tuple[float, ...]
     _time_s: tuple[float, ...]
-    _tooth_arcsec: float
 
     def __init__(self, jumps: tuple[TrueJump, ...], teeth: float, dt_s: float) -> None:
         self._dt = dt_s
@@ -224,11 +199,6 @@ class Roller:
     """
 
     by_motor_only: ClassVar[bool] = False
-    _amplitude: float
-    _order: float
-    _phase_rad: float
-    _pressed_at_deg: float
-    _sharpness: float
 
     def __init__(self, truth: TrueRoller) -> None:
         self._amplitude = truth.amplitude_arcsec

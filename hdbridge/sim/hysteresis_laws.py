@@ -44,15 +44,7 @@ class RollingFrictionLaw:
     ``x (1 - ln x)`` for n = 2. Only the last reversal counts, so there is no return-point memory.
     """
 
-    _branch_arcsec: float
-    _branch_deg: float
-    _direction: float
-    _error: float
-    _exponent: float
-    _motor_deg: float
-    _offset: float
     _saturated: bool
-    _width: float
 
     def __init__(self, truth: RollingFriction, motor_deg: float) -> None:
         self._offset = truth.offset_arcsec
@@ -98,9 +90,7 @@ class RollingFrictionLaw:
 class MaxwellSlipLaw:
     """Maxwell slip: parallel springs with sliders (Prandtl-Ishlinskii), with return-point memory."""
 
-    _error: float
     _limits: tuple[float, ...]
-    _motor_deg: float
     _states: list[float]
     _stiffnesses: tuple[float, ...]
 
@@ -137,14 +127,6 @@ class BoucWenLaw:
     beta + gamma = 1. It is integrated over the motor's travel x by the midpoint rule, in short steps.
     """
 
-    _beta: float
-    _exponent: float
-    _gamma: float
-    _motor_deg: float
-    _offset: float
-    _yield: float
-    _z: float
-
     def __init__(self, truth: BoucWen, motor_deg: float) -> None:
         self._offset = truth.offset_arcsec
         self._yield = truth.yield_deg
@@ -176,12 +158,6 @@ class BoucWenLaw:
 @state
 class DahlLaw:
     """Dahl's law: ``dz/dx = (1 - z sgn dx)^i / yield``, solved exactly; the error is offset * z."""
-
-    _exponent: float
-    _motor_deg: float
-    _offset: float
-    _yield: float
-    _z: float
 
     def __init__(self, truth: Dahl, motor_deg: float) -> None:
         self._offset = truth.offset_arcsec

@@ -20,15 +20,6 @@ GRAVITY_M_S2 = 9.80665
 class Spring:
     """Spring torque as a function of wind-up: zero within the dead zone, then three linear stages."""
 
-    _first_deg: float
-    _first_nm: float
-    _gap_deg: float
-    _k1: float
-    _k2: float
-    _k3: float
-    _second_deg: float
-    _second_nm: float
-
     def __init__(self, stiffness: float, later: TrueStiffening | None, gap_deg: float) -> None:
         self._gap_deg = gap_deg
         self._k1 = self._k2 = self._k3 = stiffness
@@ -63,16 +54,7 @@ class Spring:
 class LoadedPlant(Plant):
     """`Plant` with every load and spring property of the truth file."""
 
-    _arm_nm: float
-    _breakaway: float
-    _breakaway_exponent: float
-    _breakaway_speed: float
-    _down_deg: float
-    _gap_deg: float
-    _held_deg: float
     _held_nm: list[float]
-    _play_deg: float
-    _played_deg: float
     _shaken: bool
     _shaking_nm: tuple[float, ...]
     _shaking_phase: tuple[float, ...]
@@ -82,10 +64,6 @@ class LoadedPlant(Plant):
     _slides: bool
     _spring: Spring
     _step: int
-    _thinning_exponent: float
-    _thinning_from: float
-    _viscous: float
-    _whole_inertia: float
 
     def __init__(self, truth: Truth) -> None:
         Plant.__init__(self, truth)

@@ -54,7 +54,7 @@ class Machine:
         self._noise = random.Random(f"load encoder {seed}")
         self._rated_nm = truth.motor.rated_torque_nm
         self._sense = float(truth.motor.encoder.direction)
-        self._limit_nm = self._rated_limit_nm = axis.loops.servo.limit_nm
+        self._limit_nm = self._rated_limit_nm = axis.servo.limit_nm
         self._limit_permille = 1000.0 * self._limit_nm / self._rated_nm
         self._response: Response | None = None
         if truth.servo.response is not None:

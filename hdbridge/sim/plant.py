@@ -40,34 +40,14 @@ class Plant:
 
     now: Conditions
     """Angles of motor and load, and the other conditions of the gear."""
-    motor_deg_s: float
-    load_deg_s: float
-    output_deg: float
-    encoder_deg: float
     loss_j: float
     """Friction work at the motor shaft since this attribute was last reset."""
     outer_nm: float
     """External torque on the load, in addition to its weight; only `LoadedPlant` applies it."""
-    _arm: float
-    _cold_coulomb: float
-    _cold_drag: float
-    _cold_sticking: float
-    _coulomb: float
     _coupled: bool
     _coupling: Transition
-    _damping: float
-    _drag: float
-    _dt: float
-    _encoder_rate: float
     _flexspline: Transition
     _gear: Gear
-    _inertia: float
-    _load_drag: float
-    _load_friction: float
-    _ratio: float
-    _sticking: float
-    _stiffness: float
-    _stribeck: float
 
     def __init__(self, truth: Truth) -> None:
         dt = truth.substep_s

@@ -30,10 +30,7 @@ class MovingAverage:
     ago.
     """
 
-    _duration_s: float
-    _integral: float
     _late_integral: Late
-    _start_deg: float
 
     def __init__(self, duration_s: float, dt_s: float) -> None:
         self._duration_s = max(duration_s, dt_s)
@@ -58,13 +55,6 @@ class MovingAverage:
 @state
 class Notch:
     """Second-order notch, transposed direct form."""
-
-    _a1: float
-    _a2: float
-    _b0: float
-    _b2: float
-    _first: float
-    _second: float
 
     def __init__(self, truth: TrueNotch | None, dt_s: float) -> None:
         half = math.tan(math.pi * min(truth.frequency_hz * dt_s, HIGHEST_NOTCH)) if truth else 0.0
@@ -95,43 +85,11 @@ class Servo:
 
     limit_nm: float
     """Torque limit in either direction."""
-    measured_deg_s: float
-    _acceleration_gain: float
     _average: MovingAverage
-    _dead_band: float
-    _decay: float
-    _direction: float
-    _dt: float
-    _filter: float
-    _filtered_nm: float
-    _filtered_speed: float
-    _friction: float
-    _hunting_band: float
-    _integral: float
-    _integral_rate: float
-    _last_reference: float
-    _load_ahead: float
-    _load_gain: float
     _load_known: bool
     _load_model: Transition
-    _load_speed: float
-    _measured: float
-    _momentum: float
     _notch: Notch
-    _observed_nm: float
-    _observed_share: float
-    _observer_share: float
-    _position_gain: float
-    _reference: float
-    _reference_speed: float
-    _speed_share: float
-    _step_deg: float
-    _steps_per_deg: float
     _sums_position: bool
-    _torque_share: float
-    _velocity_feedforward: float
-    _velocity_gain: float
-    _viscous: float
     _with_average: bool
     _with_filters: bool
 
