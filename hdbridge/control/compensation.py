@@ -64,8 +64,6 @@ class CompensationLimits:
 class _Faded(Tracker):
     """Tracker that multiplies an effect's error by a weight; it follows the motion at any weight."""
 
-    __slots__ = ("_tracker", "needs", "weight")
-
     def __init__(self, tracker: Tracker, needs: frozenset[Channel]) -> None:
         self._tracker = tracker
         self.needs = needs
@@ -80,12 +78,6 @@ class _Faded(Tracker):
 
 class Inverse:
     """Inverse of the model, from the state after the last `advance`."""
-
-    __slots__ = (
-        "_before_deg", "_error", "_fall", "_forward", "_known", "_moment", "_motor_deg", "_offset",
-        "_offsets", "_peeked", "_rise", "_slope", "_standing", "_stateful", "_timeless", "_tracker", "_turns",
-        "faded", "memory_deg", "needs",
-    )  # fmt: skip
 
     def __init__(self, model: TransmissionModel, start: Start = Start.VIRGIN) -> None:
         """Omits effects that cannot or must not be compensated, such as the load encoder's errors.
@@ -303,12 +295,6 @@ class Compensation:
     It begins disengaged, with a motor target of N times the load target. `engage` and `disengage` fade the
     correction in and out, so switching never causes a jump.
     """
-
-    __slots__ = (
-        "_fading", "_inverse", "_known", "_prefilter", "_ratio", "_static", "_target",
-        "correction_arcsec", "limited", "maximum_arcsec", "model", "needs", "ramp_step",
-        "step_arcsec", "weight",
-    )  # fmt: skip
 
     def __init__(self, model: TransmissionModel, limits: CompensationLimits, period_s: float) -> None:
         """``period_s`` is the control cycle.

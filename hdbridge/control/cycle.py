@@ -25,11 +25,6 @@ class Cycle:
     and the list of faults; ``monitor`` may be shared with the boot-up.
     """
 
-    __slots__ = (
-        "_axis", "_bus", "_exchange", "clock", "histogram", "monitor", "period_s", "stop_feedbacks",
-        "supervision",
-    )  # fmt: skip
-
     def __init__(
         self,
         link: Link,

@@ -31,8 +31,6 @@ class FaultCount(BaseModel):
 class FaultCounter:
     """Counts faults and skipped periods since its creation."""
 
-    __slots__ = ("_before", "_skipped", "_supervision")
-
     def __init__(self, supervision: Supervision, skipped: int) -> None:
         """``skipped`` is the number of periods skipped before its creation."""
         self._supervision = supervision

@@ -42,8 +42,6 @@ class Histogram:
     Its size is fixed at 704 integers.
     """
 
-    __slots__ = ("_counts", "maximum_us", "total")
-
     def __init__(self) -> None:
         self._counts = [0] * _BINS
         self.total = 0
