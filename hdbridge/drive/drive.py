@@ -23,7 +23,7 @@ from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.drive import modes, objects
 from hdbridge.drive.bootup import BootReport, BootUp
 from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
-from hdbridge.drive.dictionary import find
+from hdbridge.drive.dictionary import dictionary_of, find
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.masterdetection import DEFAULT_MASTER_ID, MasterDetector, listening_s
@@ -33,7 +33,6 @@ from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoAbortError, SdoClient
 from hdbridge.drive.states import Command, State, decode, row_for
 from hdbridge.drive.writes import master_heartbeat
 from hdbridge.errors import DriveError, HdbridgeError, InputError, TransitionError
-from hdbridge.files.edsfile import shared_eds
 
 _log = logging.getLogger(__name__)
 _CLOSING_TIMEOUT_S: Final = 0.2
@@ -69,8 +68,7 @@ class Drive:
         self.axis = axis
         self.link = Link(bus, clock if clock is not None else MonotonicClock())
         self.monitor = NetworkMonitor(axis.drive.node_id)
-        if od is None:
-            od = shared_eds(axis.eds_path, axis.drive.node_id).dictionary
+        od = dictionary_of(axis) if od is None else od
         self.image = ProcessImage(axis, od)
         self.sdo = SdoClient(self.link, self.monitor, axis.drive.node_id, od, sdo_timeout_s)
         self._clients = {axis.drive.node_id: self.sdo}
