@@ -261,7 +261,8 @@ class Drive:
         before anything is sent if a value is not finite or outside the limits, `DriveError` if the drive
         fails on the way, and `TransitionError` on time-out (computed from the travel unless given).
         """
-        move = modes.ProfileMove.checked(self.image, load_deg, velocity_deg_s, acceleration_deg_s2, timeout_s)
+        move = modes.ProfileMove(load_deg, velocity_deg_s, acceleration_deg_s2, timeout_s)
+        move.checked(self.image)
         self._need(Mode.PP)
         modes.run_move(self._commander, move)
         return self.read_positions()
@@ -279,15 +280,10 @@ class Drive:
 
         Speeds, acceleration and offset (607Ch) are at the load. Raises like `move_to`.
         """
-        homing = modes.Homing.checked(
-            self.axis,
-            method,
-            switch_velocity_deg_s,
-            zero_velocity_deg_s,
-            acceleration_deg_s2,
-            offset_deg,
-            timeout_s,
+        homing = modes.Homing(
+            method, switch_velocity_deg_s, zero_velocity_deg_s, acceleration_deg_s2, offset_deg, timeout_s
         )
+        homing.checked(self.axis)
         self._need(Mode.HM)
         modes.run_homing(self._commander, homing)
         return self.read_positions()
