@@ -321,9 +321,7 @@ class AxisCycle:
         return reaction
 
     def _latch(self) -> None:
-        """Stops sending set-points to the axis and withdraws the request to enable it, so that it restarts
-        disabled.
-        """
+        """Stops the set-points of the axis, and withdraws the request to enable it."""
         self.image.power.quick_stop()
         if not self.silent:
             self.silence()
@@ -338,9 +336,7 @@ class AxisCycle:
                 self.changed()
 
     def _believable(self, last: Feedback, count: int) -> bool:
-        """Returns False if the positions contradict the last good ones; also records an excessive following
-        error.
-        """
+        """Returns False if the positions contradict the last ones; records an excessive following error."""
         image, plausibility = self.image, self._plausibility
         motor = image.motor_counts
         cycles = count - self._good_cycle

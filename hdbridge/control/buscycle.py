@@ -376,9 +376,7 @@ class BusCycle:
                     axis.pending.append((Fault.LOST_TPDO, ", ".join(lost)))
 
     def _other(self, frame: Frame) -> None:
-        """Forwards a frame that the cycle does not wait for to its axis and to ``on_frame``; records bus
-        faults.
-        """
+        """Forwards any other frame to its axis and to ``on_frame``; records bus faults."""
         self._period_bits += FRAME_BITS[len(frame.data)]
         axis = self._listeners.get(frame.can_id)
         if axis is not None:

@@ -204,8 +204,7 @@ class Inverse:
         self._forward = forward
 
     def solve(self, load_deg: float, moment: Moment = _NOWHERE, weight: float = 1.0) -> float:
-        """Returns the motor angle in degrees that brings the load to ``load_deg``; the state does not
-        change.
+        """Returns the motor angle, degrees, that brings the load to ``load_deg``; changes no state.
 
         ``weight`` scales the error (0: uncompensated). Accurate to 1e-6 arcsec at the load, or to the last
         bit of the motor angle if the error is so steep that one bit exceeds this.
@@ -268,8 +267,7 @@ class Inverse:
 
 
 def _gentle(effects: tuple[Effect, ...], start: Start, steepest: float) -> tuple[list[Tracker], float]:
-    """Returns trackers of the effects, and a bound on the steepest negative slope of their sum, arcsec per
-    motor degree.
+    """Returns trackers of the effects, and a bound on the fall of their sum, arcsec per motor degree.
 
     The load rests while the motor crosses backlash. The error then falls as fast as the motor angle divided
     by the ratio rises, or faster if noise made the fitted backlash too narrow. If the sum would fall more

@@ -158,9 +158,7 @@ class LatencyReport:
 
     @property
     def sustained_s(self) -> float | None:
-        """Shortest measured period that the computer sustains together with all longer ones; None if there is
-        none.
-        """
+        """Shortest measured period that the computer sustains together with all longer ones, or None."""
         best = None
         for each in reversed(self.measurements):
             if not each.sustained:

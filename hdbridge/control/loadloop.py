@@ -150,8 +150,7 @@ class LoadLoop:
         return self._doubt
 
     def use_models(self, whole: TransmissionModel, predicting: TransmissionModel) -> None:
-        """Sets the models: ``whole`` has the full hysteresis, ``predicting`` predicts the ``motor`` argument
-        of `step`.
+        """Sets the models: ``predicting`` gives the ``motor`` of `step`, ``whole`` has the full hysteresis.
 
         The load may lag the motor by the unpredicted part of the hysteresis, and by a fraction of the
         predicted part. If the hysteresis is unknown, only the loop's own bound limits the lag.

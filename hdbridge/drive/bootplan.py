@@ -44,9 +44,7 @@ def plan(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[PlannedWr
 
 
 def left_to_drive(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[OmittedObject]:
-    """Returns the objects whose values `plan` leaves to the drive, and the missing objects that the control
-    cycle does not need.
-    """
+    """Returns the objects that `plan` leaves to the drive, and missing ones that the cycle does not need."""
     od = dictionary_of(axis) if od is None else od
     return [*_split(axis, od)[1], *_not_read(axis, od)]
 
@@ -145,9 +143,7 @@ def _value_of_6502h(od: ObjectDictionary) -> int:
 
 
 def _not_read(axis: AxisConfig, od: ObjectDictionary) -> Iterator[OmittedObject]:
-    """Yields the optional objects that the control cycle and the boot-up would read, but that the drive
-    cannot provide.
-    """
+    """Yields the optional objects of cycle and boot-up that the drive cannot provide."""
     absent = layouts(axis, od).absent
     for address, consequence in (
         (objects.POSITION_DEMAND, "the last target sent is used instead"),

@@ -85,8 +85,7 @@ class Drive:
         """Result of the last boot-up."""
 
     def listen(self) -> None:
-        """Listens once for another master on the bus, without sending; raises `BusInUseError` if there is
-        one.
+        """Listens once for another master without sending; raises `BusInUseError` if there is one.
 
         Takes two heartbeat periods, and at least the 0.51 s in which the slowest master sends two SYNCs.
         Called by `boot`; must be called before reading objects of a drive that is not booted.
@@ -135,8 +134,7 @@ class Drive:
         return Identity.model_validate({**self.axis.drive.identity.model_dump(exclude_none=True), **answered})
 
     def enable(self, mode: Mode | None = None) -> None:
-        """Prepares for power in ``mode``: sets target = actual position and the mode, checks 6061h, then
-        enables.
+        """Sets the target to the actual position, sets and checks the mode, then enables.
 
         The default is the mode of the control cycle (``drive.mode``). In PP and HM, this method walks the
         states by SDO. A cyclic mode requires SYNC and set-points while the drive is enabled, so this method
@@ -301,9 +299,7 @@ class Drive:
         return Positions(motor, load, self.image.motor_deg(motor), self.image.load_deg(load))
 
     def can_set(self, address: Address) -> bool:
-        """Returns True if an object can be written, according to the EDS and to the writes accepted in the
-        boot-up.
-        """
+        """Returns True if an object can be written, by the EDS and by the writes of the boot-up."""
         variable = find(self.sdo.od, address.index, address.sub)
         left = self.report.left if self.report is not None else ()
         return variable is not None and variable.writable and (address.index, address.sub) not in left
@@ -377,9 +373,7 @@ class Drive:
                 quick.store(objects.HEARTBEAT_CONSUMER, 0)
 
     def _power_off_blindly(self) -> None:
-        """Powers off without waiting for answers, so that even a drive that can no longer send is powered
-        off.
-        """
+        """Powers off without waiting for answers, because a drive may be unable to send."""
         request = objects.COB_SDO_REQUEST + self.axis.drive.node_id
         with suppress(HdbridgeError):
             for word in (Command.QUICK_STOP.word, Command.DISABLE_VOLTAGE.word):

@@ -190,9 +190,7 @@ def _offers(od: ObjectDictionary, communication: int, mapping: int) -> Iterator[
 
 
 def mapped(od: ObjectDictionary, words: Iterable[int | None]) -> tuple[PdoEntry, ...]:
-    """Decodes the words of a mapping into entries; empty if a word is unknown or not a whole
-    number of bytes.
-    """
+    """Decodes a mapping; empty if a word is unknown or the length is not a whole number of bytes."""
     entries = []
     for word in words:
         if word is None:
@@ -338,9 +336,7 @@ def _check_needed(
 
 
 def _source_complaints(axis: AxisConfig, od: ObjectDictionary, offers: Sequence[_Offer]) -> Iterator[str]:
-    """Yields an error for each load encoder or channel object that is missing, has a different type or cannot
-    be mapped.
-    """
+    """Yields an error for each source that is missing, has a different type or cannot be mapped."""
     sources: dict[str, Source | ChannelSource] = {}
     if axis.load_encoder.source.node is None:
         sources["load_encoder"] = axis.load_encoder.source

@@ -48,9 +48,7 @@ class Object:
         return f"{self.index:04X}h:{self.sub:02X}" + (f" '{self.name}'" if self.name else "")
 
     def decode(self, data: bytes) -> Value:
-        """Decodes a value; unknown types become hexadecimal text. `InputError` if the bytes do not fit the
-        type.
-        """
+        """Decodes a value, of unknown types as hexadecimal text; `InputError` for a wrong length."""
         try:
             if self.integer is not None:
                 return self.integer.decode(_fitting(data, self.integer.bits // 8))

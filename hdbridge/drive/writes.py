@@ -173,9 +173,7 @@ def _pdos(axis: AxisConfig, od: ObjectDictionary, pdos: Layouts) -> Iterator[Pla
 
 
 def _carried(axis: AxisConfig, layout: Layout) -> list[str]:
-    """Returns, for each entry of a PDO, the key of the axis file that requests the object; empty if no key
-    does.
-    """
+    """Returns the key of the axis file that requests each entry of a PDO; empty without one."""
     encoder = axis.load_encoder.source
     keys = {(encoder.index, encoder.subindex): "load_encoder.source"}
     for key, channel in axis.channels.items():
@@ -252,9 +250,7 @@ def _cycle(axis: AxisConfig, od: ObjectDictionary) -> Iterator[PlannedWrite]:
 
 
 def _period(axis: AxisConfig, od: ObjectDictionary) -> tuple[int, int]:
-    """Returns the cycle time as a mantissa and an exponent that the drive accepts; some drives fix the
-    exponent or the period.
-    """
+    """Returns the cycle time as a mantissa and an exponent (base 10, s) that the drive accepts."""
     seconds = Decimal(repr(axis.drive.cycle_ms)) / 1000
     pairs = [(seconds.scaleb(-exponent), exponent) for exponent in _EXPONENTS]
     whole = [(int(m), e) for m, e in pairs if m == int(m) and 1 <= m <= _LARGEST_MANTISSA]

@@ -101,9 +101,7 @@ class Cable:
 
 @state
 class SensorWarming:
-    """Shift of the reading with the encoder's warming: proportional to the square of the speed, with a
-    lag.
-    """
+    """Shift of the reading with the encoder's warming, which lags the square of the speed."""
 
     _led: bool
 
@@ -212,8 +210,7 @@ class FixedErrors:
 
 @state
 class Body:
-    """Shift of the load encoder's reading by its cable and its warming, which depend on the travel of its
-    shaft.
+    """Shift of the load encoder's reading by its cable and its warming.
 
     The shift has a state, so it must be updated once per substep; it may be read at any time.
     """

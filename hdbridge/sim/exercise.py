@@ -86,9 +86,7 @@ class Exercise:
             self.lead(way, 2.0 * ramp_s + even_s, distance_deg)
 
     def sine(self, amplitude_deg: float, frequency_hz: float, periods: float) -> None:
-        """Oscillates as 1 - cos, between the current position and a position at twice the amplitude from
-        it.
-        """
+        """Oscillates as 1 - cos, from here to twice the amplitude from here."""
         turn = math.tau * frequency_hz
         self.lead(lambda seconds: amplitude_deg * (1.0 - np.cos(turn * seconds)), periods / frequency_hz)
 

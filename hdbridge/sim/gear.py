@@ -154,9 +154,7 @@ class ZeroDrift:
 
 @state
 class SlowZeroDrift:
-    """Shift of the output proportional to the temperature of a housing, which lags the measured
-    temperature.
-    """
+    """Shift of the output with the temperature of a housing, which lags the measured temperature."""
 
     by_motor_only: ClassVar[bool] = False
 

@@ -194,9 +194,7 @@ class Damage:
 
 @state
 class Roller:
-    """Roller on the motor's hub: an error that varies with the roller's own angle, largest at the load angle
-    of the contact.
-    """
+    """Roller on the motor's hub: an error over its own angle, largest at the load angle of the contact."""
 
     by_motor_only: ClassVar[bool] = False
 

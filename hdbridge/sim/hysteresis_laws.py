@@ -23,9 +23,7 @@ class Law(Protocol):
 
 
 def law_of(truth: Hysteresis | None, motor_deg: float) -> Law | None:
-    """Returns the hysteresis law of a truth file in its initial state at a motor angle; None without
-    hysteresis.
-    """
+    """Returns the law of a truth file in its initial state at a motor angle; None without hysteresis."""
     if isinstance(truth, RollingFriction):
         return RollingFrictionLaw(truth, motor_deg)
     if isinstance(truth, MaxwellSlip):

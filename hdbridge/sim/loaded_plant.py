@@ -195,9 +195,7 @@ class LoadedPlant(Plant):
         return min(limit, max(-limit, held))
 
     def _play(self, load_deg: float) -> float:
-        """Returns the angle of the coupling's near side, which the load drags along once it has crossed the
-        play.
-        """
+        """Returns the angle of the coupling's near side, which the load drags along across the play."""
         played = min(load_deg + self._play_deg, max(load_deg - self._play_deg, self._played_deg))
         self._played_deg = played
         return played

@@ -21,9 +21,7 @@ FloatArray = fast.FloatArray
 
 
 class Cycles(NamedTuple):
-    """Measurements at the end of each of many cycles, named like the machine's attributes; shape (n,)
-    each.
-    """
+    """Measurements at the end of many cycles, named like the machine's attributes; shape (n,) each."""
 
     motor_reading: FloatArray
     load_reading: FloatArray
@@ -40,8 +38,7 @@ class Machine:
     """
 
     def __init__(self, truth: Truth, seed: int, *, may_compile: bool = False, loaded: bool = False) -> None:
-        """``may_compile`` permits a pause of some seconds, after which the machine runs faster; see
-        `sim.fast`.
+        """``may_compile`` permits a pause of some seconds, then the machine is faster (`sim.fast`).
 
         ``loaded`` permits an external torque on the load in `follow_all`.
         """

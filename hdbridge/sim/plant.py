@@ -171,9 +171,7 @@ class Plant:
         self._encoder_rate = rate + step.rate_by_distance * ahead + step.rate_by_rate * slip
 
     def _apply_friction(self, before: float, load: float, speed: float, loss: float) -> tuple[float, float]:
-        """Applies Coulomb friction at the load: reduces the load's speed, or holds the load if the friction
-        suffices.
-        """
+        """Applies Coulomb friction at the load: slows the load, or holds it if the friction suffices."""
         if abs(speed) <= loss:
             return before, 0.0
         loss = math.copysign(loss, speed)

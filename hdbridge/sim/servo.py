@@ -26,9 +26,7 @@ integral may rest."""
 
 @state
 class MovingAverage:
-    """Moving average of the demand, computed from the integral of the demand now and one averaging time
-    ago.
-    """
+    """Moving average of the demand, from its integral now and one averaging time ago."""
 
     _late_integral: Late
 
@@ -131,9 +129,7 @@ class Servo:
         self.engage(0.0, 0.0)
 
     def engage(self, motor_deg: float, motor_deg_s: float) -> float:
-        """Starts the loops at the motor's position, without torque or error; returns the angle that they
-        measure.
-        """
+        """Starts the loops at a motor angle, without torque or error; returns the angle that they measure."""
         self._measured = self._interpolated(motor_deg)
         self._reference = self._last_reference = self._measured
         self._reference_speed = self.measured_deg_s = motor_deg_s
