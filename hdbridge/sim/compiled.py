@@ -28,7 +28,7 @@ from numba.core.registry import cpu_target
 from numba.core.typing.arraydecl import RecordAttribute
 from numba.extending import overload, overload_method
 
-from hdbridge.sim import ageing, encoder, gear, gear_pieces, hysteresis_laws
+from hdbridge.sim import encoder, gear, gear_pieces, hysteresis_laws
 from hdbridge.sim.axis import Axis, Measured
 from hdbridge.sim.fast import FloatArray, IntArray
 from hdbridge.sim.plant import Plant
@@ -71,7 +71,7 @@ KINDS: Final[dict[Any, Kinds]] = {
             gear.ZeroDrift,
             gear.SlowZeroDrift,
             gear_pieces.Wear,
-            ageing.WornTeeth,
+            gear_pieces.WornTeeth,
             gear_pieces.Creep,
             gear_pieces.Jumps,
             gear_pieces.Damage,
@@ -81,7 +81,7 @@ KINDS: Final[dict[Any, Kinds]] = {
         0.0,
     ),
     gear.Factor: Kinds(
-        (gear_pieces.SpeedFactor, gear_pieces.WarmthFactor, ageing.AgeFactor),
+        (gear_pieces.SpeedFactor, gear_pieces.WarmthFactor, gear_pieces.AgeFactor),
         4,
         1.0,
     ),

@@ -8,8 +8,8 @@ The error is a sum of pieces, each a physical cause. To add a cause, write a cla
 import math
 from typing import ClassVar, Protocol
 
-from hdbridge.sim.ageing import AgeFactor, WornTeeth
 from hdbridge.sim.gear_pieces import (
+    AgeFactor,
     Creep,
     Damage,
     Flank,
@@ -19,6 +19,7 @@ from hdbridge.sim.gear_pieces import (
     SpeedFactor,
     WarmthFactor,
     Wear,
+    WornTeeth,
 )
 from hdbridge.sim.hysteresis_laws import Law, law_of
 from hdbridge.sim.orders import Orders

@@ -1,15 +1,18 @@
 """Causes of transmission error in the gear other than orders and hysteresis; see `hdbridge.sim.gear`.
 
 Each piece is evaluated once per substep, in order of time, so a piece with a state advances by one substep
-per evaluation.
+per evaluation. Ageing is linear from switch-on: stiffening grease and settling preload change the hysteresis
+loop, and wear of the teeth changes the tooth error.
 """
 
 import math
 import random
 from typing import ClassVar, Final
 
+from hdbridge.sim.orders import Orders
 from hdbridge.sim.state import Conditions, state
 from hdbridge.sim.truth.gear import (
+    TrueAgeing,
     TrueCreep,
     TrueDamage,
     TrueFlank,
@@ -76,6 +79,53 @@ class WarmthFactor:
 
     def at(self, temperature_c: float) -> float:
         return max(0.05, 1.0 + self._per_k * (temperature_c - self._reference_c))
+
+
+@state
+class Age:
+    """Completed fraction of the ageing, which rises from 0 at switch-on to 1 and stays there."""
+
+    def __init__(self, truth: TrueAgeing, dt_s: float) -> None:
+        self._step = dt_s / truth.duration_s
+        self._share = 0.0
+
+    def grown(self) -> float:
+        """Advances by one substep and returns the completed fraction."""
+        self._share = min(1.0, self._share + self._step)
+        return self._share
+
+
+@state
+class AgeFactor:
+    """Factor that multiplies the elastic hysteresis and grows with age."""
+
+    _age: Age
+
+    def __init__(self, truth: TrueAgeing, dt_s: float) -> None:
+        self._age = Age(truth, dt_s)
+        self._growth = truth.hysteresis_growth
+
+    def factor(self, now: Conditions) -> float:
+        return 1.0 + self._growth * self._age.grown()
+
+
+@state
+class WornTeeth:
+    """Additional tooth error, a function of the motor angle, that grows with age."""
+
+    by_motor_only: ClassVar[bool] = False
+    _age: Age
+    _orders: Orders
+
+    def __init__(self, truth: TrueAgeing, dt_s: float) -> None:
+        self._age = Age(truth, dt_s)
+        self._orders = Orders(truth.motor_orders)
+
+    def arcsec(self, now: Conditions) -> float:
+        share = self._age.grown()
+        error, slope = self._orders.at(math.radians(now.motor_deg))
+        now.slope_arcsec += share * slope
+        return share * error
 
 
 @state
