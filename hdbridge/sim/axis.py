@@ -58,41 +58,28 @@ class Measured(NamedTuple):
 class Axis:
     """Servo axis, initially at rest at angle zero with its power stage off."""
 
-    heat: Heat
-    plant: Plant
-    servo: Servo
-    _body: Body
     _holds: bool
     """True while the demand has not changed since switch-on."""
-    _late_demand: Late
-    _late_load: Late
-    _late_motor: Late
-    _load_errors: FixedErrors
-    _load_losses: Losses
-    _motor_errors: FixedErrors
-    _motor_losses: Losses
     _plain: bool
     """True if the demand is not delayed and the encoders are ideal."""
-    _powered: bool
-    _with_late_demand: bool
-    _with_late_load: bool
-    _with_late_motor: bool
 
     def __init__(self, truth: Truth, *, loaded: bool = False) -> None:
         """``loaded`` allows an external torque on the load."""
         motor, load = truth.motor.encoder, truth.load_.encoder
         dt_s = self._dt_s = truth.substep_s
-        self.plant = LoadedPlant(truth) if loaded or LoadedPlant.needed(truth) else Plant(truth)
+        self.plant: Plant = LoadedPlant(truth) if loaded or LoadedPlant.needed(truth) else Plant(truth)
         self.servo = Servo(truth)
         self.heat = Heat(truth)
         self._powered = self._holds = False
         self._hold_counts = self._hold_deg = 0.0
         self.motor_counts_per_deg = motor.direction * motor.counts_per_turn / DEG_PER_TURN
         self._motor_zero = float(motor.zero_counts)
-        self._motor_errors, self._motor_losses = FixedErrors(motor), Losses(motor.losses)
+        self._motor_errors = FixedErrors(motor)
+        self._motor_losses = Losses(motor.losses)
         self._load_counts_per_deg = load.direction * load.counts_per_turn / DEG_PER_TURN
         self._load_zero = float(load.zero_counts)
-        self._load_errors, self._load_losses = FixedErrors(load), Losses(load.losses)
+        self._load_errors = FixedErrors(load)
+        self._load_losses = Losses(load.losses)
         self._body = Body(load, dt_s)
         self._with_late_motor = bool(motor.late_ms)
         self._late_motor = Late(motor.late_ms / 1e3, dt_s, self.plant.now.motor_deg)

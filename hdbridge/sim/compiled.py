@@ -217,29 +217,48 @@ def _version() -> int:
 
 @cache
 def _attributes(cls: Any) -> dict[str, Any]:
-    """Returns the attributes of a state class and its ancestors with their types, ``float`` by default."""
-    hints = get_type_hints(cls)
-    family = [each for each in reversed(cls.__mro__) if each in STATES]
-    assigned = [name for each in family for name in _assigned(each.__module__)[each.__name__]]
-    return {name: hints.get(name, float) for name in assigned}
+    """Returns the attributes of a state class and its ancestors, with their types.
+
+    The type of an attribute is that of its annotation, else that of a constant or a constructor call that is
+    assigned to it, else ``float``.
+    """
+    found: dict[str, Any] = {}
+    for each in reversed(cls.__mro__):
+        if each in STATES:
+            found |= _assigned(each.__module__)[each.__name__]
+    return found | {name: hint for name, hint in get_type_hints(cls).items() if name in found}
 
 
 @cache
-def _assigned(module: str) -> dict[str, list[str]]:
-    """Returns the attributes that the methods of each class of a module assign."""
-    tree = ast.parse(inspect.getsource(sys.modules[module]))
-    return {
-        cls.name: [
-            each.attr
-            for each in ast.walk(cls)
-            if isinstance(each, ast.Attribute)
-            and isinstance(each.ctx, ast.Store)
-            and isinstance(each.value, ast.Name)
-            and each.value.id == "self"
-        ]
-        for cls in tree.body
-        if isinstance(cls, ast.ClassDef)
-    }
+def _assigned(module: str) -> dict[str, dict[str, Any]]:
+    """Returns the attributes that the methods of each class of a module assign, with their types."""
+    tree, scope = ast.parse(inspect.getsource(sys.modules[module])), vars(sys.modules[module])
+    found: dict[str, dict[str, Any]] = {}
+    for cls in (each for each in tree.body if isinstance(each, ast.ClassDef)):
+        own = found[cls.name] = dict.fromkeys(_stored(cls), float)
+        for each in ast.walk(cls):
+            if isinstance(each, ast.AnnAssign):
+                own |= dict.fromkeys(_stored(each.target), eval(ast.unparse(each.annotation), scope))
+            elif isinstance(each, ast.Assign) and (kind := _type_of(each.value, scope)) is not None:
+                own |= dict.fromkeys(_stored(*each.targets), kind)
+    return found
+
+
+def _stored(*nodes: ast.AST) -> list[str]:
+    """Returns the attributes of ``self`` that are assigned in these nodes."""
+    every = [each for node in nodes for each in ast.walk(node) if isinstance(each, ast.Attribute)]
+    stored = [each for each in every if isinstance(each.ctx, ast.Store)]
+    return [each.attr for each in stored if ast.unparse(each.value) == "self"]
+
+
+def _type_of(value: ast.expr, scope: dict[str, Any]) -> Any:
+    """Returns the type of a constant, or the state class or type of numbers that is called; else None."""
+    if isinstance(value, ast.Constant):
+        return type(value.value)
+    if isinstance(value, ast.Call) and isinstance(value.func, ast.Name):
+        called = eval(value.func.id, scope)
+        return called if called in STATES or called in (float, int, bool) else None
+    return None
 
 
 class Members(NamedTuple):

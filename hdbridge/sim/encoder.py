@@ -79,8 +79,6 @@ class Signals:
 class Cable:
     """Cable that is taut beyond an angle; it then twists the encoder's body, which reduces the reading."""
 
-    _led: bool
-
     def __init__(self, truth: TrueCable) -> None:
         self._from_deg = truth.taut_from_deg
         self._per_deg = truth.arcsec_per_deg / ARCSEC_PER_DEG
@@ -102,8 +100,6 @@ class Cable:
 @state
 class SensorWarming:
     """Shift of the reading with the encoder's warming, which lags the square of the speed."""
-
-    _led: bool
 
     def __init__(self, truth: TrueSensorWarming, interval_s: float) -> None:
         self._goal = truth.arcsec_at_10_deg_s / 100.0 / ARCSEC_PER_DEG
@@ -128,17 +124,14 @@ class SensorWarming:
 class Losses:
     """Lost counts of an encoder."""
 
-    _counts: tuple[float, ...]
-    _count: int
     _past: int
     """Number of losses so far."""
-    _times_s: tuple[float, ...]
 
     def __init__(self, losses: Iterable[TrueLoss]) -> None:
         in_order = sorted(losses, key=lambda each: each.time_s)
-        self._times_s = tuple(each.time_s for each in in_order)
-        self._counts = tuple(float(each.counts) for each in in_order)
-        self._count = len(in_order)
+        self._times_s: tuple[float, ...] = tuple(each.time_s for each in in_order)
+        self._counts: tuple[float, ...] = tuple(float(each.counts) for each in in_order)
+        self._count: int = len(in_order)
         self._past, self._lost = 0, 0.0
 
     def counts(self, now_s: float) -> float:
@@ -157,12 +150,10 @@ class Late:
     """Delayed angle."""
     _angles: list[float]
     """Angles since the delayed one, in a ring buffer that starts at ``_oldest``."""
-    _kept: int
-    _oldest: int
 
     def __init__(self, late_s: float, dt_s: float, start_deg: float) -> None:
         whole, self._part = divmod(late_s / dt_s, 1.0)
-        self._kept = int(whole) + 2
+        self._kept: int = int(whole) + 2
         self._angles = [0.0] * self._kept
         self.begin(start_deg)
 
@@ -187,14 +178,10 @@ class Late:
 class FixedErrors:
     """Reading errors that depend on the shaft's angle alone."""
 
-    _disc: Disc
-    _signals: Signals
-    _with_disc: bool
-    _with_signals: bool
-
     def __init__(self, truth: TrueEncoder) -> None:
         signals = truth.signals if isinstance(truth, TrueLoadEncoder) else None
-        self._with_disc, self._with_signals = truth.disc is not None, signals is not None
+        self._with_disc = bool(truth.disc)
+        self._with_signals = bool(signals)
         self._disc = Disc(truth.disc or TrueDisc(radius_mm=1.0))
         self._signals = Signals(signals or TrueSignals(lines_per_turn=1))
 
@@ -217,8 +204,6 @@ class Body:
 
     deg: float
     """Current shift of the reading."""
-    moves: bool
-    _errors: tuple[ReadingError, ...]
 
     def __init__(self, truth: TrueLoadEncoder, dt_s: float) -> None:
         errors: list[ReadingError] = []
@@ -226,7 +211,7 @@ class Body:
             errors.append(Cable(truth.cable))
         if truth.sensor_warming is not None:
             errors.append(SensorWarming(truth.sensor_warming, dt_s))
-        self._errors = tuple(errors)
+        self._errors: tuple[ReadingError, ...] = tuple(errors)
         self.moves = bool(errors)
         self.deg = 0.0
 

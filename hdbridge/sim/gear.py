@@ -57,12 +57,6 @@ class MotorOrders:
     The error may also depend on the loaded flank, the torque and the temperature.
     """
 
-    by_motor_only: bool
-    _factors: tuple[Factor, ...]
-    _flank: Flank
-    _flanked: bool
-    _orders: Orders
-
     def __init__(
         self,
         orders: tuple[TrueOrder, ...],
@@ -75,10 +69,10 @@ class MotorOrders:
         self._turns = turns
         self._rad_per_deg = math.radians(turns)
         self._growth_per_nm = growth_per_nm
-        self._flanked = flank is not None
+        self._flanked: bool = flank is not None
         self._flank = Flank(flank if flank is not None else TrueFlank(shift_deg=0.0, travel_deg=1.0))
-        self._factors = factors
-        self.by_motor_only = flank is None and not growth_per_nm and not factors
+        self._factors: tuple[Factor, ...] = factors
+        self.by_motor_only: bool = flank is None and not growth_per_nm and not factors
 
     def arcsec(self, now: Conditions) -> float:
         angle_deg = now.motor_deg
@@ -99,7 +93,6 @@ class LoadOrders:
     """Tooth error as a function of the load angle."""
 
     by_motor_only: ClassVar[bool] = False
-    _orders: Orders
 
     def __init__(self, orders: tuple[TrueOrder, ...]) -> None:
         self._orders = Orders(orders)
@@ -112,19 +105,16 @@ class LoadOrders:
 class ElasticHysteresis:
     """Elastic hysteresis over the motor's travel; may also depend on speed, temperature or age."""
 
-    by_motor_only: bool
-    _factors: tuple[Factor, ...]
-    _law: Law
     _loop_slope: float
     """Slope of the loop over the last travel of the motor, arcsec per radian."""
 
     def __init__(self, law: Law, factors: tuple[Factor, ...], reaction: float) -> None:
-        self._law = law
-        self._factors = factors
+        self._law: Law = law
+        self._factors: tuple[Factor, ...] = factors
         self._reaction = reaction
         self._loop_deg = self._loop_slope = 0.0
         self._loop_arcsec = law.advance(0.0)
-        self.by_motor_only = not factors
+        self.by_motor_only: bool = not factors
 
     def arcsec(self, now: Conditions) -> float:
         loop, size = self._law.advance(now.motor_deg), 1.0
@@ -246,14 +236,11 @@ def _zero_drift(truth: Truth) -> list[Piece]:
 class Gear:
     """Output of the gear before its spring, in degrees of the load."""
 
-    by_motor_only: bool
-    _pieces: tuple[Piece, ...]
-
     def __init__(self, truth: Truth) -> None:
         pieces = pieces_of(truth)
         self._ratio = truth.gear.ratio
-        self._pieces = tuple(pieces)
-        self.by_motor_only = all(piece.by_motor_only for piece in pieces)
+        self._pieces: tuple[Piece, ...] = tuple(pieces)
+        self.by_motor_only: bool = all(piece.by_motor_only for piece in pieces)
         """True if the output cannot change while the motor is at rest."""
 
     def turned_deg(self, now: Conditions) -> float:

@@ -99,8 +99,6 @@ class Age:
 class AgeFactor:
     """Factor that multiplies the elastic hysteresis and grows with age."""
 
-    _age: Age
-
     def __init__(self, truth: TrueAgeing, dt_s: float) -> None:
         self._age = Age(truth, dt_s)
         self._growth = truth.hysteresis_growth
@@ -114,8 +112,6 @@ class WornTeeth:
     """Additional tooth error, a function of the motor angle, that grows with age."""
 
     by_motor_only: ClassVar[bool] = False
-    _age: Age
-    _orders: Orders
 
     def __init__(self, truth: TrueAgeing, dt_s: float) -> None:
         self._age = Age(truth, dt_s)
@@ -161,17 +157,15 @@ class Creep:
     """
 
     by_motor_only: ClassVar[bool] = False
-    _amplitudes: tuple[float, ...]
-    _nearer: tuple[float, ...]
-    _per_nm: tuple[float, ...]
-    _states: list[float]
 
     def __init__(self, elements: tuple[TrueCreep, ...], dt_s: float) -> None:
         self._dt = dt_s
-        self._amplitudes = tuple(each.amplitude_arcsec for each in elements)
-        self._per_nm = tuple(each.arcsec_per_nm for each in elements)
-        self._nearer = tuple(-math.expm1(-dt_s / each.time_constant_s) for each in elements)
-        self._states = [0.0] * len(elements)
+        self._amplitudes: tuple[float, ...] = tuple(each.amplitude_arcsec for each in elements)
+        self._per_nm: tuple[float, ...] = tuple(each.arcsec_per_nm for each in elements)
+        self._nearer: tuple[float, ...] = tuple(
+            -math.expm1(-dt_s / each.time_constant_s) for each in elements
+        )
+        self._states: list[float] = [0.0] * len(elements)
         self._last_deg = 0.0
 
     def arcsec(self, now: Conditions) -> float:
@@ -193,18 +187,14 @@ class Jumps:
     """Tooth jumps, each spread over its duration."""
 
     by_motor_only: ClassVar[bool] = False
-    _duration_s: tuple[float, ...]
-    _step: int
-    _teeth: tuple[float, ...]
-    _time_s: tuple[float, ...]
 
     def __init__(self, jumps: tuple[TrueJump, ...], teeth: float, dt_s: float) -> None:
         self._dt = dt_s
-        self._time_s = tuple(each.time_s for each in jumps)
-        self._duration_s = tuple(each.duration_s for each in jumps)
-        self._teeth = tuple(float(each.teeth) for each in jumps)
+        self._time_s: tuple[float, ...] = tuple(each.time_s for each in jumps)
+        self._duration_s: tuple[float, ...] = tuple(each.duration_s for each in jumps)
+        self._teeth: tuple[float, ...] = tuple(float(each.teeth) for each in jumps)
         self._tooth_arcsec = DEG_PER_TURN / teeth * ARCSEC_PER_DEG
-        self._step = -1
+        self._step: int = -1
 
     def arcsec(self, now: Conditions) -> float:
         self._step += 1
@@ -222,14 +212,11 @@ class Damage:
     """Damaged teeth: smooth bumps of the error at certain load angles."""
 
     by_motor_only: ClassVar[bool] = False
-    _at_deg: tuple[float, ...]
-    _height: tuple[float, ...]
-    _reach_deg: tuple[float, ...]
 
     def __init__(self, teeth: tuple[TrueDamage, ...]) -> None:
-        self._at_deg = tuple(each.at_deg for each in teeth)
-        self._reach_deg = tuple(each.width_deg / 2.0 for each in teeth)
-        self._height = tuple(each.height_arcsec for each in teeth)
+        self._at_deg: tuple[float, ...] = tuple(each.at_deg for each in teeth)
+        self._reach_deg: tuple[float, ...] = tuple(each.width_deg / 2.0 for each in teeth)
+        self._height: tuple[float, ...] = tuple(each.height_arcsec for each in teeth)
 
     def arcsec(self, now: Conditions) -> float:
         error = 0.0

@@ -17,9 +17,6 @@ class Heat:
     """Motor friction at the current temperature, relative to the friction in the truth file."""
     since_s: float
     """Time since the axis was switched on."""
-    _friction_grows: bool
-    _growth: WarmthFactor
-    _ambient_varies: bool
 
     def __init__(self, truth: Truth) -> None:
         heat = truth.temperature

@@ -42,8 +42,6 @@ class RollingFrictionLaw:
     ``x (1 - ln x)`` for n = 2. Only the last reversal counts, so there is no return-point memory.
     """
 
-    _saturated: bool
-
     def __init__(self, truth: RollingFriction, motor_deg: float) -> None:
         self._offset = truth.offset_arcsec
         self._width = truth.width_deg
@@ -88,14 +86,12 @@ class RollingFrictionLaw:
 class MaxwellSlipLaw:
     """Maxwell slip: parallel springs with sliders (Prandtl-Ishlinskii), with return-point memory."""
 
-    _limits: tuple[float, ...]
-    _states: list[float]
-    _stiffnesses: tuple[float, ...]
-
     def __init__(self, truth: MaxwellSlip, motor_deg: float) -> None:
-        self._stiffnesses = tuple(each.limit_arcsec / each.yield_deg for each in truth.elements)
-        self._limits = tuple(each.limit_arcsec for each in truth.elements)
-        self._states = [0.0] * len(self._limits)
+        self._stiffnesses: tuple[float, ...] = tuple(
+            each.limit_arcsec / each.yield_deg for each in truth.elements
+        )
+        self._limits: tuple[float, ...] = tuple(each.limit_arcsec for each in truth.elements)
+        self._states: list[float] = [0.0] * len(self._limits)
         self._motor_deg = motor_deg
         self._error = 0.0
 

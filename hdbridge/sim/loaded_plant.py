@@ -54,17 +54,6 @@ class Spring:
 class LoadedPlant(Plant):
     """`Plant` with every load and spring property of the truth file."""
 
-    _held_nm: list[float]
-    _shaken: bool
-    _shaking_nm: tuple[float, ...]
-    _shaking_phase: tuple[float, ...]
-    _shaking_turn: tuple[float, ...]
-    _slider_limit: tuple[float, ...]
-    _slider_stiffness: tuple[float, ...]
-    _slides: bool
-    _spring: Spring
-    _step: int
-
     def __init__(self, truth: Truth) -> None:
         Plant.__init__(self, truth)
         gear, load = truth.gear, truth.load_
@@ -86,13 +75,19 @@ class LoadedPlant(Plant):
             self._arm_nm = mass.mass_kg * GRAVITY_M_S2 * mass.arm_m * math.cos(math.radians(mass.tilt_deg))
             self._down_deg = mass.down_deg
         self._shaken = bool(load.vibration)
-        self._shaking_turn = tuple(math.tau * each.frequency_hz * self._dt for each in load.vibration)
-        self._shaking_phase = tuple(math.radians(each.phase_deg) for each in load.vibration)
-        self._shaking_nm = tuple(each.torque_nm for each in load.vibration)
+        self._shaking_turn: tuple[float, ...] = tuple(
+            math.tau * each.frequency_hz * self._dt for each in load.vibration
+        )
+        self._shaking_phase: tuple[float, ...] = tuple(
+            math.radians(each.phase_deg) for each in load.vibration
+        )
+        self._shaking_nm: tuple[float, ...] = tuple(each.torque_nm for each in load.vibration)
         self._slides = bool(load.presliding)
-        self._slider_stiffness = tuple(each.limit_nm / each.travel_deg for each in load.presliding)
-        self._slider_limit = tuple(each.limit_nm for each in load.presliding)
-        self._held_nm = [0.0] * len(self._slider_limit)
+        self._slider_stiffness: tuple[float, ...] = tuple(
+            each.limit_nm / each.travel_deg for each in load.presliding
+        )
+        self._slider_limit: tuple[float, ...] = tuple(each.limit_nm for each in load.presliding)
+        self._held_nm: list[float] = [0.0] * len(self._slider_limit)
         self._held_deg = self.now.load_deg
         self._step = 0
         coupling = load.encoder.coupling

@@ -44,10 +44,6 @@ class Plant:
     """Friction work at the motor shaft since this attribute was last reset."""
     outer_nm: float
     """External torque on the load, in addition to its weight; only `LoadedPlant` applies it."""
-    _coupled: bool
-    _coupling: Transition
-    _flexspline: Transition
-    _gear: Gear
 
     def __init__(self, truth: Truth) -> None:
         dt = truth.substep_s
@@ -75,8 +71,8 @@ class Plant:
         self._load_friction = load.coulomb_nm / inertia / RAD_PER_DEG * dt
 
         coupling = load.encoder.coupling
-        self._coupled = coupling is not None
-        self._coupling = transition(coupling, dt)
+        self._coupled: bool = coupling is not None
+        self._coupling: Transition = transition(coupling, dt)
 
         start_c = truth.temperature.start_c
         self.now = Conditions(truth.temperature.ambient_c if start_c is None else start_c)

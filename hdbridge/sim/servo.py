@@ -28,8 +28,6 @@ integral may rest."""
 class MovingAverage:
     """Moving average of the demand, from its integral now and one averaging time ago."""
 
-    _late_integral: Late
-
     def __init__(self, duration_s: float, dt_s: float) -> None:
         self._duration_s = max(duration_s, dt_s)
         self._late_integral = Late(self._duration_s, dt_s, 0.0)
@@ -83,20 +81,13 @@ class Servo:
 
     limit_nm: float
     """Torque limit in either direction."""
-    _average: MovingAverage
-    _load_known: bool
-    _load_model: Transition
-    _notch: Notch
-    _sums_position: bool
-    _with_average: bool
-    _with_filters: bool
 
     def __init__(self, truth: Truth) -> None:
         servo, encoder = truth.servo, truth.motor.encoder
         dt = truth.substep_s
         self._dt = dt
         self._filter = 1000.0 / servo.command_filter_ms
-        self._with_average = servo.moving_average_ms > 0.0
+        self._with_average: bool = servo.moving_average_ms > 0.0
         self._average = MovingAverage(servo.moving_average_ms / 1000.0, dt)
         self._with_filters = bool(servo.notch or servo.speed_filter_ms or servo.torque_filter_ms)
         self._speed_share = _share(servo.speed_filter_ms / 1000.0, dt)
@@ -108,7 +99,7 @@ class Servo:
         self._observer_share = -math.expm1(-rate * dt)
         self._observed_share = observer.share if observer else 0.0
         self._momentum = rate * observer.inertia_kg_m2 * RAD_PER_DEG if observer else 0.0
-        self._sums_position = servo.integral_of == "position"
+        self._sums_position: bool = servo.integral_of == "position"
         self._decay = math.exp(-self._filter * dt)
         self._position_gain = servo.position_gain_per_s
         self._velocity_gain = servo.velocity_gain_nm_s_per_rad * RAD_PER_DEG
@@ -116,8 +107,8 @@ class Servo:
         self._velocity_feedforward = servo.velocity_feedforward
         self._acceleration_gain = servo.inertia_feedforward_kg_m2 * RAD_PER_DEG / dt
         load = servo.load_feedforward
-        self._load_known = load is not None
-        self._load_model = transition(load, dt)
+        self._load_known: bool = load is not None
+        self._load_model: Transition = transition(load, dt)
         self._load_gain = load.inertia_kg_m2 * RAD_PER_DEG / dt if load else 0.0
         self._viscous = servo.viscous_feedforward_nm_s_per_rad * RAD_PER_DEG
         self._friction = servo.friction_feedforward_nm

@@ -1,8 +1,8 @@
 """Decorator for the state classes of the simulation, and the conditions that the gear depends on.
 
 The attributes of a state class are laid out in memory, and its methods compiled (`hdbridge.sim.compiled`).
-They are numbers, tuples and lists of numbers, and objects of other state classes. A class declares those that
-are not a ``float``.
+They are numbers, tuples and lists of numbers, and objects of other state classes. An annotation states the
+type if the assignment does not show it.
 """
 
 from typing import Final, TypeVar
