@@ -408,11 +408,6 @@ class AxisConfig(OtherChannels):
             )
 
     @property
-    def is_from_file(self) -> bool:
-        """True if the axis was read from a file, so that its EDS file is known."""
-        return self._eds_path is not None
-
-    @property
     def eds_path(self) -> Path:
         """Absolute path of the drive's EDS file; raises `InputError` if the axis was not read from a file."""
         if self._eds_path is None:

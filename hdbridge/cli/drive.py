@@ -46,7 +46,7 @@ def home(session: Session, homing: opt.Homing, json_file: opt.Json = None) -> No
     from hdbridge.drive.modes import Homing
 
     axis = session.axis
-    Homing.checked(axis, **vars(homing))  # refused before anything is connected
+    Homing(**vars(homing)).checked(axis)  # refused before anything is connected
     with session.drive() as drive:
         drive.boot()
         note(f"booted node {axis.drive.node_id} over {drive.link.name}")

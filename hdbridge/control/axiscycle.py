@@ -47,13 +47,6 @@ class AxisCycle:
     and affects all axes.
     """
 
-    __slots__ = (
-        "_awaited_channels", "_channel_ids", "_channels", "_commanded", "_good_cycle", "_handled_stop",
-        "_last", "_left", "_plausibility", "_refused", "_still", "_stop_cycles", "_traffic", "awaited",
-        "changed", "command", "feedback", "flushing", "image", "last_sent_s", "master_timeout_s", "monitor",
-        "name", "needed", "pending", "silent", "supervision",
-    )  # fmt: skip
-
     def __init__(
         self,
         image: ProcessImage,
@@ -75,10 +68,7 @@ class AxisCycle:
         position, so that enabling causes no motion. It remains in force until replaced."""
         self.silent = True
         """True while the axis receives no RPDO."""
-        self.feedback = Feedback(
-            -1, 0.0, image.statusword or 0, image.motor_counts, image.load_counts, image.demand_counts,
-            image.torque_permille, False, image.readings,
-        )  # fmt: skip
+        self.feedback = self._feedback(-1, 0.0, False)
         """Feedback of the last cycle; stale if the cycle had none."""
         self.master_timeout_s = drive_master_timeout_s(axis)
         """Time without a frame of the master after which the drive stops on its own."""
@@ -243,12 +233,7 @@ class AxisCycle:
             complete = self._believable(self._last, count)
         before = self.feedback
         if complete:
-            feedback = self._last = new_tuple(Feedback, (
-                count, time_s, image.statusword or 0, image.motor_counts,
-                image.load_counts, image.demand_counts, image.torque_permille, True,
-                image.readings,
-            ))  # fmt: skip
-            self.feedback = feedback
+            self.feedback = feedback = self._last = self._feedback(count, time_s, True)
             self._good_cycle = count
         else:
             feedback = self.stale(count, time_s)
@@ -276,15 +261,10 @@ class AxisCycle:
 
     def listen(self, count: int, time_s: float, complete: bool) -> None:
         """Ends one period of a silent axis."""
-        image = self.image
         if self._channels:
-            image.step_channels()
+            self.image.step_channels()
         if complete:
-            self.feedback = self._last = new_tuple(Feedback, (
-                count, time_s, image.statusword or 0, image.motor_counts,
-                image.load_counts, image.demand_counts, image.torque_permille, True,
-                image.readings,
-            ))  # fmt: skip
+            self.feedback = self._last = self._feedback(count, time_s, True)
         else:
             self.stale(count, time_s)
 
@@ -303,17 +283,21 @@ class AxisCycle:
 
     def stale(self, count: int, time_s: float) -> Feedback:
         """Returns stale feedback with the last good values, for a cycle without feedback."""
-        image = self.image
         if self._last is not None:
             self.feedback = self._last._replace(cycle=count, time_s=time_s, fresh=False)
         else:
-            self.feedback = Feedback(
-                count, time_s, image.statusword or 0, image.motor_counts, image.load_counts,
-                image.demand_counts, image.torque_permille, False, image.readings,
-            )  # fmt: skip
+            self.feedback = self._feedback(count, time_s, False)
         return self.feedback
 
     # ---------------------------------------------------------------- parts of a cycle
+
+    def _feedback(self, count: int, time_s: float, fresh: bool) -> Feedback:
+        """Returns the values of the process image as feedback of a cycle."""
+        image = self.image
+        return new_tuple(Feedback, (
+            count, time_s, image.statusword or 0, image.motor_counts, image.load_counts,
+            image.demand_counts, image.torque_permille, fresh, image.readings,
+        ))  # fmt: skip
 
     def _react(self, count: int, data: Frames | None, before: Feedback) -> Frames | None:
         """Completes a cycle with a new fault, with a fault in the cycle before, or with a latched stop."""
@@ -337,9 +321,7 @@ class AxisCycle:
         return reaction
 
     def _latch(self) -> None:
-        """Stops sending set-points to the axis and withdraws the request to enable it, so that it restarts
-        disabled.
-        """
+        """Stops the set-points of the axis, and withdraws the request to enable it."""
         self.image.power.quick_stop()
         if not self.silent:
             self.silence()
@@ -354,9 +336,7 @@ class AxisCycle:
                 self.changed()
 
     def _believable(self, last: Feedback, count: int) -> bool:
-        """Returns False if the positions contradict the last good ones; also records an excessive following
-        error.
-        """
+        """Returns False if the positions contradict the last ones; records an excessive following error."""
         image, plausibility = self.image, self._plausibility
         motor = image.motor_counts
         cycles = count - self._good_cycle

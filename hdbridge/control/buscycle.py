@@ -65,15 +65,6 @@ class BusCycle:
     must not raise.
     """
 
-    __slots__ = (
-        "_awaited", "_beginning", "_bits", "_bus_faults", "_changed", "_deadline",
-        "_discarded", "_dropped", "_early", "_flushing", "_heartbeat_id", "_heartbeat_period_s",
-        "_heartbeat_s", "_interrupted", "_late_s", "_listeners", "_listening", "_per_bit", "_period_bits",
-        "_recv", "_send", "_slots", "_speaking", "_window_s", "axes", "busy_s", "clock", "count", "down",
-        "due_s", "faults", "histogram", "late_s", "on_frame", "outgoing", "overruns", "period_s",
-        "refused", "skipped", "woke_s",
-    )  # fmt: skip
-
     def __init__(
         self,
         link: Link,
@@ -385,9 +376,7 @@ class BusCycle:
                     axis.pending.append((Fault.LOST_TPDO, ", ".join(lost)))
 
     def _other(self, frame: Frame) -> None:
-        """Forwards a frame that the cycle does not wait for to its axis and to ``on_frame``; records bus
-        faults.
-        """
+        """Forwards any other frame to its axis and to ``on_frame``; records bus faults."""
         self._period_bits += FRAME_BITS[len(frame.data)]
         axis = self._listeners.get(frame.can_id)
         if axis is not None:

@@ -56,8 +56,7 @@ _RESETS: Final = (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION)
 def import_log(
     path: Path, axis: AxisConfig, *, channel: str | None = None, all_states: bool = False
 ) -> Recording:
-    """Returns the recording of one axis from a bus log; ``channel`` is required if the axis is on several
-    buses.
+    """Returns the recording of one axis from a bus log; ``channel`` selects one of several buses.
 
     Samples with the drive not enabled are left out unless ``all_states``. A new part begins at a gap and when
     the drive boots. The notes state the origin of the mapping.

@@ -18,10 +18,6 @@ if TYPE_CHECKING:
 class ChannelState:
     """Channels of one axis for its effects; the last reading of each measured channel is held."""
 
-    __slots__ = (
-        "_channels", "_motor_torque", "_observer", "_present", "_ratio", "_slots", "_values", "torque_nm",
-    )  # fmt: skip
-
     def __init__(self, axis: AxisConfig) -> None:
         self.torque_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
         """Motor torque for one unit (per mille) of 6077h, positive forward; Nm."""

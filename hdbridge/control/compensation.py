@@ -64,8 +64,6 @@ class CompensationLimits:
 class _Faded(Tracker):
     """Tracker that multiplies an effect's error by a weight; it follows the motion at any weight."""
 
-    __slots__ = ("_tracker", "needs", "weight")
-
     def __init__(self, tracker: Tracker, needs: frozenset[Channel]) -> None:
         self._tracker = tracker
         self.needs = needs
@@ -80,12 +78,6 @@ class _Faded(Tracker):
 
 class Inverse:
     """Inverse of the model, from the state after the last `advance`."""
-
-    __slots__ = (
-        "_before_deg", "_error", "_fall", "_forward", "_known", "_moment", "_motor_deg", "_offset",
-        "_offsets", "_peeked", "_rise", "_slope", "_standing", "_stateful", "_timeless", "_tracker", "_turns",
-        "faded", "memory_deg", "needs",
-    )  # fmt: skip
 
     def __init__(self, model: TransmissionModel, start: Start = Start.VIRGIN) -> None:
         """Omits effects that cannot or must not be compensated, such as the load encoder's errors.
@@ -212,8 +204,7 @@ class Inverse:
         self._forward = forward
 
     def solve(self, load_deg: float, moment: Moment = _NOWHERE, weight: float = 1.0) -> float:
-        """Returns the motor angle in degrees that brings the load to ``load_deg``; the state does not
-        change.
+        """Returns the motor angle, degrees, that brings the load to ``load_deg``; changes no state.
 
         ``weight`` scales the error (0: uncompensated). Accurate to 1e-6 arcsec at the load, or to the last
         bit of the motor angle if the error is so steep that one bit exceeds this.
@@ -276,8 +267,7 @@ class Inverse:
 
 
 def _gentle(effects: tuple[Effect, ...], start: Start, steepest: float) -> tuple[list[Tracker], float]:
-    """Returns trackers of the effects, and a bound on the steepest negative slope of their sum, arcsec per
-    motor degree.
+    """Returns trackers of the effects, and a bound on the fall of their sum, arcsec per motor degree.
 
     The load rests while the motor crosses backlash. The error then falls as fast as the motor angle divided
     by the ratio rises, or faster if noise made the fitted backlash too narrow. If the sum would fall more
@@ -303,12 +293,6 @@ class Compensation:
     It begins disengaged, with a motor target of N times the load target. `engage` and `disengage` fade the
     correction in and out, so switching never causes a jump.
     """
-
-    __slots__ = (
-        "_fading", "_inverse", "_known", "_prefilter", "_ratio", "_static", "_target",
-        "correction_arcsec", "limited", "maximum_arcsec", "model", "needs", "ramp_step",
-        "step_arcsec", "weight",
-    )  # fmt: skip
 
     def __init__(self, model: TransmissionModel, limits: CompensationLimits, period_s: float) -> None:
         """``period_s`` is the control cycle.

@@ -18,17 +18,12 @@ from hdbridge.errors import InputError
 __all__ = ["LATE", "WINDOW", "Command", "Cycle", "Feedback", "Target"]
 
 
-class Cycle:
+class Cycle(BusCycle):
     """Runs the process image over a link, one `tick` per period.
 
     ``image`` provides the controlword (``image.power.go``) and the scaling; ``supervision`` holds the latch
     and the list of faults; ``monitor`` may be shared with the boot-up.
     """
-
-    __slots__ = (
-        "_axis", "_bus", "_exchange", "clock", "histogram", "monitor", "period_s", "stop_feedbacks",
-        "supervision",
-    )  # fmt: skip
 
     def __init__(
         self,
@@ -41,40 +36,13 @@ class Cycle:
         monitor: NetworkMonitor | None = None,
         stop_timeout_s: float = 1.0,
     ) -> None:
-        self.clock = clock
-        self.period_s = period_s
-        self.supervision = supervision
+        super().__init__(link, clock, period_s)
         self._axis = AxisCycle(
-            image,
-            supervision,
-            monitor=monitor,
-            stop_timeout_s=stop_timeout_s,
-            refused=(InputError,),
+            image, supervision, monitor=monitor, stop_timeout_s=stop_timeout_s, refused=(InputError,)
         )
-        self.monitor = self._axis.monitor
-        self._bus = BusCycle(link, clock, period_s)
-        self._bus.join(self._axis)
-        self._exchange = self._bus.exchange
-        self.histogram = self._bus.histogram
+        self.join(self._axis)
         self.stop_feedbacks: list[Feedback] = []
         """Feedback of the cycles that `tick` ran to complete the last quick stop."""
-        self.restart()
-
-    @property
-    def overruns(self) -> int:
-        return self._bus.overruns
-
-    @property
-    def skipped(self) -> int:
-        return self._bus.skipped
-
-    def restart(self) -> None:
-        """Restarts at once with the next `tick`, after a pause; the cycle numbers continue.
-
-        Frames and encoder motion during the pause are not judged. The latch and the histogram stay.
-        """
-        self._bus.restart()
-        self._axis.begin()
 
     def tick(self, command: Command = None) -> Feedback:
         """Runs one period and returns its feedback.
@@ -88,18 +56,19 @@ class Cycle:
         the quick stop has timed out, or no RPDO is sent any more (`Reaction.LATCH`). Errors of ``command``
         other than `InputError` propagate; the caller must then stop the axis.
         """
-        supervision, axis = self.supervision, self._axis
+        axis = self._axis
+        supervision = axis.supervision
         if supervision.stop is not None:
             raise supervision.error()
         if axis.silent:
             axis.begin()
         axis.command = command
-        self._exchange()
+        self.exchange()
         if supervision.stop is None:
             return axis.feedback
         self.stop_feedbacks = [axis.feedback]
         while axis.stopping:
-            self._exchange()
+            self.exchange()
             self.stop_feedbacks.append(axis.feedback)
         stop = axis.stopped
         assert stop is not None

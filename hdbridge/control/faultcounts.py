@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from hdbridge.drive.supervision import Fault, Supervision
+from hdbridge.strictness import Strict
 
 PERIODS_SKIPPED = "a period was skipped"
 
 
-class FaultCount(BaseModel):
+class FaultCount(Strict):
     """A kind of fault, with the number of cycles in which it occurred."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
     what: str = Field(description="the fault, in the words of the fault table")
     cycles: int = Field(ge=1, description="number of cycles in which it occurred")
@@ -30,8 +29,6 @@ class FaultCount(BaseModel):
 
 class FaultCounter:
     """Counts faults and skipped periods since its creation."""
-
-    __slots__ = ("_before", "_skipped", "_supervision")
 
     def __init__(self, supervision: Supervision, skipped: int) -> None:
         """``skipped`` is the number of periods skipped before its creation."""

@@ -42,8 +42,6 @@ class Histogram:
     Its size is fixed at 704 integers.
     """
 
-    __slots__ = ("_counts", "maximum_us", "total")
-
     def __init__(self) -> None:
         self._counts = [0] * _BINS
         self.total = 0
@@ -160,9 +158,7 @@ class LatencyReport:
 
     @property
     def sustained_s(self) -> float | None:
-        """Shortest measured period that the computer sustains together with all longer ones; None if there is
-        none.
-        """
+        """Shortest measured period that the computer sustains together with all longer ones, or None."""
         best = None
         for each in reversed(self.measurements):
             if not each.sustained:

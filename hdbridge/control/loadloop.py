@@ -73,13 +73,6 @@ def loop_width_arcsec(model: TransmissionModel) -> float:
 class LoadLoop:
     """Load loop of one axis; `step` is called once per control period. All values are arcsec at the load."""
 
-    __slots__ = (
-        "_agreed", "_agreeing", "_beyond", "_counts", "_difference", "_doubt", "_drift_share", "_error",
-        "_gain_step", "_jumped", "_jumped_most", "_maximum", "_most", "_motor", "_noise", "_noise_readings",
-        "_noise_share", "_off", "_outliers", "_patience", "_patience_max", "_patience_min", "_reference",
-        "_rest_motor", "_settled", "_share", "_slack", "_slew_step", "_standing", "_value",
-    )  # fmt: skip
-
     def __init__(
         self,
         gain_1_s: float,
@@ -157,8 +150,7 @@ class LoadLoop:
         return self._doubt
 
     def use_models(self, whole: TransmissionModel, predicting: TransmissionModel) -> None:
-        """Sets the models: ``whole`` has the full hysteresis, ``predicting`` predicts the ``motor`` argument
-        of `step`.
+        """Sets the models: ``predicting`` gives the ``motor`` of `step`, ``whole`` has the full hysteresis.
 
         The load may lag the motor by the unpredicted part of the hysteresis, and by a fraction of the
         predicted part. If the hysteresis is unknown, only the loop's own bound limits the lag.

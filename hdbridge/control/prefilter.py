@@ -22,11 +22,6 @@ _VARYING = frozenset({Channel.SPEED, Channel.LOAD_ANGLE})
 class Prefilter:
     """Filters a correction; one call per cycle."""
 
-    __slots__ = (
-        "_before", "_feedback", "_full_step", "_last", "_output", "_predicted", "_reaches", "_step",
-        "_varies", "_weights",
-    )  # fmt: skip
-
     def __init__(self, lead: LeadFilter, period_s: float, needs: frozenset[Channel]) -> None:
         """``needs`` are the channels of the compensated effects; speed and load angle are extrapolated."""
         self._weights = lead.weights

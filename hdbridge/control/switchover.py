@@ -29,8 +29,6 @@ class Correction:
     During a change these attributes hold different functions, so they must be looked up in each cycle.
     """
 
-    __slots__ = ("_limited", "_new", "_now", "_weight", "command", "hold")
-
     command: Callable[[float, Moment], float]
     """Returns the motor target in degrees for this cycle's load target (`Compensation.command`)."""
     hold: Callable[[float, Moment], float]

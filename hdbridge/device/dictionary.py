@@ -99,9 +99,7 @@ class Entry:
     """
 
     def __init__(self, variable: ODVariable, own: ODVariable | None = None) -> None:
-        """``own`` is the same object in the bundled EDS, whose default is used if the drive's EDS has
-        none.
-        """
+        """``own`` is the object in the bundled EDS, which gives the default if ``variable`` has none."""
         self.index: Final[int] = variable.index
         self.sub: Final[int] = variable.subindex
         self.name: Final[str] = variable.name
@@ -294,9 +292,7 @@ class Dictionary:
                 entry.default += after - before
 
     def restore(self, first: int = 0x0000, last: int = 0xFFFF) -> None:
-        """Restores the default of every entry from index ``first`` to ``last``, without calling the
-        guards.
-        """
+        """Restores the defaults of these indices, without calling the guards."""
         for entry in self._entries.values():
             if first <= entry.index <= last:
                 entry.value = entry.default

@@ -128,9 +128,7 @@ class Pdo:
             raise SdoAbortError(Abort.RANGE)
 
     def _check_fixed(self, sub: int, value: int) -> None:
-        """Refuses a different value while the PDO exists; the current value is accepted, because some masters
-        write it again.
-        """
+        """Refuses a different value while the PDO exists; some masters write the current one again."""
         if self.valid and value != self._parameter(sub):
             raise SdoAbortError(Abort.STATE)
 

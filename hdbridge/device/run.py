@@ -34,8 +34,7 @@ class Server:
         self._failing_since_s: float | None = None
 
     def poll(self, wait_s: float | None = None) -> bool:
-        """Waits for a frame for at most ``wait_s``, then handles everything that is due; False if reading
-        failed.
+        """Waits for a frame for up to ``wait_s`` and handles everything due; False if reading failed.
 
         A failure of the interface stops the axis as selected by 6007h, and the node continues on its own
         clock. Raises BusError when reading has failed for ``PATIENCE_S``.

@@ -44,12 +44,8 @@ def plan(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[PlannedWr
 
 
 def left_to_drive(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[OmittedObject]:
-    """Returns the objects whose values `plan` leaves to the drive, and the missing objects that the control
-    cycle does not need.
-    """
+    """Returns the objects that `plan` leaves to the drive, and missing ones that the cycle does not need."""
     od = dictionary_of(axis) if od is None else od
-    if od is None:
-        return []
     return [*_split(axis, od)[1], *_not_read(axis, od)]
 
 
@@ -60,7 +56,7 @@ def unrequested_objects(axis: AxisConfig) -> list[str]:
     found = []
     for layout in layouts(axis, od).rpdos:
         for entry in layout.codec.entries:
-            variable = find(od, entry.index, entry.sub) if od is not None else None
+            variable = find(od, entry.index, entry.sub)
             if variable is not None and (entry.index, entry.sub) not in own:
                 value = held(variable) or 0
                 found.append(f"{entry.index:04X}h:{entry.sub:02X} = {value} in RPDO{layout.number}")
@@ -70,13 +66,12 @@ def unrequested_objects(axis: AxisConfig) -> list[str]:
 def _split(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[list[PlannedWrite], list[OmittedObject]]:
     """Splits all rows into the writes of the boot-up and the objects left to the drive."""
     od = dictionary_of(axis) if od is None else od
-    if od is not None:
-        _check_mode(axis, od)
+    _check_mode(axis, od)
     pdos = layouts(axis, od)
     planned: list[PlannedWrite] = []
     left: dict[tuple[int, int], OmittedObject] = {}
     for row in rows(axis, od, pdos):
-        reason = _omission_reason(axis, od, row) if od is not None else None
+        reason = _omission_reason(axis, od, row)
         if reason is None:
             planned.append(row)
         else:
@@ -148,9 +143,7 @@ def _value_of_6502h(od: ObjectDictionary) -> int:
 
 
 def _not_read(axis: AxisConfig, od: ObjectDictionary) -> Iterator[OmittedObject]:
-    """Yields the optional objects that the control cycle and the boot-up would read, but that the drive
-    cannot provide.
-    """
+    """Yields the optional objects of cycle and boot-up that the drive cannot provide."""
     absent = layouts(axis, od).absent
     for address, consequence in (
         (objects.POSITION_DEMAND, "the last target sent is used instead"),

@@ -240,9 +240,7 @@ class BootUp:
             state = decode(self._sdo.fetch(objects.STATUSWORD))
 
     def _configure(self, rows: list[PlannedWrite]) -> None:
-        """Configures a PDO unless it is already configured as planned, because a correct configuration may be
-        read-only.
-        """
+        """Configures a PDO unless it is as planned, because a correct configuration may be read-only."""
         lasting = [row for row in rows if not row.passing]
         wrong = [row for row in lasting if not self._is_held(row)]
         if not wrong:
@@ -295,9 +293,7 @@ class BootUp:
             self._held.append(row)
 
     def _may_keep(self, row: PlannedWrite, error: DriveError) -> bool:
-        """Returns True if the drive may keep its own value: a default not set by the user, or a read-only
-        object.
-        """
+        """Returns True if the drive may keep its value: the user stated no other, or it is read-only."""
         if not row.without or row.exact:
             return False
         cause = error.__cause__
@@ -331,9 +327,7 @@ class BootUp:
 
 
 def read_identity(axis: AxisConfig, sdo: SdoClient) -> dict[str, int]:
-    """Reads the identity objects that the EDS lists or the axis file states, by the keys of
-    ``drive.identity``.
-    """
+    """Reads the identity objects that the EDS lists or the axis file states, by key of ``drive.identity``."""
     return {
         name: sdo.fetch(address)
         for address, name in IDENTITY

@@ -144,9 +144,7 @@ class Commander:
             self.pause(POLL_S)
 
     def preload_target(self) -> int:
-        """Sets the target to the actual position, so that enabling causes no motion; returns it in motor
-        counts.
-        """
+        """Sets the target to the actual position (motor counts), so that enabling moves nothing."""
         actual = self.sdo.fetch(objects.POSITION_ACTUAL)
         self.sdo.store(objects.TARGET_POSITION, wrap_int32(actual))
         found = self.sdo.fetch(objects.TARGET_POSITION)

@@ -21,11 +21,9 @@ def load_eds(path: Path | str, node_id: int) -> ObjectDictionary:
     return read_eds(path, node_id).dictionary
 
 
-def dictionary_of(axis: AxisConfig) -> ObjectDictionary | None:
-    """Returns the read-only, shared dictionary of the axis's drive; None if the axis was not read from a
-    file.
-    """
-    return shared_eds(axis.eds_path, axis.drive.node_id).dictionary if axis.is_from_file else None
+def dictionary_of(axis: AxisConfig) -> ObjectDictionary:
+    """Returns the read-only, shared dictionary of the axis's drive."""
+    return shared_eds(axis.eds_path, axis.drive.node_id).dictionary
 
 
 def find(od: ObjectDictionary, index: int, sub: int) -> ODVariable | None:

@@ -23,7 +23,7 @@ from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.drive import modes, objects
 from hdbridge.drive.bootup import BootReport, BootUp
 from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
-from hdbridge.drive.dictionary import find
+from hdbridge.drive.dictionary import dictionary_of, find
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.masterdetection import DEFAULT_MASTER_ID, MasterDetector, listening_s
@@ -33,7 +33,6 @@ from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoAbortError, SdoClient
 from hdbridge.drive.states import Command, State, decode, row_for
 from hdbridge.drive.writes import master_heartbeat
 from hdbridge.errors import DriveError, HdbridgeError, InputError, TransitionError
-from hdbridge.files.edsfile import shared_eds
 
 _log = logging.getLogger(__name__)
 _CLOSING_TIMEOUT_S: Final = 0.2
@@ -69,8 +68,7 @@ class Drive:
         self.axis = axis
         self.link = Link(bus, clock if clock is not None else MonotonicClock())
         self.monitor = NetworkMonitor(axis.drive.node_id)
-        if od is None:
-            od = shared_eds(axis.eds_path, axis.drive.node_id).dictionary
+        od = dictionary_of(axis) if od is None else od
         self.image = ProcessImage(axis, od)
         self.sdo = SdoClient(self.link, self.monitor, axis.drive.node_id, od, sdo_timeout_s)
         self._clients = {axis.drive.node_id: self.sdo}
@@ -87,8 +85,7 @@ class Drive:
         """Result of the last boot-up."""
 
     def listen(self) -> None:
-        """Listens once for another master on the bus, without sending; raises `BusInUseError` if there is
-        one.
+        """Listens once for another master without sending; raises `BusInUseError` if there is one.
 
         Takes two heartbeat periods, and at least the 0.51 s in which the slowest master sends two SYNCs.
         Called by `boot`; must be called before reading objects of a drive that is not booted.
@@ -137,8 +134,7 @@ class Drive:
         return Identity.model_validate({**self.axis.drive.identity.model_dump(exclude_none=True), **answered})
 
     def enable(self, mode: Mode | None = None) -> None:
-        """Prepares for power in ``mode``: sets target = actual position and the mode, checks 6061h, then
-        enables.
+        """Sets the target to the actual position, sets and checks the mode, then enables.
 
         The default is the mode of the control cycle (``drive.mode``). In PP and HM, this method walks the
         states by SDO. A cyclic mode requires SYNC and set-points while the drive is enabled, so this method
@@ -263,7 +259,8 @@ class Drive:
         before anything is sent if a value is not finite or outside the limits, `DriveError` if the drive
         fails on the way, and `TransitionError` on time-out (computed from the travel unless given).
         """
-        move = modes.ProfileMove.checked(self.image, load_deg, velocity_deg_s, acceleration_deg_s2, timeout_s)
+        move = modes.ProfileMove(load_deg, velocity_deg_s, acceleration_deg_s2, timeout_s)
+        move.checked(self.image)
         self._need(Mode.PP)
         modes.run_move(self._commander, move)
         return self.read_positions()
@@ -281,15 +278,10 @@ class Drive:
 
         Speeds, acceleration and offset (607Ch) are at the load. Raises like `move_to`.
         """
-        homing = modes.Homing.checked(
-            self.axis,
-            method,
-            switch_velocity_deg_s,
-            zero_velocity_deg_s,
-            acceleration_deg_s2,
-            offset_deg,
-            timeout_s,
+        homing = modes.Homing(
+            method, switch_velocity_deg_s, zero_velocity_deg_s, acceleration_deg_s2, offset_deg, timeout_s
         )
+        homing.checked(self.axis)
         self._need(Mode.HM)
         modes.run_homing(self._commander, homing)
         return self.read_positions()
@@ -307,9 +299,7 @@ class Drive:
         return Positions(motor, load, self.image.motor_deg(motor), self.image.load_deg(load))
 
     def can_set(self, address: Address) -> bool:
-        """Returns True if an object can be written, according to the EDS and to the writes accepted in the
-        boot-up.
-        """
+        """Returns True if an object can be written, by the EDS and by the writes of the boot-up."""
         variable = find(self.sdo.od, address.index, address.sub)
         left = self.report.left if self.report is not None else ()
         return variable is not None and variable.writable and (address.index, address.sub) not in left
@@ -383,9 +373,7 @@ class Drive:
                 quick.store(objects.HEARTBEAT_CONSUMER, 0)
 
     def _power_off_blindly(self) -> None:
-        """Powers off without waiting for answers, so that even a drive that can no longer send is powered
-        off.
-        """
+        """Powers off without waiting for answers, because a drive may be unable to send."""
         request = objects.COB_SDO_REQUEST + self.axis.drive.node_id
         with suppress(HdbridgeError):
             for word in (Command.QUICK_STOP.word, Command.DISABLE_VOLTAGE.word):

@@ -120,8 +120,6 @@ def gateway_error(code: int) -> str:
 
 
 def error_name(code: int) -> str:
-    """Returns the name of an error code, for example ``following error`` for 8611h, or the name
-    of its class.
-    """
+    """Returns the name of an error code or of its class: ``following error`` for 8611h."""
     name = _CODES.get(code) or _CLASSES.get(code >> 8) or _FAMILIES.get(code >> 12)
     return name or "a code that no profile names"

@@ -31,9 +31,7 @@ _DONTWAIT: Final = socket.MSG_DONTWAIT
 
 
 def fast_link(link: Link) -> Link:
-    """Returns a link on the same bus and clock for use in the cycle; it shares the count of
-    dropped frames.
-    """
+    """Returns a link for the cycle on the same bus and clock, with the same count of dropped frames."""
     if type(link) is not Link:
         return link
     fast = _SocketLink(link) if type(link.bus) is SocketcanBus else _MessageLink(link.bus, link.clock)

@@ -39,8 +39,7 @@ def drive_heartbeat_ms(axis: AxisConfig, od: ObjectDictionary | None = None) -> 
     """Returns the period of the drive's heartbeat, ms; 0 if its EDS lacks 1017h."""
     od = dictionary_of(axis) if od is None else od
     address = objects.HEARTBEAT_PRODUCER
-    there = od is None or find(od, address.index, address.sub) is not None
-    return axis.drive.heartbeat_ms if there else 0
+    return axis.drive.heartbeat_ms if find(od, address.index, address.sub) is not None else 0
 
 
 def position_limits_counts(axis: AxisConfig) -> tuple[int, int]:
@@ -238,15 +237,14 @@ class ProcessImage:
 
     # -- sent frames --------------------------------------------------------------------------------------
 
-    def _packer(self, layout: Layout, od: ObjectDictionary | None) -> Callable[[int, int], tuple[int, bytes]]:
-        """Returns a function that builds an RPDO frame from controlword and target, either of which may be in
-        a different RPDO.
+    def _packer(self, layout: Layout, od: ObjectDictionary) -> Callable[[int, int], tuple[int, bytes]]:
+        """Returns a function that builds an RPDO frame from controlword and target, as far as it has them.
 
         A read-only mapping may contain other objects. The mode of operation then has the value for the cycle;
         all others have their value from the EDS, or 0 if the EDS states none.
         """
         entries, can_id, pack = layout.codec.entries, layout.can_id, layout.codec.pack
-        values = [0 if entry.is_gap or od is None else _held(od, entry) for entry in entries]
+        values = [0 if entry.is_gap else _held(od, entry) for entry in entries]
         words, targets, modes = (
             [
                 place

@@ -31,7 +31,6 @@ _PREDEFINED: Final = 4
 """Number of PDOs of each kind with a predefined identifier (CiA 301)."""
 _STEP: Final = 0x100
 _MOST_ENTRIES: Final = 64
-_STANDARD_ENTRIES: Final = 8
 _LAST_SYNCHRONOUS: Final = 240
 _EXTENDED: Final = 0x2000_0000
 OPTIONAL: Final = (objects.TORQUE_ACTUAL, objects.POSITION_DEMAND)
@@ -95,8 +94,7 @@ def layouts(axis: AxisConfig, od: ObjectDictionary | None = None) -> Layouts:
     od = dictionary_of(axis) if od is None else od
     offers = list(_offers(od, objects.TPDO_COMMUNICATION, objects.TPDO_MAPPING))
     receivers = list(_offers(od, objects.RPDO_COMMUNICATION, objects.RPDO_MAPPING))
-    if od is not None:
-        _check_needed(axis, od, offers, receivers)
+    _check_needed(axis, od, offers, receivers)
     node_id, source = axis.drive.node_id, axis.load_encoder.source
     load = PdoEntry(source.index, source.subindex, IntegerType.named(source.type))
     senders = [each for each in offers if each.every is None or 1 <= each.every <= _LAST_SYNCHRONOUS]
@@ -151,7 +149,7 @@ def _channel_layouts(
     return found
 
 
-def _receiving(axis: AxisConfig, od: ObjectDictionary | None, offers: Sequence[_Offer]) -> tuple[Layout, ...]:
+def _receiving(axis: AxisConfig, od: ObjectDictionary, offers: Sequence[_Offer]) -> tuple[Layout, ...]:
     needs = [_entry(od, objects.CONTROLWORD), _entry(od, cyclic_mode(axis).target)]
     chosen = _assign(needs, offers, None)
     if chosen is None:
@@ -166,12 +164,8 @@ def _receiving(axis: AxisConfig, od: ObjectDictionary | None, offers: Sequence[_
 # -- capabilities of the drive ----------------------------------------------------------------------------
 
 
-def _offers(od: ObjectDictionary | None, communication: int, mapping: int) -> Iterator[_Offer]:
+def _offers(od: ObjectDictionary, communication: int, mapping: int) -> Iterator[_Offer]:
     """Yields the PDOs of a kind, given the indices of its first communication and mapping parameters."""
-    if od is None:
-        for number in range(1, _PREDEFINED + 1):
-            yield _Offer(number, _STANDARD_ENTRIES, None, None, None)
-        return
     for place in (index - communication for index in od):
         if not 0 <= place < PDOS_PER_KIND:
             continue
@@ -195,17 +189,15 @@ def _offers(od: ObjectDictionary | None, communication: int, mapping: int) -> It
         yield _Offer(place + 1, len(words), fixed, can_id, every)
 
 
-def mapped(od: ObjectDictionary | None, words: Iterable[int | None]) -> tuple[PdoEntry, ...]:
-    """Decodes the words of a mapping into entries; empty if a word is unknown or not a whole
-    number of bytes.
-    """
+def mapped(od: ObjectDictionary, words: Iterable[int | None]) -> tuple[PdoEntry, ...]:
+    """Decodes a mapping; empty if a word is unknown or the length is not a whole number of bytes."""
     entries = []
     for word in words:
         if word is None:
             return ()
         index, sub, bits = word >> 16, word >> 8 & 0xFF, word & 0xFF
         standard = objects.STANDARD.get((index, sub))
-        variable = find(od, index, sub) if od is not None else None
+        variable = find(od, index, sub)
         kind = integer_type(variable) if variable is not None else standard.type if standard else None
         if kind is None or kind.bits != bits:
             kind = next((each for each in IntegerType if each.bits == bits and not each.signed), None)
@@ -215,16 +207,14 @@ def mapped(od: ObjectDictionary | None, words: Iterable[int | None]) -> tuple[Pd
     return tuple(entries) if 0 < sum(each.type.bits for each in entries) <= 8 * MAX_BYTES else ()
 
 
-def _entry(od: ObjectDictionary | None, address: Address) -> PdoEntry:
+def _entry(od: ObjectDictionary, address: Address) -> PdoEntry:
     """Returns the PDO entry of an object, with the type given by the EDS."""
-    variable = find(od, address.index, address.sub) if od is not None else None
+    variable = find(od, address.index, address.sub)
     kind = integer_type(variable) if variable is not None else None
     return PdoEntry(address.index, address.sub, kind or address.type)
 
 
-def _can_be_sent(od: ObjectDictionary | None, address: Address, offers: Iterable[_Offer]) -> bool:
-    if od is None:
-        return True
+def _can_be_sent(od: ObjectDictionary, address: Address, offers: Iterable[_Offer]) -> bool:
     variable = find(od, address.index, address.sub)
     if variable is None or integer_type(variable) is None:
         return False
@@ -346,9 +336,7 @@ def _check_needed(
 
 
 def _source_complaints(axis: AxisConfig, od: ObjectDictionary, offers: Sequence[_Offer]) -> Iterator[str]:
-    """Yields an error for each load encoder or channel object that is missing, has a different type or cannot
-    be mapped.
-    """
+    """Yields an error for each source that is missing, has a different type or cannot be mapped."""
     sources: dict[str, Source | ChannelSource] = {}
     if axis.load_encoder.source.node is None:
         sources["load_encoder"] = axis.load_encoder.source

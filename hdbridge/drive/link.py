@@ -214,9 +214,7 @@ def _errno(error: BaseException | None) -> int | None:
 
 
 def check_interface(interface: str, where: str) -> None:
-    """Raises `InputError` if python-can has no such interface; ``where`` is the key or option
-    that names it.
-    """
+    """Raises `InputError` for an unknown interface; ``where`` is the key or option that names it."""
     if unknown := unknown_interface(interface):
         raise InputError(f"{where}: {unknown}")
 
@@ -232,9 +230,7 @@ def unknown_interface(interface: str) -> str | None:
 
 
 def absent_interface(settings: BusConfig) -> str | None:
-    """Returns an error text if this computer lacks the network interface of a SocketCAN
-    channel, else None.
-    """
+    """Returns an error text if this computer lacks the network interface of SocketCAN, else None."""
     channel = str(settings.channel)
     if settings.interface != "socketcan" or (_NETWORK / channel).exists():
         return None

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
-from typing import Final, Self
+from typing import Final
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
@@ -54,96 +54,74 @@ def _stopping_on_failure(commander: Commander) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class ProfileMove:
-    """A validated PP move: target in motor counts, limits at the load, and time-out."""
+    """A PP move. All values are at the load; speed and acceleration default to the axis's limits."""
 
     load_deg: float
-    target_counts: int
-    velocity_deg_s: float
-    acceleration_deg_s2: float
-    timeout_s: float | None
+    velocity_deg_s: float | None = None
+    acceleration_deg_s2: float | None = None
+    timeout_s: float | None = None
+    """Time-out; by default 1.5 times the duration of the move plus 2 s."""
 
-    @classmethod
-    def checked(
-        cls,
-        image: ProcessImage,
-        load_deg: float,
-        velocity_deg_s: float | None,
-        acceleration_deg_s2: float | None,
-        timeout_s: float | None,
-    ) -> Self:
-        """Builds a move. All values are at the load; speed and acceleration default to the axis's limits.
+    def checked(self, image: ProcessImage) -> tuple[int, float, float]:
+        """Returns target (motor counts), speed and acceleration.
 
-        Raises `InputError` if a value is not finite or outside the limits. Without ``timeout_s`` the time-out
-        is computed from the travel.
+        Raises `InputError` if a value is not finite or outside the limits.
         """
-        axis = image.axis
-        limits = axis.limits
-        if not limits.contains(load_deg):
+        axis, limits = image.axis, image.axis.limits
+        if not limits.contains(self.load_deg):
             raise InputError(
-                f"target of {load_deg!r} deg is outside {axis.where('limits.position_min_deg')} .. "
+                f"target of {self.load_deg!r} deg is outside {axis.where('limits.position_min_deg')} .. "
                 f"position_max_deg, {limits.position_min_deg:g} .. {limits.position_max_deg:g} deg; nothing "
                 "was sent"
             )
-        return cls(
-            load_deg,
-            image.target_counts_for(load_deg * axis.gear.ratio),
-            _at_most(velocity_deg_s, limits.velocity_deg_s, "velocity_deg_s"),
-            _at_most(acceleration_deg_s2, limits.acceleration_deg_s2, "acceleration_deg_s2"),
-            timeout_s,
+        return (
+            image.target_counts_for(self.load_deg * axis.gear.ratio),
+            _at_most(self.velocity_deg_s, limits.velocity_deg_s, "velocity_deg_s"),
+            _at_most(self.acceleration_deg_s2, limits.acceleration_deg_s2, "acceleration_deg_s2"),
         )
-
-    def time_allowed_s(self, axis: AxisConfig, start_counts: int) -> float:
-        """Returns the given time-out, else 1.5 times the duration of the move plus 2 s."""
-        if self.timeout_s is not None:
-            return self.timeout_s
-        way_deg = abs(axis.motor_encoder.degrees(self.target_counts - start_counts)) / axis.gear.ratio
-        move_s = way_deg / self.velocity_deg_s + self.velocity_deg_s / self.acceleration_deg_s2
-        return _TIME_MARGIN * move_s + _TIME_EXTRA_S
 
 
 @dataclass(frozen=True, slots=True)
 class Homing:
-    """A validated homing run: method (6098h), speeds, acceleration and offset at the load."""
+    """A homing run: method (6098h), speeds, acceleration and offset at the load, and time-out."""
 
     method: int
-    switch_velocity_deg_s: float
-    zero_velocity_deg_s: float
-    acceleration_deg_s2: float
-    offset_deg: float
-    timeout_s: float
+    switch_velocity_deg_s: float | None = None
+    zero_velocity_deg_s: float | None = None
+    acceleration_deg_s2: float | None = None
+    offset_deg: float = 0.0
+    timeout_s: float = 60.0
 
-    @classmethod
-    def checked(
-        cls,
-        axis: AxisConfig,
-        method: int,
-        switch_velocity_deg_s: float | None,
-        zero_velocity_deg_s: float | None,
-        acceleration_deg_s2: float | None,
-        offset_deg: float,
-        timeout_s: float,
-    ) -> Self:
-        """Builds a homing run, with defaults from the axis's limits.
+    def checked(self, axis: AxisConfig) -> dict[Address, int]:
+        """Returns the values of the drive's objects, with defaults from the axis's limits.
 
         Raises `InputError` if a value is not finite or beyond the limits.
         """
         limits = axis.limits
-        towards_switch = switch_velocity_deg_s or TOWARDS_SWITCH * limits.velocity_deg_s
-        towards_zero = zero_velocity_deg_s or TOWARDS_ZERO * limits.velocity_deg_s
+        towards_switch = self.switch_velocity_deg_s or TOWARDS_SWITCH * limits.velocity_deg_s
+        towards_zero = self.zero_velocity_deg_s or TOWARDS_ZERO * limits.velocity_deg_s
         highest_deg = abs(axis.motor_encoder.degrees(_OFFSET_COUNTS) / axis.gear.ratio)
-        if not abs(offset_deg) < highest_deg:  # also false for NaN
+        if not abs(self.offset_deg) < highest_deg:  # also false for NaN
             raise InputError(
-                f"offset_deg: found {offset_deg!r}; expected an angle within {highest_deg:.4g} deg, which "
-                "607Ch can hold; nothing was sent"
+                f"offset_deg: found {self.offset_deg!r}; expected an angle within {highest_deg:.4g} deg, "
+                "which 607Ch can hold; nothing was sent"
             )
-        return cls(
-            method,
-            _at_most(towards_switch, limits.velocity_deg_s, "velocity_deg_s", "switch_"),
-            _at_most(towards_zero, limits.velocity_deg_s, "velocity_deg_s", "zero_"),
-            _at_most(acceleration_deg_s2, limits.acceleration_deg_s2, "acceleration_deg_s2"),
-            offset_deg,
-            timeout_s,
-        )
+        rates = {
+            objects.HOMING_SPEED_SWITCH: _at_most(
+                towards_switch, limits.velocity_deg_s, "velocity_deg_s", "switch_"
+            ),
+            objects.HOMING_SPEED_ZERO: _at_most(
+                towards_zero, limits.velocity_deg_s, "velocity_deg_s", "zero_"
+            ),
+            objects.HOMING_ACCELERATION: _at_most(
+                self.acceleration_deg_s2, limits.acceleration_deg_s2, "acceleration_deg_s2"
+            ),
+        }
+        return {
+            objects.HOMING_METHOD: self.method,
+            **{address: motor_rate(axis, value) for address, value in rates.items()},
+            objects.HOME_OFFSET: round(axis.motor_encoder.counts(self.offset_deg * axis.gear.ratio)),
+        }
 
 
 def run_move(commander: Commander, move: ProfileMove) -> None:
@@ -153,12 +131,17 @@ def run_move(commander: Commander, move: ProfileMove) -> None:
     stopped.
     """
     axis, sdo = commander.axis, commander.sdo
+    target_counts, speed, acceleration = move.checked(commander.image)
     with _stopping_on_failure(commander):
-        timeout_s = move.time_allowed_s(axis, sdo.fetch(objects.POSITION_ACTUAL))
-        sdo.store(objects.PROFILE_VELOCITY, motor_rate(axis, move.velocity_deg_s))
+        travel_counts = target_counts - sdo.fetch(objects.POSITION_ACTUAL)
+        travel_deg = abs(axis.motor_encoder.degrees(travel_counts)) / axis.gear.ratio
+        timeout_s = move.timeout_s
+        if timeout_s is None:
+            timeout_s = _TIME_MARGIN * (travel_deg / speed + speed / acceleration) + _TIME_EXTRA_S
+        sdo.store(objects.PROFILE_VELOCITY, motor_rate(axis, speed))
         for address in (objects.PROFILE_ACCELERATION, objects.PROFILE_DECELERATION):
-            _store_if_there(sdo, address, motor_rate(axis, move.acceleration_deg_s2))
-        sdo.store(objects.TARGET_POSITION, move.target_counts)
+            _store_if_there(sdo, address, motor_rate(axis, acceleration))
+        sdo.store(objects.TARGET_POSITION, target_counts)
         commander.control(ENABLED)
         doing = f"moving to {move.load_deg:g} deg"
         _wait(commander, doing, "room for a set-point", _has_room, STEP_TIMEOUT_S)
@@ -181,17 +164,13 @@ def run_homing(commander: Commander, homing: Homing) -> None:
     Raises `DriveError` if the drive reports a homing error, `TransitionError` on time-out; the axis is then
     stopped.
     """
-    axis, sdo = commander.axis, commander.sdo
-    offset = round(axis.motor_encoder.counts(homing.offset_deg * axis.gear.ratio))
+    sdo, values = commander.sdo, homing.checked(commander.axis)
     with _stopping_on_failure(commander):
-        sdo.store(objects.HOMING_METHOD, homing.method)
-        sdo.store(objects.HOMING_SPEED_SWITCH, motor_rate(axis, homing.switch_velocity_deg_s))
-        sdo.store(objects.HOMING_SPEED_ZERO, motor_rate(axis, homing.zero_velocity_deg_s))
-        _store_if_there(sdo, objects.HOMING_ACCELERATION, motor_rate(axis, homing.acceleration_deg_s2))
-        if offset:
-            sdo.store(objects.HOME_OFFSET, offset)
-        else:
-            _store_if_there(sdo, objects.HOME_OFFSET, 0)
+        for address, value in values.items():
+            if address is objects.HOMING_ACCELERATION or (address is objects.HOME_OFFSET and not value):
+                _store_if_there(sdo, address, value)
+            else:
+                sdo.store(address, value)
         commander.control(ENABLED)
         before = commander.statusword()
         commander.control(ENABLED | START_HOMING)

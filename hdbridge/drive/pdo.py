@@ -38,9 +38,7 @@ class PdoEntry:
 
     @property
     def is_gap(self) -> bool:
-        """True for padding: a data type mapped in place of an object; a drive's own mapping may contain
-        it.
-        """
+        """True for padding, a data type mapped in place of an object."""
         return self.index < _FIRST_OBJECT
 
     @property
@@ -82,9 +80,7 @@ class PdoCodec:
             raise InputError(f"a PDO maps an object once, but got {names}")
 
     def unpack(self, data: bytes | bytearray) -> tuple[int, ...]:
-        """Returns the mapped values in order; raises `PdoLengthError` unless ``data`` has the mapped
-        length.
-        """
+        """Returns the mapped values in order; raises `PdoLengthError` for any other length."""
         try:
             values = self._unpack(data)
         except struct.error as error:
@@ -100,9 +96,7 @@ class PdoCodec:
         return tuple(decoded)
 
     def pack(self, values: Sequence[int]) -> bytes:
-        """Returns the frame's data; raises `InputError` if a value is not an integer within the range of its
-        type.
-        """
+        """Returns the frame's data; raises `InputError` if a value does not fit its integer type."""
         if not self._odd:
             try:
                 # struct itself refuses non-integers (NaN is a float) and out-of-range values.

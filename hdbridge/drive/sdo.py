@@ -170,9 +170,7 @@ class SdoClient:
         return find(self.od, index, sub) is not None
 
     def type_of(self, index: int, sub: int) -> IntegerType:
-        """Returns an object's integer type by the EDS, else by the profile; `SdoError` if it is in
-        neither.
-        """
+        """Returns an object's integer type by the EDS, else by the profile, else raises `SdoError`."""
         variable = find(self.od, index, sub)
         if variable is not None:
             kind = integer_type(variable)
@@ -214,9 +212,7 @@ class SdoClient:
         return kind.decode(data[:size])
 
     def write(self, index: int, sub: int, value: int, type: IntegerType | None = None) -> None:  # noqa: A002
-        """Writes an integer object; raises `InputError` if the value is out of range,
-        `SdoError` on refusal.
-        """
+        """Writes an integer object; raises `InputError` for a value out of range, `SdoError` on refusal."""
         kind = type or self.type_of(index, sub)
         if not isinstance(value, int) or not kind.minimum <= value <= kind.maximum:
             raise InputError(

@@ -56,9 +56,7 @@ class Command(Enum):
 
 
 class Transition(NamedTuple):
-    """Row of the table: in ``source``, ``command`` leads to ``target``. Without a command, the drive changes
-    on its own.
-    """
+    """Row of the table: ``command`` leads from ``source`` to ``target``; None if the drive does it itself."""
 
     number: int
     source: State
@@ -113,9 +111,7 @@ _DECODED: Final = tuple(_decoded(bits) for bits in range(_STATE_BITS + 1))
 
 
 def decode(statusword: int | None) -> State:
-    """Returns the state in a statusword; UNKNOWN for None, for a value beyond 16 bits and for
-    undefined bits.
-    """
+    """Returns the state in a statusword; UNKNOWN for None, beyond 16 bits and for undefined bits."""
     if statusword is None or not 0 <= statusword <= 0xFFFF:
         return State.UNKNOWN
     return _DECODED[statusword & _STATE_BITS]
@@ -158,8 +154,7 @@ _FIRST_ROWS: Final = {(a, b): _first_row(a, b) for a in State for b in State}
 
 
 def controlword_for(state: State, target: State) -> int:
-    """Returns the controlword for the next step from ``state`` to ``target``, or the controlword that holds
-    the target.
+    """Returns the controlword for the next step to ``target``, or the one that holds the drive there.
 
     It is 0 (disable voltage) if the drive must first change state on its own. Raises `TransitionError`
     without a path, which includes every exit from a fault (use `PowerWalk.reset_fault`) and the direct exit

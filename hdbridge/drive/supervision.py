@@ -57,9 +57,7 @@ class Fault(Enum):
 
 
 class Row(NamedTuple):
-    """Reactions to one fault: ``first`` immediately, ``then`` from the ``threshold``-th consecutive cycle
-    with this fault.
-    """
+    """Reactions to one fault: ``first``, and ``then`` from ``threshold`` consecutive cycles on."""
 
     fault: Fault
     first: Reaction

@@ -3,7 +3,6 @@
 import math
 import re
 import struct
-from dataclasses import dataclass
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
@@ -18,20 +17,17 @@ _REALS = {datatypes.REAL32: ("<f", "real32"), datatypes.REAL64: ("<d", "real64")
 _TEXTS = {datatypes.VISIBLE_STRING: "text", datatypes.UNICODE_STRING: "unicode text"}
 
 
-@dataclass(frozen=True, slots=True)
 class Object:
     """Entry of a node's object dictionary: name, type, access and limits."""
 
-    index: int
-    sub: int
-    name: str
-    data_type: int
-    """Number of the type in the EDS; 0 if the object is only in the profile."""
-    integer: IntegerType | None
-    readable: bool = True
-    writable: bool = True
-    permitted: tuple[int, int] | None = None
-    """Least and greatest value of an integer; None for the range of its type."""
+    def __init__(self, variable: ODVariable, name: str) -> None:
+        self.index, self.sub, self.name = variable.index, variable.subindex, name
+        self.data_type = variable.data_type or 0
+        """Number of the type in the EDS."""
+        self.integer = INTEGER_TYPES.get(self.data_type)
+        self.readable, self.writable = variable.readable, variable.writable
+        self.permitted = permitted(variable, self.integer) if self.integer is not None else (0, 0)
+        """Least and greatest value of an integer."""
 
     @property
     def type_name(self) -> str:
@@ -48,9 +44,7 @@ class Object:
         return f"{self.index:04X}h:{self.sub:02X}" + (f" '{self.name}'" if self.name else "")
 
     def decode(self, data: bytes) -> Value:
-        """Decodes a value; unknown types become hexadecimal text. `InputError` if the bytes do not fit the
-        type.
-        """
+        """Decodes a value, of unknown types as hexadecimal text; `InputError` for a wrong length."""
         try:
             if self.integer is not None:
                 return self.integer.decode(_fitting(data, self.integer.bits // 8))
@@ -99,7 +93,7 @@ class Object:
             raise self._wrong(text, "bytes in hexadecimal, such as '01 a0'") from None
 
     def _integer(self, text: str, kind: IntegerType) -> int:
-        low, high = self.permitted or (kind.minimum, kind.maximum)
+        low, high = self.permitted
         try:
             value = int(text, 16) if re.fullmatch(r"0[xX][0-9a-fA-F]+", text) else int(text)
         except ValueError:
@@ -127,32 +121,19 @@ def find_object(text: str, od: ObjectDictionary) -> Object:
                 f"{text!r}: no object of the EDS has this name; expected its number, such as 6064h or "
                 "1018h:04" + (f", or did you mean '{close}'?" if close else "")
             )
-        return _of(variable)
+        return Object(variable, _name(variable))
     index, sub = int(number[1], 16), int(number[2] or "0", 16)
     variable = next((each for each in known.values() if (each.index, each.subindex) == (index, sub)), None)
     if variable is not None:
-        return _of(variable)
+        return Object(variable, _name(variable))
     standard = STANDARD.get((index, sub))
     if standard is not None:
-        return Object(index, sub, standard.name, 0, standard.type)
+        variable = ODVariable(standard.name, index, sub)
+        variable.data_type = next(each for each, kind in INTEGER_TYPES.items() if kind is standard.type)
+        return Object(variable, standard.name)
     subs = sorted(each.subindex for each in known.values() if each.index == index)
     has = f"; it has the sub-indices {', '.join(f'{each:02X}' for each in subs)}" if subs else ""
     raise InputError(f"{index:04X}h:{sub:02X}: neither the EDS nor the profile has this object{has}")
-
-
-def _of(variable: ODVariable) -> Object:
-    data_type = variable.data_type or 0
-    kind = INTEGER_TYPES.get(data_type)
-    return Object(
-        variable.index,
-        variable.subindex,
-        _name(variable),
-        data_type,
-        kind,
-        readable=variable.readable,
-        writable=variable.writable,
-        permitted=permitted(variable, kind) if kind is not None else None,
-    )
 
 
 def _name(variable: ODVariable) -> str:

@@ -73,7 +73,7 @@ class PlannedWrite:
         return found & self.compared == self.value & self.compared
 
 
-def rows(axis: AxisConfig, od: ObjectDictionary | None, pdos: Layouts) -> list[PlannedWrite]:
+def rows(axis: AxisConfig, od: ObjectDictionary, pdos: Layouts) -> list[PlannedWrite]:
     """Returns all writes in order, whether or not the drive has the objects.
 
     The rows of the PDOs and of the cycle depend on what ``od`` permits. Raises `InputError` if a value of the
@@ -137,7 +137,7 @@ def _heartbeats(axis: AxisConfig) -> Iterator[PlannedWrite]:
         yield PlannedWrite(source.node, address.index, address.sub, ms, why, field, address.type)
 
 
-def _pdos(axis: AxisConfig, od: ObjectDictionary | None, pdos: Layouts) -> Iterator[PlannedWrite]:
+def _pdos(axis: AxisConfig, od: ObjectDictionary, pdos: Layouts) -> Iterator[PlannedWrite]:
     used = set()
     for layout in (*pdos.cyclic, *pdos.channels):
         used.add((layout.node_id, objects.TPDO_COMMUNICATION + layout.number - 1))
@@ -167,15 +167,13 @@ def _pdos(axis: AxisConfig, od: ObjectDictionary | None, pdos: Layouts) -> Itera
         (objects.RPDO_COMMUNICATION, "RPDO", "it stays configured, but no node sends it"),
     ):
         for index in range(base, base + PDOS_PER_KIND):
-            if od is not None and find(od, index, 1) and (axis.drive.node_id, index) not in used:
+            if find(od, index, 1) and (axis.drive.node_id, index) not in used:
                 why = f"{kind}{index - base + 1} is not used"
                 yield _invalid(axis.drive.node_id, index, why, without=without)
 
 
 def _carried(axis: AxisConfig, layout: Layout) -> list[str]:
-    """Returns, for each entry of a PDO, the key of the axis file that requests the object; empty if no key
-    does.
-    """
+    """Returns the key of the axis file that requests each entry of a PDO; empty without one."""
     encoder = axis.load_encoder.source
     keys = {(encoder.index, encoder.subindex): "load_encoder.source"}
     for key, channel in axis.channels.items():
@@ -239,7 +237,7 @@ def _pdo(layout: Layout, communication: int, mapping: int, fields: list[str]) ->
     )
 
 
-def _cycle(axis: AxisConfig, od: ObjectDictionary | None) -> Iterator[PlannedWrite]:
+def _cycle(axis: AxisConfig, od: ObjectDictionary) -> Iterator[PlannedWrite]:
     mantissa, exponent = _period(axis, od)
     why = f"the cycle is {axis.drive.cycle_ms:g} ms = {mantissa}e{exponent} s"
     without = f"the drive has to take its period, {axis.drive.cycle_ms:g} ms, from SYNC or its own settings"
@@ -251,15 +249,11 @@ def _cycle(axis: AxisConfig, od: ObjectDictionary | None) -> Iterator[PlannedWri
         )
 
 
-def _period(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[int, int]:
-    """Returns the cycle time as a mantissa and an exponent that the drive accepts; some drives fix the
-    exponent or the period.
-    """
+def _period(axis: AxisConfig, od: ObjectDictionary) -> tuple[int, int]:
+    """Returns the cycle time as a mantissa and an exponent (base 10, s) that the drive accepts."""
     seconds = Decimal(repr(axis.drive.cycle_ms)) / 1000
     pairs = [(seconds.scaleb(-exponent), exponent) for exponent in _EXPONENTS]
     whole = [(int(m), e) for m, e in pairs if m == int(m) and 1 <= m <= _LARGEST_MANTISSA]
-    if od is None:
-        return whole[0]
     mantissa = find(od, objects.CYCLE_MANTISSA.index, objects.CYCLE_MANTISSA.sub)
     exponent = find(od, objects.CYCLE_EXPONENT.index, objects.CYCLE_EXPONENT.sub)
     if mantissa is None:

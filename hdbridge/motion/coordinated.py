@@ -10,18 +10,16 @@ a straight line without stopping. To avoid a stop at a corner, the caller must s
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from ruckig import InputParameter, Ruckig, RuckigError, Synchronization, Trajectory
+from ruckig import InputParameter, Ruckig, Synchronization
 
 from hdbridge.axis.effects import FloatArray
 from hdbridge.errors import InputError
-from hdbridge.motion.generator import SHARES, SOLVED
-from hdbridge.motion.procedures.moves import MotionLimits
+from hdbridge.motion.procedures.moves import MotionLimits, solutions
 from hdbridge.motion.stream import ACCELERATION_MARGIN
 
 _STRAIGHT = 1e-9
@@ -150,14 +148,11 @@ def _leg(
     demand.current_position = [0.0] * count
     demand.target_position = (end - begin).tolist()
     demand.max_jerk = [each.jerk_deg_s3 for each in limits]
-    for share in SHARES:
-        demand.max_velocity = [share * each.velocity_deg_s for each in limits]
-        demand.max_acceleration = [share * each.acceleration_deg_s2 for each in limits]
-        trajectory = Trajectory(count)
-        with suppress(RuckigError):
-            if Ruckig(count).calculate(demand, trajectory) in SOLVED and trajectory.duration <= MOST_S:
-                break
-    else:
+    velocities = [each.velocity_deg_s for each in limits]
+    accelerations = [each.acceleration_deg_s2 for each in limits]
+    found = solutions(Ruckig(count), demand, velocities, accelerations)
+    trajectory = next((each for each in found if each.duration <= MOST_S), None)
+    if trajectory is None:
         raise InputError(
             f"no synchronised move from {begin.tolist()} to {end.tolist()} deg within the limits and "
             f"{MOST_S:g} s: check the targets, the share, and the limits in the axis files"

@@ -9,14 +9,10 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError, Trajectory
+from ruckig import ControlInterface, InputParameter, Ruckig
 
-from hdbridge.motion.procedures.moves import MotionLimits
+from hdbridge.motion.procedures.moves import MotionLimits, solutions
 
-SOLVED = frozenset({Result.Working, Result.Finished})
-SHARES = (1.0, 1.0 - 1e-6)
-"""Factors for the limits in successive attempts, because ruckig fails if limits and distance coincide
-exactly."""
 _MISS_DEG = 1e-6
 """Maximum distance of a plan's end from its target; a larger one is a numerical failure of ruckig."""
 _ROUNDING_DEG = 1e-9
@@ -128,26 +124,20 @@ class Generator:
         demand.current_position = [0.0]
         demand.current_velocity = [now.velocity_deg_s]
         demand.current_acceleration = [now.acceleration_deg_s2]
-        for share in SHARES:
-            demand.max_velocity = [share * min(velocity_deg_s, limits.velocity_deg_s)]
-            demand.max_acceleration = [share * min(acceleration_deg_s2, limits.acceleration_deg_s2)]
-            trajectory = Trajectory(1)
-            try:
-                if self._ruckig.calculate(demand, trajectory) not in SOLVED:
-                    continue
-            except RuckigError:
-                continue
+        velocity = [min(velocity_deg_s, limits.velocity_deg_s)]
+        acceleration = [min(acceleration_deg_s2, limits.acceleration_deg_s2)]
+        for trajectory in solutions(self._ruckig, demand, velocity, acceleration):
             duration_s = float(trajectory.duration)
             if not math.isfinite(duration_s):
                 continue
             extremes = trajectory.position_extrema[0]
-            position, velocity, _ = trajectory.at_time(duration_s)
+            position, speed, _ = trajectory.at_time(duration_s)
             turn_deg = begin_deg + _turn(now.velocity_deg_s, trajectory.at_time, duration_s)
             if (
                 begin_deg + extremes.min >= bounds.lower_deg - _ROUNDING_DEG
                 and begin_deg + extremes.max <= bounds.upper_deg + _ROUNDING_DEG
                 and bounds.lower_deg - _ROUNDING_DEG <= turn_deg <= bounds.upper_deg + _ROUNDING_DEG
-                and abs(velocity[0]) <= _MISS_DEG
+                and abs(speed[0]) <= _MISS_DEG
             ):
                 return Plan(begin_deg, begin_deg + float(position[0]), duration_s, trajectory.at_time)
         return None

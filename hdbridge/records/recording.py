@@ -96,6 +96,10 @@ class RecordingFile(Strict):
         write_atomically(folder / ABOUT_NAME, HEADER + dump_yaml(data))
 
 
+_COMMON: Final = ("axis", "ratio", "drive", "date", "versions", "notes")
+"""Attributes that a recording and its ``recording.yaml`` share."""
+
+
 @dataclass(frozen=True)
 class Recording:
     """A record with its segments and provenance; for a plain CSV file, only the record."""
@@ -146,16 +150,8 @@ class Recording:
                         "CSV file",
                     )
             records.append(replace(Record.read_csv(file, minimum_samples=0), origin=None))
-        return cls(
-            records[0] if len(records) == 1 else concatenate(records),
-            about.segments,
-            about.axis,
-            about.ratio,
-            about.drive,
-            about.date,
-            about.versions,
-            about.notes,
-        )
+        record = records[0] if len(records) == 1 else concatenate(records)
+        return cls(record, about.segments, **{name: getattr(about, name) for name in _COMMON})
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
@@ -170,7 +166,7 @@ class Recording:
             for segment in each.segments
         ]
         common: dict[str, Any] = {}
-        for name in ("axis", "ratio", "drive", "date", "versions", "notes"):
+        for name in _COMMON:
             first, *others = (getattr(each, name) for each in parts)
             if all(each == first for each in others):
                 common[name] = first
@@ -194,9 +190,7 @@ class Recording:
             path = folder / (RECORD_NAME if len(parts) == 1 else f"record-{number:03d}.csv.gz")
             part.write_csv(path)
             files.append(RecordedFile.of(path, len(part)))
-        common = {
-            name: getattr(self, name) for name in ("axis", "ratio", "drive", "date", "versions", "notes")
-        }
+        common = {name: getattr(self, name) for name in _COMMON}
         RecordingFile.made(files=tuple(files), segments=self.segments, **common).write(folder)
 
     def pieces(self, *kinds: str) -> Iterator[tuple[Segment, Record]]:

@@ -1,6 +1,6 @@
 """Axis compiled to machine code from the Python classes, with identical results.
 
-An object of the classes that `hdbridge.sim.state` declares is laid out as a numpy record, attribute by
+An object of the classes marked by `hdbridge.sim.state` is laid out as a numpy record, attribute by
 attribute, and numba compiles the classes' methods for such records. The physics is therefore written only
 once. If an attribute may belong to one of several classes (a hysteresis law, a cause of transmission error),
 its record has space for each of these classes, and a field for the actual class.
@@ -10,14 +10,16 @@ similar functions are those of the C library that Python uses. An axis that cann
 (`Uncompilable`) runs in Python.
 """
 
+import ast
 import hashlib
 import inspect
 import math
+import sys
 import threading
 from collections.abc import Callable, Iterable
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, ClassVar, Final, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, Final, NamedTuple, get_args, get_origin, get_type_hints
 
 import numba
 import numpy as np
@@ -26,7 +28,7 @@ from numba.core.registry import cpu_target
 from numba.core.typing.arraydecl import RecordAttribute
 from numba.extending import overload, overload_method
 
-from hdbridge.sim import ageing, encoder, gear, gear_pieces, hysteresis_laws
+from hdbridge.sim import encoder, gear, gear_pieces, hysteresis_laws
 from hdbridge.sim.axis import Axis, Measured
 from hdbridge.sim.fast import FloatArray, IntArray
 from hdbridge.sim.plant import Plant
@@ -69,7 +71,7 @@ KINDS: Final[dict[Any, Kinds]] = {
             gear.ZeroDrift,
             gear.SlowZeroDrift,
             gear_pieces.Wear,
-            ageing.WornTeeth,
+            gear_pieces.WornTeeth,
             gear_pieces.Creep,
             gear_pieces.Jumps,
             gear_pieces.Damage,
@@ -79,7 +81,7 @@ KINDS: Final[dict[Any, Kinds]] = {
         0.0,
     ),
     gear.Factor: Kinds(
-        (gear_pieces.SpeedFactor, gear_pieces.WarmthFactor, ageing.AgeFactor),
+        (gear_pieces.SpeedFactor, gear_pieces.WarmthFactor, gear_pieces.AgeFactor),
         4,
         1.0,
     ),
@@ -96,7 +98,7 @@ class CompiledAxis:
         """Lays out the axis; raises `Uncompilable` if that is not possible."""
         if getattr(numba.config, "USING_SVML", False):
             raise Uncompilable("numba would take sine and exponential from Intel's library")
-        plant: Any = type(axis.loops.plant)
+        plant: Any = type(axis.plant)
         room = _room(axis)
         self._record = np.zeros(1, _layout_of(plant, room))
         _fill(self._record[0], axis)
@@ -215,9 +217,48 @@ def _version() -> int:
 
 @cache
 def _attributes(cls: Any) -> dict[str, Any]:
-    """Returns the declared attributes of a state class and its ancestors."""
-    hints = get_type_hints(cls)
-    return {name: hint for name, hint in hints.items() if get_origin(hint) is not ClassVar}
+    """Returns the attributes of a state class and its ancestors, with their types.
+
+    The type of an attribute is that of its annotation, else that of a constant or a constructor call that is
+    assigned to it, else ``float``.
+    """
+    found: dict[str, Any] = {}
+    for each in reversed(cls.__mro__):
+        if each in STATES:
+            found |= _assigned(each.__module__)[each.__name__]
+    return found | {name: hint for name, hint in get_type_hints(cls).items() if name in found}
+
+
+@cache
+def _assigned(module: str) -> dict[str, dict[str, Any]]:
+    """Returns the attributes that the methods of each class of a module assign, with their types."""
+    tree, scope = ast.parse(inspect.getsource(sys.modules[module])), vars(sys.modules[module])
+    found: dict[str, dict[str, Any]] = {}
+    for cls in (each for each in tree.body if isinstance(each, ast.ClassDef)):
+        own = found[cls.name] = dict.fromkeys(_stored(cls), float)
+        for each in ast.walk(cls):
+            if isinstance(each, ast.AnnAssign):
+                own |= dict.fromkeys(_stored(each.target), eval(ast.unparse(each.annotation), scope))
+            elif isinstance(each, ast.Assign) and (kind := _type_of(each.value, scope)) is not None:
+                own |= dict.fromkeys(_stored(*each.targets), kind)
+    return found
+
+
+def _stored(*nodes: ast.AST) -> list[str]:
+    """Returns the attributes of ``self`` that are assigned in these nodes."""
+    every = [each for node in nodes for each in ast.walk(node) if isinstance(each, ast.Attribute)]
+    stored = [each for each in every if isinstance(each.ctx, ast.Store)]
+    return [each.attr for each in stored if ast.unparse(each.value) == "self"]
+
+
+def _type_of(value: ast.expr, scope: dict[str, Any]) -> Any:
+    """Returns the type of a constant, or the state class or type of numbers that is called; else None."""
+    if isinstance(value, ast.Constant):
+        return type(value.value)
+    if isinstance(value, ast.Call) and isinstance(value.func, ast.Name):
+        called = eval(value.func.id, scope)
+        return called if called in STATES or called in (float, int, bool) else None
+    return None
 
 
 class Members(NamedTuple):

@@ -40,11 +40,6 @@ class Disc:
     a)``, about e/R sin a.
     """
 
-    _eccentric_rad: float
-    _oval: float
-    _oval_rad: float
-    _relative: float
-
     def __init__(self, truth: TrueDisc) -> None:
         self._relative = truth.eccentricity_um / 1000.0 / truth.radius_mm
         self._eccentric_rad = math.radians(truth.eccentric_at_deg)
@@ -65,13 +60,6 @@ class Signals:
     Offsets cause an error once per line, unequal amplitudes or phases twice, third harmonics four times.
     """
 
-    _cosine_offset: float
-    _gain: float
-    _lines: float
-    _phase_rad: float
-    _sine_offset: float
-    _third: float
-
     def __init__(self, truth: TrueSignals) -> None:
         self._lines = float(truth.lines_per_turn)
         self._sine_offset = truth.sine_offset
@@ -90,13 +78,6 @@ class Signals:
 @state
 class Cable:
     """Cable that is taut beyond an angle; it then twists the encoder's body, which reduces the reading."""
-
-    _drag: float
-    _from_deg: float
-    _last_deg: float
-    _led: bool
-    _per_deg: float
-    _way: float
 
     def __init__(self, truth: TrueCable) -> None:
         self._from_deg = truth.taut_from_deg
@@ -118,17 +99,7 @@ class Cable:
 
 @state
 class SensorWarming:
-    """Shift of the reading with the encoder's warming: proportional to the square of the speed, with a
-    lag.
-    """
-
-    _exponent: float
-    _goal: float
-    _interval_s: float
-    _last_deg: float
-    _led: bool
-    _nearer: float
-    _shift_deg: float
+    """Shift of the reading with the encoder's warming, which lags the square of the speed."""
 
     def __init__(self, truth: TrueSensorWarming, interval_s: float) -> None:
         self._goal = truth.arcsec_at_10_deg_s / 100.0 / ARCSEC_PER_DEG
@@ -153,18 +124,14 @@ class SensorWarming:
 class Losses:
     """Lost counts of an encoder."""
 
-    _counts: tuple[float, ...]
-    _count: int
-    _lost: float
     _past: int
     """Number of losses so far."""
-    _times_s: tuple[float, ...]
 
     def __init__(self, losses: Iterable[TrueLoss]) -> None:
         in_order = sorted(losses, key=lambda each: each.time_s)
-        self._times_s = tuple(each.time_s for each in in_order)
-        self._counts = tuple(float(each.counts) for each in in_order)
-        self._count = len(in_order)
+        self._times_s: tuple[float, ...] = tuple(each.time_s for each in in_order)
+        self._counts: tuple[float, ...] = tuple(float(each.counts) for each in in_order)
+        self._count: int = len(in_order)
         self._past, self._lost = 0, 0.0
 
     def counts(self, now_s: float) -> float:
@@ -183,13 +150,10 @@ class Late:
     """Delayed angle."""
     _angles: list[float]
     """Angles since the delayed one, in a ring buffer that starts at ``_oldest``."""
-    _kept: int
-    _oldest: int
-    _part: float
 
     def __init__(self, late_s: float, dt_s: float, start_deg: float) -> None:
         whole, self._part = divmod(late_s / dt_s, 1.0)
-        self._kept = int(whole) + 2
+        self._kept: int = int(whole) + 2
         self._angles = [0.0] * self._kept
         self.begin(start_deg)
 
@@ -214,14 +178,10 @@ class Late:
 class FixedErrors:
     """Reading errors that depend on the shaft's angle alone."""
 
-    _disc: Disc
-    _signals: Signals
-    _with_disc: bool
-    _with_signals: bool
-
     def __init__(self, truth: TrueEncoder) -> None:
         signals = truth.signals if isinstance(truth, TrueLoadEncoder) else None
-        self._with_disc, self._with_signals = truth.disc is not None, signals is not None
+        self._with_disc = bool(truth.disc)
+        self._with_signals = bool(signals)
         self._disc = Disc(truth.disc or TrueDisc(radius_mm=1.0))
         self._signals = Signals(signals or TrueSignals(lines_per_turn=1))
 
@@ -237,16 +197,13 @@ class FixedErrors:
 
 @state
 class Body:
-    """Shift of the load encoder's reading by its cable and its warming, which depend on the travel of its
-    shaft.
+    """Shift of the load encoder's reading by its cable and its warming.
 
     The shift has a state, so it must be updated once per substep; it may be read at any time.
     """
 
     deg: float
     """Current shift of the reading."""
-    moves: bool
-    _errors: tuple[ReadingError, ...]
 
     def __init__(self, truth: TrueLoadEncoder, dt_s: float) -> None:
         errors: list[ReadingError] = []
@@ -254,7 +211,7 @@ class Body:
             errors.append(Cable(truth.cable))
         if truth.sensor_warming is not None:
             errors.append(SensorWarming(truth.sensor_warming, dt_s))
-        self._errors = tuple(errors)
+        self._errors: tuple[ReadingError, ...] = tuple(errors)
         self.moves = bool(errors)
         self.deg = 0.0
 

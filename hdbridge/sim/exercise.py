@@ -47,7 +47,7 @@ class Exercise:
         self._load_zero = load.zero_counts
         self._cycle = 0
         self._target = float(machine.motor_counts)
-        self._rows: list[tuple[float, ...]] = []
+        self._parts: list[Floats] = [np.empty((len(Readings._fields), 0))]
 
     @property
     def target_deg(self) -> float:
@@ -57,7 +57,7 @@ class Exercise:
     @property
     def samples(self) -> int:
         """Number of samples recorded so far."""
-        return len(self._rows)
+        return sum(each.shape[1] for each in self._parts)
 
     def hold(self, duration_s: float) -> None:
         self.lead(lambda seconds: 0.0 * seconds, duration_s)
@@ -86,16 +86,13 @@ class Exercise:
             self.lead(way, 2.0 * ramp_s + even_s, distance_deg)
 
     def sine(self, amplitude_deg: float, frequency_hz: float, periods: float) -> None:
-        """Oscillates as 1 - cos, between the current position and a position at twice the amplitude from
-        it.
-        """
+        """Oscillates as 1 - cos, from here to twice the amplitude from here."""
         turn = math.tau * frequency_hz
         self.lead(lambda seconds: amplitude_deg * (1.0 - np.cos(turn * seconds)), periods / frequency_hz)
 
     def readings(self) -> Readings:
         """Returns all samples recorded so far."""
-        columns = np.array(self._rows, dtype=np.float64).reshape(-1, len(Readings._fields)).T
-        return Readings(*columns)
+        return Readings(*np.concatenate(self._parts, axis=1))
 
     def lead(
         self, way: Callable[[Floats], Floats], duration_s: float, distance_deg: float | None = None
@@ -108,27 +105,18 @@ class Exercise:
         ways = way(np.arange(1, cycles + 1, dtype=np.float64) * self.cycle_s)
         if distance_deg is not None:
             ways[-1] = distance_deg
-        start = self._target
-        follow, substeps = self.machine.follow, self._substeps
-        last = start
-        for target in (start + self._counts_per_deg * ways).tolist():
-            follow(last, target, substeps)
-            last = target
-            self._cycle += 1
-            if self._cycle % self._per_sample == 0:
-                self._keep(target)
-        self._target = last
-
-    def _keep(self, target: float) -> None:
-        machine = self.machine
-        self._rows.append(
-            (
-                self._cycle * self.cycle_s,
-                (machine.motor_counts - self._zero) / self._counts_per_deg,
-                (machine.load_counts - self._load_zero) / self._load_counts_per_deg,
-                (target - self._zero) / self._counts_per_deg,
-                machine.load_torque_nm,
-                machine.torque_permille / 1000.0 * self._rated_nm,
-                machine.temperature_c,
-            )
+        target = self._target + self._counts_per_deg * ways
+        seen = self.machine.follow_all([self._target, *target.tolist()], [self._substeps] * cycles)
+        number = self._cycle + np.arange(1, cycles + 1)
+        columns = (
+            number * self.cycle_s,
+            (np.floor(seen.motor_reading + 0.5) - self._zero) / self._counts_per_deg,
+            (np.floor(seen.load_reading + 0.5) - self._load_zero) / self._load_counts_per_deg,
+            (target - self._zero) / self._counts_per_deg,
+            seen.load_torque_nm,
+            seen.torque_permille / 1000.0 * self._rated_nm,
+            seen.temperature_c,
         )
+        self._parts.append(np.stack(columns)[:, number % self._per_sample == 0])
+        self._cycle += cycles
+        self._target = float(target[-1])

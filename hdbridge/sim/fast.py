@@ -58,7 +58,7 @@ def compiled_axis(axis: Axis) -> AnyAxis:
         made = compiled.CompiledAxis(axis)
     except compiled.Uncompilable:
         return axis
-    plant = type(axis.loops.plant)
+    plant = type(axis.plant)
     if plant not in _agreeing:
         _agreeing[plant] = _agree(copy.deepcopy(axis))
     return made if _agreeing[plant] else axis
@@ -73,7 +73,7 @@ def _agree(axis: Axis) -> bool:
     from hdbridge.sim import compiled  # noqa: PLC0415
 
     other = compiled.CompiledAxis(axis)
-    limit_nm, place = axis.loops.servo.limit_nm, axis.at_first()[0]
+    limit_nm, place = axis.servo.limit_nm, axis.at_first()[0]
     for cycle in range(_PROOF_CYCLES):
         step_deg = _PROOF_STEP_DEG if cycle < _PROOF_CYCLES // 2 else -_PROOF_STEP_DEG
         step = step_deg * axis.motor_counts_per_deg

@@ -8,8 +8,8 @@ The error is a sum of pieces, each a physical cause. To add a cause, write a cla
 import math
 from typing import ClassVar, Protocol
 
-from hdbridge.sim.ageing import AgeFactor, WornTeeth
 from hdbridge.sim.gear_pieces import (
+    AgeFactor,
     Creep,
     Damage,
     Flank,
@@ -19,6 +19,7 @@ from hdbridge.sim.gear_pieces import (
     SpeedFactor,
     WarmthFactor,
     Wear,
+    WornTeeth,
 )
 from hdbridge.sim.hysteresis_laws import Law, law_of
 from hdbridge.sim.orders import Orders
@@ -56,15 +57,6 @@ class MotorOrders:
     The error may also depend on the loaded flank, the torque and the temperature.
     """
 
-    by_motor_only: bool
-    _factors: tuple[Factor, ...]
-    _flank: Flank
-    _flanked: bool
-    _growth_per_nm: float
-    _orders: Orders
-    _rad_per_deg: float
-    _turns: float
-
     def __init__(
         self,
         orders: tuple[TrueOrder, ...],
@@ -77,10 +69,10 @@ class MotorOrders:
         self._turns = turns
         self._rad_per_deg = math.radians(turns)
         self._growth_per_nm = growth_per_nm
-        self._flanked = flank is not None
+        self._flanked: bool = flank is not None
         self._flank = Flank(flank if flank is not None else TrueFlank(shift_deg=0.0, travel_deg=1.0))
-        self._factors = factors
-        self.by_motor_only = flank is None and not growth_per_nm and not factors
+        self._factors: tuple[Factor, ...] = factors
+        self.by_motor_only: bool = flank is None and not growth_per_nm and not factors
 
     def arcsec(self, now: Conditions) -> float:
         angle_deg = now.motor_deg
@@ -101,7 +93,6 @@ class LoadOrders:
     """Tooth error as a function of the load angle."""
 
     by_motor_only: ClassVar[bool] = False
-    _orders: Orders
 
     def __init__(self, orders: tuple[TrueOrder, ...]) -> None:
         self._orders = Orders(orders)
@@ -114,22 +105,16 @@ class LoadOrders:
 class ElasticHysteresis:
     """Elastic hysteresis over the motor's travel; may also depend on speed, temperature or age."""
 
-    by_motor_only: bool
-    _factors: tuple[Factor, ...]
-    _law: Law
-    _loop_arcsec: float
-    _loop_deg: float
     _loop_slope: float
     """Slope of the loop over the last travel of the motor, arcsec per radian."""
-    _reaction: float
 
     def __init__(self, law: Law, factors: tuple[Factor, ...], reaction: float) -> None:
-        self._law = law
-        self._factors = factors
+        self._law: Law = law
+        self._factors: tuple[Factor, ...] = factors
         self._reaction = reaction
         self._loop_deg = self._loop_slope = 0.0
         self._loop_arcsec = law.advance(0.0)
-        self.by_motor_only = not factors
+        self.by_motor_only: bool = not factors
 
     def arcsec(self, now: Conditions) -> float:
         loop, size = self._law.advance(now.motor_deg), 1.0
@@ -149,8 +134,6 @@ class ZeroDrift:
     """Shift of the output proportional to the temperature above ambient."""
 
     by_motor_only: ClassVar[bool] = False
-    _ambient_c: float
-    _arcsec_per_k: float
 
     def __init__(self, ambient_c: float, arcsec_per_k: float) -> None:
         self._ambient_c = ambient_c
@@ -162,15 +145,9 @@ class ZeroDrift:
 
 @state
 class SlowZeroDrift:
-    """Shift of the output proportional to the temperature of a housing, which lags the measured
-    temperature.
-    """
+    """Shift of the output with the temperature of a housing, which lags the measured temperature."""
 
     by_motor_only: ClassVar[bool] = False
-    _ambient_c: float
-    _arcsec_per_k: float
-    _housing_c: float
-    _nearer: float
 
     def __init__(self, ambient_c: float, arcsec_per_k: float, start_c: float, nearer: float) -> None:
         self._ambient_c = ambient_c
@@ -259,15 +236,11 @@ def _zero_drift(truth: Truth) -> list[Piece]:
 class Gear:
     """Output of the gear before its spring, in degrees of the load."""
 
-    by_motor_only: bool
-    _pieces: tuple[Piece, ...]
-    _ratio: float
-
     def __init__(self, truth: Truth) -> None:
         pieces = pieces_of(truth)
         self._ratio = truth.gear.ratio
-        self._pieces = tuple(pieces)
-        self.by_motor_only = all(piece.by_motor_only for piece in pieces)
+        self._pieces: tuple[Piece, ...] = tuple(pieces)
+        self.by_motor_only: bool = all(piece.by_motor_only for piece in pieces)
         """True if the output cannot change while the motor is at rest."""
 
     def turned_deg(self, now: Conditions) -> float:

@@ -1,15 +1,18 @@
 """Causes of transmission error in the gear other than orders and hysteresis; see `hdbridge.sim.gear`.
 
 Each piece is evaluated once per substep, in order of time, so a piece with a state advances by one substep
-per evaluation.
+per evaluation. Ageing is linear from switch-on: stiffening grease and settling preload change the hysteresis
+loop, and wear of the teeth changes the tooth error.
 """
 
 import math
 import random
 from typing import ClassVar, Final
 
+from hdbridge.sim.orders import Orders
 from hdbridge.sim.state import Conditions, state
 from hdbridge.sim.truth.gear import (
+    TrueAgeing,
     TrueCreep,
     TrueDamage,
     TrueFlank,
@@ -29,11 +32,6 @@ SLIDING_DEG_S: Final = 0.5
 class Flank:
     """Loaded flank of the teeth, from -1 to 1, which changes with the motor's travel."""
 
-    _last_deg: float
-    _share: float
-    _shift_deg: float
-    _travel_deg: float
-
     def __init__(self, truth: TrueFlank) -> None:
         self._shift_deg = truth.shift_deg
         self._travel_deg = truth.travel_deg
@@ -51,13 +49,6 @@ class Flank:
 @state
 class SpeedFactor:
     """Factor for rolling friction that grows with the logarithm of the motor speed, with a lag."""
-
-    _dt: float
-    _from_deg_s: float
-    _gain: float
-    _last_deg: float
-    _nearer: float
-    _now: float
 
     def __init__(self, truth: TrueRate, dt_s: float) -> None:
         self._gain = truth.growth_per_decade
@@ -79,9 +70,6 @@ class SpeedFactor:
 class WarmthFactor:
     """Factor that grows linearly with the temperature; at least 0.05."""
 
-    _per_k: float
-    _reference_c: float
-
     def __init__(self, per_k: float, reference_c: float) -> None:
         self._per_k = per_k
         self._reference_c = reference_c
@@ -94,16 +82,53 @@ class WarmthFactor:
 
 
 @state
+class Age:
+    """Completed fraction of the ageing, which rises from 0 at switch-on to 1 and stays there."""
+
+    def __init__(self, truth: TrueAgeing, dt_s: float) -> None:
+        self._step = dt_s / truth.duration_s
+        self._share = 0.0
+
+    def grown(self) -> float:
+        """Advances by one substep and returns the completed fraction."""
+        self._share = min(1.0, self._share + self._step)
+        return self._share
+
+
+@state
+class AgeFactor:
+    """Factor that multiplies the elastic hysteresis and grows with age."""
+
+    def __init__(self, truth: TrueAgeing, dt_s: float) -> None:
+        self._age = Age(truth, dt_s)
+        self._growth = truth.hysteresis_growth
+
+    def factor(self, now: Conditions) -> float:
+        return 1.0 + self._growth * self._age.grown()
+
+
+@state
+class WornTeeth:
+    """Additional tooth error, a function of the motor angle, that grows with age."""
+
+    by_motor_only: ClassVar[bool] = False
+
+    def __init__(self, truth: TrueAgeing, dt_s: float) -> None:
+        self._age = Age(truth, dt_s)
+        self._orders = Orders(truth.motor_orders)
+
+    def arcsec(self, now: Conditions) -> float:
+        share = self._age.grown()
+        error, slope = self._orders.at(math.radians(now.motor_deg))
+        now.slope_arcsec += share * slope
+        return share * error
+
+
+@state
 class Wear:
     """Lost motion between the teeth: the output lags in either direction, and the lag grows with wear."""
 
     by_motor_only: ClassVar[bool] = True
-    _exponent: float
-    _follower_deg: float
-    _last_deg: float
-    _per_1000: float
-    _ratio: float
-    _turns: float
 
     def __init__(self, truth: TrueWear, ratio: float) -> None:
         self._per_1000 = truth.arcsec_per_1000_turns
@@ -132,19 +157,15 @@ class Creep:
     """
 
     by_motor_only: ClassVar[bool] = False
-    _amplitudes: tuple[float, ...]
-    _dt: float
-    _last_deg: float
-    _nearer: tuple[float, ...]
-    _per_nm: tuple[float, ...]
-    _states: list[float]
 
     def __init__(self, elements: tuple[TrueCreep, ...], dt_s: float) -> None:
         self._dt = dt_s
-        self._amplitudes = tuple(each.amplitude_arcsec for each in elements)
-        self._per_nm = tuple(each.arcsec_per_nm for each in elements)
-        self._nearer = tuple(-math.expm1(-dt_s / each.time_constant_s) for each in elements)
-        self._states = [0.0] * len(elements)
+        self._amplitudes: tuple[float, ...] = tuple(each.amplitude_arcsec for each in elements)
+        self._per_nm: tuple[float, ...] = tuple(each.arcsec_per_nm for each in elements)
+        self._nearer: tuple[float, ...] = tuple(
+            -math.expm1(-dt_s / each.time_constant_s) for each in elements
+        )
+        self._states: list[float] = [0.0] * len(elements)
         self._last_deg = 0.0
 
     def arcsec(self, now: Conditions) -> float:
@@ -166,20 +187,14 @@ class Jumps:
     """Tooth jumps, each spread over its duration."""
 
     by_motor_only: ClassVar[bool] = False
-    _dt: float
-    _duration_s: tuple[float, ...]
-    _step: int
-    _teeth: tuple[float, ...]
-    _time_s: tuple[float, ...]
-    _tooth_arcsec: float
 
     def __init__(self, jumps: tuple[TrueJump, ...], teeth: float, dt_s: float) -> None:
         self._dt = dt_s
-        self._time_s = tuple(each.time_s for each in jumps)
-        self._duration_s = tuple(each.duration_s for each in jumps)
-        self._teeth = tuple(float(each.teeth) for each in jumps)
+        self._time_s: tuple[float, ...] = tuple(each.time_s for each in jumps)
+        self._duration_s: tuple[float, ...] = tuple(each.duration_s for each in jumps)
+        self._teeth: tuple[float, ...] = tuple(float(each.teeth) for each in jumps)
         self._tooth_arcsec = DEG_PER_TURN / teeth * ARCSEC_PER_DEG
-        self._step = -1
+        self._step: int = -1
 
     def arcsec(self, now: Conditions) -> float:
         self._step += 1
@@ -197,14 +212,11 @@ class Damage:
     """Damaged teeth: smooth bumps of the error at certain load angles."""
 
     by_motor_only: ClassVar[bool] = False
-    _at_deg: tuple[float, ...]
-    _height: tuple[float, ...]
-    _reach_deg: tuple[float, ...]
 
     def __init__(self, teeth: tuple[TrueDamage, ...]) -> None:
-        self._at_deg = tuple(each.at_deg for each in teeth)
-        self._reach_deg = tuple(each.width_deg / 2.0 for each in teeth)
-        self._height = tuple(each.height_arcsec for each in teeth)
+        self._at_deg: tuple[float, ...] = tuple(each.at_deg for each in teeth)
+        self._reach_deg: tuple[float, ...] = tuple(each.width_deg / 2.0 for each in teeth)
+        self._height: tuple[float, ...] = tuple(each.height_arcsec for each in teeth)
 
     def arcsec(self, now: Conditions) -> float:
         error = 0.0
@@ -219,16 +231,9 @@ class Damage:
 
 @state
 class Roller:
-    """Roller on the motor's hub: an error that varies with the roller's own angle, largest at the load angle
-    of the contact.
-    """
+    """Roller on the motor's hub: an error over its own angle, largest at the load angle of the contact."""
 
     by_motor_only: ClassVar[bool] = False
-    _amplitude: float
-    _order: float
-    _phase_rad: float
-    _pressed_at_deg: float
-    _sharpness: float
 
     def __init__(self, truth: TrueRoller) -> None:
         self._amplitude = truth.amplitude_arcsec

@@ -17,19 +17,6 @@ class Heat:
     """Motor friction at the current temperature, relative to the friction in the truth file."""
     since_s: float
     """Time since the axis was switched on."""
-    _ambient_c: float
-    _ambient_k_per_hour: float
-    _ambient_period_s: float
-    _ambient_swing_k: float
-    _copper_loss_w: float
-    _dt_s: float
-    _friction_grows: bool
-    _growth: WarmthFactor
-    _resistance_k_per_w: float
-    _step_s: float
-    _time_constant_s: float
-    _warming_fraction: float
-    _ambient_varies: bool
 
     def __init__(self, truth: Truth) -> None:
         heat = truth.temperature

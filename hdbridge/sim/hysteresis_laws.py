@@ -23,9 +23,7 @@ class Law(Protocol):
 
 
 def law_of(truth: Hysteresis | None, motor_deg: float) -> Law | None:
-    """Returns the hysteresis law of a truth file in its initial state at a motor angle; None without
-    hysteresis.
-    """
+    """Returns the law of a truth file in its initial state at a motor angle; None without hysteresis."""
     if isinstance(truth, RollingFriction):
         return RollingFrictionLaw(truth, motor_deg)
     if isinstance(truth, MaxwellSlip):
@@ -43,16 +41,6 @@ class RollingFrictionLaw:
     is the direction and ``x = |motor - a| / width``, at most 1. ``g(x) = (x^(n-1) - (n-1) x) / (2-n)``, and
     ``x (1 - ln x)`` for n = 2. Only the last reversal counts, so there is no return-point memory.
     """
-
-    _branch_arcsec: float
-    _branch_deg: float
-    _direction: float
-    _error: float
-    _exponent: float
-    _motor_deg: float
-    _offset: float
-    _saturated: bool
-    _width: float
 
     def __init__(self, truth: RollingFriction, motor_deg: float) -> None:
         self._offset = truth.offset_arcsec
@@ -98,16 +86,12 @@ class RollingFrictionLaw:
 class MaxwellSlipLaw:
     """Maxwell slip: parallel springs with sliders (Prandtl-Ishlinskii), with return-point memory."""
 
-    _error: float
-    _limits: tuple[float, ...]
-    _motor_deg: float
-    _states: list[float]
-    _stiffnesses: tuple[float, ...]
-
     def __init__(self, truth: MaxwellSlip, motor_deg: float) -> None:
-        self._stiffnesses = tuple(each.limit_arcsec / each.yield_deg for each in truth.elements)
-        self._limits = tuple(each.limit_arcsec for each in truth.elements)
-        self._states = [0.0] * len(self._limits)
+        self._stiffnesses: tuple[float, ...] = tuple(
+            each.limit_arcsec / each.yield_deg for each in truth.elements
+        )
+        self._limits: tuple[float, ...] = tuple(each.limit_arcsec for each in truth.elements)
+        self._states: list[float] = [0.0] * len(self._limits)
         self._motor_deg = motor_deg
         self._error = 0.0
 
@@ -136,14 +120,6 @@ class BoucWenLaw:
 
     beta + gamma = 1. It is integrated over the motor's travel x by the midpoint rule, in short steps.
     """
-
-    _beta: float
-    _exponent: float
-    _gamma: float
-    _motor_deg: float
-    _offset: float
-    _yield: float
-    _z: float
 
     def __init__(self, truth: BoucWen, motor_deg: float) -> None:
         self._offset = truth.offset_arcsec
@@ -176,12 +152,6 @@ class BoucWenLaw:
 @state
 class DahlLaw:
     """Dahl's law: ``dz/dx = (1 - z sgn dx)^i / yield``, solved exactly; the error is offset * z."""
-
-    _exponent: float
-    _motor_deg: float
-    _offset: float
-    _yield: float
-    _z: float
 
     def __init__(self, truth: Dahl, motor_deg: float) -> None:
         self._offset = truth.offset_arcsec

@@ -20,15 +20,6 @@ GRAVITY_M_S2 = 9.80665
 class Spring:
     """Spring torque as a function of wind-up: zero within the dead zone, then three linear stages."""
 
-    _first_deg: float
-    _first_nm: float
-    _gap_deg: float
-    _k1: float
-    _k2: float
-    _k3: float
-    _second_deg: float
-    _second_nm: float
-
     def __init__(self, stiffness: float, later: TrueStiffening | None, gap_deg: float) -> None:
         self._gap_deg = gap_deg
         self._k1 = self._k2 = self._k3 = stiffness
@@ -63,30 +54,6 @@ class Spring:
 class LoadedPlant(Plant):
     """`Plant` with every load and spring property of the truth file."""
 
-    _arm_nm: float
-    _breakaway: float
-    _breakaway_exponent: float
-    _breakaway_speed: float
-    _down_deg: float
-    _gap_deg: float
-    _held_deg: float
-    _held_nm: list[float]
-    _play_deg: float
-    _played_deg: float
-    _shaken: bool
-    _shaking_nm: tuple[float, ...]
-    _shaking_phase: tuple[float, ...]
-    _shaking_turn: tuple[float, ...]
-    _slider_limit: tuple[float, ...]
-    _slider_stiffness: tuple[float, ...]
-    _slides: bool
-    _spring: Spring
-    _step: int
-    _thinning_exponent: float
-    _thinning_from: float
-    _viscous: float
-    _whole_inertia: float
-
     def __init__(self, truth: Truth) -> None:
         Plant.__init__(self, truth)
         gear, load = truth.gear, truth.load_
@@ -108,13 +75,19 @@ class LoadedPlant(Plant):
             self._arm_nm = mass.mass_kg * GRAVITY_M_S2 * mass.arm_m * math.cos(math.radians(mass.tilt_deg))
             self._down_deg = mass.down_deg
         self._shaken = bool(load.vibration)
-        self._shaking_turn = tuple(math.tau * each.frequency_hz * self._dt for each in load.vibration)
-        self._shaking_phase = tuple(math.radians(each.phase_deg) for each in load.vibration)
-        self._shaking_nm = tuple(each.torque_nm for each in load.vibration)
+        self._shaking_turn: tuple[float, ...] = tuple(
+            math.tau * each.frequency_hz * self._dt for each in load.vibration
+        )
+        self._shaking_phase: tuple[float, ...] = tuple(
+            math.radians(each.phase_deg) for each in load.vibration
+        )
+        self._shaking_nm: tuple[float, ...] = tuple(each.torque_nm for each in load.vibration)
         self._slides = bool(load.presliding)
-        self._slider_stiffness = tuple(each.limit_nm / each.travel_deg for each in load.presliding)
-        self._slider_limit = tuple(each.limit_nm for each in load.presliding)
-        self._held_nm = [0.0] * len(self._slider_limit)
+        self._slider_stiffness: tuple[float, ...] = tuple(
+            each.limit_nm / each.travel_deg for each in load.presliding
+        )
+        self._slider_limit: tuple[float, ...] = tuple(each.limit_nm for each in load.presliding)
+        self._held_nm: list[float] = [0.0] * len(self._slider_limit)
         self._held_deg = self.now.load_deg
         self._step = 0
         coupling = load.encoder.coupling
@@ -217,9 +190,7 @@ class LoadedPlant(Plant):
         return min(limit, max(-limit, held))
 
     def _play(self, load_deg: float) -> float:
-        """Returns the angle of the coupling's near side, which the load drags along once it has crossed the
-        play.
-        """
+        """Returns the angle of the coupling's near side, which the load drags along across the play."""
         played = min(load_deg + self._play_deg, max(load_deg - self._play_deg, self._played_deg))
         self._played_deg = played
         return played

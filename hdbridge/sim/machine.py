@@ -21,9 +21,7 @@ FloatArray = fast.FloatArray
 
 
 class Cycles(NamedTuple):
-    """Measurements at the end of each of many cycles, named like the machine's attributes; shape (n,)
-    each.
-    """
+    """Measurements at the end of many cycles, named like the machine's attributes; shape (n,) each."""
 
     motor_reading: FloatArray
     load_reading: FloatArray
@@ -40,8 +38,7 @@ class Machine:
     """
 
     def __init__(self, truth: Truth, seed: int, *, may_compile: bool = False, loaded: bool = False) -> None:
-        """``may_compile`` permits a pause of some seconds, after which the machine runs faster; see
-        `sim.fast`.
+        """``may_compile`` permits a pause of some seconds, then the machine is faster (`sim.fast`).
 
         ``loaded`` permits an external torque on the load in `follow_all`.
         """
@@ -54,7 +51,7 @@ class Machine:
         self._noise = random.Random(f"load encoder {seed}")
         self._rated_nm = truth.motor.rated_torque_nm
         self._sense = float(truth.motor.encoder.direction)
-        self._limit_nm = self._rated_limit_nm = axis.loops.servo.limit_nm
+        self._limit_nm = self._rated_limit_nm = axis.servo.limit_nm
         self._limit_permille = 1000.0 * self._limit_nm / self._rated_nm
         self._response: Response | None = None
         if truth.servo.response is not None:

@@ -12,16 +12,15 @@ from hdbridge.sim.truth.hysteresis import TrueOrder
 class Orders:
     """``sum of amplitude cos(order angle + phase)`` as a function of an angle."""
 
-    _coefficients: tuple[complex, ...]
-    _count: int
-
     def __init__(self, orders: Iterable[TrueOrder]) -> None:
         terms = {
             each.order: cmath.rect(each.amplitude_arcsec, math.radians(each.phase_deg)) for each in orders
         }
         # Highest order first, for Horner's rule; the last one, order 0, is always zero.
-        self._coefficients = tuple(terms.get(order, 0j) for order in range(max(terms, default=0), 0, -1))
-        self._count = len(self._coefficients)
+        self._coefficients: tuple[complex, ...] = tuple(
+            terms.get(order, 0j) for order in range(max(terms, default=0), 0, -1)
+        )
+        self._count: int = len(self._coefficients)
 
     def at(self, angle_rad: float) -> tuple[float, float]:
         """Returns the sum in arcsec, and its derivative with respect to the angle in arcsec per radian."""

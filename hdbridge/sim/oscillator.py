@@ -28,11 +28,6 @@ class Oscillator(Protocol):
 class Transition:
     """`Step` as a class of the simulation's state."""
 
-    distance_by_distance: float
-    distance_by_rate: float
-    rate_by_distance: float
-    rate_by_rate: float
-
     def __init__(self, step: Step) -> None:
         self.distance_by_distance, self.distance_by_rate, self.rate_by_distance, self.rate_by_rate = step
 

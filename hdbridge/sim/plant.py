@@ -40,34 +40,10 @@ class Plant:
 
     now: Conditions
     """Angles of motor and load, and the other conditions of the gear."""
-    motor_deg_s: float
-    load_deg_s: float
-    output_deg: float
-    encoder_deg: float
     loss_j: float
     """Friction work at the motor shaft since this attribute was last reset."""
     outer_nm: float
     """External torque on the load, in addition to its weight; only `LoadedPlant` applies it."""
-    _arm: float
-    _cold_coulomb: float
-    _cold_drag: float
-    _cold_sticking: float
-    _coulomb: float
-    _coupled: bool
-    _coupling: Transition
-    _damping: float
-    _drag: float
-    _dt: float
-    _encoder_rate: float
-    _flexspline: Transition
-    _gear: Gear
-    _inertia: float
-    _load_drag: float
-    _load_friction: float
-    _ratio: float
-    _sticking: float
-    _stiffness: float
-    _stribeck: float
 
     def __init__(self, truth: Truth) -> None:
         dt = truth.substep_s
@@ -95,8 +71,8 @@ class Plant:
         self._load_friction = load.coulomb_nm / inertia / RAD_PER_DEG * dt
 
         coupling = load.encoder.coupling
-        self._coupled = coupling is not None
-        self._coupling = transition(coupling, dt)
+        self._coupled: bool = coupling is not None
+        self._coupling: Transition = transition(coupling, dt)
 
         start_c = truth.temperature.start_c
         self.now = Conditions(truth.temperature.ambient_c if start_c is None else start_c)
@@ -191,9 +167,7 @@ class Plant:
         self._encoder_rate = rate + step.rate_by_distance * ahead + step.rate_by_rate * slip
 
     def _apply_friction(self, before: float, load: float, speed: float, loss: float) -> tuple[float, float]:
-        """Applies Coulomb friction at the load: reduces the load's speed, or holds the load if the friction
-        suffices.
-        """
+        """Applies Coulomb friction at the load: slows the load, or holds it if the friction suffices."""
         if abs(speed) <= loss:
             return before, 0.0
         loss = math.copysign(loss, speed)

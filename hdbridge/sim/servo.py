@@ -26,14 +26,7 @@ integral may rest."""
 
 @state
 class MovingAverage:
-    """Moving average of the demand, computed from the integral of the demand now and one averaging time
-    ago.
-    """
-
-    _duration_s: float
-    _integral: float
-    _late_integral: Late
-    _start_deg: float
+    """Moving average of the demand, from its integral now and one averaging time ago."""
 
     def __init__(self, duration_s: float, dt_s: float) -> None:
         self._duration_s = max(duration_s, dt_s)
@@ -58,13 +51,6 @@ class MovingAverage:
 @state
 class Notch:
     """Second-order notch, transposed direct form."""
-
-    _a1: float
-    _a2: float
-    _b0: float
-    _b2: float
-    _first: float
-    _second: float
 
     def __init__(self, truth: TrueNotch | None, dt_s: float) -> None:
         half = math.tan(math.pi * min(truth.frequency_hz * dt_s, HIGHEST_NOTCH)) if truth else 0.0
@@ -95,52 +81,13 @@ class Servo:
 
     limit_nm: float
     """Torque limit in either direction."""
-    measured_deg_s: float
-    _acceleration_gain: float
-    _average: MovingAverage
-    _dead_band: float
-    _decay: float
-    _direction: float
-    _dt: float
-    _filter: float
-    _filtered_nm: float
-    _filtered_speed: float
-    _friction: float
-    _hunting_band: float
-    _integral: float
-    _integral_rate: float
-    _last_reference: float
-    _load_ahead: float
-    _load_gain: float
-    _load_known: bool
-    _load_model: Transition
-    _load_speed: float
-    _measured: float
-    _momentum: float
-    _notch: Notch
-    _observed_nm: float
-    _observed_share: float
-    _observer_share: float
-    _position_gain: float
-    _reference: float
-    _reference_speed: float
-    _speed_share: float
-    _step_deg: float
-    _steps_per_deg: float
-    _sums_position: bool
-    _torque_share: float
-    _velocity_feedforward: float
-    _velocity_gain: float
-    _viscous: float
-    _with_average: bool
-    _with_filters: bool
 
     def __init__(self, truth: Truth) -> None:
         servo, encoder = truth.servo, truth.motor.encoder
         dt = truth.substep_s
         self._dt = dt
         self._filter = 1000.0 / servo.command_filter_ms
-        self._with_average = servo.moving_average_ms > 0.0
+        self._with_average: bool = servo.moving_average_ms > 0.0
         self._average = MovingAverage(servo.moving_average_ms / 1000.0, dt)
         self._with_filters = bool(servo.notch or servo.speed_filter_ms or servo.torque_filter_ms)
         self._speed_share = _share(servo.speed_filter_ms / 1000.0, dt)
@@ -152,7 +99,7 @@ class Servo:
         self._observer_share = -math.expm1(-rate * dt)
         self._observed_share = observer.share if observer else 0.0
         self._momentum = rate * observer.inertia_kg_m2 * RAD_PER_DEG if observer else 0.0
-        self._sums_position = servo.integral_of == "position"
+        self._sums_position: bool = servo.integral_of == "position"
         self._decay = math.exp(-self._filter * dt)
         self._position_gain = servo.position_gain_per_s
         self._velocity_gain = servo.velocity_gain_nm_s_per_rad * RAD_PER_DEG
@@ -160,8 +107,8 @@ class Servo:
         self._velocity_feedforward = servo.velocity_feedforward
         self._acceleration_gain = servo.inertia_feedforward_kg_m2 * RAD_PER_DEG / dt
         load = servo.load_feedforward
-        self._load_known = load is not None
-        self._load_model = transition(load, dt)
+        self._load_known: bool = load is not None
+        self._load_model: Transition = transition(load, dt)
         self._load_gain = load.inertia_kg_m2 * RAD_PER_DEG / dt if load else 0.0
         self._viscous = servo.viscous_feedforward_nm_s_per_rad * RAD_PER_DEG
         self._friction = servo.friction_feedforward_nm
@@ -173,9 +120,7 @@ class Servo:
         self.engage(0.0, 0.0)
 
     def engage(self, motor_deg: float, motor_deg_s: float) -> float:
-        """Starts the loops at the motor's position, without torque or error; returns the angle that they
-        measure.
-        """
+        """Starts the loops at a motor angle, without torque or error; returns the angle that they measure."""
         self._measured = self._interpolated(motor_deg)
         self._reference = self._last_reference = self._measured
         self._reference_speed = self.measured_deg_s = motor_deg_s

@@ -7,6 +7,7 @@ from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hdbridge.drive.dictionary import INTEGER_TYPES
 from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.values import Object, find_object
 from hdbridge.errors import InputError
@@ -53,10 +54,19 @@ def test_requests_forbidden_by_the_eds_are_not_sent(hdbridge, arguments, complai
     assert complaint in done.stderr
 
 
+def object_of(data_type: int) -> Object:
+    """Object 2000h of this type."""
+    od = ObjectDictionary()
+    variable = ODVariable("thing", 0x2000)
+    variable.data_type = data_type
+    od.add_object(variable)
+    return find_object("2000h", od)
+
+
 @given(st.sampled_from(IntegerType), st.data())
 def test_an_integer_is_read_as_it_was_written(kind, data):
     value = data.draw(st.integers(kind.minimum, kind.maximum))
-    one = Object(0x2000, 0, "", 0, kind)
+    one = object_of(next(number for number, each in INTEGER_TYPES.items() if each is kind))
     assert one.decode(one.encode(str(value))) == value
     for beyond in (kind.minimum - 1, kind.maximum + 1):
         with pytest.raises(InputError, match="nothing was written"):
@@ -73,11 +83,7 @@ def test_an_integer_is_read_as_it_was_written(kind, data):
     ],
 )
 def test_other_types_are_read_as_they_were_written(data_type, text, data, value):
-    od = ObjectDictionary()
-    variable = ODVariable("thing", 0x2000)
-    variable.data_type = data_type
-    od.add_object(variable)
-    one = find_object("2000h", od)
+    one = object_of(data_type)
     assert one.encode(text) == data
     assert one.decode(data) == value
 
@@ -85,4 +91,4 @@ def test_other_types_are_read_as_they_were_written(data_type, text, data, value)
 @pytest.mark.parametrize("data_type", [datatypes.REAL64, datatypes.BOOLEAN])
 def test_an_answer_of_the_wrong_length_is_rejected(data_type):
     with pytest.raises(InputError, match="check that drive"):
-        Object(0x2000, 0, "", data_type, None).decode(b"\x01\x02\x03")
+        object_of(data_type).decode(b"\x01\x02\x03")

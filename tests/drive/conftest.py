@@ -7,6 +7,7 @@ from uuid import uuid4
 
 import can
 import pytest
+import yaml
 from support.ideal_motor import IdealMotor
 from support.keys import with_keys
 from support.spoilt import SpoiltBus
@@ -26,7 +27,7 @@ AXIS: dict[str, Any] = {
     "bus": {"interface": "virtual", "channel": "test"},
     "drive": {
         "node_id": 1,
-        "eds": "none.eds",
+        "eds": "hdbridge-402.eds",
         "identity": {"vendor_id": 0x4844, "product_code": 0x402, "revision": 0x10000},
         "cycle_ms": 4,
         "heartbeat_ms": 50,
@@ -49,7 +50,7 @@ AXIS: dict[str, Any] = {
 
 def make_axis(**changes: Any) -> AxisConfig:
     """Returns the axis above with changes: keys are dotted names with two underscores for each dot."""
-    return AxisConfig.model_validate(with_keys(AXIS, changes))
+    return AxisConfig.from_text(yaml.safe_dump(with_keys(AXIS, changes)), EDS.parent / "axis.yaml")
 
 
 Answers = Callable[[bytes], list[bytes] | None]

@@ -145,7 +145,7 @@ def test_another_drive_or_another_scale_is_refused(
 def test_a_feed_that_does_not_scale(bus: Any, slave: Any, clock: Any, build_axis: Any) -> None:
     """If 6092h does not scale, the error names the line that does; with it, the drive is accepted."""
     slave.values[0x6092, 1] = 360_000
-    with pytest.raises(IdentityError, match=r"'feed_scales: false' under axis.yaml: drive"):
+    with pytest.raises(IdentityError, match=r"'feed_scales: false' under .*axis.yaml:4:1: drive"):
         Drive(bus, build_axis(), clock, slave.od).boot()
     Drive(bus, build_axis(drive__feed_scales=False), clock, slave.od).boot()
     slave.values[0x6091, 1] = 50
@@ -158,7 +158,9 @@ def test_a_feed_that_does_not_scale(bus: Any, slave: Any, clock: Any, build_axis
 def test_missing_mandatory_objects_are_refused_before_anything_is_sent(
     slave: Any, bus: Any, axis: Any, clock: Any, sent: Any
 ) -> None:
-    with pytest.raises(InputError, match=r"drive\.eds: none\.eds lacks 6040h:00 controlword, .* more"):
+    with pytest.raises(
+        InputError, match=r"drive\.eds: hdbridge-402\.eds lacks 6040h:00 controlword, .* more"
+    ):
         Drive(bus, axis, clock, ObjectDictionary())
     del slave.od[0x6064]
     with pytest.raises(InputError, match=r"lacks 6064h:00 position actual value, which"):

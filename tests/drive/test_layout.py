@@ -97,7 +97,9 @@ def test_few_and_small_pdos(laid_out: Any) -> None:
     tiny = without(small, (0x1A01, 2))
     found = laid_out(tiny)
     assert [words(each) for each in found.cyclic] == [[STATUS, POSITION], [LOAD]]
-    with pytest.raises(InputError, match=r"drive\.eds: the TPDOs of none\.eds cannot carry .* it has 1;"):
+    with pytest.raises(
+        InputError, match=r"drive\.eds: the TPDOs of hdbridge-402\.eds cannot carry .* it has 1;"
+    ):
         laid_out(without(tiny, 0x1801, 0x1A01))
     with pytest.raises(InputError, match="it has none"):
         laid_out(without(eds, 0x1800, 0x1801))
@@ -136,12 +138,18 @@ def test_more_channels_than_pdos(laid_out: Any) -> None:
 @pytest.mark.parametrize(
     ("source", "complaint"),
     [
-        ({"index": 0x2155}, r"load_encoder\.source\.index: none\.eds has no object 2155h:01; expected"),
+        (
+            {"index": 0x2155},
+            r"load_encoder\.source\.index: hdbridge-402\.eds has no object 2155h:01; expected",
+        ),
         ({"subindex": 2}, r"has no object 60E4h:02 \(of 60E4h it has 00, 01\)"),
         ({"index": 0x6063}, r"has no object 6063h:01 \(of 6063h it has 00\)"),
-        ({"type": "int16"}, r"load_encoder\.source\.type: none\.eds says that 60E4h:01 is int32"),
-        ({"type": "uint32"}, r"load_encoder\.source\.type: none\.eds says that 60E4h:01 is int32"),
-        ({"index": 0x607D}, r"load_encoder\.source\.index: none\.eds says that 607Dh:01 cannot be mapped"),
+        ({"type": "int16"}, r"load_encoder\.source\.type: hdbridge-402\.eds says that 60E4h:01 is int32"),
+        ({"type": "uint32"}, r"load_encoder\.source\.type: hdbridge-402\.eds says that 60E4h:01 is int32"),
+        (
+            {"index": 0x607D},
+            r"load_encoder\.source\.index: hdbridge-402\.eds says that 607Dh:01 cannot be mapped",
+        ),
     ],
 )
 def test_the_load_encoder_must_match_the_eds(laid_out: Any, source: dict[str, Any], complaint: str) -> None:

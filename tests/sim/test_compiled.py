@@ -1,6 +1,7 @@
 """The compiled axis equals the Python one bit for bit for any truth file."""
 
 import random
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -273,6 +274,26 @@ def test_every_state_of_the_simulation_is_known_to_the_compiler() -> None:
         assert kinds.classes
         assert all(hasattr(cls, method) for cls in kinds.classes)
     assert known <= set(compiled.STATES)
+
+
+def states_in(value: Any) -> Iterator[Any]:
+    """The state objects of an axis."""
+    if type(value) in compiled.STATES:
+        yield value
+        for each in vars(value).values():
+            yield from states_in(each)
+    elif isinstance(value, tuple | list):
+        for each in value:
+            yield from states_in(each)
+
+
+@given(truths())
+def test_every_attribute_of_a_state_has_its_declared_type_or_is_a_float(known: Truth) -> None:
+    for each in states_in(Axis(known)):
+        declared = compiled._attributes(type(each))
+        assert vars(each).keys() == declared.keys()
+        for name, kind in declared.items():
+            assert kind not in {float, int, bool} or type(getattr(each, name)) is kind
 
 
 def test_an_external_torque_acts_alike_compiled_or_not() -> None:

@@ -18,16 +18,17 @@ import numpy as np
 from hdbridge.client import messages
 from hdbridge.daemon.memory import sample_dtype
 from hdbridge.daemon.service.lease import Lease
-from hdbridge.drive.objects import IntegerType
-from hdbridge.drive.values import Object, Value
+from hdbridge.drive import load_eds
+from hdbridge.drive.values import Object, Value, find_object
 from hdbridge.enums import Scheme
 from hdbridge.errors import InputError, RefusedError
+from hdbridge.files.profile import bundled_folder
 
 BEGAN = datetime(2025, 1, 31, 12, 0, tzinfo=UTC)
 LIMITS = messages.Limits(
     position_min_deg=-180, position_max_deg=180, velocity_deg_s=60, acceleration_deg_s2=300, jerk_deg_s3=3000
 )
-STATUSWORD = Object(0x6041, 0, "Statusword", 6, IntegerType("uint16"))
+STATUSWORD = find_object("6041h", load_eds(bundled_folder("eds") / "hdbridge-402.eds", 1))
 
 
 class FakeAxis:

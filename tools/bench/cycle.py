@@ -232,7 +232,7 @@ class Variants:
         # The answering process may be slow in its first cycles.
         for _ in range(20):
             self.cycle.restart()
-            self.cycle.supervision.reset()
+            self.cycle.axes[0].supervision.reset()
             with suppress(SafetyStop):
                 if self.cycle.tick().fresh:
                     break

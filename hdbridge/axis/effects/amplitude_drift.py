@@ -33,7 +33,7 @@ from hdbridge.axis.effects.orders import (
 from hdbridge.axis.effects.rate_dependence import RateDependence
 from hdbridge.axis.effects.synchronous import Synchronous
 from hdbridge.axis.effects.torque import TorqueGrowth
-from hdbridge.axis.effects.warmth import Warmed, WarmthState
+from hdbridge.axis.effects.warmth import Warmed, WarmthTracker
 
 REACH_K: Final = 30.0
 """Maximum difference between the reference temperature and the temperature range of the record, K."""
@@ -257,7 +257,7 @@ class _Tracker(Tracker):
         self._loop = loop
         self._ripple = 0.01 * effect.ripple_percent_per_k
         self._friction = 0.01 * effect.friction_percent_per_k
-        self._warmth = WarmthState(effect)
+        self._warmth = WarmthTracker(effect)
 
     @property
     def memory_deg(self) -> float:
@@ -265,11 +265,11 @@ class _Tracker(Tracker):
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
         friction = self._friction * self._loop.peek(motor_deg, moment)
-        return self._warmth.at(moment) * (self._ripple_at(motor_deg, moment) + friction)
+        return self._warmth.peek(motor_deg, moment) * (self._ripple_at(motor_deg, moment) + friction)
 
     def advance(self, motor_deg: float, moment: Moment) -> float:
         friction = self._friction * self._loop.advance(motor_deg, moment)
-        return self._warmth.to(moment) * (self._ripple_at(motor_deg, moment) + friction)
+        return self._warmth.advance(motor_deg, moment) * (self._ripple_at(motor_deg, moment) + friction)
 
     def _ripple_at(self, motor_deg: float, moment: Moment) -> float:
         ripple = self._ripple * self._orders.peek(motor_deg, moment)

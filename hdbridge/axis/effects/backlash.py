@@ -8,7 +8,7 @@ from pydantic import Field
 
 from hdbridge.axis.effects.base import Effect, Linear
 from hdbridge.axis.effects.described import Cause, Compensable, Experiment, Observations, Shape, Tracker
-from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
+from hdbridge.axis.effects.motion import FloatArray, Motion, Start
 from hdbridge.axis.effects.play import Stop, stop
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -85,30 +85,14 @@ class Backlash(Linear):
         return (-0.5 * stop(motion.motor_deg, self.crossing_deg, start))[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return _Tracker(-0.5 * self.gap_arcsec, Stop(self.crossing_deg, start))
+        return Stop(-0.5 * self.gap_arcsec, self.crossing_deg, start)
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
         crossing = max(self.crossing_deg, self.gap_arcsec / fall_arcsec_per_deg)
-        return _Tracker(-0.5 * self.gap_arcsec, Stop(crossing, start))
+        return Stop(-0.5 * self.gap_arcsec, crossing, start)
 
     def bound_arcsec(self) -> float:
         return 0.5 * self.gap_arcsec
 
     def slope_bound_arcsec_per_deg(self) -> float:
         return self.gap_arcsec / self.crossing_deg
-
-
-class _Tracker(Tracker):
-    def __init__(self, height: float, play: Stop) -> None:
-        self._height = height
-        self._stop = play
-
-    @property
-    def memory_deg(self) -> float:
-        return self._stop.memory_deg
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        return self._height * self._stop.at(motor_deg)
-
-    def advance(self, motor_deg: float, moment: Moment) -> float:
-        return self._height * self._stop.to(motor_deg)

@@ -194,3 +194,20 @@ class Memoryless(Tracker):
 
 class Level(Memoryless):
     """Tracker of an error that depends only on the moment, not on the motor angle."""
+
+
+class Scaled(Tracker):
+    """Tracker of another tracker's error times a factor that depends on the moment."""
+
+    def __init__(self, tracker: Tracker, factor: Callable[[Moment], float]) -> None:
+        self._tracker, self._factor = tracker, factor
+
+    @property
+    def memory_deg(self) -> float:
+        return self._tracker.memory_deg
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._factor(moment) * self._tracker.peek(motor_deg, moment)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        return self._factor(moment) * self._tracker.advance(motor_deg, moment)

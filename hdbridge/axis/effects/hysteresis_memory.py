@@ -109,9 +109,7 @@ class HysteresisMemory(ElasticLoop):
 
 
 def _reached(motor_deg: FloatArray, angle: float, begin: int, end: int, sign: int) -> int:
-    """Returns the first index, from ``begin`` to ``end``, at which motion in direction ``sign`` reaches
-    ``angle``.
-    """
+    """Returns the first index in the range at which motion in this direction reaches ``angle``."""
     return bisect_left(motor_deg, sign * angle, begin, end, key=lambda each: sign * each)
 
 

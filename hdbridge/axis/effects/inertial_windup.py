@@ -1,13 +1,10 @@
 """Wind-up of the gear by the load's own inertia during acceleration."""
 
-from collections.abc import Iterator, Sequence
-from typing import Self
-
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import Angleless, Effect, Linear
-from hdbridge.axis.effects.described import Cause, Compensable, Observations
+from hdbridge.axis.effects.base import Angleless, Linear
+from hdbridge.axis.effects.described import Cause, Compensable
 from hdbridge.axis.effects.kinematics import acceleration_of
 from hdbridge.axis.effects.load_order import Ratio
 from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
@@ -48,10 +45,6 @@ class InertialWindup(Angleless, Linear):
     limit_deg_s2: float = Field(
         1e6, gt=0, le=1e8, description="motor acceleration above which the effect is constant"
     )
-
-    @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        yield cls(ratio=observations.ratio, inertia_over_stiffness_s2=1e-5)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Returns the error for J / K = 1 s^2, shape (n, 1)."""

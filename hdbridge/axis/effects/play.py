@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from hdbridge.axis.effects.motion import FloatArray, Start
+from hdbridge.axis.effects.described import Tracker
+from hdbridge.axis.effects.motion import FloatArray, Moment, Start
 from hdbridge.axis.effects.path import path_of
 
 
@@ -29,10 +30,11 @@ def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:
     return result
 
 
-class Stop:
-    """On-line stop operator: `at` evaluates it, `to` changes its state."""
+class Stop(Tracker):
+    """Tracker of ``height`` times the stop operator."""
 
-    def __init__(self, width_deg: float, start: Start) -> None:
+    def __init__(self, height: float, width_deg: float, start: Start) -> None:
+        self._height = height
         self._gain = 2.0 / width_deg
         self._value = float(start.value)
         self._angle: float | None = None
@@ -42,15 +44,16 @@ class Stop:
         """Motor travel from one limit to the other."""
         return 2.0 / self._gain
 
-    def at(self, motor_deg: float) -> float:
-        """Returns the value after a move to ``motor_deg`` in one direction, without changing the state."""
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._height * self._at(motor_deg)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        self._value = self._at(motor_deg)
+        self._angle = motor_deg
+        return self._height * self._value
+
+    def _at(self, motor_deg: float) -> float:
         if self._angle is None:
             return self._value
         value = self._value + self._gain * (motor_deg - self._angle)
         return 1.0 if value > 1.0 else -1.0 if value < -1.0 else value
-
-    def to(self, motor_deg: float) -> float:
-        """Moves to ``motor_deg`` and returns the value there."""
-        self._value = self.at(motor_deg)
-        self._angle = motor_deg
-        return self._value

@@ -10,7 +10,7 @@ from pydantic import Field
 from hdbridge.axis.effects.base import Effect
 from hdbridge.axis.effects.carried import Loop, Modulating, has_loop, loop_of
 from hdbridge.axis.effects.coordinate import Coordinate, Spacing
-from hdbridge.axis.effects.described import Cause, Compensable, Observations, Part, Shape, Tracker
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Part, Scaled, Shape, Tracker
 from hdbridge.axis.effects.kinematics import speed_of, top_speed_deg_s
 from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
 
@@ -70,7 +70,7 @@ class RateDependence(Modulating):
         return (rate * self.loop.law().predict(motion, start))[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return _Tracker(self, self.loop.law().tracker(start))
+        return Scaled(self.loop.law().tracker(start), self._rate)
 
     def bound_arcsec(self) -> float:
         return self._most() * abs(self.loop.offset_arcsec)
@@ -87,30 +87,13 @@ class RateDependence(Modulating):
         if self.growth_percent <= 0.0:
             return None
         loop = self.loop.law().gentle_tracker(start, fall_arcsec_per_deg / self._most())
-        return None if loop is None else _Tracker(self, loop)
+        return None if loop is None else Scaled(loop, self._rate)
+
+    def _rate(self, moment: Moment) -> float:
+        """Returns the relative growth of the loop at this speed."""
+        speed = min(abs(moment.motor_speed_deg_s), self.limit_deg_s)
+        return 0.01 * self.growth_percent / math.log(10.0) * math.log1p(speed / self.reference_deg_s)
 
     def _most(self) -> float:
         """Returns the relative growth of the loop at the highest speed."""
         return 0.01 * self.growth_percent * math.log10(1.0 + self.limit_deg_s / self.reference_deg_s)
-
-
-class _Tracker(Tracker):
-    def __init__(self, effect: RateDependence, loop: Tracker) -> None:
-        self._loop = loop
-        self._gain = 0.01 * effect.growth_percent / math.log(10.0)
-        self._reference = effect.reference_deg_s
-        self._limit = effect.limit_deg_s
-
-    @property
-    def memory_deg(self) -> float:
-        return self._loop.memory_deg
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        return self._rate(moment) * self._loop.peek(motor_deg, moment)
-
-    def advance(self, motor_deg: float, moment: Moment) -> float:
-        return self._rate(moment) * self._loop.advance(motor_deg, moment)
-
-    def _rate(self, moment: Moment) -> float:
-        speed = min(abs(moment.motor_speed_deg_s), self._limit)
-        return self._gain * math.log1p(speed / self._reference)

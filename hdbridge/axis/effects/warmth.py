@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import Effect
-from hdbridge.axis.effects.described import Observations, Shape
+from hdbridge.axis.effects.described import Observations, Shape, Tracker
 from hdbridge.axis.effects.kinematics import duration_s
 from hdbridge.axis.effects.motion import SLOT, Channel, FloatArray, Moment, Motion
 from hdbridge.axis.effects.recurrence import lagged
@@ -70,10 +70,11 @@ class Warmed(Effect):
         return np.clip(warmth, -self.limit_k, self.limit_k)
 
 
-class WarmthState:
-    """On-line state of the warmth: `at` evaluates it, `to` advances it."""
+class WarmthTracker(Tracker):
+    """Tracker of the warmth times ``gain``."""
 
-    def __init__(self, effect: Warmed) -> None:
+    def __init__(self, effect: Warmed, gain: float = 1.0) -> None:
+        self._gain = gain
         self._tau = effect.tau_s
         self._by_time = effect.driven_by == "time"
         self._reference = effect.reference_c
@@ -82,18 +83,16 @@ class WarmthState:
         self._start: float | None = None
         self._time = self._temperature = 0.0
 
-    def at(self, moment: Moment) -> float:
-        """Returns the warmth at this moment, K, without changing the state."""
+    def peek(self, motor_deg: float, moment: Moment) -> float:
         if self._by_time:
             since = 0.0 if self._start is None else moment.time_s - self._start
             warmth = -self._final * math.expm1(-since / self._tau)
         else:
             warmth = self._followed(moment) - self._reference
-        return min(max(warmth, -self._limit), self._limit)
+        return self._gain * min(max(warmth, -self._limit), self._limit)
 
-    def to(self, moment: Moment) -> float:
-        """Advances the state to this moment and returns the warmth, K."""
-        warmth = self.at(moment)
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        warmth = self.peek(motor_deg, moment)
         self._temperature = self._followed(moment)
         if self._start is None:
             self._start = moment.time_s

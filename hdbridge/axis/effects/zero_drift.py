@@ -10,8 +10,8 @@ from hdbridge.axis.effects import coordinate as over
 from hdbridge.axis.effects.base import Effect, Linear
 from hdbridge.axis.effects.coordinate import Coordinate
 from hdbridge.axis.effects.described import Cause, Compensable, Experiment, Observations, Tracker
-from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.warmth import Warmed, WarmthState
+from hdbridge.axis.effects.motion import FloatArray, Motion, Start
+from hdbridge.axis.effects.warmth import Warmed, WarmthTracker
 
 
 class ZeroDrift(Linear, Warmed):
@@ -70,22 +70,10 @@ class ZeroDrift(Linear, Warmed):
         return self.warmth(motion)[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return _Tracker(self.drift_arcsec_per_k, WarmthState(self))
+        return WarmthTracker(self, self.drift_arcsec_per_k)
 
     def bound_arcsec(self) -> float:
         return abs(self.drift_arcsec_per_k) * self.limit_k
 
     def slope_bound_arcsec_per_deg(self) -> float:
         return 0.0
-
-
-class _Tracker(Tracker):
-    def __init__(self, drift: float, warmth: WarmthState) -> None:
-        self._drift = drift
-        self._warmth = warmth
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        return self._drift * self._warmth.at(moment)
-
-    def advance(self, motor_deg: float, moment: Moment) -> float:
-        return self._drift * self._warmth.to(moment)

@@ -26,7 +26,7 @@ class GearOfModel(Strict):
 class Provenance(Strict):
     """Origin and binding of a model; unknown keys are preserved."""
 
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="allow")
+    model_config = ConfigDict(extra="allow")
 
     axis: str | None = Field(None, description="name of the axis")
     drive: Identity | None = Field(None, description="identity of the drive")
@@ -35,10 +35,8 @@ class Provenance(Strict):
     reason: str | None = Field(None, description="reason")
 
 
-class EffectEntry(BaseModel):
+class EffectEntry(Strict):
     """One effect of the model file."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
     effect: str = Field(description="name in the catalogue")
     parameters: dict[str, Any] = Field(description="its parameters, with the unit in the name")

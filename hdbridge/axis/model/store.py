@@ -25,12 +25,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Generic, Literal, Protocol, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import dump_yaml, read_yaml, write_atomically
+from hdbridge.strictness import Strict
 
 PENDING = "pending"
 ACTIVE = "active"
@@ -39,10 +40,8 @@ _HEADER = "# What was activated when, by hdbridge; read it with `{}`.\n"
 Action = Literal["found", "commit", "activate", "rollback"]
 
 
-class Activation(BaseModel):
+class Activation(Strict):
     """An entry of the log: one change of the active version."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
     date: str = Field(description="date, ISO 8601")
     action: Action = Field(description="action")
@@ -50,10 +49,8 @@ class Activation(BaseModel):
     reason: str = Field("", description="reason for the activation, in words")
 
 
-class LogFile(BaseModel):
+class LogFile(Strict):
     """Content of ``history/log.yaml``."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
     schema_: Literal["hdbridge.history/1"] = Field(
         alias="schema", description="schema and version of this file"

@@ -6,7 +6,7 @@ test without either.
 """
 
 import math
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypeVar
 
@@ -102,6 +102,26 @@ class Procedure(Protocol[Outcome]):
         ...
 
 
+def solutions(
+    planner: Ruckig, demand: InputParameter, velocity: Sequence[float], acceleration: Sequence[float]
+) -> Iterator[Trajectory]:
+    """Yields the trajectories within these limits of each axis, and within slightly lower ones.
+
+    Ruckig fails if limits and distance coincide exactly, as with 200 deg/s2, 4000 deg/s3 and 1 deg plus a
+    rounding error. With slightly lower limits it succeeds.
+    """
+    for share in (1.0, 1.0 - 1e-6):
+        demand.max_velocity = [share * each for each in velocity]
+        demand.max_acceleration = [share * each for each in acceleration]
+        trajectory = Trajectory(len(velocity))
+        try:
+            result = planner.calculate(demand, trajectory)
+        except RuckigError:  # a value that is not finite, or a limit that is not positive
+            continue
+        if result in {Result.Working, Result.Finished}:
+            yield trajectory
+
+
 class _Timed:
     """Base class of legs that end with their path."""
 
@@ -124,16 +144,17 @@ class MoveTo(_Timed):
         limits.check(self.load_deg)
         if self.load_deg == start_deg:
             return Path(0.0, lambda _: start_deg, start_deg, start_deg)
-        # Ruckig fails if limits and distance coincide exactly, as with 200 deg/s2, 4000 deg/s3 and 1 deg plus
-        # a rounding error. With slightly lower limits it succeeds.
-        for share in (1.0, 1.0 - 1e-6):
-            trajectory, result = self._trajectory(start_deg, limits, share)
-            if result in {Result.Working, Result.Finished}:
-                break
-        else:
+        demand = InputParameter(1)
+        demand.current_position = [start_deg]
+        demand.target_position = [self.load_deg]
+        demand.max_jerk = [limits.jerk_deg_s3]
+        velocity = min(self.velocity_deg_s or math.inf, limits.velocity_deg_s)
+        acceleration = min(self.acceleration_deg_s2 or math.inf, limits.acceleration_deg_s2)
+        trajectory = next(solutions(Ruckig(1), demand, [velocity], [acceleration]), None)
+        if trajectory is None:
             raise InputError(
-                f"no trajectory from {start_deg:g} to {self.load_deg:g} deg within the limits "
-                f"({result.name}): check the target, and velocity, acceleration and jerk in the axis file"
+                f"no trajectory from {start_deg:g} to {self.load_deg:g} deg within the limits: check the "
+                "target, and velocity, acceleration and jerk in the axis file"
             )
         at_time, duration, goal = trajectory.at_time, trajectory.duration, self.load_deg
 
@@ -141,21 +162,6 @@ class MoveTo(_Timed):
             return goal if time_s >= duration else float(at_time(time_s)[0][0])
 
         return Path(duration, at, min(start_deg, goal), max(start_deg, goal))
-
-    def _trajectory(self, start_deg: float, limits: MotionLimits, share: float) -> tuple[Trajectory, Result]:
-        demand = InputParameter(1)
-        demand.current_position = [start_deg]
-        demand.target_position = [self.load_deg]
-        demand.max_velocity = [share * min(self.velocity_deg_s or math.inf, limits.velocity_deg_s)]
-        demand.max_acceleration = [
-            share * min(self.acceleration_deg_s2 or math.inf, limits.acceleration_deg_s2)
-        ]
-        demand.max_jerk = [limits.jerk_deg_s3]
-        trajectory = Trajectory(1)
-        try:
-            return trajectory, Ruckig(1).calculate(demand, trajectory)
-        except RuckigError:  # a value that is not finite, or a limit that is not positive
-            return trajectory, Result.ErrorInvalidInput
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Sample, Sine, Steps
+from hdbridge.motion.procedures.standstill import Precondition
 from hdbridge.units import DEG_PER_TURN
 
 PRECONDITION_TURNS = 2.0
@@ -51,8 +52,7 @@ class PathTest:
         for name, distance_deg in (("long move", far_deg), ("short move", short_deg)):
             for sign in (1.0, -1.0):
                 begin, end = middle - sign * 0.5 * distance_deg, middle + sign * 0.5 * distance_deg
-                yield MoveTo(begin - sign * run_up_deg, kind="precondition")
-                yield MoveTo(begin, kind="precondition")
+                yield from Precondition(begin, sign * run_up_deg).moves(axis)
                 yield Dwell(REST_S, kind="precondition")
                 samples = yield MoveTo(end, kind=KIND)
                 rest = yield Dwell(REST_S, kind=KIND)
@@ -60,8 +60,7 @@ class PathTest:
         omega = math.tau * SINE_HZ
         speed = min(SINE_SPEED * limits.velocity_deg_s, limits.acceleration_deg_s2 / omega)
         amplitude_deg = min(speed / omega, 0.5 * room_deg)
-        yield MoveTo(middle + amplitude_deg - run_up_deg, kind="precondition")
-        yield MoveTo(middle + amplitude_deg, kind="precondition")
+        yield from Precondition(middle + amplitude_deg, run_up_deg).moves(axis)
         yield Dwell(REST_S, kind="precondition")
         samples = yield Sine(middle, amplitude_deg, SINE_HZ, SINE_PERIODS, kind=KIND)
         rest = yield Dwell(REST_S, kind=KIND)

@@ -26,7 +26,7 @@ from hdbridge.motion.procedures.moves import AxisView, Procedure
 from hdbridge.motion.procedures.positioning import Positioning, targets
 from hdbridge.motion.procedures.reversals import Reversals
 from hdbridge.motion.procedures.sine import Sines
-from hdbridge.motion.procedures.standstill import Precondition, Reference, Standstill
+from hdbridge.motion.procedures.standstill import Precondition, Standstill
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.motion.procedures.sweep import Sweep
 from hdbridge.strictness import Strict
@@ -242,7 +242,7 @@ class Plan(Strict):
         room = Room(axis, self.precondition_deg)
         prelude = (
             Precondition(room.pose_deg, self.precondition_deg / axis.ratio),
-            Reference(room.pose_deg, self.reference_s),
+            Standstill(room.pose_deg, self.reference_s, "reference"),
         )
         tasks = []
         for number, entry in enumerate(self.procedures, 1):

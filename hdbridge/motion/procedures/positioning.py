@@ -1,10 +1,9 @@
 """Positioning test of machine tools (ISO 230-2): repeated approaches to targets from both sides."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hdbridge.motion.procedures.moves import AxisView, MoveTo, Sample, Settle, Steps
-from hdbridge.units import ARCSEC_PER_DEG
+from hdbridge.motion.procedures.moves import AxisView, MoveTo, Settle, Steps
+from hdbridge.motion.procedures.stepping import step
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,16 +34,11 @@ class Positioning:
         for _ in range(self.cycles):
             for upwards in (True, False):
                 for target in self.targets_deg if upwards else reversed(self.targets_deg):
-                    yield MoveTo(target, kind="step")
-                    samples = yield self.settle
-                    found.append(Approach(target, upwards, self._error(target, samples)))
+                    stand = yield from step(target, self.settle)
+                    found.append(Approach(target, upwards, stand.error_arcsec))
                 beyond = self.overrun_deg if upwards else -self.overrun_deg
                 yield MoveTo(self.targets_deg[-1 if upwards else 0] + beyond, kind="precondition")
         return tuple(found)
-
-    def _error(self, target_deg: float, samples: Sequence[Sample]) -> float:
-        window = self.settle.window(samples)
-        return sum(each.load_position_deg - target_deg for each in window) / len(window) * ARCSEC_PER_DEG
 
 
 def targets(low_deg: float, high_deg: float, axis: AxisView) -> tuple[float, ...]:

@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass
 
-from hdbridge.motion.procedures.moves import AxisView, MoveTo, Settle, Steps
-from hdbridge.motion.procedures.stepping import Standing, SteppingOutcome, standing
+from hdbridge.motion.procedures.moves import AxisView, Settle, Steps
+from hdbridge.motion.procedures.standstill import Precondition
+from hdbridge.motion.procedures.stepping import Standing, SteppingOutcome, step
 
 _GOLDEN = 0.618_033_988_75
 
@@ -27,8 +28,7 @@ class SmallSteps:
 
     def moves(self, axis: AxisView) -> Steps[SteppingOutcome]:
         """Yields a jerk-limited move and a settle for each step."""
-        yield MoveTo(self.centre_deg - self.precondition_deg, kind="precondition")
-        yield MoveTo(self.centre_deg, kind="precondition")
+        yield from Precondition(self.centre_deg, self.precondition_deg).moves(axis)
         ways: tuple[list[Standing], list[Standing]] = ([], [])
         last = self.centre_deg
         for index in range(1, self.count + 1):
@@ -36,8 +36,6 @@ class SmallSteps:
             # values.
             share = (index * index * _GOLDEN) % 1.0
             target = self.centre_deg + (2.0 * share - 1.0) * self.reach_deg / axis.ratio
-            yield MoveTo(target, kind="step")
-            samples = yield self.settle
-            ways[target < last].append(standing(target, samples, self.settle))
+            ways[target < last].append((yield from step(target, self.settle)))
             last = target
         return SteppingOutcome(cw=tuple(ways[0]), ccw=tuple(ways[1]))

@@ -27,21 +27,10 @@ class Standstill:
 
     load_deg: float = 0.0
     duration_s: float = 10.0
+    kind: str = "standstill"
+    """Purpose: ``reference`` at a recurring pose, always approached from the same side, which shows drift."""
 
     def moves(self, axis: AxisView) -> Steps[None]:
         yield MoveTo(self.load_deg)
         yield Dwell(0.5, kind="move")
-        yield Dwell(self.duration_s)
-
-
-@dataclass(frozen=True, slots=True)
-class Reference:
-    """Standstill at a recurring pose, always approached from the same side, so that changes show drift."""
-
-    load_deg: float = 0.0
-    duration_s: float = 1.5
-
-    def moves(self, axis: AxisView) -> Steps[None]:
-        yield MoveTo(self.load_deg)
-        yield Dwell(0.5, kind="move")
-        yield Dwell(self.duration_s, kind="reference")
+        yield Dwell(self.duration_s, self.kind)

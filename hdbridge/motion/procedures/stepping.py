@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from hdbridge.errors import InputError
 from hdbridge.motion.procedures.moves import AxisView, MoveTo, Sample, Settle, Steps
+from hdbridge.motion.procedures.standstill import Precondition
 from hdbridge.units import ARCSEC_PER_DEG
 
 
@@ -58,18 +59,24 @@ class Stepping:
 
     def moves(self, axis: AxisView) -> Steps[SteppingOutcome]:
         """Yields a jerk-limited move and a settle for each step."""
-        yield MoveTo(self.start_deg - self.precondition_deg, kind="precondition")
-        yield MoveTo(self.start_deg, kind="precondition")
+        yield from Precondition(self.start_deg, self.precondition_deg).moves(axis)
         passes: list[tuple[Standing, ...]] = []
         for order in (range(1, self.count + 1), range(self.count - 1, -1, -1)):
             stands: list[Standing] = []
             for index in order:
                 target = self.start_deg + index * self.step_deg / axis.ratio
-                yield MoveTo(target, kind="step")
-                samples = yield self.settle
-                stands.append(standing(target, samples, self.settle))
+                stands.append((yield from step(target, self.settle)))
             passes.append(tuple(stands))
         return SteppingOutcome(cw=passes[0], ccw=passes[1])
+
+
+def step(
+    target_deg: float, settle: Settle, velocity_deg_s: float | None = None, kind: str = "step"
+) -> Steps[Standing]:
+    """Yields a jerk-limited move and a settle; returns the result at the target."""
+    yield MoveTo(target_deg, velocity_deg_s, kind)
+    samples = yield settle
+    return standing(target_deg, samples, settle)
 
 
 def standing(target_deg: float, samples: Sequence[Sample], settle: Settle) -> Standing:

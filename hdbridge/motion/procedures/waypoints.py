@@ -4,8 +4,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from hdbridge.motion.procedures.moves import AxisView, MotionLimits, MoveTo, Path, Sample, Settle, Steps
-from hdbridge.motion.procedures.stepping import Standing, standing
+from hdbridge.motion.procedures.moves import AxisView, MotionLimits, Path, Sample, Settle, Steps
+from hdbridge.motion.procedures.stepping import Standing, step
 
 
 class Hold:
@@ -45,8 +45,6 @@ class WayPoints:
         """Yields a move and a settle for each way point; the outcome is the load's position at each."""
         stands: list[Standing] = []
         for target_deg in self.targets_deg:
-            yield MoveTo(target_deg, self.velocity_deg_s)
-            samples = yield self.settle
-            stands.append(standing(target_deg, samples, self.settle))
+            stands.append((yield from step(target_deg, self.settle, self.velocity_deg_s, "move")))
         yield self.hold
         return tuple(stands)
