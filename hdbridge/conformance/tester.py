@@ -108,45 +108,52 @@ class Result:
     duration_s: float
 
 
-Decorator = Callable[[Callable[["NodeTester"], None]], Callable[["NodeTester"], None]]
+Object = int | tuple[int, int]
+"""Index of an object, or index and sub-index."""
+Step = Callable[["NodeTester"], object]
+Decorator = Callable[[Step], Step]
 
 
 class Table(list[Check]):
-    """Checks of one subject; `check` adds a function."""
+    """Checks of one subject. A check is a sequence of steps, which end it by an exception.
+
+    An object as a step means that the check applies only to a node with this object.
+    """
 
     def __init__(self, *, drives: bool = False, moves: bool = False) -> None:
         """``drives``: the checks are for drives of CiA 402; ``moves``: each check may switch power on."""
         super().__init__()
         self._drives, self._moves = drives, moves
 
+    def add(self, name: str, text: str, clause: str, *steps: Object | Step, stores: bool = False) -> None:
+        """Adds a check."""
+
+        def run(t: NodeTester) -> None:
+            if self._drives:
+                t.need_402()
+            for step in steps:
+                if callable(step):
+                    step(t)
+                else:
+                    t.require(*((step,) if isinstance(step, int) else step))
+
+        self.append(Check(name, text, clause, run, self._moves, stores))
+
+    def rows(self, clause: str, *rows: tuple[str, str, *tuple[Object | Step, ...]]) -> None:
+        """Adds checks of one clause: name, text and steps of each."""
+        for name, text, *steps in rows:
+            self.add(name, text, clause, *steps)
+
     def check(
-        self,
-        name: str,
-        text: str,
-        clause: str,
-        *needs: int | tuple[int, int],
-        first: Callable[[NodeTester], object] | None = None,
-        stores: bool = False,
+        self, name: str, text: str, clause: str, *steps: Object | Step, stores: bool = False
     ) -> Decorator:
-        """Decorates the function of a check, which applies only to a node with the objects ``needs``.
+        """Decorates the last step of a check."""
 
-        ``first`` brings the node into the state in which the function begins.
-        """
-
-        def add(function: Callable[[NodeTester], None]) -> Callable[[NodeTester], None]:
-            def run(t: NodeTester) -> None:
-                if self._drives:
-                    t.need_402()
-                for each in needs:
-                    t.require(*((each,) if isinstance(each, int) else each))
-                if first is not None:
-                    first(t)
-                function(t)
-
-            self.append(Check(name, text, clause, run, self._moves, stores))
+        def decorate(function: Step) -> Step:
+            self.add(name, text, clause, *steps, function, stores=stores)
             return function
 
-        return add
+        return decorate
 
 
 @dataclass(frozen=True)
