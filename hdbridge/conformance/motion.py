@@ -39,7 +39,6 @@ _SWITCHED_ON: Final = State.SWITCHED_ON
 _ENABLED: Final = State.OPERATION_ENABLED
 _STOPPED: Final = State.QUICK_STOP_ACTIVE
 _FAULT: Final = State.FAULT
-_MASTER: Final = 126
 _CYCLE_S: Final = 0.01
 _STOP_S: Final = 0.5
 """Maximum time from a stop command to standstill."""
@@ -94,7 +93,7 @@ def _bring(t: NodeTester, state: State, mode: int | None = None) -> None:
         t.write(0x605A, 0, 6, 2)
     if state is _FAULT:
         _fault_when_lost(t)
-        _guarded(t)
+        t.be_supervised(300)
         _enable_and_beat(t)
         _lose_master(t)
         return
@@ -112,15 +111,10 @@ def _fault_when_lost(t: NodeTester) -> None:
     t.write(0x6007, 0, 1, 2)
 
 
-def _guarded(t: NodeTester) -> None:
-    t.require(0x1016, 1)
-    t.write(0x1016, 1, _MASTER << 16 | 300, 4)
-
-
 def _enable_and_beat(t: NodeTester) -> None:
     """Enables the drive, and begins its supervision of the tester with a heartbeat."""
     t.walk()
-    t.send(0x700 + _MASTER, b"\x05")
+    t.beat()
 
 
 def _lose_master(t: NodeTester, *states: State) -> None:
@@ -204,7 +198,7 @@ def _(t: NodeTester) -> None:
     t.reaches(_READY)
     t.control(0x0F)
     t.reaches(_ENABLED)
-    t.send(0x700 + _MASTER, b"\x05")
+    t.beat()
     t.control(0x8F)
     t.stays(_ENABLED, 0.0)
     _lose_master(t)
@@ -244,7 +238,7 @@ def _lost_master(code: int, states: tuple[State, ...], text: str) -> None:
         _select(t, mode)
         t.write(0x6007, 0, code, 2)
         t.write(0x1029, 1, 1, 1) if t.has(0x1029, 1) else None
-        _guarded(t)
+        t.be_supervised(300)
         _enable_and_beat(t)
         _lose_master(t, *states)
         if not code:
@@ -303,7 +297,7 @@ def _reaction(code: int) -> None:
         _select_slowly(t)
         _fault_when_lost(t)
         _set_if_supported(t, 0x605E, code, before, 2)
-        _guarded(t)
+        t.be_supervised(300)
         _enable_and_beat(t)
         _begin_move(t, 8)
         _lose_master(t)
@@ -704,9 +698,9 @@ def _(t: NodeTester) -> None:
     t.require(0x6007)
     stream = _Stream(t)
     _fault_when_lost(t)
-    _guarded(t)
+    t.be_supervised(300)
     stream.enable()
-    t.send(0x700 + _MASTER, b"\x05")
+    t.beat()
     stream.cycle(50, 0.02 * t.travel * _direction(t, 3))
     t.reaches(_FAULT)
     _stands(t)

@@ -7,7 +7,7 @@ from typing import Final
 
 from hdbridge.cia301 import NmtCommand
 from hdbridge.conformance.steps import no_emergency, puts, sends_nmt, waits, writes
-from hdbridge.conformance.tester import ENTERED, NodeTester, Step, Table, upload_request
+from hdbridge.conformance.tester import ENTERED, MASTER, NodeTester, Step, Table, upload_request
 
 CHECKS: Final = Table()
 check: Final = CHECKS.check
@@ -16,8 +16,6 @@ _BOOT: Final = "CiA 301, 7.3.2"
 _HEARTBEAT: Final = "CiA 301, 7.2.8 and object 1017h"
 _CONSUMER: Final = "CiA 301, 7.2.8 and object 1016h"
 _GUARDING: Final = "CiA 301, 7.2.8 and objects 100Ch, 100Dh"
-_MASTER: Final = 126
-"""Node id of the tester's heartbeat."""
 
 # ---------------------------------------------------------------- boot-up
 
@@ -205,20 +203,15 @@ CHECKS.rows(
 # ---------------------------------------------------------------- heartbeat consumer
 
 
-def _watch(t: NodeTester, time_ms: int = 100) -> None:
-    t.require(0x1016, 1)
-    t.write(0x1016, 1, _MASTER << 16 | time_ms, 4)
-
-
-def _beat(t: NodeTester, count: int = 3, period_s: float = 0.04, node_id: int = _MASTER) -> None:
+def _beat(t: NodeTester, count: int = 3, period_s: float = 0.04, node_id: int = MASTER) -> None:
     for _ in range(count):
-        t.send(0x700 + node_id, b"\x05")
+        t.beat(node_id)
         t.wait(period_s)
 
 
 def lose_heartbeat(t: NodeTester) -> None:
     """Makes the node lose the tester's heartbeat; fails unless it sends EMCY 8130h."""
-    _watch(t)
+    t.be_supervised()
     _beat(t)
     codes = t.emergencies_after(0.3)
     t.true(0x8130 in codes, f"EMCY codes {[f'{code:04X}h' for code in codes]}", "8130h within 100 ms")
@@ -226,11 +219,12 @@ def lose_heartbeat(t: NodeTester) -> None:
 
 CHECKS.rows(
     _CONSUMER,
-    ("consumer.idle", "The consumer waits for the first heartbeat", _watch, no_emergency(0.4)),
-    ("consumer.regular", "Heartbeats in time cause no error", lambda t: _watch(t, 200),
+    ("consumer.idle", "The consumer waits for the first heartbeat", NodeTester.be_supervised,
+     no_emergency(0.4)),
+    ("consumer.regular", "Heartbeats in time cause no error", lambda t: t.be_supervised(200),
      no_emergency(0.0, lambda t: _beat(t, 8, 0.05))),
-    ("consumer.off", "1016h with time 0 supervises nothing", _watch, _beat,
-     puts(0x1016, 1, _MASTER << 16, 4), no_emergency(0.4)),
+    ("consumer.off", "1016h with time 0 supervises nothing", NodeTester.be_supervised, _beat,
+     puts(0x1016, 1, MASTER << 16, 4), no_emergency(0.4)),
     ("consumer.loss", "A lost heartbeat is EMCY 8130h within the consumer time", lose_heartbeat),
     ("consumer.recovery", "A heartbeat that returns ends the error", lose_heartbeat,
      lambda t: t.equal(t.emergencies_after(0.0, lambda: _beat(t))[-1:], [0], "last EMCY code")),
@@ -239,18 +233,18 @@ CHECKS.rows(
 
 @check("consumer.loss.time", "The EMCY comes when the consumer time is over", _CONSUMER)
 def _(t: NodeTester) -> None:
-    _watch(t, 200)
+    t.be_supervised(200)
     _beat(t, 3)
     begun_s = t.now
-    t.send(0x700 + _MASTER, b"\x05")
+    t.beat()
     frame = t.true(t.hears(0x080 + t.node_id, 0.4 + t.timing.jitter_s), "no EMCY", "EMCY 8130h after 200 ms")
     t.near(frame.time_s - begun_s, 0.2, "time to the EMCY")
 
 
-@check("consumer.other-node", "Heartbeats of another node do not count", _CONSUMER, _watch)
+@check("consumer.other-node", "Heartbeats of another node do not count", _CONSUMER, NodeTester.be_supervised)
 def _(t: NodeTester) -> None:
     _beat(t)
-    codes = t.emergencies_after(0.0, lambda: _beat(t, 8, 0.05, _MASTER - 1))
+    codes = t.emergencies_after(0.0, lambda: _beat(t, 8, 0.05, MASTER - 1))
     t.true(0x8130 in codes, f"EMCY codes {codes}", "8130h")
 
 

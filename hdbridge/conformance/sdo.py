@@ -496,16 +496,11 @@ CHECKS.rows(
 )  # fmt: skip
 
 
-@check(
-    "sdo.channel",
-    "1200h names the default identifiers of the SDO server",
-    "CiA 301, object 1200h",
-    (0x1200, 1),
-)
-def _(t: NodeTester) -> None:
-    t.equal([t.read(0x1200, sub) & 0x7FF for sub in (1, 2)], [0x600 + t.node_id, 0x580 + t.node_id], "1200h")
-
-
+CHECKS.add(
+    "sdo.channel", "1200h names the default identifiers of the SDO server", "CiA 301, object 1200h",
+    (0x1200, 1), lambda t: t.equal([t.read(0x1200, sub) & 0x7FF for sub in (1, 2)],
+                                   [0x600 + t.node_id, 0x580 + t.node_id], "1200h"),
+)  # fmt: skip
 CHECKS.add(
     "sdo.range", "A value outside the range of an object is abort 06090030h to 06090032h", _SDO, (0x1800, 2),
     refuses(0x1800, 2, b"\xf5", RANGE),

@@ -36,6 +36,8 @@ RANGE: Final = (0x06090030, 0x06090031, 0x06090032, 0x06090036)
 LENGTH: Final = (0x06070010, 0x06070012, 0x06070013)
 COMMAND: Final = (0x05040001,)
 
+MASTER: Final = 126
+"""Node id of the tester's heartbeat."""
 PDO_INVALID: Final = 1 << 31
 ENABLING: Final = (
     (State.READY_TO_SWITCH_ON, 0x06),
@@ -375,6 +377,15 @@ class NodeTester:
         self.watch_state()
         self.nmt(command)
         self.equal(self.state(), ENTERED[command], "NMT state")
+
+    def be_supervised(self, time_ms: int = 100) -> None:
+        """Makes the node supervise the tester's heartbeat with this time-out."""
+        self.require(0x1016, 1)
+        self.write(0x1016, 1, MASTER << 16 | time_ms, 4)
+
+    def beat(self, node_id: int = MASTER) -> None:
+        """Sends a heartbeat."""
+        self.send(0x700 + node_id, b"\x05")
 
     def sync(self, counter: int | None = None) -> None:
         self.send(0x080, b"" if counter is None else bytes((counter,)))
