@@ -1,4 +1,7 @@
-"""Steps of checks, for the tables: each function returns a step that fails unless the node is right."""
+"""Steps of checks, for the tables.
+
+A function with parameters returns a step. Its docstring states what the step does, or requires of the node.
+"""
 
 from collections.abc import Callable
 

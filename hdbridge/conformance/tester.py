@@ -117,9 +117,9 @@ Decorator = Callable[[Step], Step]
 
 
 class Table(list[Check]):
-    """Checks of one subject. A check is a sequence of steps, which end it by an exception.
+    """Checks of one subject. A check is a sequence of steps; a step that fails raises an exception.
 
-    An object as a step means that the check applies only to a node with this object.
+    An object in place of a step limits the check to nodes with this object.
     """
 
     def __init__(self, *, drives: bool = False, moves: bool = False) -> None:
