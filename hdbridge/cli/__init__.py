@@ -26,64 +26,27 @@ from hdbridge.cli import eventlog, usage
 from hdbridge.errors import HdbridgeError, InputError, OutputError
 
 PANELS: Final = {
-    "Without hardware": {
-        "demo": "Step a simulated axis 240 times each way under four compensation schemes.",
-        "simulate": "Run the simulated drive of a profile on its bus, in real time, until Ctrl-C.",
-    },
-    "Before the first move": {
-        "setup": "Set up an axis in one sitting: bus, axis file, checks, calibration, model, first move.",
-        "new": "Make the folder of an axis: a copy of a bundled profile, or from the data of a drive on the "
-        "bus.",
-        "check": "Check the files of an axis or of a machine; report their meaning, or the errors with "
-        "their location.",
-        "scan": "List the nodes on a CAN bus: type, identity, state, and lines for an axis file.",
-        "doctor": "Check an axis before its first long motion: files, bus, drive, encoders, directions, "
-        "ratio, stops.",
-        "conform": "Check a node against CiA 301 and CiA 402: NMT, SDO, PDO, SYNC, EMCY, its EDS, the drive "
-        "profile.",
-        "sdo": "Read or write an object of the drive by SDO, typed by its EDS.",
-        "latency": "Measure timer latency; print its histogram and the shortest cycle that this computer "
-        "sustains.",
-    },
-    "The model of an axis": {
-        "calibrate": "Measure an axis by a plan, fit its model, test it on the axis, and keep it as pending.",
-        "measure": "Move an axis by a plan and keep the recording, for diagnose, twin and fit.",
-        "fit": "Fit a model to recordings; report parameter intervals and what the data cannot determine.",
-        "report": "Fit a recording again and report the result; nothing moves.",
-        "diagnose": "Compare records with a model; name the causes that it lacks, and those that are not "
-        "separable.",
-        "improve": "Diagnose the active model, extend it, step with both, and keep the better one as "
-        "pending.",
-        "twin": "Fit the simulated drive to recordings of an axis; report its errors, and keep the twin as "
-        "pending.",
-        "model": "Manage the models of an axis: the active one, a pending one, and all earlier ones.",
-    },
-    "Many joints": {
-        "fleet": "Diagnose recordings of many joints on Dask; report the joints to inspect first."
-    },
-    "Day and night": {
-        "run": "Run the daemon: control the drives of a machine and accept load angles from clients.",
-        "ctl": "Control a running daemon: state, motion, stop, compensation.",
-        "gateway": "The axes of a machine as drives of another master.",
-        "record": "Flight recordings and bus logs: list, mend, and make records for fit and diagnose.",
-        "install-service": "Show, write or remove the systemd files that run a machine's daemon from the "
-        "start of the computer.",
-    },
-    "Positioning": {
-        "move": "Move the load to one angle or to several, compensated by the active model, and hold the "
-        "last.",
-        "reset": "Reset a fault of the drive once its cause is gone; power stays off.",
-        "home": "Home the drive by one of its own methods (CiA 402, mode HM); print the position of the "
-        "axis.",
-        "step": "Step the axis both ways under each compensation scheme; print the results at "
-        "the load encoder.",
-        "motion": "Run the axis at several speeds; print the ripple of the load without and with "
-        "compensation.",
-    },
-}
-"""All commands under their headings in `hdbridge --help`, with their summaries there.
+    "Without hardware": ("demo", "simulate"),
+    "Before the first move": ("setup", "new", "check", "scan", "doctor", "conform", "sdo", "latency"),
+    "The model of an axis": (
+        "calibrate", "measure", "fit", "report", "diagnose", "improve", "twin", "model",
+    ),
+    "Many joints": ("fleet",),
+    "Day and night": ("run", "ctl", "gateway", "record", "install-service"),
+    "Positioning": ("move", "reset", "home", "step", "motion"),
+}  # fmt: skip
+"""All commands under their headings in `hdbridge --help`.
 
-A command is imported only for its own help or to be run, and it imports its dependencies when it runs."""
+A command is imported only for help or to be run, and it imports its dependencies when it runs."""
+_GROUPS: Final = {
+    "sdo": "Read or write an object of the drive by SDO, typed by its EDS.",
+    "model": "Manage the models of an axis: the active one, a pending one, and all earlier ones.",
+    "fleet": "Diagnose recordings of many joints on Dask; report the joints to inspect first.",
+    "ctl": "Control a running daemon: state, motion, stop, compensation.",
+    "gateway": "The axes of a machine as drives of another master.",
+    "record": "Flight recordings and bus logs: list, mend, and make records for fit and diagnose.",
+}
+"""Summaries of the groups of commands."""
 _MODULES: Final = {
     "bringup": ("new", "check", "scan", "doctor", "latency"),
     "calibration": ("calibrate", "measure", "fit", "report"),
@@ -114,32 +77,32 @@ def load(name: str) -> typer.Typer:
     if callable(command):
         add(loaded, name, name, command)
         return loaded
-    summary = next(commands[name] for commands in PANELS.values() if name in commands)
-    group = typer.Typer(help=summary, no_args_is_help=True, rich_markup_mode="markdown")
+    group = typer.Typer(help=_GROUPS[name], no_args_is_help=True, rich_markup_mode="markdown")
     for each, function in command.items():
         add(group, each, f"{name} {each}", function)
     loaded.add_typer(group, name=name)
     return loaded
 
 
-class _LoadedToRun(TyperGroup):
-    """Command group that replaces the placeholders of the overview with the real commands."""
+class _Overview(TyperGroup):
+    """Command group that replaces placeholders with the real commands."""
 
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        name, _, rest = super().resolve_command(ctx, args)
-        assert name is not None
-        return name, _built(name), rest
+    def get_command(self, ctx: Any, name: str) -> Any:
+        placeholder: Any = super().get_command(ctx, name)
+        return placeholder and _built(name, placeholder.rich_help_panel)
 
 
 @cache
-def _built(name: str) -> Any:
+def _built(name: str, panel: str) -> Any:
     """Builds a command with its options; cached, because a process may run the command several times."""
-    return usage.strict(get_group(load(name)).commands[name])
+    command = usage.strict(get_group(load(name)).commands[name])
+    command.rich_help_panel = panel
+    return command
 
 
 app = typer.Typer(
     name="hdbridge",
-    cls=_LoadedToRun,
+    cls=_Overview,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
@@ -152,13 +115,9 @@ app = typer.Typer(
 )
 
 
-def _in_overview() -> None:
-    """Placeholder for a command that has not been imported."""
-
-
-for _panel, _commands in PANELS.items():
-    for _name, _summary in _commands.items():
-        app.command(_name, help=_summary, rich_help_panel=_panel)(_in_overview)
+for _panel, _names in PANELS.items():
+    for _name in _names:
+        app.command(_name, rich_help_panel=_panel)(lambda: None)
 
 
 def _print_version(asked: bool) -> None:

@@ -1,11 +1,20 @@
 """Checks of CiA 402 that need no power: objects, units, modes, and states up to *ready to switch on*."""
 
 import struct
-from collections.abc import Callable
 from typing import Final
 
 from hdbridge.cia301 import NmtCommand
-from hdbridge.conformance.tester import RANGE, READ_ONLY, NodeTester, Table, expedited, pack, state_name
+from hdbridge.conformance.steps import control, holds, reaches, reads, refuses, reset_node, stays
+from hdbridge.conformance.tester import (
+    RANGE,
+    READ_ONLY,
+    NodeTester,
+    Step,
+    Table,
+    expedited,
+    pack,
+    state_name,
+)
 from hdbridge.drive.states import State, decode
 
 CHECKS: Final = Table(drives=True)
@@ -13,7 +22,6 @@ check: Final = CHECKS.check
 _PROFILE: Final = "CiA 402-2"
 _STATES: Final = "CiA 402-2, finite state automaton"
 _MODES: Final = "CiA 402-2, objects 6060h, 6061h, 6502h"
-_OPTIONS: Final = "CiA 402-2, objects 605Ah to 605Eh, 6007h"
 _DISABLED: Final = State.SWITCH_ON_DISABLED
 _READY: Final = State.READY_TO_SWITCH_ON
 _UNITS: Final = "CiA 402-2, objects 608Fh, 6091h, 6092h"
@@ -38,36 +46,18 @@ def _(t: NodeTester) -> None:
     )
 
 
-def _mandatory(index: int, size: int, name: str, *, writable: bool) -> None:
-    @check(
-        f"402.object.{index:04X}",
-        f"{index:04X}h, {name}, exists with {size} byte{'s' * (size > 1)}",
-        _PROFILE,
-    )
-    def _(t: NodeTester) -> None:
+def _is_mandatory(index: int, size: int, *, writable: bool) -> Step:
+    def step(t: NodeTester) -> None:
         data = t.upload(index)
         t.equal(len(data), size, "bytes")
         if not writable:
             t.aborts(expedited(index, 0, data), READ_ONLY, f"download to {index:04X}h")
 
-
-_mandatory(0x6040, 2, "controlword", writable=True)
-_mandatory(0x6041, 2, "statusword", writable=False)
-_mandatory(0x6060, 1, "modes of operation", writable=True)
-_mandatory(0x6061, 1, "modes of operation display", writable=False)
-_mandatory(0x6502, 4, "supported drive modes", writable=False)
+    return step
 
 
-@check("402.modes", "6502h names at least one mode", _MODES)
-def _(t: NodeTester) -> None:
-    t.true(t.read(0x6502) & 0x3FF, f"6502h = {t.read(0x6502):08X}h", "a bit from 0 to 9")
-
-
-def _mode(number: int, name: str) -> None:
-    @check(
-        f"402.mode.{number}", f"Mode {number}, {name}, is accepted if 6502h names it, else refused", _MODES
-    )
-    def _(t: NodeTester) -> None:
+def _takes_mode(number: int) -> Step:
+    def step(t: NodeTester) -> None:
         if t.read(0x6502) >> number - 1 & 1:
             t.write(0x6060, 0, number, 1)
             t.wait(0.05)
@@ -75,14 +65,7 @@ def _mode(number: int, name: str) -> None:
         else:
             _refuses_mode(t, number)
 
-
-for _number, _name in MODES.items():
-    _mode(_number, _name)
-
-
-@check("402.mode.reserved", "A reserved mode, 5, is refused or not displayed", _MODES)
-def _(t: NodeTester) -> None:
-    _refuses_mode(t, 5)
+    return step
 
 
 def _refuses_mode(t: NodeTester, number: int) -> None:
@@ -92,13 +75,28 @@ def _refuses_mode(t: NodeTester, number: int) -> None:
     t.true(t.read(0x6061, signed=True) != number, f"6061h = {number}", "another mode")
 
 
+CHECKS.rows(
+    _PROFILE,
+    *((f"402.object.{index:04X}", f"{index:04X}h, {name}, exists with {size} byte{'s' * (size > 1)}",
+       _is_mandatory(index, size, writable=writable))
+      for index, size, name, writable in (
+          (0x6040, 2, "controlword", True),
+          (0x6041, 2, "statusword", False),
+          (0x6060, 1, "modes of operation", True),
+          (0x6061, 1, "modes of operation display", False),
+          (0x6502, 4, "supported drive modes", False))),
+)  # fmt: skip
+CHECKS.rows(
+    _MODES,
+    ("402.modes", "6502h names at least one mode",
+     lambda t: t.true(t.read(0x6502) & 0x3FF, f"6502h = {t.read(0x6502):08X}h", "a bit from 0 to 9")),
+    *((f"402.mode.{number}", f"Mode {number}, {name}, is accepted if 6502h names it, else refused",
+       _takes_mode(number)) for number, name in MODES.items()),
+    ("402.mode.reserved", "A reserved mode, 5, is refused or not displayed", lambda t: _refuses_mode(t, 5)),
+)  # fmt: skip
+
+
 # ---------------------------------------------------------------- states without power
-
-
-@check("402.state.reset", "After the NMT command reset node the drive reaches switch on disabled", _STATES)
-def _(t: NodeTester) -> None:
-    t.reset(NmtCommand.RESET_NODE)
-    t.reaches(_DISABLED)
 
 
 def ready(t: NodeTester) -> None:
@@ -108,74 +106,49 @@ def ready(t: NodeTester) -> None:
     t.reaches(_READY)
 
 
-def _leads(name: str, text: str, begin: Callable[[NodeTester], None], word: int, state: State) -> None:
-    @check(f"402.state.{name}", text, _STATES, first=begin)
-    def _(t: NodeTester) -> None:
-        t.control(word)
-        t.reaches(state)
+def _bit(bit: int, value: int) -> Step:
+    return lambda t: t.equal(t.read(0x6041) >> bit & 1, value, f"bit {bit}")
 
 
-_leads(
-    "shutdown", "Shutdown leads from switch on disabled to ready to switch on (2)", NodeTester.disable,
-    0x06, _READY,
+CHECKS.rows(
+    _STATES,
+    ("402.state.reset", "After the NMT command reset node the drive reaches switch on disabled", reset_node,
+     reaches(_DISABLED)),
+    ("402.state.shutdown", "Shutdown leads from switch on disabled to ready to switch on (2)",
+     NodeTester.disable, control(0x06), reaches(_READY)),
+    ("402.state.disable-voltage", "Disable voltage leads from ready to switch on to switch on disabled (7)",
+     ready, control(0x00), reaches(_DISABLED)),
+    ("402.state.quick-stop", "Quick stop leads from ready to switch on to switch on disabled (7)", ready,
+     control(0x02), reaches(_DISABLED)),
+    ("402.state.mode-bits", "Bits 4 to 6 and 8 of the controlword do not disturb shutdown",
+     NodeTester.disable, control(0x176), reaches(_READY)),
+    *((f"402.state.disabled.{name}", f"{text} changes nothing in switch on disabled", NodeTester.disable,
+       control(word), stays(_DISABLED))
+      for name, text, word in (
+          ("disable-voltage", "Disable voltage", 0x00), ("quick-stop", "Quick stop", 0x02),
+          ("fault-reset", "Fault reset", 0x80))),
+    ("402.state.ready.repeated", "Repeated shutdown changes nothing in ready to switch on", ready,
+     control(0x06), stays(_READY)),
+    ("402.state.stable", "The drive stays in ready to switch on without a command", ready,
+     stays(_READY, 0.5)),
+    ("402.status.quick-stop", "Bit 5 of the statusword is 1 in ready to switch on", ready, _bit(5, 1)),
+    ("402.status.fault", "Bit 3 of the statusword is 0 without a fault", NodeTester.disable, _bit(3, 0)),
+    ("402.status.remote", "Bit 9 of the statusword, remote, is 1 while the controlword is obeyed", ready,
+     _bit(9, 1)),
+    ("402.status.limit", "Bit 11 of the statusword, internal limit, is 0 at rest without power",
+     NodeTester.disable, _bit(11, 0)),
 )  # fmt: skip
-for _name, _word, _command in (
-    ("disable-voltage", 0x00, "Disable voltage"),
-    ("quick-stop", 0x02, "Quick stop"),
-):
-    _leads(
-        _name, f"{_command} leads from ready to switch on to switch on disabled (7)", ready, _word, _DISABLED
-    )
-_leads(
-    "mode-bits", "Bits 4 to 6 and 8 of the controlword do not disturb shutdown", NodeTester.disable,
-    0x176, _READY,
+CHECKS.add(
+    "402.error-code", "603Fh is 0 without a fault", "CiA 402-2, object 603Fh", 0x603F, NodeTester.disable,
+    holds(0x603F, 0, 0),
+)  # fmt: skip
+CHECKS.add(
+    "402.controlword.read", "6040h reads as the controlword that was written", "CiA 402-2, object 6040h",
+    ready, holds(0x6040, 0, 0x06),
 )  # fmt: skip
 
 
-def _no_effect(name: str, word: int, text: str, state: State) -> None:
-    @check(f"402.state.{name}", f"{text} changes nothing in {state.value}", _STATES)
-    def _(t: NodeTester) -> None:
-        (ready if state is _READY else NodeTester.disable)(t)
-        t.control(word)
-        t.stays(state)
-
-
-_no_effect("disabled.disable-voltage", 0x00, "Disable voltage", _DISABLED)
-_no_effect("disabled.quick-stop", 0x02, "Quick stop", _DISABLED)
-_no_effect("disabled.fault-reset", 0x80, "Fault reset", _DISABLED)
-_no_effect("ready.repeated", 0x06, "Repeated shutdown", _READY)
-
-
-@check("402.state.stable", "The drive stays in ready to switch on without a command", _STATES, first=ready)
-def _(t: NodeTester) -> None:
-    t.stays(_READY, 0.5)
-
-
-def _bit(name: str, bit: int, value: int, text: str, begin: Callable[[NodeTester], None]) -> None:
-    @check(f"402.status.{name}", f"Bit {bit} of the statusword{text}", _STATES, first=begin)
-    def _(t: NodeTester) -> None:
-        t.equal(t.read(0x6041) >> bit & 1, value, f"bit {bit}")
-
-
-_bit("quick-stop", 5, 1, " is 1 in ready to switch on", ready)
-_bit("fault", 3, 0, " is 0 without a fault", NodeTester.disable)
-_bit("remote", 9, 1, ", remote, is 1 while the controlword is obeyed", ready)
-_bit("limit", 11, 0, ", internal limit, is 0 at rest without power", NodeTester.disable)
-
-
-@check("402.error-code", "603Fh is 0 without a fault", "CiA 402-2, object 603Fh", 0x603F)
-def _(t: NodeTester) -> None:
-    t.disable()
-    t.equal(t.read(0x603F), 0, "603Fh")
-
-
-@check("402.controlword.read", "6040h reads as the controlword that was written", "CiA 402-2, object 6040h")
-def _(t: NodeTester) -> None:
-    ready(t)
-    t.equal(t.read(0x6040), 0x06, "6040h")
-
-
-@check("402.controlword.pdo", "The controlword is obeyed as an RPDO", _STATES, first=NodeTester.disable)
+@check("402.controlword.pdo", "The controlword is obeyed as an RPDO", _STATES, NodeTester.disable)
 def _(t: NodeTester) -> None:
     can_id = t.map_pdo(0x1400, ((0x6040, 0, 16),), 255)
     t.nmt(NmtCommand.START)
@@ -196,7 +169,7 @@ def _(t: NodeTester) -> None:
     t.reaches(_READY)
 
 
-@check("402.statusword.pdo", "A TPDO carries the statusword", _STATES, first=ready)
+@check("402.statusword.pdo", "A TPDO carries the statusword", _STATES, ready)
 def _(t: NodeTester) -> None:
     can_id = t.map_pdo(0x1800, ((0x6041, 0, 16),), 1)
     t.nmt(NmtCommand.START)
@@ -221,45 +194,54 @@ def _(t: NodeTester) -> None:
 # ---------------------------------------------------------------- option codes
 
 
-def _reserved(name: str, text: str, clause: str, index: int, value: int, size: int = 2) -> None:
-    @check(f"402.{name}.reserved", text, clause, index)
-    def _(t: NodeTester) -> None:
-        t.refuses_value(index, 0, pack(value, size), RANGE)
+def _holds_one_of(index: int, defined: tuple[int, ...]) -> Step:
+    """A signed object of two bytes has a defined value or one of the manufacturer, which is negative."""
 
-
-def _option(index: int, name: str, reserved: int, defined: tuple[int, ...]) -> None:
-    text = f"{index:04X}h, {name}: the reserved value {reserved} is refused"
-    _reserved(f"option.{index:04X}", text, _OPTIONS, index, reserved)
-
-    @check(f"402.option.{index:04X}", f"{index:04X}h, {name}, holds a defined value", _OPTIONS, index)
-    def _(t: NodeTester) -> None:
+    def step(t: NodeTester) -> None:
         data = t.upload(index)
         t.equal(len(data), 2, "bytes")
         value = int.from_bytes(data, "little", signed=True)
         t.true(value in defined or value < 0, f"{index:04X}h = {value}", f"one of {defined}")
 
+    return step
 
-_option(0x6007, "abort connection", 4, (0, 1, 2, 3))
-_option(0x605A, "quick stop", 9, (0, 1, 2, 3, 4, 5, 6, 7, 8))
-_option(0x605B, "shutdown", 2, (0, 1))
-_option(0x605C, "disable operation", 2, (0, 1))
-_option(0x605D, "halt", 5, (1, 2, 3, 4))
-_option(0x605E, "fault reaction", 5, (0, 1, 2, 3, 4))
+
+for _index, _name, _reserved, _defined in (
+    (0x6007, "abort connection", 4, (0, 1, 2, 3)),
+    (0x605A, "quick stop", 9, (0, 1, 2, 3, 4, 5, 6, 7, 8)),
+    (0x605B, "shutdown", 2, (0, 1)),
+    (0x605C, "disable operation", 2, (0, 1)),
+    (0x605D, "halt", 5, (1, 2, 3, 4)),
+    (0x605E, "fault reaction", 5, (0, 1, 2, 3, 4)),
+):
+    _id, _object = f"402.option.{_index:04X}", f"{_index:04X}h, {_name}"
+    CHECKS.rows(
+        "CiA 402-2, objects 605Ah to 605Eh, 6007h",
+        (f"{_id}.reserved", f"{_object}: the reserved value {_reserved} is refused", _index,
+         refuses(_index, 0, pack(_reserved, 2), RANGE)),
+        (_id, f"{_object}, holds a defined value", _index, _holds_one_of(_index, _defined)),
+    )  # fmt: skip
 
 
 # ---------------------------------------------------------------- units and limits
 
 
-def _ratio(index: int, name: str, words: str) -> None:
-    @check(f"402.units.{name}", f"{index:04X}h: {words} are not 0", _UNITS, (index, 1))
-    def _(t: NodeTester) -> None:
+def _are_positive(index: int) -> Step:
+    def step(t: NodeTester) -> None:
         found = [t.read(index, sub) for sub in (1, 2)]
         t.true(all(found), f"{index:04X}h = {found}", "both above 0")
 
+    return step
 
-_ratio(0x608F, "encoder", "increments and revolutions")
-_ratio(0x6091, "gear", "motor and driving shaft revolutions")
-_ratio(0x6092, "feed", "feed and driving shaft revolutions")
+
+CHECKS.rows(
+    _UNITS,
+    ("402.units.encoder", "608Fh: increments and revolutions are not 0", (0x608F, 1), _are_positive(0x608F)),
+    ("402.units.gear", "6091h: motor and driving shaft revolutions are not 0", (0x6091, 1),
+     _are_positive(0x6091)),
+    ("402.units.feed", "6092h: feed and driving shaft revolutions are not 0", (0x6092, 1),
+     _are_positive(0x6092)),
+)  # fmt: skip
 
 
 @check(
@@ -290,21 +272,15 @@ def _(t: NodeTester) -> None:
     t.true(low < high or low == high == 0, f"607Dh = {low}, {high}", "lower below upper")
 
 
-def _positive(index: int, name: str) -> None:
-    text, clause = f"{index:04X}h, {name}, is above 0", f"CiA 402-2, object {index:04X}h"
-
-    @check(f"402.limits.{index:04X}", text, clause, index)
-    def _(t: NodeTester) -> None:
-        t.true(t.read(index), f"{index:04X}h = 0", "a value above 0")
-
-
-_positive(0x607F, "max profile velocity")
-_positive(0x6080, "max motor speed")
-_positive(0x6081, "profile velocity")
-_positive(0x6083, "profile acceleration")
-_positive(0x6084, "profile deceleration")
-_positive(0x6085, "quick stop deceleration")
-_positive(0x6076, "motor rated torque")
+for _index, _name in (
+    (0x607F, "max profile velocity"), (0x6080, "max motor speed"), (0x6081, "profile velocity"),
+    (0x6083, "profile acceleration"), (0x6084, "profile deceleration"),
+    (0x6085, "quick stop deceleration"), (0x6076, "motor rated torque"),
+):  # fmt: skip
+    CHECKS.add(
+        f"402.limits.{_index:04X}", f"{_index:04X}h, {_name}, is above 0",
+        f"CiA 402-2, object {_index:04X}h", _index, reads(_index, 0, bool, "a value above 0"),
+    )  # fmt: skip
 
 
 @check("402.period", "60C2h is a period from 0.1 ms to 1 s", "CiA 402-2, object 60C2h", (0x60C2, 1))
@@ -320,10 +296,13 @@ def _(t: NodeTester) -> None:
         t.write(0x6098, 0, t.read(0x60E3, sub, signed=True), 1)
 
 
-_reserved("homing", "A reserved homing method, 38, is refused", "CiA 402-2, object 6098h", 0x6098, 38, 1)
-_reserved(
-    "profile-type", "6086h, motion profile type: the reserved value 5 is refused", "CiA 402-2, object 6086h",
-    0x6086, 5,
+CHECKS.add(
+    "402.homing.reserved", "A reserved homing method, 38, is refused", "CiA 402-2, object 6098h", 0x6098,
+    refuses(0x6098, 0, pack(38, 1), RANGE),
+)  # fmt: skip
+CHECKS.add(
+    "402.profile-type.reserved", "6086h, motion profile type: the reserved value 5 is refused",
+    "CiA 402-2, object 6086h", 0x6086, refuses(0x6086, 0, pack(5, 2), RANGE),
 )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from typing import Final
 
 from hdbridge.cia301 import NmtCommand
 from hdbridge.conformance.network import lose_heartbeat
+from hdbridge.conformance.steps import aborts, has_bits, holds, no_emergency, puts, reads, reset_node, waits
 from hdbridge.conformance.tester import PDO_INVALID, RANGE, READ_ONLY, NodeTester, Table, expedited
 
 CHECKS: Final = Table()
@@ -19,90 +20,56 @@ _SAVE: Final = b"save"
 _LOAD: Final = b"load"
 
 
-@check("emcy.register", "1001h is 0 without an error", _REGISTER)
-def _(t: NodeTester) -> None:
-    t.reset(NmtCommand.RESET_NODE)
-    t.equal(t.upload(0x1001), b"\0", "1001h")
-
-
-def _register(name: str, text: str, bit: int) -> None:
-    @check(f"emcy.register.{name}", f"{text} sets bit {bit} of 1001h", _REGISTER)
-    def _(t: NodeTester) -> None:
-        lose_heartbeat(t)
-        t.equal(t.read(0x1001) & 1 << bit, 1 << bit, f"bit {bit}")
-
-
-_register("error", "An error", 0)
-_register("communication", "A communication error", 4)
-
-
-@check("emcy.register.read-only", "1001h cannot be written", _REGISTER)
-def _(t: NodeTester) -> None:
-    t.aborts(expedited(0x1001, 0, b"\0"), READ_ONLY, "download to 1001h")
-
-
-@check("emcy.identifier", "1014h is 80h + node id by default", _EMCY, 0x1014, first=NodeTester.reset)
-def _(t: NodeTester) -> None:
-    t.equal(f"{t.read(0x1014) & 0x7FF:03X}h", f"{0x80 + t.node_id:03X}h", "identifier")
-
-
-@check("emcy.frame", "An EMCY message has eight bytes", _EMCY, first=lose_heartbeat)
-def _(t: NodeTester) -> None:
-    t.equal({len(frame.data) for frame in t.heard(0x80 + t.node_id)}, {8}, "length")
-
-
-@check("emcy.frame.register", "Byte 2 of an EMCY message is 1001h", _EMCY, first=lose_heartbeat)
-def _(t: NodeTester) -> None:
-    t.equal(t.heard(0x80 + t.node_id)[-1].data[2], t.read(0x1001), "error register")
-
-
-@check("emcy.once", "An error is reported once", _EMCY, first=lose_heartbeat)
-def _(t: NodeTester) -> None:
-    t.wait(0.5)
-    t.equal(t.emergencies().count(0x8130), 1, "number of EMCY messages")
-
-
-@check("emcy.disabled", "1014h with bit 31 set sends no EMCY", _EMCY, 0x1014, first=lose_heartbeat)
-def _(t: NodeTester) -> None:
-    t.send(0x77E, b"\x05")
-    t.wait(0.02)
+def _switch_off(t: NodeTester) -> None:
     t.write(0x1014, 0, t.read(0x1014) | PDO_INVALID, 4)
-    t.equal(t.emergencies_after(0.4), [], "EMCY codes")
+
+
+CHECKS.rows(
+    _REGISTER,
+    ("emcy.register", "1001h is 0 without an error", reset_node, holds(0x1001, 0, 0)),
+    ("emcy.register.error", "An error sets bit 0 of 1001h", lose_heartbeat, has_bits(0x1001, 1, 1, "bit 0")),
+    ("emcy.register.communication", "A communication error sets bit 4 of 1001h", lose_heartbeat,
+     has_bits(0x1001, 16, 16, "bit 4")),
+    ("emcy.register.read-only", "1001h cannot be written",
+     aborts(expedited(0x1001, 0, b"\0"), READ_ONLY, "download to 1001h")),
+)  # fmt: skip
+CHECKS.rows(
+    _EMCY,
+    ("emcy.identifier", "1014h is 80h + node id by default", 0x1014, NodeTester.reset,
+     lambda t: t.equal(f"{t.read(0x1014) & 0x7FF:03X}h", f"{0x80 + t.node_id:03X}h", "identifier")),
+    ("emcy.frame", "An EMCY message has eight bytes", lose_heartbeat,
+     lambda t: t.equal({len(frame.data) for frame in t.heard(0x80 + t.node_id)}, {8}, "length")),
+    ("emcy.frame.register", "Byte 2 of an EMCY message is 1001h", lose_heartbeat,
+     lambda t: t.equal(t.heard(0x80 + t.node_id)[-1].data[2], t.read(0x1001), "error register")),
+    ("emcy.once", "An error is reported once", lose_heartbeat, waits(0.5),
+     lambda t: t.equal(t.emergencies().count(0x8130), 1, "number of EMCY messages")),
+    ("emcy.disabled", "1014h with bit 31 set sends no EMCY", 0x1014, lose_heartbeat,
+     NodeTester.beat, waits(0.02), _switch_off, no_emergency(0.4)),
+)  # fmt: skip
 
 
 @check("emcy.identifier.other", "EMCY is sent with the identifier in 1014h", _EMCY, 0x1014)
 def _(t: NodeTester) -> None:
     other = 0x80 + (t.node_id ^ 1 or 2)
-    t.write(0x1014, 0, t.read(0x1014) | PDO_INVALID, 4)
+    _switch_off(t)
     t.write(0x1014, 0, other, 4)
-    t.require(0x1016, 1)
-    t.write(0x1016, 1, 126 << 16 | 50, 4)
-    heard = t.heard_after(other, 0.2, lambda: t.send(0x77E, b"\x05"))
+    t.be_supervised(50)
+    heard = t.heard_after(other, 0.2, t.beat)
     t.true(heard, "no EMCY with the new identifier", "EMCY 8130h")
 
 
-@check("emcy.history", "An error is the first entry of 1003h", _HISTORY, 0x1003, first=lose_heartbeat)
-def _(t: NodeTester) -> None:
-    t.equal(f"{t.read(0x1003, 1) & 0xFFFF:04X}h", "8130h", "1003h:01")
-
-
-@check("emcy.history.count", "1003h:00 counts the errors", _HISTORY, 0x1003)
-def _(t: NodeTester) -> None:
-    t.put(0x1003, 0, 0, 1)
-    lose_heartbeat(t)
-    t.equal(t.read(0x1003, 0), 1, "1003h:00")
-
-
-@check("emcy.history.clear", "Writing 0 to 1003h:00 clears the history", _HISTORY, 0x1003)
-def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
-    t.put(0x1003, 0, 0, 1)
-    t.equal(t.read(0x1003, 0), 0, "1003h:00")
-
-
-@check("emcy.history.write", "Writing anything else to 1003h:00 is abort 06090030h", _HISTORY, 0x1003)
-def _(t: NodeTester) -> None:
-    t.aborts(expedited(0x1003, 0, b"\x01"), RANGE, "1003h:00 = 1")
+_clear_history: Final = puts(0x1003, 0, 0, 1)
+CHECKS.rows(
+    _HISTORY,
+    ("emcy.history", "An error is the first entry of 1003h", 0x1003, lose_heartbeat,
+     holds(0x1003, 1, 0x8130, 4)),
+    ("emcy.history.count", "1003h:00 counts the errors", 0x1003, _clear_history, lose_heartbeat,
+     holds(0x1003, 0, 1)),
+    ("emcy.history.clear", "Writing 0 to 1003h:00 clears the history", 0x1003, lose_heartbeat,
+     _clear_history, holds(0x1003, 0, 0)),
+    ("emcy.history.write", "Writing anything else to 1003h:00 is abort 06090030h", 0x1003,
+     aborts(expedited(0x1003, 0, b"\x01"), RANGE, "1003h:00 = 1")),
+)  # fmt: skip
 
 
 @check("emcy.history.order", "The newest error is in 1003h:01", _HISTORY, 0x1003)
@@ -137,14 +104,12 @@ def _(t: NodeTester) -> None:
         t.equal(len(t.upload(0x1018, sub)), 4, f"bytes of 1018h:{sub:02X}")
 
 
-@check("identity.vendor", "1018h:01 is not 0", _IDENTITY)
-def _(t: NodeTester) -> None:
-    t.true(t.read(0x1018, 1), "vendor id 0", "a number assigned by CiA")
-
-
-@check("identity.read-only", "1018h:01 cannot be written", _IDENTITY)
-def _(t: NodeTester) -> None:
-    t.aborts(expedited(0x1018, 1, t.upload(0x1018, 1)), READ_ONLY, "download to 1018h:01")
+CHECKS.rows(
+    _IDENTITY,
+    ("identity.vendor", "1018h:01 is not 0", reads(0x1018, 1, bool, "a number assigned by CiA")),
+    ("identity.read-only", "1018h:01 cannot be written",
+     lambda t: t.aborts(expedited(0x1018, 1, t.upload(0x1018, 1)), READ_ONLY, "download to 1018h:01")),
+)  # fmt: skip
 
 
 def _identity(sub: int, key: str, name: str) -> None:
@@ -168,18 +133,16 @@ _identity(3, "revision_number", "revision number")
 
 
 def _storage(index: int, verb: str) -> None:
-    @check(f"store.{index:04X}.capability", f"{index:04X}h:01 says that parameters can be {verb}", _STORE)
-    def _(t: NodeTester) -> None:
-        t.require(index, 1)
-        t.true(t.read(index, 1) & 3, f"{index:04X}h:01 = {t.read(index, 1)}", "bit 0 or bit 1")
-
-    @check(f"store.{index:04X}.signature", f"{index:04X}h:01 refuses a wrong signature", _STORE, (index, 1))
-    def _(t: NodeTester) -> None:
-        t.aborts(expedited(index, 1, b"evil"), _NO_STORAGE, "signature 'evil'")
-
-    @check(f"store.{index:04X}.entries", f"{index:04X}h:00 is 1 to 127", _STORE, (index, 1))
-    def _(t: NodeTester) -> None:
-        t.true(1 <= t.read(index, 0) <= 127, f"{index:04X}h:00 = {t.read(index, 0)}", "1 to 127")
+    name, entry = f"{index:04X}", (index, 1)
+    CHECKS.rows(
+        _STORE,
+        (f"store.{name}.capability", f"{name}h:01 says that parameters can be {verb}", entry,
+         reads(index, 1, lambda value: value & 3, "bit 0 or bit 1")),
+        (f"store.{name}.signature", f"{name}h:01 refuses a wrong signature", entry,
+         aborts(expedited(index, 1, b"evil"), _NO_STORAGE, "signature 'evil'")),
+        (f"store.{name}.entries", f"{name}h:00 is 1 to 127", entry,
+         reads(index, 0, lambda value: 1 <= value <= 127, "1 to 127")),
+    )  # fmt: skip
 
 
 _storage(0x1010, "saved")
@@ -213,7 +176,7 @@ def _overwrite(t: NodeTester) -> None:
     t.reset(NmtCommand.RESET_NODE)
 
 
-_stored("save", "Saved parameters survive a reset", lambda t: t.reset(NmtCommand.RESET_NODE))
+_stored("save", "Saved parameters survive a reset", reset_node)
 _stored("unsaved", "Parameters that were not saved do not survive a reset", _overwrite)
 _stored(
     "load.later", "Default values become valid at the next reset, not at once",

@@ -8,11 +8,13 @@ from typing import Final, Self
 
 from hdbridge.cia301 import NmtCommand
 from hdbridge.conformance.drive import MODES
+from hdbridge.conformance.steps import control, has_bits, holds, reads, stays, waits
 from hdbridge.conformance.tester import (
     ENABLING,
     Decorator,
     NodeTester,
     NotApplicableError,
+    Step,
     Table,
     expedited,
     pack,
@@ -37,7 +39,6 @@ _SWITCHED_ON: Final = State.SWITCHED_ON
 _ENABLED: Final = State.OPERATION_ENABLED
 _STOPPED: Final = State.QUICK_STOP_ACTIVE
 _FAULT: Final = State.FAULT
-_MASTER: Final = 126
 _CYCLE_S: Final = 0.01
 _STOP_S: Final = 0.5
 """Maximum time from a stop command to standstill."""
@@ -92,7 +93,7 @@ def _bring(t: NodeTester, state: State, mode: int | None = None) -> None:
         t.write(0x605A, 0, 6, 2)
     if state is _FAULT:
         _fault_when_lost(t)
-        _guarded(t)
+        t.be_supervised(300)
         _enable_and_beat(t)
         _lose_master(t)
         return
@@ -110,15 +111,10 @@ def _fault_when_lost(t: NodeTester) -> None:
     t.write(0x6007, 0, 1, 2)
 
 
-def _guarded(t: NodeTester) -> None:
-    t.require(0x1016, 1)
-    t.write(0x1016, 1, _MASTER << 16 | 300, 4)
-
-
 def _enable_and_beat(t: NodeTester) -> None:
     """Enables the drive, and begins its supervision of the tester with a heartbeat."""
     t.walk()
-    t.send(0x700 + _MASTER, b"\x05")
+    t.beat()
 
 
 def _lose_master(t: NodeTester, *states: State) -> None:
@@ -137,79 +133,72 @@ def _reset_fault(t: NodeTester, word: int = 0x80) -> None:
 # ---------------------------------------------------------------- transitions
 
 
-def _transition(number: str, state: State, word: int, command: str, then: State) -> None:
-    text = f"{command} leads from {state.value} to {then.value}"
+def _in(state: State) -> Step:
+    """Brings the drive to a power state, at rest."""
+    return lambda t: _bring(t, state)
 
-    @check(f"402.transition.{number}", f"Transition {number.split('.', maxsplit=1)[0]}: {text}", _STATES)
-    def _(t: NodeTester) -> None:
-        _bring(t, state)
+
+def _leads(word: int, state: State) -> Step:
+    """A controlword leads to a state without motion."""
+
+    def step(t: NodeTester) -> None:
         before = _position(t)
         t.control(word)
-        t.reaches(then)
+        t.reaches(state)
         _moved_at_most(t, before, t.travel)
 
-
-_transition("2", _DISABLED, 0x06, "Shutdown", _READY)
-_transition("3", _READY, 0x07, "Switch on", _SWITCHED_ON)
-_transition("3+4", _READY, 0x0F, "Switch on and enable operation", _ENABLED)
-_transition("4", _SWITCHED_ON, 0x0F, "Enable operation", _ENABLED)
-_transition("5", _ENABLED, 0x07, "Disable operation", _SWITCHED_ON)
-_transition("6", _SWITCHED_ON, 0x06, "Shutdown", _READY)
-_transition("8", _ENABLED, 0x06, "Shutdown", _READY)
-_transition("9", _ENABLED, 0x00, "Disable voltage", _DISABLED)
-_transition("10", _SWITCHED_ON, 0x00, "Disable voltage", _DISABLED)
-_transition("10.quick-stop", _SWITCHED_ON, 0x02, "Quick stop", _DISABLED)
-_transition("12", _STOPPED, 0x00, "Disable voltage", _DISABLED)
-_transition("16", _STOPPED, 0x0F, "Enable operation", _ENABLED)
-_transition("15", _FAULT, 0x80, "Fault reset", _DISABLED)
+    return step
 
 
-def _unmoved(name: str, state: State, word: int, command: str) -> None:
-    @check(f"402.no-transition.{name}", f"{command} changes nothing in {state.value}", _STATES)
-    def _(t: NodeTester) -> None:
-        _bring(t, state)
-        t.control(word)
-        t.stays(state)
+CHECKS.rows(
+    _STATES,
+    *((f"402.transition.{number}",
+       f"Transition {number.split('.')[0]}: {command} leads from {state.value} to {then.value}",
+       _in(state), _leads(word, then))
+      for number, state, word, command, then in (
+          ("2", _DISABLED, 0x06, "Shutdown", _READY),
+          ("3", _READY, 0x07, "Switch on", _SWITCHED_ON),
+          ("3+4", _READY, 0x0F, "Switch on and enable operation", _ENABLED),
+          ("4", _SWITCHED_ON, 0x0F, "Enable operation", _ENABLED),
+          ("5", _ENABLED, 0x07, "Disable operation", _SWITCHED_ON),
+          ("6", _SWITCHED_ON, 0x06, "Shutdown", _READY),
+          ("8", _ENABLED, 0x06, "Shutdown", _READY),
+          ("9", _ENABLED, 0x00, "Disable voltage", _DISABLED),
+          ("10", _SWITCHED_ON, 0x00, "Disable voltage", _DISABLED),
+          ("10.quick-stop", _SWITCHED_ON, 0x02, "Quick stop", _DISABLED),
+          ("12", _STOPPED, 0x00, "Disable voltage", _DISABLED),
+          ("16", _STOPPED, 0x0F, "Enable operation", _ENABLED),
+          ("15", _FAULT, 0x80, "Fault reset", _DISABLED))),
+    *((f"402.no-transition.{name}", f"{command} changes nothing in {state.value}", _in(state), control(word),
+       stays(state))
+      for name, state, word, command in (
+          ("disabled.switch-on", _DISABLED, 0x07, "Switch on"),
+          ("disabled.enable", _DISABLED, 0x0F, "Enable operation"),
+          ("switched-on.repeated", _SWITCHED_ON, 0x07, "Repeated switch on"),
+          ("enabled.repeated", _ENABLED, 0x0F, "Repeated enable operation"),
+          ("stopped.shutdown", _STOPPED, 0x06, "Shutdown"),
+          ("stopped.repeated", _STOPPED, 0x02, "Repeated quick stop"),
+          ("fault.disable-voltage", _FAULT, 0x00, "Disable voltage"),
+          ("fault.shutdown", _FAULT, 0x06, "Shutdown"),
+          ("fault.switch-on", _FAULT, 0x07, "Switch on"),
+          ("fault.enable", _FAULT, 0x0F, "Enable operation"),
+          ("fault.quick-stop", _FAULT, 0x02, "Quick stop"))),
+)  # fmt: skip
 
 
-_unmoved("disabled.switch-on", _DISABLED, 0x07, "Switch on")
-_unmoved("disabled.enable", _DISABLED, 0x0F, "Enable operation")
-_unmoved("switched-on.repeated", _SWITCHED_ON, 0x07, "Repeated switch on")
-_unmoved("enabled.repeated", _ENABLED, 0x0F, "Repeated enable operation")
-_unmoved("stopped.shutdown", _STOPPED, 0x06, "Shutdown")
-_unmoved("stopped.repeated", _STOPPED, 0x02, "Repeated quick stop")
-_unmoved("fault.disable-voltage", _FAULT, 0x00, "Disable voltage")
-_unmoved("fault.shutdown", _FAULT, 0x06, "Shutdown")
-_unmoved("fault.switch-on", _FAULT, 0x07, "Switch on")
-_unmoved("fault.enable", _FAULT, 0x0F, "Enable operation")
-_unmoved("fault.quick-stop", _FAULT, 0x02, "Quick stop")
-
-
-def _in_fault(name: str, text: str, clause: str = _STATES, *needs: int) -> Decorator:
-    """Decorates a check that begins with a fault."""
-    return check(f"402.fault.{name}", text, clause, *needs, first=lambda t: _bring(t, _FAULT))
-
-
-@_in_fault("reset.again", "A second fault is reset by another rising edge of bit 7")
+@check(
+    "402.fault.reset.edge",
+    "Bit 7 that is held does not reset a fault: only a rising edge of bit 7 resets a fault", _STATES,
+    _in(_FAULT), control(0x00),
+)  # fmt: skip
 def _(t: NodeTester) -> None:
-    _reset_fault(t)
-    _enable_and_beat(t)
-    _lose_master(t)
-    _reset_fault(t, 0x8F)
-
-
-@_in_fault(
-    "reset.edge", "Bit 7 that is held does not reset a fault: only a rising edge of bit 7 resets a fault"
-)
-def _(t: NodeTester) -> None:
-    t.control(0x00)
     _reset_fault(t)
     # The last controlword before the second fault already sets bit 7, so no rising edge follows the fault.
     t.control(0x06)
     t.reaches(_READY)
     t.control(0x0F)
     t.reaches(_ENABLED)
-    t.send(0x700 + _MASTER, b"\x05")
+    t.beat()
     t.control(0x8F)
     t.stays(_ENABLED, 0.0)
     _lose_master(t)
@@ -217,40 +206,25 @@ def _(t: NodeTester) -> None:
     t.stays(_FAULT, 0.1)
 
 
-@_in_fault("reset.enables-nothing", "A fault reset with the bits of enable operation does not enable")
-def _(t: NodeTester) -> None:
-    _reset_fault(t, 0x8F)
-    t.control(0x0F)
-    t.stays(_DISABLED, 0.1)
-
-
-@_in_fault("code", "603Fh is the code of the fault", "CiA 402-2, object 603Fh", 0x603F)
-def _(t: NodeTester) -> None:
-    t.equal(f"{t.read(0x603F):04X}h", "8130h", "603Fh")
-
-
-@_in_fault("code.reset", "603Fh is 0 after the fault reset", "CiA 402-2, object 603Fh", 0x603F)
-def _(t: NodeTester) -> None:
-    _reset_fault(t)
-    t.equal(t.read(0x603F), 0, "603Fh")
-
-
-@_in_fault("emergency", "A fault is reported by EMCY with its code")
-def _(t: NodeTester) -> None:
-    t.true(0x8130 in t.emergencies(), f"EMCY codes {t.emergencies()}", "8130h")
-
-
-@_in_fault("emergency.reset", "The fault reset is reported by EMCY 0000h")
-def _(t: NodeTester) -> None:
-    t.equal(t.emergencies_after(0.05, lambda: _reset_fault(t))[-1:], [0], "last EMCY code")
-
-
-@_in_fault("register", "1001h is not 0 during a fault, and 0 after its reset")
-def _(t: NodeTester) -> None:
-    t.true(t.read(0x1001), "1001h = 0 during the fault", "bit 0")
-    _reset_fault(t)
-    t.wait(0.05)
-    t.equal(t.read(0x1001), 0, "1001h after the reset")
+CHECKS.rows(
+    _STATES,
+    ("402.fault.reset.again", "A second fault is reset by another rising edge of bit 7", _in(_FAULT),
+     _reset_fault, _enable_and_beat, _lose_master, lambda t: _reset_fault(t, 0x8F)),
+    ("402.fault.reset.enables-nothing", "A fault reset with the bits of enable operation does not enable",
+     _in(_FAULT), lambda t: _reset_fault(t, 0x8F), control(0x0F), stays(_DISABLED, 0.1)),
+    ("402.fault.emergency", "A fault is reported by EMCY with its code", _in(_FAULT),
+     lambda t: t.true(0x8130 in t.emergencies(), f"EMCY codes {t.emergencies()}", "8130h")),
+    ("402.fault.emergency.reset", "The fault reset is reported by EMCY 0000h", _in(_FAULT),
+     lambda t: t.equal(t.emergencies_after(0.05, lambda: _reset_fault(t))[-1:], [0], "last EMCY code")),
+    ("402.fault.register", "1001h is not 0 during a fault, and 0 after its reset", _in(_FAULT),
+     reads(0x1001, 0, bool, "bit 0 during the fault"), _reset_fault, waits(0.05), holds(0x1001, 0, 0)),
+)  # fmt: skip
+CHECKS.rows(
+    "CiA 402-2, object 603Fh",
+    ("402.fault.code", "603Fh is the code of the fault", 0x603F, _in(_FAULT), holds(0x603F, 0, 0x8130, 4)),
+    ("402.fault.code.reset", "603Fh is 0 after the fault reset", 0x603F, _in(_FAULT), _reset_fault,
+     holds(0x603F, 0, 0)),
+)  # fmt: skip
 
 
 # ---------------------------------------------------------------- option codes
@@ -264,7 +238,7 @@ def _lost_master(code: int, states: tuple[State, ...], text: str) -> None:
         _select(t, mode)
         t.write(0x6007, 0, code, 2)
         t.write(0x1029, 1, 1, 1) if t.has(0x1029, 1) else None
-        _guarded(t)
+        t.be_supervised(300)
         _enable_and_beat(t)
         _lose_master(t, *states)
         if not code:
@@ -323,7 +297,7 @@ def _reaction(code: int) -> None:
         _select_slowly(t)
         _fault_when_lost(t)
         _set_if_supported(t, 0x605E, code, before, 2)
-        _guarded(t)
+        t.be_supervised(300)
         _enable_and_beat(t)
         _begin_move(t, 8)
         _lose_master(t)
@@ -352,7 +326,7 @@ def _enable_slowly(t: NodeTester) -> None:
 
 def _pp(name: str, text: str) -> Decorator:
     """Decorates a check that begins with the drive enabled in profile position mode."""
-    return check(f"402.pp.{name}", text, _PP, first=_enable_slowly)
+    return check(f"402.pp.{name}", text, _PP, _enable_slowly)
 
 
 def _direction(t: NodeTester, distances: int) -> int:
@@ -431,24 +405,31 @@ def _(t: NodeTester) -> None:
     _moved_at_most(t, before, 0.5 * t.travel)
 
 
-@_pp("move", "A new set-point is reached")
-def _(t: NodeTester) -> None:
-    _arrives(t, _begin_move(t, 2))
+def _begins(distances: int) -> Step:
+    return lambda t: _begin_move(t, distances)
 
 
-@_pp("acknowledge", "Bit 12 acknowledges a new set-point")
-def _(t: NodeTester) -> None:
-    t.equal(t.read(0x6041) & _BIT_12, 0, "bit 12 before the set-point")
-    _begin_move(t, 2)
-    t.equal(t.read(0x6041) & _BIT_12, _BIT_12, "bit 12 while bit 4 of the controlword is 1")
+def _put_target(t: NodeTester) -> None:
+    t.put(0x607A, 0, _ahead(t, 3), 4)
 
 
-@_pp("acknowledge.end", "Bit 12 falls when bit 4 of the controlword falls")
-def _(t: NodeTester) -> None:
-    _begin_move(t, 2)
-    t.control(0x0F)
-    t.wait(0.05)
-    t.equal(t.read(0x6041) & _BIT_12, 0, "bit 12")
+def _stands_long(t: NodeTester) -> None:
+    _stands(t, 0.3)
+
+
+CHECKS.rows(
+    _PP,
+    ("402.pp.move", "A new set-point is reached", _enable_slowly, lambda t: _arrives(t, _begin_move(t, 2))),
+    ("402.pp.acknowledge", "Bit 12 acknowledges a new set-point", _enable_slowly,
+     has_bits(0x6041, _BIT_12, 0, "bit 12 before the set-point"), _begins(2),
+     has_bits(0x6041, _BIT_12, _BIT_12, "bit 12 while bit 4 of the controlword is 1")),
+    ("402.pp.acknowledge.end", "Bit 12 falls when bit 4 of the controlword falls", _enable_slowly,
+     _begins(2), control(0x0F), waits(0.05), has_bits(0x6041, _BIT_12, 0, "bit 12")),
+    ("402.pp.target-alone", "A target without a new set-point moves nothing", _enable_slowly, _put_target,
+     control(0x0F), _stands_long),
+    ("402.pp.stale", "A target from before enabling moves nothing", _select_slowly, _put_target,
+     NodeTester.walk, _stands_long),
+)  # fmt: skip
 
 
 @_pp("reached", "Target reached is 0 during a move and 1 after it")
@@ -458,26 +439,12 @@ def _(t: NodeTester) -> None:
     _arrives(t, target)
 
 
-@_pp("target-alone", "A target without a new set-point moves nothing")
-def _(t: NodeTester) -> None:
-    t.put(0x607A, 0, _ahead(t, 3), 4)
-    t.control(0x0F)
-    _stands(t, 0.3)
-
-
 @_pp("held", "Bit 4 that is held does not start a second move")
 def _(t: NodeTester) -> None:
     target = _begin_move(t, 2)
     _arrives(t, target)
     t.put(0x607A, 0, 2 * _position(t) - target + _direction(t, 2) * t.travel, 4)
     t.control(0x1F)
-    _stands(t, 0.3)
-
-
-@check("402.pp.stale", "A target from before enabling moves nothing", _PP, first=_select_slowly)
-def _(t: NodeTester) -> None:
-    t.put(0x607A, 0, _ahead(t, 3), 4)
-    t.walk()
     _stands(t, 0.3)
 
 
@@ -731,9 +698,9 @@ def _(t: NodeTester) -> None:
     t.require(0x6007)
     stream = _Stream(t)
     _fault_when_lost(t)
-    _guarded(t)
+    t.be_supervised(300)
     stream.enable()
-    t.send(0x700 + _MASTER, b"\x05")
+    t.beat()
     stream.cycle(50, 0.02 * t.travel * _direction(t, 3))
     t.reaches(_FAULT)
     _stands(t)

@@ -6,7 +6,8 @@ from statistics import median
 from typing import Final
 
 from hdbridge.cia301 import NmtCommand
-from hdbridge.conformance.tester import ENTERED, Decorator, NodeTester, Table, upload_request
+from hdbridge.conformance.steps import no_emergency, puts, sends_nmt, waits, writes
+from hdbridge.conformance.tester import ENTERED, MASTER, NodeTester, Step, Table, upload_request
 
 CHECKS: Final = Table()
 check: Final = CHECKS.check
@@ -15,24 +16,34 @@ _BOOT: Final = "CiA 301, 7.3.2"
 _HEARTBEAT: Final = "CiA 301, 7.2.8 and object 1017h"
 _CONSUMER: Final = "CiA 301, 7.2.8 and object 1016h"
 _GUARDING: Final = "CiA 301, 7.2.8 and objects 100Ch, 100Dh"
-_MASTER: Final = 126
-"""Node id of the tester's heartbeat."""
 
 # ---------------------------------------------------------------- boot-up
+
+
+_PRE: Final = NmtCommand.PRE_OPERATIONAL
+_START: Final = NmtCommand.START
+_STOP: Final = NmtCommand.STOP
+
+
+def _is_in(command: NmtCommand) -> Step:
+    """The node is in the NMT state to which the command leads."""
+    return lambda t: t.equal(t.state(), ENTERED[command], "NMT state")
+
+
+def _enters(command: NmtCommand) -> Step:
+    return lambda t: t.enter(command)
 
 
 def _boots(command: int) -> None:
     name = "node" if command == NmtCommand.RESET_NODE else "communication"
 
-    @check(f"nmt.reset-{name}", f"NMT reset {name} is followed by a boot-up message", _BOOT)
-    def _(t: NodeTester) -> None:
-        t.reset(command)
-
-    @check(f"nmt.reset-{name}.pre-operational", f"After reset {name} the node is PRE-OPERATIONAL", _BOOT)
-    def _(t: NodeTester) -> None:
-        t.reset(command)
-        t.watch_state()
-        t.equal(t.state(), ENTERED[_PRE], "NMT state")
+    CHECKS.rows(
+        _BOOT,
+        (f"nmt.reset-{name}", f"NMT reset {name} is followed by a boot-up message",
+         lambda t: t.reset(command)),
+        (f"nmt.reset-{name}.pre-operational", f"After reset {name} the node is PRE-OPERATIONAL",
+         lambda t: t.reset(command), NodeTester.watch_state, _is_in(_PRE)),
+    )  # fmt: skip
 
     @check(f"nmt.reset-{name}.first", f"After reset {name} nothing is sent before the boot-up message", _BOOT)
     def _(t: NodeTester) -> None:
@@ -51,15 +62,14 @@ _boots(NmtCommand.RESET_NODE)
 _boots(NmtCommand.RESET_COMMUNICATION)
 
 
-@check("nmt.boot-up.frame", "The boot-up message is 700h + node id with one byte, 00h", _BOOT)
-def _(t: NodeTester) -> None:
-    t.equal(t.reset().data, b"\0", "data of the boot-up message")
-
-
-@check("nmt.boot-up.once", "A reset is followed by one boot-up message", _BOOT)
-def _(t: NodeTester) -> None:
-    beats = t.heard_after(0x700 + t.node_id, 0.1, t.reset)
-    t.equal(sum(frame.data == b"\0" for frame in beats), 1, "number of boot-up messages")
+CHECKS.rows(
+    _BOOT,
+    ("nmt.boot-up.frame", "The boot-up message is 700h + node id with one byte, 00h",
+     lambda t: t.equal(t.reset().data, b"\0", "data of the boot-up message")),
+    ("nmt.boot-up.once", "A reset is followed by one boot-up message",
+     lambda t: t.equal([frame.data for frame in t.heard_after(0x700 + t.node_id, 0.1, t.reset)].count(b"\0"),
+                       1, "number of boot-up messages")),
+)  # fmt: skip
 
 
 @check("nmt.reset-communication.parameters", "Reset communication restores 1000h to 1FFFh", _BOOT, 0x1017)
@@ -93,74 +103,43 @@ def _(t: NodeTester) -> None:
 # ---------------------------------------------------------------- states
 
 
-def _transition(name: str, first: NmtCommand, command: NmtCommand) -> None:
-    text = f"NMT command {command} leads from {ENTERED[first]} to {ENTERED[command]}"
-
-    @check(f"nmt.{name}", text, _NMT)
-    def _(t: NodeTester) -> None:
-        t.enter(first)
-        t.enter(command)
+def _ignores(send: Step) -> tuple[Step, Step, Step]:
+    return NodeTester.watch_state, send, _is_in(_PRE)
 
 
-_PRE: Final = NmtCommand.PRE_OPERATIONAL
-_START: Final = NmtCommand.START
-_STOP: Final = NmtCommand.STOP
-_transition("start", _PRE, _START)
-_transition("stop", _PRE, _STOP)
-_transition("start-from-stopped", _STOP, _START)
-_transition("stop-from-operational", _START, _STOP)
-_transition("enter-pre-operational", _START, _PRE)
-_transition("enter-pre-operational-from-stopped", _STOP, _PRE)
+CHECKS.rows(
+    _NMT,
+    *((f"nmt.{name}", f"NMT command {command} leads from {ENTERED[first]} to {ENTERED[command]}",
+       _enters(first), _enters(command))
+      for name, first, command in (
+          ("start", _PRE, _START), ("stop", _PRE, _STOP), ("start-from-stopped", _STOP, _START),
+          ("stop-from-operational", _START, _STOP), ("enter-pre-operational", _START, _PRE),
+          ("enter-pre-operational-from-stopped", _STOP, _PRE))),
+    ("nmt.repeated", "A repeated NMT start changes nothing", _enters(_START), _enters(_START)),
+    ("nmt.reset-from-stopped", "Reset communication is obeyed in STOPPED", _enters(_STOP), NodeTester.reset),
+    ("nmt.broadcast", "A command to node 0 is obeyed", NodeTester.watch_state, lambda t: t.nmt(_START, 0),
+     _is_in(_START)),
+    ("nmt.ignores.other-node", "The node ignores a command to another node",
+     *_ignores(lambda t: t.nmt(_START, t.node_id % 127 + 1))),
+    ("nmt.ignores.reserved", "The node ignores a reserved command", *_ignores(lambda t: t.nmt(3))),
+    ("nmt.ignores.short", "The node ignores a command of one byte",
+     *_ignores(lambda t: t.send(0x000, bytes((_START,))))),
+    ("nmt.ignores.extended", "The node ignores a command with a 29-bit identifier",
+     *_ignores(lambda t: t.send_special(0, bytes((_START, t.node_id))))),
+)  # fmt: skip
 
 
-@check("nmt.repeated", "A repeated NMT start changes nothing", _NMT)
-def _(t: NodeTester) -> None:
-    t.enter(_START)
-    t.enter(_START)
+def _answers_sdo(expected: str) -> Step:
+    return lambda t: t.equal("an answer" if t.ask(upload_request(0x1000)) else "no answer", expected)
 
 
-@check("nmt.reset-from-stopped", "Reset communication is obeyed in STOPPED", _NMT)
-def _(t: NodeTester) -> None:
-    t.enter(_STOP)
-    t.reset()
-
-
-@check("nmt.broadcast", "A command to node 0 is obeyed", _NMT, first=NodeTester.watch_state)
-def _(t: NodeTester) -> None:
-    t.nmt(_START, 0)
-    t.equal(t.state(), ENTERED[_START], "NMT state")
-
-
-def _ignored(name: str, what: str, send: Callable[[NodeTester], None]) -> None:
-    @check(f"nmt.ignores.{name}", f"The node ignores {what}", _NMT, first=NodeTester.watch_state)
-    def _(t: NodeTester) -> None:
-        send(t)
-        t.equal(t.state(), ENTERED[_PRE], "NMT state")
-
-
-_ignored("other-node", "a command to another node", lambda t: t.nmt(_START, t.node_id % 127 + 1))
-_ignored("reserved", "a reserved command", lambda t: t.nmt(3))
-_ignored("short", "a command of one byte", lambda t: t.send(0x000, bytes((_START,))))
-_ignored(
-    "extended",
-    "a command with a 29-bit identifier",
-    lambda t: t.send_special(0, bytes((_START, t.node_id))),
-)
-
-
-def _sdo(command: NmtCommand, *, answers: bool) -> None:
-    text, state = "are answered" if answers else "are not answered", ENTERED[command]
-
-    @check(f"nmt.sdo.{state.lower()}", f"SDO requests {text} in {state}", _BOOT)
-    def _(t: NodeTester) -> None:
-        t.enter(command)
-        answer = t.ask(upload_request(0x1000))
-        t.equal("an answer" if answer else "no answer", "an answer" if answers else "no answer")
-
-
-_sdo(_PRE, answers=True)
-_sdo(_START, answers=True)
-_sdo(_STOP, answers=False)
+CHECKS.rows(
+    _BOOT,
+    *((f"nmt.sdo.{ENTERED[command].lower()}", f"SDO requests are answered in {ENTERED[command]}",
+       _enters(command), _answers_sdo("an answer")) for command in (_PRE, _START)),
+    ("nmt.sdo.stopped", "SDO requests are not answered in STOPPED", _enters(_STOP),
+     _answers_sdo("no answer")),
+)  # fmt: skip
 
 
 def _no_pdo(command: NmtCommand) -> None:
@@ -193,134 +172,90 @@ def _period(t: NodeTester, period_ms: int) -> None:
     t.near(median(intervals), 1e-3 * period_ms, "period of the heartbeat")
 
 
-@check("heartbeat.period", "Heartbeats come with the period of 1017h", _HEARTBEAT)
-def _(t: NodeTester) -> None:
-    _period(t, 100)
+def _beats_with(value: int) -> Step:
+    """The data of the next heartbeat are this byte."""
+    return lambda t: t.equal(
+        t.reply(0x700 + t.node_id, timeout_s=0.2 + t.timing.jitter_s), bytes((value,)), "data"
+    )
 
 
-@check("heartbeat.period.other", "A new value of 1017h changes the period", _HEARTBEAT, 0x1017)
-def _(t: NodeTester) -> None:
-    t.write(0x1017, 0, 100, 2)
-    t.wait(0.25)
-    _period(t, 250)
+def _all_beats(what: str, expected: int, value: Callable[[bytes], int]) -> Step:
+    """All heartbeats that were heard have this value."""
+    return lambda t: t.equal({value(frame.data) for frame in t.heard(0x700 + t.node_id)}, {expected}, what)
 
 
-@check("heartbeat.off", "1017h = 0 ends the heartbeat", _HEARTBEAT)
-def _(t: NodeTester) -> None:
-    _beats(t, 50)
-    t.put(0x1017, 0, 0, 2)
-    t.equal(len(t.heard_after(0x700 + t.node_id, 0.3)), 0, "number of heartbeats")
+CHECKS.rows(
+    _HEARTBEAT,
+    ("heartbeat.period", "Heartbeats come with the period of 1017h", lambda t: _period(t, 100)),
+    ("heartbeat.period.other", "A new value of 1017h changes the period", 0x1017, writes(0x1017, 0, 100, 2),
+     waits(0.25), lambda t: _period(t, 250)),
+    ("heartbeat.off", "1017h = 0 ends the heartbeat", lambda t: _beats(t, 50), puts(0x1017, 0, 0, 2),
+     lambda t: t.equal(len(t.heard_after(0x700 + t.node_id, 0.3)), 0, "number of heartbeats")),
+    ("heartbeat.frame", "A heartbeat has one byte", lambda t: _beats(t, 50), _all_beats("length", 1, len)),
+    ("heartbeat.toggle", "Bit 7 of a heartbeat is 0", lambda t: _beats(t, 50),
+     _all_beats("bit 7", 0, lambda data: data[0] >> 7)),
+    *((f"heartbeat.{ENTERED[command].lower()}", f"The heartbeat in {ENTERED[command]} is {value:02X}h",
+       0x1017, writes(0x1017, 0, 50, 2), sends_nmt(command), _beats_with(value))
+      for command, value in ((_PRE, 0x7F), (_START, 0x05), (_STOP, 0x04))),
+)  # fmt: skip
 
-
-@check("heartbeat.frame", "A heartbeat has one byte", _HEARTBEAT)
-def _(t: NodeTester) -> None:
-    _beats(t, 50)
-    lengths = {len(frame.data) for frame in t.heard(0x700 + t.node_id)}
-    t.equal(lengths, {1}, "length")
-
-
-@check("heartbeat.toggle", "Bit 7 of a heartbeat is 0", _HEARTBEAT)
-def _(t: NodeTester) -> None:
-    _beats(t, 50)
-    bits = {frame.data[0] >> 7 for frame in t.heard(0x700 + t.node_id) if frame.data}
-    t.equal(bits, {0}, "bit 7")
-
-
-def _heartbeat_state(command: NmtCommand, value: int) -> None:
-    state = ENTERED[command]
-
-    @check(f"heartbeat.{state.lower()}", f"The heartbeat in {state} is {value:02X}h", _HEARTBEAT, 0x1017)
-    def _(t: NodeTester) -> None:
-        t.write(0x1017, 0, 50, 2)
-        t.nmt(command)
-        data = t.reply(0x700 + t.node_id, timeout_s=0.2 + t.timing.jitter_s)
-        t.equal(data, bytes((value,)), "data")
-
-
-_heartbeat_state(_PRE, 0x7F)
-_heartbeat_state(_START, 0x05)
-_heartbeat_state(_STOP, 0x04)
 
 # ---------------------------------------------------------------- heartbeat consumer
 
 
-def _watch(t: NodeTester, time_ms: int = 100) -> None:
-    t.require(0x1016, 1)
-    t.write(0x1016, 1, _MASTER << 16 | time_ms, 4)
-
-
-def _beat(t: NodeTester, count: int = 3, period_s: float = 0.04, node_id: int = _MASTER) -> None:
+def _beat(t: NodeTester, count: int = 3, period_s: float = 0.04, node_id: int = MASTER) -> None:
     for _ in range(count):
-        t.send(0x700 + node_id, b"\x05")
+        t.beat(node_id)
         t.wait(period_s)
-
-
-@check("consumer.idle", "The consumer waits for the first heartbeat", _CONSUMER, first=_watch)
-def _(t: NodeTester) -> None:
-    t.equal(t.emergencies_after(0.4), [], "EMCY codes")
-
-
-@check("consumer.regular", "Heartbeats in time cause no error", _CONSUMER)
-def _(t: NodeTester) -> None:
-    _watch(t, 200)
-    t.equal(t.emergencies_after(0.0, lambda: _beat(t, 8, 0.05)), [], "EMCY codes")
-
-
-@check("consumer.loss", "A lost heartbeat is EMCY 8130h within the consumer time", _CONSUMER)
-def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
-
-
-@check("consumer.loss.time", "The EMCY comes when the consumer time is over", _CONSUMER)
-def _(t: NodeTester) -> None:
-    _watch(t, 200)
-    _beat(t, 3)
-    begun_s = t.now
-    t.send(0x700 + _MASTER, b"\x05")
-    frame = t.true(t.hears(0x080 + t.node_id, 0.4 + t.timing.jitter_s), "no EMCY", "EMCY 8130h after 200 ms")
-    t.near(frame.time_s - begun_s, 0.2, "time to the EMCY")
-
-
-@check("consumer.off", "1016h with time 0 supervises nothing", _CONSUMER, first=_watch)
-def _(t: NodeTester) -> None:
-    _beat(t)
-    t.put(0x1016, 1, _MASTER << 16, 4)
-    t.equal(t.emergencies_after(0.4), [], "EMCY codes")
-
-
-@check("consumer.other-node", "Heartbeats of another node do not count", _CONSUMER, first=_watch)
-def _(t: NodeTester) -> None:
-    _beat(t)
-    codes = t.emergencies_after(0.0, lambda: _beat(t, 8, 0.05, _MASTER - 1))
-    t.true(0x8130 in codes, f"EMCY codes {codes}", "8130h")
-
-
-@check("consumer.recovery", "A heartbeat that returns ends the error", _CONSUMER)
-def _(t: NodeTester) -> None:
-    lose_heartbeat(t)
-    t.equal(t.emergencies_after(0.0, lambda: _beat(t))[-1:], [0], "last EMCY code")
 
 
 def lose_heartbeat(t: NodeTester) -> None:
     """Makes the node lose the tester's heartbeat; fails unless it sends EMCY 8130h."""
-    _watch(t)
+    t.be_supervised()
     _beat(t)
     codes = t.emergencies_after(0.3)
     t.true(0x8130 in codes, f"EMCY codes {[f'{code:04X}h' for code in codes]}", "8130h within 100 ms")
 
 
+CHECKS.rows(
+    _CONSUMER,
+    ("consumer.idle", "The consumer waits for the first heartbeat", NodeTester.be_supervised,
+     no_emergency(0.4)),
+    ("consumer.regular", "Heartbeats in time cause no error", lambda t: t.be_supervised(200),
+     no_emergency(0.0, lambda t: _beat(t, 8, 0.05))),
+    ("consumer.off", "1016h with time 0 supervises nothing", NodeTester.be_supervised, _beat,
+     puts(0x1016, 1, MASTER << 16, 4), no_emergency(0.4)),
+    ("consumer.loss", "A lost heartbeat is EMCY 8130h within the consumer time", lose_heartbeat),
+    ("consumer.recovery", "A heartbeat that returns ends the error", lose_heartbeat,
+     lambda t: t.equal(t.emergencies_after(0.0, lambda: _beat(t))[-1:], [0], "last EMCY code")),
+)  # fmt: skip
+
+
+@check("consumer.loss.time", "The EMCY comes when the consumer time is over", _CONSUMER)
+def _(t: NodeTester) -> None:
+    t.be_supervised(200)
+    _beat(t, 3)
+    begun_s = t.now
+    t.beat()
+    frame = t.true(t.hears(0x080 + t.node_id, 0.4 + t.timing.jitter_s), "no EMCY", "EMCY 8130h after 200 ms")
+    t.near(frame.time_s - begun_s, 0.2, "time to the EMCY")
+
+
+@check("consumer.other-node", "Heartbeats of another node do not count", _CONSUMER, NodeTester.be_supervised)
+def _(t: NodeTester) -> None:
+    _beat(t)
+    codes = t.emergencies_after(0.0, lambda: _beat(t, 8, 0.05, MASTER - 1))
+    t.true(0x8130 in codes, f"EMCY codes {codes}", "8130h")
+
+
 def _behaviour(value: int, command: NmtCommand) -> None:
     state, clause = ENTERED[command], "CiA 301, object 1029h"
 
-    @check(f"error-behaviour.{value}", f"1029h:01 = {value}: after a lost heartbeat {state}", clause)
-    def _(t: NodeTester) -> None:
-        t.require(0x1029, 1)
-        t.write(0x1029, 1, value, 1)
-        t.enter(_START)
-        lose_heartbeat(t)
-        t.equal(t.state(), state, "NMT state")
-        t.nmt(_PRE)
-        _beat(t)
+    CHECKS.add(
+        f"error-behaviour.{value}", f"1029h:01 = {value}: after a lost heartbeat {state}", clause,
+        (0x1029, 1), writes(0x1029, 1, value, 1), _enters(_START), lose_heartbeat, _is_in(command),
+        sends_nmt(_PRE), _beat,
+    )  # fmt: skip
 
 
 _behaviour(0, _PRE)
@@ -328,10 +263,6 @@ _behaviour(1, _START)
 _behaviour(2, _STOP)
 
 # ---------------------------------------------------------------- node guarding
-
-
-def _guarding(name: str, text: str, first: Callable[[NodeTester], None] | None = None) -> Decorator:
-    return check(f"guarding.{name}", text, _GUARDING, 0x100C, 0x100D, first=first)
 
 
 def _limit_life(t: NodeTester) -> None:
@@ -345,48 +276,42 @@ def _guard(t: NodeTester) -> bytes:
     return t.true(answer, "no answer to the remote frame", "the NMT state")
 
 
-@_guarding("answer", "A remote frame is answered with the NMT state")
-def _(t: NodeTester) -> None:
+def _keep_guarding(t: NodeTester) -> None:
+    for _ in range(6):
+        _guard(t)
+        t.wait(0.08)
+
+
+def _answers_with_state(t: NodeTester) -> None:
     answer = _guard(t)
     t.equal((len(answer), answer[0] & 0x7F), (1, 0x7F), "length and state")
 
 
-@_guarding("state", "The answer in OPERATIONAL has the state 05h")
-def _(t: NodeTester) -> None:
-    t.nmt(_START)
-    t.equal(_guard(t)[0] & 0x7F, 0x05, "state")
-
-
-@_guarding("toggle", "The toggle bit changes with every answer")
-def _(t: NodeTester) -> None:
+def _toggle_bits(t: NodeTester) -> None:
     bits = [_guard(t)[0] >> 7 for _ in range(4)]
     t.true(bits in ([0, 1, 0, 1], [1, 0, 1, 0]), f"toggle bits {bits}", "alternating")
 
 
-@_guarding("toggle.first", "The first toggle bit after a reset is 0")
-def _(t: NodeTester) -> None:
-    _guard(t)
-    t.reset()
-    t.equal(_guard(t)[0] >> 7, 0, "toggle bit")
-
-
-@_guarding("idle", "Life guarding waits for the first remote frame", _limit_life)
-def _(t: NodeTester) -> None:
-    t.equal(t.emergencies_after(0.5), [], "EMCY codes")
-
-
-@_guarding("regular", "Remote frames in time cause no error", _limit_life)
-def _(t: NodeTester) -> None:
-    for _ in range(6):
-        _guard(t)
-        t.wait(0.08)
-    t.equal(t.emergencies(), [], "EMCY codes")
-
-
-@_guarding("loss", "No remote frame for the node life time is EMCY 8130h", _limit_life)
-def _(t: NodeTester) -> None:
+def _lost_guarding(t: NodeTester) -> None:
     begun_s = t.now
     _guard(t)
     frame = t.hears(0x080 + t.node_id, 0.5 + t.timing.jitter_s)
     lost = frame if frame is not None and frame.data[:2] == b"\x30\x81" else None
     t.near(t.true(lost, "no EMCY 8130h", "EMCY 8130h after 200 ms").time_s - begun_s, 0.2, "time to the EMCY")
+
+
+CHECKS.rows(
+    _GUARDING,
+    *((f"guarding.{name}", text, 0x100C, 0x100D, *steps) for name, text, *steps in (
+        ("answer", "A remote frame is answered with the NMT state",
+         _answers_with_state),
+        ("state", "The answer in OPERATIONAL has the state 05h", sends_nmt(_START),
+         lambda t: t.equal(_guard(t)[0] & 0x7F, 0x05, "state")),
+        ("toggle", "The toggle bit changes with every answer", _toggle_bits),
+        ("toggle.first", "The first toggle bit after a reset is 0", _guard, NodeTester.reset,
+         lambda t: t.equal(_guard(t)[0] >> 7, 0, "toggle bit")),
+        ("idle", "Life guarding waits for the first remote frame", _limit_life, no_emergency(0.5)),
+        ("regular", "Remote frames in time cause no error", _limit_life, no_emergency(0.0, _keep_guarding)),
+        ("loss", "No remote frame for the node life time is EMCY 8130h", _limit_life, _lost_guarding),
+    )),
+)  # fmt: skip

@@ -7,11 +7,13 @@ from statistics import median
 from typing import Any, Final
 
 from hdbridge.cia301 import NmtCommand
+from hdbridge.conformance.steps import has_bits, refuses, writes
 from hdbridge.conformance.tester import (
     ABSENT,
     PDO_INVALID,
     RANGE,
     NodeTester,
+    Step,
     Table,
     abort_code,
     abort_codes,
@@ -112,25 +114,25 @@ for _first in (_TPDO, _RPDO):
         _transmission_type(_first, _value, allowed=False)
 
 
-def _fixed_while_valid(name: str, first: int, text: str, sub: int, change: Callable[[int], bytes]) -> None:
-    @check(f"{name}.fixed", text, _COMMUNICATION)
-    def _(t: NodeTester) -> None:
+def _is_fixed(first: int, sub: int, change: Callable[[int], bytes]) -> Step:
+    """An entry of a PDO that exists cannot be changed."""
+
+    def step(t: NodeTester) -> None:
         t.map_pdo(first, (t.scratch() if first == _RPDO else _REGISTER,), 255)
         t.require(first, sub)
         t.refuses(expedited(first, sub, change(t.read(first, sub))), "change while the PDO exists")
 
+    return step
 
-_fixed_while_valid(
-    "tpdo.identifier", _TPDO, "The identifier of a TPDO that exists cannot be changed", 1,
-    lambda now: pack(now & ~0x7FF | _SPARE_ID, 4),
-)  # fmt: skip
-_fixed_while_valid(
-    "rpdo.identifier", _RPDO, "The identifier of an RPDO that exists cannot be changed", 1,
-    lambda now: pack(now & ~0x7FF | _SPARE_ID, 4),
-)  # fmt: skip
-_fixed_while_valid(
-    "tpdo.inhibit", _TPDO, "The inhibit time of a TPDO that exists cannot be changed", 3,
-    lambda now: pack(now + 10, 2),
+
+CHECKS.rows(
+    _COMMUNICATION,
+    ("tpdo.identifier.fixed", "The identifier of a TPDO that exists cannot be changed",
+     _is_fixed(_TPDO, 1, lambda now: pack(now & ~0x7FF | _SPARE_ID, 4))),
+    ("rpdo.identifier.fixed", "The identifier of an RPDO that exists cannot be changed",
+     _is_fixed(_RPDO, 1, lambda now: pack(now & ~0x7FF | _SPARE_ID, 4))),
+    ("tpdo.inhibit.fixed", "The inhibit time of a TPDO that exists cannot be changed",
+     _is_fixed(_TPDO, 3, lambda now: pack(now + 10, 2))),
 )  # fmt: skip
 
 
@@ -256,11 +258,6 @@ _every(2)
 _every(5)
 
 
-@check("tpdo.sync.none", "A synchronous TPDO is not sent without SYNC", _PDO)
-def _(t: NodeTester) -> None:
-    t.equal(len(t.heard_after(_sent(t, (_REGISTER,), 1), 0.2)), 0, "number of TPDOs")
-
-
 @check("tpdo.sync.0", "Transmission type 0: a TPDO at the SYNC after a change, and only then", _PDO)
 def _(t: NodeTester) -> None:
     mapped = t.scratch()
@@ -280,10 +277,14 @@ def _(t: NodeTester) -> None:
     t.equal(_syncs(t, can_id, 3), [0, 0, 0], "TPDOs")
 
 
-@check("tpdo.identifier.other", "A TPDO is sent with the identifier that was written", _PDO)
-def _(t: NodeTester) -> None:
-    can_id = _sent(t, (_REGISTER,), 1, _SPARE_ID)
-    t.equal(_syncs(t, can_id, 2), [1, 1], "TPDOs with the new identifier")
+CHECKS.rows(
+    _PDO,
+    ("tpdo.sync.none", "A synchronous TPDO is not sent without SYNC",
+     lambda t: t.equal(len(t.heard_after(_sent(t, (_REGISTER,), 1), 0.2)), 0, "number of TPDOs")),
+    ("tpdo.identifier.other", "A TPDO is sent with the identifier that was written",
+     lambda t: t.equal(_syncs(t, _sent(t, (_REGISTER,), 1, _SPARE_ID), 2), [1, 1],
+                       "TPDOs with the new identifier")),
+)  # fmt: skip
 
 
 def _event(kind: int) -> None:
@@ -413,22 +414,21 @@ class _Reception:
 
 
 def _received(
-    name: str,
-    text: str,
     when: str = "after the RPDO",
     act: Callable[[_Reception], None] = _Reception.send,
     transmission: int = 255,
     *,
     taken: bool = False,
     **options: Any,
-) -> None:
-    """Adds a check that ``act`` makes the object hold the value sent if ``taken``, else the original one."""
+) -> Step:
+    """``act`` makes the object hold the value sent if ``taken``, else the original one."""
 
-    @check(f"rpdo.{name}", text, _PDO)
-    def _(t: NodeTester) -> None:
+    def step(t: NodeTester) -> None:
         rpdo = _Reception(t, transmission, **options)
         act(rpdo)
         rpdo.holds(rpdo.value if taken else rpdo.before, when)
+
+    return step
 
 
 def _send_and_sync(rpdo: _Reception) -> None:
@@ -453,28 +453,23 @@ def _send_when_off(rpdo: _Reception) -> None:
     rpdo.send()
 
 
-_received("event", "An RPDO of type 255 is taken at once", taken=True)
-_received("sync.before", "A synchronous RPDO has no effect before SYNC", "before SYNC", transmission=1)
-_received(
-    "sync.after", "A synchronous RPDO takes effect at SYNC", "after SYNC", _send_and_sync, 1, taken=True
-)
-_received(
-    "sync.last", "Of two synchronous RPDOs the last one counts", "after SYNC", _send_two_and_sync, 1,
-    taken=True,
-)  # fmt: skip
-_received("pre-operational", "An RPDO in PRE-OPERATIONAL has no effect", start=False)
-_received(
-    "stale", "An RPDO from before PRE-OPERATIONAL has no effect when the node starts again",
-    "after NMT start and SYNC", _send_and_restart, 1,
-)  # fmt: skip
-_received("disabled", "An RPDO with bit 31 set has no effect", act=_send_when_off)
-_received(
-    "identifier.other", "An RPDO is received with the identifier that was written", taken=True,
-    can_id=_SPARE_ID,
-)  # fmt: skip
-_received(
-    "extended", "A frame with a 29-bit identifier is not an RPDO", "after the frame",
-    lambda rpdo: rpdo.t.send_special(rpdo.can_id, rpdo.data()),
+CHECKS.rows(
+    _PDO,
+    ("rpdo.event", "An RPDO of type 255 is taken at once", _received(taken=True)),
+    ("rpdo.sync.before", "A synchronous RPDO has no effect before SYNC",
+     _received("before SYNC", transmission=1)),
+    ("rpdo.sync.after", "A synchronous RPDO takes effect at SYNC",
+     _received("after SYNC", _send_and_sync, 1, taken=True)),
+    ("rpdo.sync.last", "Of two synchronous RPDOs the last one counts",
+     _received("after SYNC", _send_two_and_sync, 1, taken=True)),
+    ("rpdo.pre-operational", "An RPDO in PRE-OPERATIONAL has no effect", _received(start=False)),
+    ("rpdo.stale", "An RPDO from before PRE-OPERATIONAL has no effect when the node starts again",
+     _received("after NMT start and SYNC", _send_and_restart, 1)),
+    ("rpdo.disabled", "An RPDO with bit 31 set has no effect", _received(act=_send_when_off)),
+    ("rpdo.identifier.other", "An RPDO is received with the identifier that was written",
+     _received(taken=True, can_id=_SPARE_ID)),
+    ("rpdo.extended", "A frame with a 29-bit identifier is not an RPDO",
+     _received("after the frame", lambda rpdo: rpdo.t.send_special(rpdo.can_id, rpdo.data()))),
 )  # fmt: skip
 
 
@@ -534,11 +529,6 @@ def _maps_dummy(t: NodeTester) -> bool:
 # ---------------------------------------------------------------- SYNC
 
 
-@check("sync.identifier", "1005h is 80h by default", _SYNC, 0x1005, first=NodeTester.reset)
-def _(t: NodeTester) -> None:
-    t.equal(t.read(0x1005) & 0x7FF, 0x80, "identifier")
-
-
 @check("sync.identifier.other", "SYNC is received with the identifier in 1005h", _SYNC, 0x1005)
 def _(t: NodeTester) -> None:
     can_id = t.map_pdo(_TPDO, (_REGISTER,), 1)
@@ -549,37 +539,31 @@ def _(t: NodeTester) -> None:
     t.equal(_syncs(t, can_id, 2), [0, 0], "TPDOs at the old SYNC")
 
 
-@check("sync.identifier.zero", "1005h: identifier 0, which is NMT, is refused", _SYNC, 0x1005)
-def _(t: NodeTester) -> None:
-    t.refuses_value(0x1005, 0, bytes(4), RANGE)
+def _counted(transmission: int, expected: list[int], timers: dict[int, int] | None = None) -> Step:
+    """Numbers of TPDOs at the SYNCs of a counter from 1 on, which overflows at 10."""
+
+    def step(t: NodeTester) -> None:
+        t.write(0x1019, 0, 10, 1)
+        can_id = _sent(t, (_REGISTER,), transmission, timers=timers)
+        t.equal(_syncs(t, can_id, len(expected), 1), expected, "TPDOs at the counters from 1 on")
+
+    return step
 
 
-@check("sync.counter", "SYNC with a counter triggers TPDOs", _COUNTER, 0x1019)
-def _(t: NodeTester) -> None:
-    t.write(0x1019, 0, 10, 1)
-    can_id = _sent(t, (_REGISTER,), 1)
-    t.equal(_syncs(t, can_id, 3, 1), [1, 1, 1], "TPDOs")
-
-
-@check("sync.counter.start", "SYNC start value: the first TPDO comes at this counter", _COUNTER, 0x1019)
-def _(t: NodeTester) -> None:
-    t.require(_TPDO, 6)
-    t.write(0x1019, 0, 10, 1)
-    can_id = _sent(t, (_REGISTER,), 2, timers={6: 3})
-    t.equal(_syncs(t, can_id, 8, 1), [0, 0, 1, 0, 1, 0, 1, 0], "TPDOs at counters 1 to 8")
-
-
-def _overflow(value: int, *, allowed: bool) -> None:
-    verb = "accepted" if allowed else "refused"
-
-    @check(f"sync.overflow.{value}", f"Overflow value {value} in 1019h is {verb}", _COUNTER, 0x1019)
-    def _(t: NodeTester) -> None:
-        if allowed:
-            t.write(0x1019, 0, value, 1)
-        else:
-            t.refuses_value(0x1019, 0, bytes((value,)), RANGE)
-
-
-_overflow(240, allowed=True)
-_overflow(1, allowed=False)
-_overflow(241, allowed=False)
+CHECKS.rows(
+    _SYNC,
+    ("sync.identifier", "1005h is 80h by default", 0x1005, NodeTester.reset,
+     has_bits(0x1005, 0x7FF, 0x80, "identifier")),
+    ("sync.identifier.zero", "1005h: identifier 0, which is NMT, is refused", 0x1005,
+     refuses(0x1005, 0, bytes(4), RANGE)),
+)  # fmt: skip
+CHECKS.rows(
+    _COUNTER,
+    ("sync.counter", "SYNC with a counter triggers TPDOs", 0x1019, _counted(1, [1, 1, 1])),
+    ("sync.counter.start", "SYNC start value: the first TPDO comes at this counter", 0x1019, (_TPDO, 6),
+     _counted(2, [0, 0, 1, 0, 1, 0, 1, 0], {6: 3})),
+    ("sync.overflow.240", "Overflow value 240 in 1019h is accepted", 0x1019, writes(0x1019, 0, 240, 1)),
+    ("sync.overflow.1", "Overflow value 1 in 1019h is refused", 0x1019, refuses(0x1019, 0, b"\1", RANGE)),
+    ("sync.overflow.241", "Overflow value 241 in 1019h is refused", 0x1019,
+     refuses(0x1019, 0, bytes((241,)), RANGE)),
+)  # fmt: skip

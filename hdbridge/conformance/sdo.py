@@ -9,6 +9,7 @@ from typing import Final
 from canopen.objectdictionary import datatypes
 
 from hdbridge.cia301 import NmtCommand
+from hdbridge.conformance.steps import aborts, refuses, sends_nmt, waits
 from hdbridge.conformance.tester import (
     ABSENT,
     COMMAND,
@@ -18,6 +19,7 @@ from hdbridge.conformance.tester import (
     WRITE_ONLY,
     NodeTester,
     NotApplicableError,
+    Step,
     Table,
     abort,
     abort_code,
@@ -80,62 +82,56 @@ def _number(t: NodeTester) -> tuple[int, int, int]:
 # ---------------------------------------------------------------- upload
 
 
-def _expedited(index: int, size: int) -> None:
-    @check(f"sdo.upload.{size}", f"{index:04X}h is uploaded expedited, with its size of {size} bytes", _SDO)
-    def _(t: NodeTester) -> None:
-        t.require(index)
-        answer = t.answer(upload_request(index))
-        t.equal(answer[0], 0x43 | (4 - size) << 2, "command")
-        t.equal(answer[1:4], _mux(index, 0), "multiplexer")
+def _is_expedited(index: int, size: int) -> Step:
+    return lambda t: t.equal(
+        t.answer(upload_request(index))[:4],
+        bytes((0x43 | (4 - size) << 2,)) + _mux(index, 0),
+        "command and multiplexer",
+    )
 
 
-_expedited(0x1000, 4)
-_expedited(0x1001, 1)
-_expedited(0x1017, 2)
+def _answers(duration_s: float, expected: int, send: Callable[[NodeTester, bytes], object]) -> Step:
+    """A request that ``send`` sends has this number of answers."""
+
+    def step(t: NodeTester) -> None:
+        answers = t.heard_after(0x580 + t.node_id, duration_s, lambda: send(t, upload_request(0x1000)))
+        t.equal(len(answers), expected, "number of answers")
+
+    return step
 
 
-@check("sdo.answer.length", "An answer has eight bytes", _SDO)
-def _(t: NodeTester) -> None:
-    t.answer(upload_request(0x1000))
+def _repeats(count: int, act: Step = lambda _: None) -> Step:
+    """So many uploads of 1000h, each after ``act``, result in the same value."""
+
+    def step(t: NodeTester) -> None:
+        first = t.upload(0x1000)
+        for _ in range(count):
+            act(t)
+            t.equal(t.upload(0x1000), first, "1000h")
+
+    return step
 
 
-@check("sdo.answer.once", "A request has one answer", _SDO)
-def _(t: NodeTester) -> None:
-    answers = t.heard_after(0x580 + t.node_id, 0.05, lambda: t.answer(upload_request(0x1000)))
-    t.equal(len(answers), 1, "number of answers")
-
-
-@check("sdo.answer.time", "50 uploads in a row are answered in time", _SDO)
-def _(t: NodeTester) -> None:
-    first = t.upload(0x1000)
-    for _ in range(50):
-        t.equal(t.upload(0x1000), first, "1000h")
-
-
-@check("sdo.operational", "SDO works during PDO traffic", _SDO)
-def _(t: NodeTester) -> None:
-    first = t.upload(0x1000)
-    t.nmt(NmtCommand.START)
-    for _ in range(10):
-        t.sync()
-        t.equal(t.upload(0x1000), first, "1000h")
-
-
-def _not_answered(name: str, what: str, send: Callable[[NodeTester, bytes], None]) -> None:
-    @check(f"sdo.{name}", f"Requests {what} are not answered", _SDO)
-    def _(t: NodeTester) -> None:
-        answers = t.heard_after(0x580 + t.node_id, 0.1, lambda: send(t, upload_request(0x1000)))
-        t.equal(len(answers), 0, "number of answers")
-
-
-_not_answered("other-node", "to another node", lambda t, data: t.send(0x600 + t.node_id % 127 + 1, data))
-_not_answered("extended", "with a 29-bit identifier", lambda t, data: t.send_special(0x600 + t.node_id, data))
-
-
-@check("sdo.short", "A request of fewer than eight bytes disturbs nothing", _SDO)
-def _(t: NodeTester) -> None:
-    t.ask(b"\x40\0\x10", 0.05)
+def _is_usual(t: NodeTester) -> None:
     t.equal(len(t.upload(0x1000)), 4, "size of 1000h")
+
+
+CHECKS.rows(
+    _SDO,
+    *((f"sdo.upload.{size}", f"{index:04X}h is uploaded expedited, with its size of {size} bytes", index,
+       _is_expedited(index, size)) for index, size in ((0x1000, 4), (0x1001, 1), (0x1017, 2))),
+    ("sdo.answer.length", "An answer has eight bytes", lambda t: t.answer(upload_request(0x1000))),
+    ("sdo.answer.once", "A request has one answer", _answers(0.05, 1, NodeTester.answer)),
+    ("sdo.answer.time", "50 uploads in a row are answered in time", _repeats(50)),
+    ("sdo.operational", "SDO works during PDO traffic", sends_nmt(NmtCommand.START),
+     _repeats(10, NodeTester.sync)),
+    ("sdo.other-node", "Requests to another node are not answered",
+     _answers(0.1, 0, lambda t, data: t.send(0x600 + t.node_id % 127 + 1, data))),
+    ("sdo.extended", "Requests with a 29-bit identifier are not answered",
+     _answers(0.1, 0, lambda t, data: t.send_special(0x600 + t.node_id, data))),
+    ("sdo.short", "A request of fewer than eight bytes disturbs nothing",
+     lambda t: t.ask(b"\x40\0\x10", 0.05), _is_usual),
+)  # fmt: skip
 
 
 @check("sdo.upload.segmented", "A long string is uploaded in segments, with its size", _SDO)
@@ -165,31 +161,6 @@ def _(t: NodeTester) -> None:
         t.equal(7 - (answer[0] >> 1 & 7), len(data) - 7 * place if last else 7, "bytes in the segment")
 
 
-@check("sdo.upload.toggle-error", "A wrong toggle bit of an upload is abort 05030000h", _SDO)
-def _(t: NodeTester) -> None:
-    _open_upload(t)
-    t.aborts(b"\x70" + bytes(7), _TOGGLE, "segment with the wrong toggle bit")
-
-
-@check("sdo.upload.after-abort", "After an abort the transfer has ended", _SDO, first=_open_upload)
-def _(t: NodeTester) -> None:
-    _segment(t, 0x70)
-    t.aborts(b"\x60" + bytes(7), COMMAND, "segment after the abort")
-
-
-@check("sdo.upload.no-initiate", "An upload segment without initiation is abort 05040001h", _SDO)
-def _(t: NodeTester) -> None:
-    t.ask(abort(), 0.02)
-    t.aborts(b"\x60" + bytes(7), COMMAND, "segment without initiation")
-
-
-@check("sdo.upload.client-abort", "An abort of the client has no answer and ends the transfer", _SDO)
-def _(t: NodeTester) -> None:
-    index, _ = _open_upload(t)
-    t.equal(t.ask(abort(index, 0), 0.05), None, "answer to the abort")
-    t.aborts(b"\x60" + bytes(7), COMMAND, "segment after the abort")
-
-
 def _is_served(t: NodeTester) -> None:
     """Fails unless a request is answered; repeats the request if the first one only ends an old transfer."""
     answer = t.ask(upload_request(0x1000))
@@ -198,27 +169,34 @@ def _is_served(t: NodeTester) -> None:
     t.equal(answer[:4], b"\x43" + _mux(0x1000, 0), "response")
 
 
-@check("sdo.upload.restart", "A new request is served after a transfer that was not finished", _SDO)
-def _(t: NodeTester) -> None:
-    _open_upload(t)
-    _segment(t, 0x60)
-    _is_served(t)
+def _cancel(t: NodeTester) -> None:
+    """Ends any transfer."""
+    t.ask(abort(), 0.02)
 
 
-@check("sdo.upload.abandoned", "A transfer that was abandoned a second ago blocks nothing", _SDO)
-def _(t: NodeTester) -> None:
-    _open_upload(t)
-    t.wait(1.0)
-    _is_served(t)
+def _abort_upload(t: NodeTester) -> None:
+    index, _ = _open_upload(t)
+    t.equal(t.ask(abort(index, 0), 0.05), None, "answer to the abort")
+
+
+CHECKS.rows(
+    _SDO,
+    ("sdo.upload.toggle-error", "A wrong toggle bit of an upload is abort 05030000h", _open_upload,
+     aborts(b"\x70" + bytes(7), _TOGGLE, "segment with the wrong toggle bit")),
+    ("sdo.upload.after-abort", "After an abort the transfer has ended", _open_upload,
+     lambda t: _segment(t, 0x70), aborts(b"\x60" + bytes(7), COMMAND, "segment after the abort")),
+    ("sdo.upload.no-initiate", "An upload segment without initiation is abort 05040001h", _cancel,
+     aborts(b"\x60" + bytes(7), COMMAND, "segment without initiation")),
+    ("sdo.upload.client-abort", "An abort of the client has no answer and ends the transfer", _abort_upload,
+     aborts(b"\x60" + bytes(7), COMMAND, "segment after the abort")),
+    ("sdo.upload.restart", "A new request is served after a transfer that was not finished", _open_upload,
+     lambda t: _segment(t, 0x60), _is_served),
+    ("sdo.upload.abandoned", "A transfer that was abandoned a second ago blocks nothing", _open_upload,
+     waits(1.0), _is_served),
+)  # fmt: skip
 
 
 # ---------------------------------------------------------------- refusals
-
-
-def _refused(name: str, text: str, codes: tuple[int, ...], request: Callable[[NodeTester], bytes]) -> None:
-    @check(f"sdo.abort.{name}", text, _SDO)
-    def _(t: NodeTester) -> None:
-        t.aborts(request(t), codes, "request")
 
 
 def _write_only(t: NodeTester) -> bytes:
@@ -239,47 +217,36 @@ def _too_short(t: NodeTester) -> bytes:
     return expedited(index, sub, bytes(size - 1))
 
 
-_refused(
-    "no-object.upload", "Upload of a missing object is abort 06020000h", ABSENT[:1],
-    lambda _: upload_request(_NOWHERE),
+CHECKS.rows(
+    _SDO,
+    ("sdo.abort.no-object.upload", "Upload of a missing object is abort 06020000h",
+     aborts(upload_request(_NOWHERE), ABSENT[:1])),
+    ("sdo.abort.no-object.download", "Download to a missing object is abort 06020000h",
+     aborts(expedited(_NOWHERE, 0, b"\0"), ABSENT[:1])),
+    ("sdo.abort.no-sub.upload", "Upload of a missing sub-index is abort 06090011h",
+     aborts(upload_request(0x1018, 200), ABSENT[1:])),
+    ("sdo.abort.no-sub.download", "Download to a missing sub-index is abort 06090011h",
+     aborts(expedited(0x1018, 200, bytes(4)), ABSENT[1:])),
+    ("sdo.abort.read-only", "Download to a read-only object is abort 06010002h",
+     aborts(expedited(0x1000, 0, bytes(4)), READ_ONLY)),
+    ("sdo.abort.const", "Download to sub-index 0 of 1018h is abort 06010002h",
+     aborts(expedited(0x1018, 0, b"\x04"), READ_ONLY)),
+    ("sdo.abort.write-only", "Upload of a write-only object is abort 06010001h",
+     lambda t: t.aborts(_write_only(t), WRITE_ONLY, "request")),
+    ("sdo.abort.too-long", "A download of too many bytes is abort 06070010h or 06070012h",
+     lambda t: t.aborts(_too_long(t), LENGTH, "request")),
+    ("sdo.abort.too-short", "A download of too few bytes is abort 06070010h or 06070013h",
+     lambda t: t.aborts(_too_short(t), LENGTH, "request")),
+    ("sdo.abort.command", "A command specifier that does not exist is abort 05040001h",
+     aborts(b"\xe0\0\x10\0" + bytes(4), COMMAND)),
+    ("sdo.abort.long-segmented", "A segmented download of too many bytes is refused at its start",
+     aborts(segmented(0x1017, 0, 9), LENGTH)),
+    ("sdo.abort.multiplexer", "An abort names the object",
+     lambda t: t.equal(t.answer(upload_request(_NOWHERE, 3))[:4], b"\x80" + _mux(_NOWHERE, 3),
+                       "command and multiplexer")),
+    ("sdo.abort.next", "A refused request does not disturb the next one",
+     lambda t: t.refuses(upload_request(_NOWHERE), "upload of a missing object"), _is_usual),
 )  # fmt: skip
-_refused(
-    "no-object.download", "Download to a missing object is abort 06020000h", ABSENT[:1],
-    lambda _: expedited(_NOWHERE, 0, b"\0"),
-)  # fmt: skip
-_refused(
-    "no-sub.upload", "Upload of a missing sub-index is abort 06090011h", ABSENT[1:],
-    lambda _: upload_request(0x1018, 200),
-)  # fmt: skip
-_refused(
-    "no-sub.download", "Download to a missing sub-index is abort 06090011h", ABSENT[1:],
-    lambda _: expedited(0x1018, 200, bytes(4)),
-)  # fmt: skip
-_refused(
-    "read-only", "Download to a read-only object is abort 06010002h", READ_ONLY,
-    lambda _: expedited(0x1000, 0, bytes(4)),
-)  # fmt: skip
-_refused(
-    "const", "Download to sub-index 0 of 1018h is abort 06010002h", READ_ONLY,
-    lambda _: expedited(0x1018, 0, b"\x04"),
-)  # fmt: skip
-_refused("write-only", "Upload of a write-only object is abort 06010001h", WRITE_ONLY, _write_only)
-_refused("too-long", "A download of too many bytes is abort 06070010h or 06070012h", LENGTH, _too_long)
-_refused("too-short", "A download of too few bytes is abort 06070010h or 06070013h", LENGTH, _too_short)
-_refused(
-    "command", "A command specifier that does not exist is abort 05040001h", COMMAND,
-    lambda _: b"\xe0\0\x10\0" + bytes(4),
-)  # fmt: skip
-_refused(
-    "long-segmented", "A segmented download of too many bytes is refused at its start", LENGTH,
-    lambda _: segmented(0x1017, 0, 9),
-)  # fmt: skip
-
-
-@check("sdo.abort.multiplexer", "An abort names the object", _SDO)
-def _(t: NodeTester) -> None:
-    answer = t.answer(upload_request(_NOWHERE, 3))
-    t.equal(answer[:4], b"\x80" + _mux(_NOWHERE, 3), "command and multiplexer")
 
 
 @check("sdo.abort.value", "A value that was refused is not stored", _SDO)
@@ -290,22 +257,13 @@ def _(t: NodeTester) -> None:
     t.equal(t.upload(index, sub), before, f"{index:04X}h")
 
 
-@check("sdo.abort.next", "A refused request does not disturb the next one", _SDO)
-def _(t: NodeTester) -> None:
-    t.refuses(upload_request(_NOWHERE), "upload of a missing object")
-    t.equal(len(t.upload(0x1000)), 4, "size of 1000h")
-
-
 # ---------------------------------------------------------------- download
 
 
-def _downloads(name: str, text: str, request: Callable[[int, int, bytes], list[bytes]]) -> None:
-    """Adds a check that writes a different value with the requests that ``request`` builds, and reads it
-    back; restores the old value.
-    """
+def _downloads(request: Callable[[int, int, bytes], list[bytes]]) -> Step:
+    """The requests of ``request`` write a different value, which is read back; the old one is restored."""
 
-    @check(f"sdo.download.{name}", text, _SDO)
-    def _(t: NodeTester) -> None:
+    def step(t: NodeTester) -> None:
         index, sub, size = _number(t)
         before = t.upload(index, sub)
         value = ((int.from_bytes(before, "little") + 100) & 0x7FFF).to_bytes(size, "little")
@@ -318,18 +276,28 @@ def _downloads(name: str, text: str, request: Callable[[int, int, bytes], list[b
         t.download(index, sub, before)
         t.equal(found, value, f"{index:04X}h")
 
+    return step
+
 
 def _last_segment(data: bytes) -> bytes:
     return bytes(((7 - len(data)) << 1 | 1,)) + data.ljust(7, b"\0")
 
 
-_downloads(
-    "expedited", "An expedited download with its size is carried out",
-    lambda index, sub, data: [expedited(index, sub, data)],
-)  # fmt: skip
-_downloads(
-    "expedited.no-size", "An expedited download without a size is carried out",
-    lambda index, sub, data: [b"\x22" + _mux(index, sub) + data.ljust(4, b"\0")],
+CHECKS.rows(
+    _SDO,
+    ("sdo.download.expedited", "An expedited download with its size is carried out",
+     _downloads(lambda index, sub, data: [expedited(index, sub, data)])),
+    ("sdo.download.expedited.no-size", "An expedited download without a size is carried out",
+     _downloads(lambda index, sub, data: [b"\x22" + _mux(index, sub) + data.ljust(4, b"\0")])),
+    ("sdo.download.segmented", "A number may come in a segment",
+     _downloads(lambda index, sub, data: [segmented(index, sub, len(data)), _last_segment(data)])),
+    ("sdo.download.segmented.no-size", "A segmented download without a size is carried out",
+     _downloads(lambda index, sub, data: [b"\x20" + _mux(index, sub) + bytes(4), _last_segment(data)])),
+    ("sdo.download.segmented.toggle-error", "A wrong toggle bit of a download is abort 05030000h",
+     lambda t: t.answer(segmented(*_number(t))),
+     aborts(b"\x1b" + bytes(7), _TOGGLE, "segment with the wrong toggle bit")),
+    ("sdo.download.no-initiate", "A download segment without initiation is abort 05040001h", _cancel,
+     aborts(b"\x01" + bytes(7), COMMAND, "segment without initiation")),
 )  # fmt: skip
 
 
@@ -338,16 +306,6 @@ def _(t: NodeTester) -> None:
     index, sub, _ = _number(t)
     answer = t.answer(expedited(index, sub, t.upload(index, sub)))
     t.equal(answer, b"\x60" + _mux(index, sub) + bytes(4), "response")
-
-
-_downloads(
-    "segmented", "A number may come in a segment",
-    lambda index, sub, data: [segmented(index, sub, len(data)), _last_segment(data)],
-)  # fmt: skip
-_downloads(
-    "segmented.no-size", "A segmented download without a size is carried out",
-    lambda index, sub, data: [b"\x20" + _mux(index, sub) + bytes(4), _last_segment(data)],
-)  # fmt: skip
 
 
 @check("sdo.download.segmented.size", "Segments that do not have the announced size are refused", _SDO)
@@ -359,19 +317,6 @@ def _(t: NodeTester) -> None:
     t.equal(answer[0], 0x60, "response to the initiation")
     t.refuses(bytes(((7 - size + 1) << 1 | 1,)) + bytes(7), "a byte too few")
     t.equal(t.upload(index, sub), before, f"{index:04X}h")
-
-
-@check("sdo.download.segmented.toggle-error", "A wrong toggle bit of a download is abort 05030000h", _SDO)
-def _(t: NodeTester) -> None:
-    index, sub, size = _number(t)
-    t.answer(segmented(index, sub, size))
-    t.aborts(b"\x1b" + bytes(7), _TOGGLE, "segment with the wrong toggle bit")
-
-
-@check("sdo.download.no-initiate", "A download segment without initiation is abort 05040001h", _SDO)
-def _(t: NodeTester) -> None:
-    t.ask(abort(), 0.02)
-    t.aborts(b"\x01" + bytes(7), COMMAND, "segment without initiation")
 
 
 @check("sdo.download.client-abort", "A download that the client aborts changes nothing", _SDO)
@@ -467,7 +412,7 @@ def _(t: NodeTester) -> None:
     t.equal(len(segments), 1, "segments in the first block")
     t.equal(segments[0][1:], data[:7].ljust(7, b"\0"), "data of the first segment")
     second = _segments(t, 1, 1)
-    t.ask(abort(), 0.02)
+    _cancel(t)
     t.equal(second[0][0] & 0x7F, 1, "sequence number in the second block")
     t.equal(second[0][1 : 1 + len(data[7:14])], data[7:14], "data of the second block")
 
@@ -478,38 +423,22 @@ def _(t: NodeTester) -> None:
     _segments(t)
     t.need(len(data) > 7, "the string fits into one segment")
     again = _segments(t, 1, 127)
-    t.ask(abort(), 0.02)
+    _cancel(t)
     t.true(again, "no segments", "those after the first")
     t.equal(again[0][1 : 1 + len(data[7:14])], data[7:14], "data of the first segment sent again")
 
 
-def _block_size(size: int) -> None:
-    @check(f"sdo.block.upload.size-{size}", f"A block size of {size} is abort 05040002h", _SDO)
-    def _(t: NodeTester) -> None:
-        index, _ = _text(t)
-        _block_upload(t)
-        t.ask(abort(), 0.02)
-        t.aborts(_block_request(index, size), (0x05040002,), f"block size {size}")
-
-
-_block_size(0)
-_block_size(128)
-
-
-@check(
-    "sdo.block.upload.sequence", "An acknowledgement of segments that were not sent is abort 05040003h", _SDO
-)
-def _(t: NodeTester) -> None:
-    _block_upload(t)
-    segments = _segments(t)
-    t.aborts(bytes((0xA2, len(segments) + 1, 127)) + bytes(5), (0x05040003,), "acknowledgement")
-
-
-@check("sdo.block.upload.missing", "Block upload of a missing object is abort 06020000h", _SDO)
-def _(t: NodeTester) -> None:
-    _block_upload(t)
-    t.ask(abort(), 0.02)
-    t.aborts(_block_request(_NOWHERE), ABSENT[:1], "block upload")
+CHECKS.rows(
+    _SDO,
+    *((f"sdo.block.upload.size-{size}", f"A block size of {size} is abort 05040002h", _block_upload, _cancel,
+       lambda t, size=size: t.aborts(_block_request(_text(t)[0], size), (0x05040002,), f"block size {size}"))
+      for size in (0, 128)),
+    ("sdo.block.upload.sequence", "An acknowledgement of segments that were not sent is abort 05040003h",
+     _block_upload, lambda t: t.aborts(
+         bytes((0xA2, len(_segments(t)) + 1, 127)) + bytes(5), (0x05040003,), "acknowledgement")),
+    ("sdo.block.upload.missing", "Block upload of a missing object is abort 06020000h", _block_upload,
+     _cancel, aborts(_block_request(_NOWHERE), ABSENT[:1], "block upload")),
+)  # fmt: skip
 
 
 def _begin_block_download(t: NodeTester, *, crc: bool) -> tuple[int, int]:
@@ -538,40 +467,41 @@ def _block_download(t: NodeTester, *, crc: bool, spoil: int = 0, skipped: bool =
     return t.answer(struct.pack("<BH5x", 0xC1 | (7 - size) << 2, (crc_hqx(data, 0) ^ spoil) if crc else 0))
 
 
-def _downloaded(name: str, text: str, *, crc: bool = True, skipped: bool = False) -> None:
-    @check(f"sdo.block.download{name}", text, _SDO)
-    def _(t: NodeTester) -> None:
-        t.equal(_block_download(t, crc=crc, skipped=skipped)[0], 0xA1, "command of the end")
+def _downloaded(*, crc: bool = True, skipped: bool = False) -> Step:
+    return lambda t: t.equal(_block_download(t, crc=crc, skipped=skipped)[0], 0xA1, "command of the end")
 
 
-_downloaded("", "A block download is carried out")
-_downloaded(".no-crc", "A block download without a checksum is carried out", crc=False)
-
-
-@check("sdo.block.download.crc", "A wrong checksum is abort 05040004h", _SDO)
-def _(t: NodeTester) -> None:
+def _crc_is_checked(t: NodeTester) -> None:
     answer = _block_download(t, crc=True, spoil=1)
     t.equal(answer[:1] + answer[4:], b"\x80" + struct.pack("<I", 0x05040004), "command and abort code")
 
 
-_downloaded(".sequence", "A segment out of order is not taken and may be sent again", skipped=True)
-
-
-@check("sdo.block.download.read-only", "Block download to a read-only object is abort 06010002h", _SDO)
-def _(t: NodeTester) -> None:
+def _end_block_download(t: NodeTester) -> None:
     _begin_block_download(t, crc=False)
     t.ask(b"\x81" + bytes(7), 0.05)
-    t.ask(abort(), 0.02)
-    t.aborts(b"\xc2" + _mux(0x1000, 0) + struct.pack("<I", 4), READ_ONLY, "block download")
+    _cancel(t)
 
 
-@check("sdo.channel", "1200h names the default identifiers of the SDO server", "CiA 301, object 1200h")
-def _(t: NodeTester) -> None:
-    t.require(0x1200, 1)
-    t.equal([t.read(0x1200, sub) & 0x7FF for sub in (1, 2)], [0x600 + t.node_id, 0x580 + t.node_id], "1200h")
+CHECKS.rows(
+    _SDO,
+    ("sdo.block.download", "A block download is carried out", _downloaded()),
+    ("sdo.block.download.no-crc", "A block download without a checksum is carried out",
+     _downloaded(crc=False)),
+    ("sdo.block.download.crc", "A wrong checksum is abort 05040004h", _crc_is_checked),
+    ("sdo.block.download.sequence", "A segment out of order is not taken and may be sent again",
+     _downloaded(skipped=True)),
+    ("sdo.block.download.read-only", "Block download to a read-only object is abort 06010002h",
+     _end_block_download,
+     aborts(b"\xc2" + _mux(0x1000, 0) + struct.pack("<I", 4), READ_ONLY, "block download")),
+)  # fmt: skip
 
 
-@check("sdo.range", "A value outside the range of an object is abort 06090030h to 06090032h", _SDO)
-def _(t: NodeTester) -> None:
-    t.require(0x1800, 2)
-    t.refuses_value(0x1800, 2, b"\xf5", RANGE)
+CHECKS.add(
+    "sdo.channel", "1200h names the default identifiers of the SDO server", "CiA 301, object 1200h",
+    (0x1200, 1), lambda t: t.equal([t.read(0x1200, sub) & 0x7FF for sub in (1, 2)],
+                                   [0x600 + t.node_id, 0x580 + t.node_id], "1200h"),
+)  # fmt: skip
+CHECKS.add(
+    "sdo.range", "A value outside the range of an object is abort 06090030h to 06090032h", _SDO, (0x1800, 2),
+    refuses(0x1800, 2, b"\xf5", RANGE),
+)  # fmt: skip

@@ -36,6 +36,8 @@ RANGE: Final = (0x06090030, 0x06090031, 0x06090032, 0x06090036)
 LENGTH: Final = (0x06070010, 0x06070012, 0x06070013)
 COMMAND: Final = (0x05040001,)
 
+MASTER: Final = 126
+"""Node id of the tester's heartbeat."""
 PDO_INVALID: Final = 1 << 31
 ENABLING: Final = (
     (State.READY_TO_SWITCH_ON, 0x06),
@@ -108,45 +110,52 @@ class Result:
     duration_s: float
 
 
-Decorator = Callable[[Callable[["NodeTester"], None]], Callable[["NodeTester"], None]]
+Object = int | tuple[int, int]
+"""Index of an object, or index and sub-index."""
+Step = Callable[["NodeTester"], object]
+Decorator = Callable[[Step], Step]
 
 
 class Table(list[Check]):
-    """Checks of one subject; `check` adds a function."""
+    """Checks of one subject. A check is a sequence of steps; a step that fails raises an exception.
+
+    An object in place of a step limits the check to nodes with this object.
+    """
 
     def __init__(self, *, drives: bool = False, moves: bool = False) -> None:
         """``drives``: the checks are for drives of CiA 402; ``moves``: each check may switch power on."""
         super().__init__()
         self._drives, self._moves = drives, moves
 
+    def add(self, name: str, text: str, clause: str, *steps: Object | Step, stores: bool = False) -> None:
+        """Adds a check."""
+
+        def run(t: NodeTester) -> None:
+            if self._drives:
+                t.need_402()
+            for step in steps:
+                if callable(step):
+                    step(t)
+                else:
+                    t.require(*((step,) if isinstance(step, int) else step))
+
+        self.append(Check(name, text, clause, run, self._moves, stores))
+
+    def rows(self, clause: str, *rows: tuple[str, str, *tuple[Object | Step, ...]]) -> None:
+        """Adds checks of one clause: name, text and steps of each."""
+        for name, text, *steps in rows:
+            self.add(name, text, clause, *steps)
+
     def check(
-        self,
-        name: str,
-        text: str,
-        clause: str,
-        *needs: int | tuple[int, int],
-        first: Callable[[NodeTester], object] | None = None,
-        stores: bool = False,
+        self, name: str, text: str, clause: str, *steps: Object | Step, stores: bool = False
     ) -> Decorator:
-        """Decorates the function of a check, which applies only to a node with the objects ``needs``.
+        """Decorates the last step of a check."""
 
-        ``first`` brings the node into the state in which the function begins.
-        """
-
-        def add(function: Callable[[NodeTester], None]) -> Callable[[NodeTester], None]:
-            def run(t: NodeTester) -> None:
-                if self._drives:
-                    t.need_402()
-                for each in needs:
-                    t.require(*((each,) if isinstance(each, int) else each))
-                if first is not None:
-                    first(t)
-                function(t)
-
-            self.append(Check(name, text, clause, run, self._moves, stores))
+        def decorate(function: Step) -> Step:
+            self.add(name, text, clause, *steps, function, stores=stores)
             return function
 
-        return add
+        return decorate
 
 
 @dataclass(frozen=True)
@@ -368,6 +377,15 @@ class NodeTester:
         self.watch_state()
         self.nmt(command)
         self.equal(self.state(), ENTERED[command], "NMT state")
+
+    def be_supervised(self, time_ms: int = 100) -> None:
+        """Makes the node supervise the tester's heartbeat with this time-out."""
+        self.require(0x1016, 1)
+        self.write(0x1016, 1, MASTER << 16 | time_ms, 4)
+
+    def beat(self, node_id: int = MASTER) -> None:
+        """Sends a heartbeat."""
+        self.send(0x700 + node_id, b"\x05")
 
     def sync(self, counter: int | None = None) -> None:
         self.send(0x080, b"" if counter is None else bytes((counter,)))

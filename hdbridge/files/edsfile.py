@@ -1,20 +1,18 @@
-"""Reads EDS and DCF files (CiA 306) as vendors ship them: a front end for canopen's reader.
+"""Reads EDS and DCF files (CiA 306) as vendors ship them, as object dictionaries of the package canopen.
 
-canopen reads well-formed files in UTF-8. This front end decodes any file, and converts its names, numbers and
-compact descriptions to the form that canopen accepts. An unreadable value is reported with line, section and
-key. It raises `InputError` if the object cannot be described without the value; otherwise it is listed in
+canopen's own reader accepts only well-formed files in UTF-8. This reader accepts any encoding, letter case
+and spelling of numbers, and compact descriptions. An unreadable value is reported with line, section and key.
+It raises `InputError` if the object cannot be described without the value; otherwise it is listed in
 `Eds.unread`.
 """
 
-import io
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Final, NamedTuple, Never
+from typing import Any, Final, NamedTuple, Never
 
-from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
-from canopen.objectdictionary.eds import import_eds
+from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
 
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import open_regular
@@ -37,7 +35,13 @@ _BITS: Final = {
     datatypes.INTEGER40: 40, datatypes.INTEGER48: 48, datatypes.INTEGER56: 56, datatypes.INTEGER64: 64,
 }  # fmt: skip
 """Number of bits of each signed type. A file may state the values of these types in two's complement."""
-_VALUES: Final = ("LowLimit", "HighLimit", "DefaultValue", "ParameterValue")
+_TEXTS: Final = (datatypes.VISIBLE_STRING, datatypes.UNICODE_STRING)
+_BYTES: Final = (datatypes.OCTET_STRING, datatypes.DOMAIN)
+_DEVICE: Final = {
+    "VendorNumber": "vendor_number", "ProductNumber": "product_number", "RevisionNumber": "revision_number",
+    "NrOfRXPDO": "nr_of_RXPDO", "NrOfTXPDO": "nr_of_TXPDO",
+}  # fmt: skip
+"""Numbers of [DeviceInfo], with the attributes of canopen's ``device_information``."""
 _LARGEST_COMPACT: Final = 254
 _PDOS: Final = 512
 _COMPACT_PDO: Final = (
@@ -68,7 +72,7 @@ def read_eds(path: Path | str, node_id: int) -> Eds:
         raise InputError(
             f"{path}: cannot be read: {error.strerror or error}; expected the drive's EDS file"
         ) from error
-    return _Reader(path, decode(data)).read(node_id)
+    return _Reader(path, decode(data), node_id).read()
 
 
 def variables(od: ObjectDictionary) -> Iterator[ODVariable]:
@@ -131,32 +135,26 @@ class _Section:
 
 
 class _Reader:
-    """Converts the text of one file to the form that canopen reads."""
+    """Builds the object dictionary of one file."""
 
-    def __init__(self, path: Path, text: str) -> None:
-        self._path = path
+    def __init__(self, path: Path, text: str, node_id: int) -> None:
+        self._path, self._node_id = path, node_id
         self._unread: list[str] = []
         self._sections: dict[str, _Section] = {}
         self._split(text)
 
-    def read(self, node_id: int) -> Eds:
+    def read(self) -> Eds:
         objects = self._objects()
         if not objects and "DEVICEINFO" not in self._sections:
             raise InputError(
                 f"{self._path}: cannot be read as an EDS: it has neither a section [DeviceInfo] nor an "
                 "object; expected the drive's EDS file"
             )
-        written: list[str] = []
-        self._write_device(written)
+        dictionary = ObjectDictionary()  # type: ignore[no-untyped-call]
+        for key, attribute in _DEVICE.items():
+            setattr(dictionary.device_information, attribute, self._device_number(key))
         for index in sorted(objects):
-            self._write_object(written, index, objects[index])
-        try:
-            dictionary = import_eds(io.StringIO("\n".join(written)), node_id)  # type: ignore[no-untyped-call]
-        except Exception as error:  # canopen raises KeyError, ValueError, configparser.Error and others
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(
-                f"{self._path}: cannot be read as an EDS: {reason[:200]}; expected the drive's EDS file"
-            ) from error
+            self._add_object(dictionary, index, objects[index])
         return Eds(dictionary, tuple(self._unread))
 
     # -- lines --------------------------------------------------------------------------------------------
@@ -201,24 +199,43 @@ class _Reader:
             self._refuse(section, line, key, text, "a number, such as 0x0007")
         return value
 
-    def _value(self, section: _Section, key: str, data_type: int) -> str | None:
-        """Converts a value to the form that canopen reads; returns None if it is missing or unreadable."""
+    def _value(self, section: _Section, key: str, data_type: int) -> Any:
+        """Returns a value of this type; None if it is missing or unreadable."""
         text = section.get(key)
-        if text == "" or data_type not in _INTEGERS:
+        if text == "" or data_type in _TEXTS:
             return text or None
+        try:
+            if data_type in _BYTES:
+                return bytes.fromhex(text)
+            if data_type in datatypes.FLOAT_TYPES:
+                return float(text)
+        except ValueError:
+            return None
         plain = text.replace(" ", "").upper()
         if "$NODEID" in plain:
             offset = _integer(_NODE_ID.sub("", plain) or "0")
             if offset is not None:
-                return f"$NODEID+0x{offset:X}" if offset >= 0 else None
+                return offset + self._node_id if offset >= 0 else None
         else:
             value = _TRUTH.get(plain) if data_type == datatypes.BOOLEAN else None
             value = _integer(plain) if value is None else value
             if value is not None:
                 bits = _BITS.get(data_type)
-                return str(value - (1 << bits) if bits and 1 << bits - 1 <= value < 1 << bits else value)
-        self._note(section, key, text, "a number")
+                return value - (1 << bits) if bits and 1 << bits - 1 <= value < 1 << bits else value
+        if data_type in _INTEGERS:
+            self._note(section, key, text, "a number")
         return None
+
+    def _limits(self, section: _Section, data_type: int) -> tuple[int | None, int | None]:
+        """Returns lower and upper limit of an integer; None without a limit."""
+        low, high = (
+            self._value(section, key, data_type)
+            if data_type in _INTEGERS and "$NODEID" not in section.get(key).upper()
+            else None
+            for key in ("LowLimit", "HighLimit")
+        )
+        # Limits without a range, such as 0 and 0, mean that there are no limits.
+        return (low, high) if low is None or high is None or low < high else (None, None)
 
     def _note(self, section: _Section, key: str, text: str, expected: str) -> None:
         place = self._place(section, section.keys[key.upper()].line, key)
@@ -241,18 +258,6 @@ class _Reader:
             )
         return objects
 
-    def _write_device(self, written: list[str]) -> None:
-        device = self._sections.get("DEVICEINFO")
-        written.append("[DeviceInfo]")
-        if device is None:
-            return
-        for key in ("VendorName", "ProductName", "OrderCode"):
-            if text := device.get(key):
-                written.append(f"{key}={text}")
-        for key in ("VendorNumber", "ProductNumber", "RevisionNumber", "NrOfRXPDO", "NrOfTXPDO"):
-            if (value := self._device_number(key)) is not None:
-                written.append(f"{key}={value}")
-
     def _device_number(self, key: str) -> int | None:
         device = self._sections.get("DEVICEINFO")
         text = device.get(key) if device is not None else ""
@@ -261,7 +266,9 @@ class _Reader:
             self._note(device, key, text, "a number")
         return value
 
-    def _write_object(self, written: list[str], index: int, parts: Mapping[int | None, _Section]) -> None:
+    def _add_object(
+        self, dictionary: ObjectDictionary, index: int, parts: Mapping[int | None, _Section]
+    ) -> None:
         members = {sub: section for sub, section in parts.items() if sub is not None}
         section = parts.get(None)
         if section is None:  # the section of the object may be missing: its sub-objects describe it fully
@@ -274,17 +281,18 @@ class _Reader:
             return
         compact = self._number(section, "CompactSubObj", 0)
         if kind in (_VAR, _DOMAIN) and not (members or compact):
-            self._write_variable(written, f"{index:04X}", section, kind)
+            dictionary.add_object(self._variable(section, kind, f"{index:04X}", index))
             return
         if compact:
             members = {**dict(self._spelt_out(index, section, compact)), **members}
         name = section.get("ParameterName") or f"{index:04X}"
-        kind = _ARRAY if kind == _ARRAY else _RECORD
-        written += [f"[{index:04X}]", f"ParameterName={name}", f"ObjectType=0x{kind:X}"]
+        made = (ODArray if kind == _ARRAY else ODRecord)(name, index)
+        dictionary.add_object(made)
         for sub in sorted(members):
-            self._write_variable(written, f"{index:04X}sub{sub:X}", members[sub], _VAR)
+            made.add_member(self._variable(members[sub], _VAR, f"{index:04X}sub{sub:X}", index, sub))
 
-    def _write_variable(self, written: list[str], name: str, section: _Section, kind: int) -> None:
+    def _variable(self, section: _Section, kind: int, name: str, index: int, sub: int = 0) -> ODVariable:
+        """Returns an entry; ``name`` is used if the file states none."""
         kind = self._number(section, "ObjectType", kind)
         data_type = self._number(section, "DataType", datatypes.DOMAIN if kind == _DOMAIN else None)
         if data_type > _LAST_STANDARD_TYPE:
@@ -293,26 +301,23 @@ class _Reader:
         if access not in _ACCESS:
             line = section.keys["ACCESSTYPE"].line
             self._refuse(section, line, "AccessType", section.get("AccessType"), ", ".join(_ACCESS))
-        written += [
-            f"[{name}]",
-            f"ParameterName={section.get('ParameterName') or name}",
-            f"ObjectType=0x{_DOMAIN if kind == _DOMAIN else _VAR:X}",
-            f"DataType=0x{data_type:04X}",
-            f"AccessType={access}",
-            f"PDOMapping={self._truth(section, 'PDOMapping')}",
-        ]
-        values = {key: self._value(section, key, data_type) for key in _VALUES}
-        if not _bounds(values["LowLimit"], values["HighLimit"]):
-            values["LowLimit"] = values["HighLimit"] = None
-        written += [f"{key}={value}" for key, value in values.items() if value is not None]
+        variable = ODVariable(section.get("ParameterName") or name, index, sub)
+        variable.data_type, variable.access_type = data_type, access
+        variable.pdo_mappable = self._truth(section, "PDOMapping")
+        variable.min, variable.max = self._limits(section, data_type)
+        variable.default = self._value(section, "DefaultValue", data_type)
+        variable.value = self._value(section, "ParameterValue", data_type)
+        relative = "$NODEID" in section.get("DefaultValue").upper()
+        variable.relative = relative and variable.default is not None
+        return variable
 
-    def _truth(self, section: _Section, key: str) -> int:
+    def _truth(self, section: _Section, key: str) -> bool:
         text = section.get(key)
         value = _TRUTH.get(text.upper())
         value = _integer(text) if value is None else value
         if value is None:
             self._refuse(section, section.keys[key.upper()].line, key, text, "0 or 1")
-        return int(value != 0)
+        return value != 0
 
     def _own_type(self, number: int) -> int:
         """Returns the base type of a custom type, as CANFestival writes it; DOMAIN (bytes) if unknown."""
@@ -328,14 +333,7 @@ class _Reader:
             self._refuse(section, line, "CompactSubObj", found, f"a number from 0 to {_LARGEST_COMPACT}")
         names = self._sections.get(f"{index:04X}NAME", section)
         values = self._sections.get(f"{index:04X}VALUE", section)
-        yield (
-            0,
-            _made(
-                "Number of entries",
-                section,
-                {"DataType": "5", "AccessType": "ro", "DefaultValue": str(count)},
-            ),
-        )
+        yield 0, _made("Number of entries", section, DataType=5, AccessType="ro", DefaultValue=count)
         for sub in range(1, count + 1):
             member = _Section(section.name, section.line)
             member.keys = {key: each for key, each in section.keys.items() if key != "OBJECTTYPE"}
@@ -366,37 +364,24 @@ class _Reader:
 
 def _compact_parameter(device: _Section, mask: int, cob_id: str) -> Iterator[tuple[int, _Section]]:
     subs = [sub for sub in range(1, 7) if mask >> sub - 1 & 1]
-    yield (
-        0,
-        _made(
-            "Highest sub-index",
-            device,
-            {"DataType": "5", "AccessType": "const", "DefaultValue": str(subs[-1])},
-        ),
-    )
+    yield 0, _made("Highest sub-index", device, DataType=5, AccessType="const", DefaultValue=subs[-1])
     for sub in subs:
         name, data_type = _COMPACT_PDO[sub - 1]
-        given = {"DefaultValue": cob_id} if sub == 1 else {}
-        yield sub, _made(name, device, {"DataType": str(data_type), "AccessType": "rw", **given})
+        default = {"DefaultValue": cob_id} if sub == 1 else {}
+        yield sub, _made(name, device, DataType=data_type, AccessType="rw", **default)
 
 
 def _compact_mapping(device: _Section) -> Iterator[tuple[int, _Section]]:
-    yield (
-        0,
-        _made("Number of mapped objects", device, {"DataType": "5", "AccessType": "rw", "DefaultValue": "0"}),
-    )
+    yield 0, _made("Number of mapped objects", device, DataType=5, AccessType="rw", DefaultValue=0)
     for sub in range(1, _COMPACT_ENTRIES + 1):
-        yield (
-            sub,
-            _made(f"Mapped object {sub}", device, {"DataType": "7", "AccessType": "rw", "DefaultValue": "0"}),
-        )
+        yield sub, _made(f"Mapped object {sub}", device, DataType=7, AccessType="rw", DefaultValue=0)
 
 
-def _made(name: str, of: _Section, keys: Mapping[str, str]) -> _Section:
+def _made(name: str, of: _Section, **keys: int | str) -> _Section:
     """Creates a section that the file describes only implicitly, within the section ``of``."""
     section = _Section(of.name, of.line)
     section.keys = {
-        key.upper(): _Key(value, of.line) for key, value in (("ParameterName", name), *keys.items())
+        key.upper(): _Key(str(value), of.line) for key, value in (("ParameterName", name), *keys.items())
     }
     return section
 
@@ -408,12 +393,6 @@ def _integer(text: str) -> int | None:
         return None
     value = int(match[2], 16 if match[2][:2] in ("0x", "0X") else 10)
     return -value if match[1] == "-" else value
-
-
-def _bounds(low: str | None, high: str | None) -> bool:
-    """Returns False for limits without a range, such as 0 and 0, which mean that there are no limits."""
-    least, greatest = _integer(low or ""), _integer(high or "")
-    return least is None or greatest is None or least < greatest
 
 
 def _shown(text: str) -> str:

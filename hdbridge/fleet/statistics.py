@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import betaln, chdtrc, chdtri, expit, logsumexp, ndtr, ndtri
+from scipy.stats import false_discovery_control
 
 from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.readings import median_deviation
@@ -166,11 +167,7 @@ def outliers(values: FloatArray, rate: float = 0.05) -> NDArray[np.bool_]:
     if len(values) < OUTLIERS_FROM or scale == 0.0:
         return np.zeros(len(values), dtype=bool)
     chance = 2.0 * ndtr(-np.abs(values - np.median(values)) / scale)
-    order = np.argsort(chance)
-    passed = np.flatnonzero(chance[order] <= rate * np.arange(1, len(values) + 1) / len(values))
-    result = np.zeros(len(values), dtype=bool)
-    result[order[: passed[-1] + 1 if len(passed) else 0]] = True
-    return result
+    return np.asarray(false_discovery_control(chance) <= rate)
 
 
 # -- Trends

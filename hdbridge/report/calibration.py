@@ -2,10 +2,11 @@
 
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, Final
 
 import numpy as np
+from scipy.stats import binned_statistic
 
 from hdbridge import __version__
 from hdbridge.analysis.identification import Traces
@@ -133,32 +134,24 @@ def _by_angle(traces: Traces, ratio: float) -> Iterator[Chart]:
     if not np.any(chosen):
         return
     motor, load = np.mod(traces.motor_deg, DEG_PER_TURN), traces.load_deg
-    for angle, drawn, width_deg, middle, kind, name, unit in (
-        (motor, traces.predicted_arcsec, 2.0, np.median, "model", "motor angle", TURN_LABEL),
-        (load, traces.error_arcsec, DEG_PER_TURN / ratio, np.mean, "mean", "load angle", LOAD_LABEL),
+    for angle, drawn, width_deg, statistic, kind, name, unit in (
+        (motor, traces.predicted_arcsec, 2.0, "median", "model", "motor angle", TURN_LABEL),
+        (load, traces.error_arcsec, DEG_PER_TURN / ratio, "mean", "mean", "load angle", LOAD_LABEL),
     ):
         series = _both_ways(traces, angle, traces.error_arcsec, chosen)
         for sign, way in ((1.0, "forward"), (-1.0, "backward")):
             rows = chosen & (traces.direction == sign)
             if np.any(rows):
-                x, y = _over(angle[rows], drawn[rows], width_deg, middle)
+                x, y = _over(angle[rows], drawn[rows], width_deg, statistic)
                 series.append(Series(f"{kind}, {way}", x, y))
         yield Chart(f"Error over the {name}", unit, Y_LABEL, series)
 
 
-def _over(
-    x: FloatArray, y: FloatArray, width: float, middle: Callable[[FloatArray], Any]
-) -> tuple[FloatArray, FloatArray]:
-    """Applies ``middle`` (mean or median) to y in intervals of x; intervals without samples become gaps."""
-    first = float(np.min(x))
-    place = ((x - first) / width).astype(np.intp)
-    values: FloatArray = np.full(int(np.max(place)) + 1, np.nan)
-    order = np.argsort(place, kind="stable")
-    present, starts = np.unique(place[order], return_index=True)
-    for each, inside in zip(present.tolist(), np.split(y[order], starts[1:]), strict=True):
-        values[each] = middle(inside)
-    centres: FloatArray = first + width * (np.arange(len(values), dtype=np.float64) + 0.5)
-    return centres, values
+def _over(x: FloatArray, y: FloatArray, width: float, statistic: str) -> tuple[FloatArray, FloatArray]:
+    """Returns the "mean" or "median" of y in intervals of x; intervals without samples become gaps."""
+    edges = float(np.min(x)) + width * np.arange(int(np.ptp(x) / width) + 2)
+    values: FloatArray = binned_statistic(x, y, statistic, edges).statistic
+    return np.asarray(edges[:-1] + 0.5 * width), values
 
 
 def _both_ways(traces: Traces, x: FloatArray, y: FloatArray, chosen: BoolArray) -> list[Series]:

@@ -33,11 +33,11 @@ X_LABEL: Final = "load target, deg"
 Y_LABEL: Final = "load error, arcsec"
 WAYS: Final = ("there (CW)", "back (CCW)")
 ISO_FIGURES: Final = (
-    ("accuracy", "accuracy A"),
-    ("repeatability", "repeatability R"),
-    ("reversal", "reversal B"),
-    ("systematic", "systematic E"),
-    ("range", "range M"),
+    ("accuracy_arcsec", "accuracy A"),
+    ("repeatability_arcsec", "repeatability R"),
+    ("reversal_arcsec", "reversal B"),
+    ("systematic_arcsec", "systematic E"),
+    ("range_arcsec", "range M"),
 )
 
 

@@ -45,12 +45,17 @@ class Reach:
                 bus.send(can.Message(arbitration_id=can_id, data=data, **kind))
         return _nothing
 
-    def set_fault(self, name: str, value: object) -> End:
-        """Sets an attribute of the drive's fault settings; ending the fault restores the previous value."""
+    def set_faults(self, **values: object) -> End:
+        """Sets attributes of the drive's fault settings; ending the fault restores the previous values."""
         settings = self.drive.faults
-        before = getattr(settings, name)
-        setattr(settings, name, value)
-        return lambda: setattr(settings, name, before)
+        before = {name: getattr(settings, name) for name in values}
+
+        def assign(given: Mapping[str, object]) -> None:
+            for name, value in given.items():
+                setattr(settings, name, value)
+
+        assign(values)
+        return lambda: assign(before)
 
     def mute(self, can_id: int) -> End:
         """Suppresses all frames of the drive with this identifier."""
@@ -141,17 +146,20 @@ class Row:
         return {**self.arguments, **given}
 
 
-def _setting(name: str, value: object) -> Make:
-    return lambda reach: reach.set_fault(name, value)
+def _sets(**values: object) -> Make:
+    return lambda reach: reach.set_faults(**values)
 
 
-def _count_setting(name: str) -> Make:
-    return lambda reach, count: reach.set_fault(name, count)
+def _sets_argument(name: str) -> Make:
+    """Returns a function that sets an attribute of the fault settings to the fault's only argument."""
+    return lambda reach, **argument: reach.set_faults(**{name: next(iter(argument.values()))})
 
 
-def _once(act: Callable[[WatchedDrive], object]) -> Make:
-    def make(reach: Reach) -> End:
-        act(reach.drive)
+def _once(act: Callable[..., object]) -> Make:
+    """Returns a function that calls ``act`` with the drive and the fault's arguments."""
+
+    def make(reach: Reach, **arguments: Value) -> End:
+        act(reach.drive, **arguments)
         return _nothing
 
     return make
@@ -176,40 +184,20 @@ def _named_object(arguments: Mapping[str, Any]) -> tuple[int, int]:
     return arguments["index"], arguments["subindex"]
 
 
-def _tpdo_stopped(reach: Reach, number: int) -> End:
-    return reach.mute(reach.drive.dictionary.value(*_tpdo({"number": number})) & 0x7FF)
-
-
-def _emergencies(reach: Reach, count: int, code: int) -> End:
-    return reach.send(0x080 + reach.drive.node_id, struct.pack("<HB5x", code, 1), times=count)
-
-
-def _drive_fault(reach: Reach, code: int) -> End:
-    reach.drive.faults.raise_error(code)
-    return _nothing
-
-
-def _missed(reach: Reach, code: int) -> End:
-    reach.drive.faults.miss_master(code)
-    return _nothing
-
-
 def _glitch(reach: Reach, counts: int, samples: int) -> End:
     left = [counts] * samples
-    return reach.set_fault("load_reading", lambda right: right + (left.pop() if left else 0))
+    return reach.set_faults(load_reading=lambda right: right + (left.pop() if left else 0))
 
 
 def _frozen(reach: Reach) -> End:
     counts = reach.drive.firmware.motion.load_counts
-    return reach.set_fault("load_reading", lambda _: counts)
+    return reach.set_faults(load_reading=lambda _: counts)
 
 
 def _drift(reach: Reach, counts_per_s: float) -> End:
     drive = reach.drive
     begin_s = drive.time_s
-    return reach.set_fault(
-        "load_reading", lambda right: right + round(counts_per_s * (drive.time_s - begin_s))
-    )
+    return reach.set_faults(load_reading=lambda right: right + round(counts_per_s * (drive.time_s - begin_s)))
 
 
 def _weak(reach: Reach, percent: float) -> End:
@@ -243,36 +231,6 @@ def _stall(reach: Reach, duration_s: float) -> End:
     return _nothing
 
 
-def _reported(reach: Reach, index: int, subindex: int, value: int) -> End:
-    return reach.drive.report_false_value(index, subindex, value)
-
-
-def _identity(reach: Reach, product_code: int) -> End:
-    return reach.drive.report_false_value(0x1018, 2, product_code)
-
-
-def _no_object(reach: Reach, index: int, subindex: int) -> End:
-    reach.drive.dictionary.remove(index, subindex)
-    return _nothing
-
-
-def _no_watchdogs(reach: Reach) -> End:
-    ends = (
-        reach.set_fault("ignore_lost_heartbeat", True),
-        reach.set_fault("ignore_missing_set_points", True),
-    )
-
-    def watches_again() -> None:
-        for end in ends:
-            end()
-
-    return watches_again
-
-
-def _slow_brakes(reach: Reach, counts_per_s2: float) -> End:
-    return reach.set_fault("deceleration_counts_s2", counts_per_s2)
-
-
 _MISSING = "a TPDO is missing"
 _DUPLICATED = "a TPDO came twice or out of its cycle"
 _WRONG_KIND = "a frame of the wrong kind was discarded"
@@ -284,22 +242,23 @@ _DROPPED_OUT = "the drive left 'operation enabled' on its own"
 
 _ROWS: Final = (
     Row("lost_tpdo", "The next `count` TPDOs are not sent.",
-        _count_setting("drop_tpdos"), {"count": 1}, _MISSING),
+        _sets_argument("drop_tpdos"), {"count": 1}, _MISSING),
     Row("late_tpdo", "The next `count` TPDOs come one SYNC later, after the fresh ones.",
-        _count_setting("hold_tpdos"), {"count": 1}, _DUPLICATED),
+        _sets_argument("hold_tpdos"), {"count": 1}, _DUPLICATED),
     Row("duplicated_tpdo", "The next `count` TPDOs come twice.",
-        _count_setting("duplicate_tpdos"), {"count": 1}, _DUPLICATED),
+        _sets_argument("duplicate_tpdos"), {"count": 1}, _DUPLICATED),
     Row("stale_tpdo", "The TPDOs of the last SYNC are repeated now.", _stale, reported_as=_DUPLICATED),
     Row("reordered_tpdos", "After the next `count` SYNCs the TPDOs come in reverse order.",
-        _count_setting("reverse_tpdos"), {"count": 1}),
+        _sets_argument("reverse_tpdos"), {"count": 1}),
     Row("short_tpdo", "The next `count` TPDOs come without their last byte.",
-        _count_setting("shorten_tpdos"), {"count": 1}, "a TPDO has the wrong length"),
+        _sets_argument("shorten_tpdos"), {"count": 1}, "a TPDO has the wrong length"),
     Row("tpdo_stopped", "TPDO `number` is not sent any more.",
-        _tpdo_stopped, {"number": 1}, _CHANNEL, required_object=_tpdo),
+        lambda reach, number: reach.mute(reach.drive.dictionary.value(*_tpdo({"number": number})) & 0x7FF),
+        {"number": 1}, _CHANNEL, required_object=_tpdo),
     Row("cable_pulled", "The drive neither receives nor sends.",
-        _setting("silent", True), reported_as=_MISSING),
+        _sets(silent=True), reported_as=_MISSING),
     Row("drive_deaf", "The drive receives nothing but continues to send.",
-        _setting("deaf", True), reported_as="the control process stalled for longer than the drive waits"),
+        _sets(deaf=True), reported_as="the control process stalled for longer than the drive waits"),
     Row("program_stalls", "The program's next wait takes `duration_s` longer (only in lockstep).",
         _stall, {"duration_s": 0.1}, "the cycle started too late", Needs.CLOCK),
     Row("remote_frame", "A remote frame (RTR) with the identifier of TPDO 1.",
@@ -314,19 +273,23 @@ _ROWS: Final = (
         lambda reach, count: reach.send(0x7E5, bytes(8), times=count), {"count": 300},
         "more frames waited than one cycle reads"),
     Row("emergency_burst", "`count` EMCY messages with `code`; the drive continues.",
-        _emergencies, {"count": 32, "code": 0x3110}, "the drive sent an emergency message"),
+        lambda reach, count, code: reach.send(
+            0x080 + reach.drive.node_id, struct.pack("<HB5x", code, 1), times=count),
+        {"count": 32, "code": 0x3110}, "the drive sent an emergency message"),
     Row("drive_fault", "The drive detects an error, sends EMCY `code`, brakes and goes into FAULT.",
-        _drive_fault, {"code": 0x3210}, "the drive reports a fault"),
+        _once(lambda drive, code: drive.faults.raise_error(code)), {"code": 0x3210},
+        "the drive reports a fault"),
     Row("enable_lost", "The power stage switches off without a message, as by a hardware enable input.",
         _once(lambda drive: drive.faults.open_enable_input()), reported_as=_DROPPED_OUT),
     Row("master_missed", "The drive misses its master, sends EMCY `code` and stops according to 6007h.",
-        _missed, {"code": 0x8130}, "the drive reports that it missed its master"),
+        _once(lambda drive, code: drive.faults.miss_master(code)), {"code": 0x8130},
+        "the drive reports that it missed its master"),
     Row("restart", "The drive restarts, as after a brown-out.",
         _once(lambda drive: drive.faults.boot_up()), reported_as="a node restarted"),
     Row("leaves_operational", "The drive goes into NMT PRE-OPERATIONAL.",
         _once(lambda drive: drive.faults.leave_operational()), reported_as="a node is not operational"),
     Row("heartbeat_lost", "The drive's heartbeat stops.",
-        _setting("mute_heartbeat", True), reported_as="the drive's heartbeat is missing"),
+        _sets(mute_heartbeat=True), reported_as="the drive's heartbeat is missing"),
     Row("second_master_sync", "SYNC of another master.",
         _frame(0x080), reported_as="another node sends SYNC"),
     Row("second_master_set_point", "An RPDO of another master: no power, target 0.",
@@ -338,16 +301,16 @@ _ROWS: Final = (
     Row("second_master_sdo", "An SDO request of another client: it reads 1000h.",
         _frame(0x600, bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0]), own=True), reported_as=_OWN_ID),
     Row("encoder_jump", "The load encoder reads `counts` more from now on.",
-        lambda reach, counts: reach.set_fault(
-            "load_jump_counts", reach.drive.faults.load_jump_counts + counts),
+        lambda reach, counts: reach.set_faults(
+            load_jump_counts=reach.drive.faults.load_jump_counts + counts),
         {"counts": 100_000}, _JUMP),
     Row("encoder_glitch", "The load encoder reads `counts` more for the next `samples` samples.",
         _glitch, {"counts": 100_000, "samples": 1}, _JUMP),
     Row("encoder_frozen", "The load encoder keeps reporting the same counts.", _frozen),
     Row("encoder_drift", "The load encoder drifts by `counts_per_s`.", _drift, {"counts_per_s": 1000.0}),
     Row("motor_encoder_jump", "The motor encoder reads `counts` more; the servo loops act on it.",
-        lambda reach, counts: reach.set_fault(
-            "motor_jump_counts", reach.drive.faults.motor_jump_counts + counts),
+        lambda reach, counts: reach.set_faults(
+            motor_jump_counts=reach.drive.faults.motor_jump_counts + counts),
         {"counts": 1000}, _JUMP),
     Row("motor_weak", "The motor gives at most `percent` of its rated torque, and falls behind.",
         _weak, {"percent": 0.0}, "the drive does not follow its demand"),
@@ -360,14 +323,18 @@ _ROWS: Final = (
     Row("sdo_silent", "SDO requests are not answered.",
         lambda reach: reach.mute(0x580 + reach.drive.node_id)),
     Row("wrong_value", "The drive reports `value` for an object, by SDO and in its TPDOs.",
-        _reported, {"index": 0x2100, "subindex": 0, "value": 32767}, _CHANNEL, required_object=_named_object),
-    Row("wrong_identity", "Object 1018h:02 holds another `product_code`.", _identity, {"product_code": 1}),
+        lambda reach, **arguments: reach.drive.report_false_value(**arguments),
+        {"index": 0x2100, "subindex": 0, "value": 32767}, _CHANNEL, required_object=_named_object),
+    Row("wrong_identity", "Object 1018h:02 holds another `product_code`.",
+        lambda reach, product_code: reach.drive.report_false_value(0x1018, 2, product_code),
+        {"product_code": 1}),
     Row("missing_object", "The drive has no object `index`:`subindex` (for good).",
-        _no_object, {"index": 0x60E4, "subindex": 1}, required_object=_named_object),
+        _once(lambda drive, index, subindex: drive.dictionary.remove(index, subindex)),
+        {"index": 0x60E4, "subindex": 1}, required_object=_named_object),
     Row("no_watchdogs", "The drive does not notice missing heartbeats or set-points of its master.",
-        _no_watchdogs),
+        _sets(ignore_lost_heartbeat=True, ignore_missing_set_points=True)),
     Row("slow_brakes", "The drive brakes with `counts_per_s2`, regardless of its objects.",
-        _slow_brakes, {"counts_per_s2": 2000.0}),
+        _sets_argument("deceleration_counts_s2"), {"counts_per_s2": 2000.0}),
 )  # fmt: skip
 
 FAULTS: Final[Mapping[str, Row]] = MappingProxyType({row.name: row for row in _ROWS})

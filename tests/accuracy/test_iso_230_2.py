@@ -1,5 +1,7 @@
 """ISO 230-2 figures against numbers worked out by hand."""
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,18 +22,18 @@ S = 2.0**0.5
 
 def test_matches_an_example_worked_by_hand():
     found = axis_accuracy(TARGET, DEVIATION, FORWARD)
-    assert found.reversal == pytest.approx(5.0)
-    assert found.mean_reversal == pytest.approx(5.0)
-    assert found.systematic == pytest.approx(5.0 - -3.0)
-    assert found.systematic_forward == pytest.approx(3.0)
-    assert found.systematic_backward == pytest.approx(3.0)
-    assert found.range == pytest.approx(2.5 - -0.5)
-    assert found.repeatability_forward == pytest.approx(4.0 * S)
-    assert found.repeatability_backward == pytest.approx(4.0 * S)
-    assert found.repeatability == pytest.approx(2.0 * S + 2.0 * S + 5.0)
-    assert found.accuracy_forward == pytest.approx(5.0 - (2.0 - 2.0 * S))
-    assert found.accuracy_backward == pytest.approx((0.0 + 2.0 * S) - (-3.0 - 2.0 * S))
-    assert found.accuracy == pytest.approx(5.0 - (-3.0 - 2.0 * S))
+    assert found.reversal_arcsec == pytest.approx(5.0)
+    assert found.mean_reversal_arcsec == pytest.approx(5.0)
+    assert found.systematic_arcsec == pytest.approx(5.0 - -3.0)
+    assert found.systematic_forward_arcsec == pytest.approx(3.0)
+    assert found.systematic_backward_arcsec == pytest.approx(3.0)
+    assert found.range_arcsec == pytest.approx(2.5 - -0.5)
+    assert found.repeatability_forward_arcsec == pytest.approx(4.0 * S)
+    assert found.repeatability_backward_arcsec == pytest.approx(4.0 * S)
+    assert found.repeatability_arcsec == pytest.approx(2.0 * S + 2.0 * S + 5.0)
+    assert found.accuracy_forward_arcsec == pytest.approx(5.0 - (2.0 - 2.0 * S))
+    assert found.accuracy_backward_arcsec == pytest.approx((0.0 + 2.0 * S) - (-3.0 - 2.0 * S))
+    assert found.accuracy_arcsec == pytest.approx(5.0 - (-3.0 - 2.0 * S))
     assert (found.targets, found.runs) == (2, 2)
 
 
@@ -39,16 +41,20 @@ def test_bidirectional_repeatability_is_never_below_either_direction():
     found = axis_accuracy(
         [0.0, 0.0, 0.0, 0.0, 9.0, 9.0, 9.0, 9.0], [-10.0, 10.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], FORWARD
     )
-    assert found.repeatability == pytest.approx(4.0 * 10.0 * S)
+    assert found.repeatability_arcsec == pytest.approx(4.0 * 10.0 * S)
 
 
 def test_a_pure_reversal_error_affects_only_b_among_the_means():
     targets = np.repeat(np.arange(0.0, 360.0, 45.0), 10)
     forward = np.tile([True] * 5 + [False] * 5, 8)
     found = axis_accuracy(targets, np.where(forward, 20.0, -20.0), forward)
-    assert (found.reversal, found.mean_reversal, found.systematic) == (40.0, 40.0, 40.0)
-    assert (found.range, found.systematic_forward, found.repeatability_forward) == (0.0, 0.0, 0.0)
-    assert (found.accuracy, found.repeatability, found.runs) == (40.0, 40.0, 5)
+    assert (found.reversal_arcsec, found.mean_reversal_arcsec, found.systematic_arcsec) == (40.0, 40.0, 40.0)
+    assert (found.range_arcsec, found.systematic_forward_arcsec, found.repeatability_forward_arcsec) == (
+        0.0,
+        0.0,
+        0.0,
+    )
+    assert (found.accuracy_arcsec, found.repeatability_arcsec, found.runs) == (40.0, 40.0, 5)
 
 
 def test_a_target_approached_from_one_side_only_is_refused_with_its_place():
@@ -67,7 +73,7 @@ def test_arrays_of_different_length_are_refused():
 
 
 def test_the_figures_for_machines_carry_their_unit():
-    figures = axis_accuracy(TARGET, DEVIATION, FORWARD).as_dict()
+    figures = asdict(axis_accuracy(TARGET, DEVIATION, FORWARD))
     assert figures["accuracy_arcsec"] == pytest.approx(5.0 + 3.0 + 2.0 * S)
     assert figures["targets"] == 2
 
@@ -80,7 +86,7 @@ def test_order_and_a_common_zero_do_not_matter(random, zero):
     other = axis_accuracy(
         [TARGET[at] for at in places], [DEVIATION[at] + zero for at in places], [FORWARD[at] for at in places]
     )
-    assert other.as_dict() == pytest.approx(plain.as_dict(), abs=1e-9)
+    assert asdict(other) == pytest.approx(asdict(plain), abs=1e-9)
 
 
 @given(st.lists(st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6), min_size=2, max_size=8))
@@ -90,8 +96,12 @@ def test_figures_keep_the_order_that_the_definitions_give_them(rows):
         targets, np.ravel(rows), np.tile([True, True, True, False, False, False], len(rows))
     )
     slack = 1e-9
-    assert found.accuracy + slack >= max(found.accuracy_forward, found.accuracy_backward)
-    assert found.accuracy + slack >= found.systematic
-    assert found.systematic + slack >= max(found.range, found.systematic_forward, found.reversal)
-    assert found.repeatability + slack >= max(found.repeatability_forward, found.reversal)
-    assert found.reversal + slack >= abs(found.mean_reversal)
+    assert found.accuracy_arcsec + slack >= max(found.accuracy_forward_arcsec, found.accuracy_backward_arcsec)
+    assert found.accuracy_arcsec + slack >= found.systematic_arcsec
+    assert found.systematic_arcsec + slack >= max(
+        found.range_arcsec, found.systematic_forward_arcsec, found.reversal_arcsec
+    )
+    assert found.repeatability_arcsec + slack >= max(
+        found.repeatability_forward_arcsec, found.reversal_arcsec
+    )
+    assert found.reversal_arcsec + slack >= abs(found.mean_reversal_arcsec)

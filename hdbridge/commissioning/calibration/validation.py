@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -111,20 +111,21 @@ class Validation:
             "survived": list(self.fault_notes),
             "of_floor": self.after.pooled.three_sigma_arcsec / self.floor.three_sigma_arcsec,
             "accuracy": {
-                "before": self.accuracy_before.as_dict() if self.accuracy_before else None,
-                "after": self.accuracy_after.as_dict() if self.accuracy_after else None,
+                "before": asdict(self.accuracy_before) if self.accuracy_before else None,
+                "after": asdict(self.accuracy_after) if self.accuracy_after else None,
             },
         }
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Validation:
         stepped = TypeAdapter(Stepped).validate_python
+        accurate = TypeAdapter(AxisAccuracy | None).validate_python
         return cls(
             stepped(data["before"]),
             stepped(data["after"]),
             Floor(data["quantisation_floor_arcsec"], data["noise_floor_arcsec"]),
-            _accuracy(data["accuracy"]["before"]),
-            _accuracy(data["accuracy"]["after"]),
+            accurate(data["accuracy"]["before"]),
+            accurate(data["accuracy"]["after"]),
             tuple(map(str, data["survived"])),
         )
 
@@ -289,12 +290,3 @@ def record_kept(bench: Bench, path: Path) -> Iterator[None]:
             path.parent.mkdir(parents=True, exist_ok=True)
             with writing():
                 record.write_csv(path)
-
-
-def _accuracy(data: dict[str, Any] | None) -> AxisAccuracy | None:
-    """Restores the accuracy from `AxisAccuracy.as_dict`."""
-    return (
-        AxisAccuracy(**{name.removesuffix("_arcsec"): value for name, value in data.items()})
-        if data
-        else None
-    )

@@ -7,7 +7,7 @@ definitions are those of ISO 230-2:2014, clause 3, for expanded results without 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,41 +22,33 @@ MINIMUM_RUNS = 2
 class AxisAccuracy:
     """Accuracy and repeatability of a rotary axis as defined by ISO 230-2:2014; angles in arcsec."""
 
-    accuracy: float
+    accuracy_arcsec: float
     """A, bi-directional: largest of mean + 2 s minus smallest of mean - 2 s, over both directions."""
-    accuracy_forward: float
+    accuracy_forward_arcsec: float
     """A (arrow up): the same for the forward approaches."""
-    accuracy_backward: float
+    accuracy_backward_arcsec: float
     """A (arrow down): the same for the backward approaches."""
-    repeatability: float
+    repeatability_arcsec: float
     """R, bi-directional: largest max(2 s_i forward + 2 s_i backward + |B_i|; 4 s_i of either)."""
-    repeatability_forward: float
+    repeatability_forward_arcsec: float
     """R (arrow up): largest 4 s_i of the forward approaches."""
-    repeatability_backward: float
+    repeatability_backward_arcsec: float
     """R (arrow down): largest 4 s_i of the backward approaches."""
-    reversal: float
+    reversal_arcsec: float
     """B: largest |B_i|, B_i = mean forward - mean backward at target i."""
-    mean_reversal: float
+    mean_reversal_arcsec: float
     """B (bar): mean of the B_i, with its sign."""
-    systematic: float
+    systematic_arcsec: float
     """E, bi-directional: largest minus smallest of all unidirectional means."""
-    systematic_forward: float
+    systematic_forward_arcsec: float
     """E (arrow up): largest minus smallest of the forward means."""
-    systematic_backward: float
+    systematic_backward_arcsec: float
     """E (arrow down): largest minus smallest of the backward means."""
-    range: float
+    range_arcsec: float
     """M: largest minus smallest of the bi-directional means (mean of both directions) of the targets."""
     targets: int
     runs: int
     """Minimum number of approaches to a target from either direction."""
-
-    def as_dict(self) -> dict[str, float]:
-        """Returns the values for JSON, with units in the names."""
-        counts = {"targets", "runs"}
-        return {
-            each.name if each.name in counts else f"{each.name}_arcsec": getattr(self, each.name)
-            for each in fields(self)
-        }
 
 
 def axis_accuracy(
@@ -103,18 +95,18 @@ def axis_accuracy(
     upper = np.maximum(mean_up + 2.0 * s_up, mean_down + 2.0 * s_down)
     lower = np.minimum(mean_up - 2.0 * s_up, mean_down - 2.0 * s_down)
     return AxisAccuracy(
-        accuracy=float(upper.max() - lower.min()),
-        accuracy_forward=float((mean_up + 2.0 * s_up).max() - (mean_up - 2.0 * s_up).min()),
-        accuracy_backward=float((mean_down + 2.0 * s_down).max() - (mean_down - 2.0 * s_down).min()),
-        repeatability=float(spread.max()),
-        repeatability_forward=float(4.0 * s_up.max()),
-        repeatability_backward=float(4.0 * s_down.max()),
-        reversal=float(np.abs(reversal).max()),
-        mean_reversal=float(reversal.mean()),
-        systematic=float(np.maximum(mean_up, mean_down).max() - np.minimum(mean_up, mean_down).min()),
-        systematic_forward=float(np.ptp(mean_up)),
-        systematic_backward=float(np.ptp(mean_down)),
-        range=float(np.ptp(both)),
+        accuracy_arcsec=float(upper.max() - lower.min()),
+        accuracy_forward_arcsec=float((mean_up + 2.0 * s_up).max() - (mean_up - 2.0 * s_up).min()),
+        accuracy_backward_arcsec=float((mean_down + 2.0 * s_down).max() - (mean_down - 2.0 * s_down).min()),
+        repeatability_arcsec=float(spread.max()),
+        repeatability_forward_arcsec=float(4.0 * s_up.max()),
+        repeatability_backward_arcsec=float(4.0 * s_down.max()),
+        reversal_arcsec=float(np.abs(reversal).max()),
+        mean_reversal_arcsec=float(reversal.mean()),
+        systematic_arcsec=float(np.maximum(mean_up, mean_down).max() - np.minimum(mean_up, mean_down).min()),
+        systematic_forward_arcsec=float(np.ptp(mean_up)),
+        systematic_backward_arcsec=float(np.ptp(mean_down)),
+        range_arcsec=float(np.ptp(both)),
         targets=count,
         runs=int(least.min()),
     )
