@@ -270,8 +270,8 @@ class ServiceBridge:
 
     def events(self, since: int = 0) -> messages.Events:
         """Returns at most the newest `EVENTS_RETURNED` events after number ``since``, oldest first."""
-        events = self.core.log.public(since)[-EVENTS_RETURNED:]
-        newest = events[-1].sequence if events else self.core.log.newest_public
+        events = self.core.log.since(since)[-EVENTS_RETURNED:]
+        newest = events[-1].sequence if events else self.core.log.newest
         return messages.Events(
             events=[reports.event_message(each, self._names) for each in events],
             lost=max(newest - since - len(events), 0),

@@ -2,11 +2,11 @@
 
 import asyncio
 import logging
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from itertools import count
 from typing import Any, Final, TypedDict, Unpack
 
-from hdbridge.daemon.memory import Cell, CommandKind, Event, EventKind, Memory
+from hdbridge.daemon.memory import Cell, CommandKind, Event, EventKind, Memory, SampleArray
 from hdbridge.daemon.service.eventlog import EventLog
 from hdbridge.daemon.service.lease import Lease
 from hdbridge.daemon.service.observer import Observer
@@ -17,6 +17,7 @@ _log = logging.getLogger(__name__)
 ANSWER_S: Final = 5.0
 """Time-out of an answer. The control process normally answers within a few cycles, but answers ENABLE and
 DISABLE only on completion."""
+_ANSWERS: Final = frozenset({EventKind.DONE, EventKind.REFUSED})
 
 
 class Arguments(TypedDict, total=False):
@@ -39,9 +40,12 @@ class Core:
         self.timing = timing
         self.log = EventLog(memory.event_reader())
         self.observer = Observer(memory, self.log, timing.clock)
+        self.observer.add(self)
         self.lease = Lease(lease_s, timing.clock.now)
         self.refuse: Callable[[CommandKind | None], None] = lambda _: None
         """Raises RefusedError if the bus is lent and no command (None: no frame) can be sent."""
+        self._answers: dict[int, Event | None] = {}
+        """Answers to the commands that are waited for, by id; None before the answer."""
         self._tasks: set[asyncio.Task[None]] = set()
         # Start from the current time, so that the numbers differ from those of an earlier service.
         self._streams = count(int(1000.0 * timing.clock.now()) + 1)
@@ -68,39 +72,65 @@ class Core:
         """Returns an unused stream number."""
         return next(self._streams)
 
+    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
+        """Takes the answers to commands from the observer."""
+        for event in events:
+            if event.kind in _ANSWERS and event.id in self._answers:
+                self._answers[event.id] = event
+
     async def do(
         self, kind: CommandKind, axis: int = -1, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
     ) -> Event:
-        """Posts a command and returns the event that reports its completion or start.
+        """Posts a command and returns its `answer`."""
+        return await self.answer(kind, self.post(kind, axis, **arguments), within_s)
 
-        Raises RefusedError with the control process's reason if nothing was done, and DaemonError if it
-        does not answer within ``within_s``.
-        """
+    def post(self, kind: CommandKind, axis: int = -1, **arguments: Unpack[Arguments]) -> int:
+        """Posts a command; returns its id. Raises RefusedError without a control process."""
         self.refuse(kind)
-        loop_pid = self.memory.status[Cell.LOOP_PID]
-        if not loop_pid:
+        if not self.memory.status[Cell.LOOP_PID]:
             raise RefusedError(
                 f"{kind.name} was not sent, because there is no control process: the daemon is starting one, "
                 "with every axis disabled; wait for it and repeat the request"
             )
-        since = self.log.newest
-        command_id = self.memory.commands.post(kind, axis, **arguments)
-        deadline_s = self.timing.clock.now() + within_s
-        while True:
-            self.observer.poll()
-            for event in self.log.since(since):
-                if event.id == command_id and event.kind is EventKind.DONE:
-                    return event
-                if event.id == command_id and event.kind is EventKind.REFUSED:
-                    raise RefusedError(event.text)
-            if self.memory.status[Cell.LOOP_PID] != loop_pid:
-                raise DaemonError(
-                    f"the control process died before it answered {kind.name}; another one has taken its "
-                    "place, with every axis disabled"
-                )
-            if self.timing.clock.now() >= deadline_s:
-                raise DaemonError(
-                    f"the control process did not answer {kind.name} within {within_s:g} s: it hangs or is "
-                    "gone; it is restarted automatically, with every axis disabled"
-                )
-            await self.timing.sleep(POLL_S)
+        return self.memory.commands.post(kind, axis, **arguments)
+
+    async def answer(self, kind: CommandKind, id_: int, within_s: float = ANSWER_S) -> Event:
+        """Returns the event that reports the completion or start of a command, after a later sample.
+
+        Raises RefusedError with the control process's reason if nothing was done, and DaemonError if it
+        does not answer within ``within_s``.
+        """
+        status, answers = self.memory.status, self._answers
+        loop_pid = status[Cell.LOOP_PID]
+        answers[id_] = None
+        try:
+            await self.until(lambda: answers[id_] is not None or status[Cell.LOOP_PID] != loop_pid, within_s)
+        finally:
+            answer = answers.pop(id_)
+        if answer is None and status[Cell.LOOP_PID] != loop_pid:
+            raise DaemonError(
+                f"the control process died before it answered {kind.name}; another one has taken its "
+                "place, with every axis disabled"
+            )
+        if answer is None:
+            raise DaemonError(
+                f"the control process did not answer {kind.name} within {within_s:g} s: it hangs or is "
+                "gone; it is restarted automatically, with every axis disabled"
+            )
+        if answer.kind is EventKind.REFUSED:
+            raise RefusedError(answer.text)
+        await self.until(lambda: self.observer.cycle > answer.cycle, ANSWER_S)
+        return answer
+
+    async def until(self, found: Callable[[], bool], within_s: float) -> bool:
+        """Waits until ``found()`` is True, checking each cycle; returns False after ``within_s``."""
+        timing, observer = self.timing, self.observer
+        deadline_s = timing.clock.now() + within_s
+        observer.poll()
+        while not found():
+            left_s = deadline_s - timing.clock.now()
+            if left_s <= 0.0:
+                return False
+            await timing.sleep(min(POLL_S, left_s))
+            observer.poll()
+        return True

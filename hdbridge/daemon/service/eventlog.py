@@ -1,8 +1,7 @@
-"""Event log: the control process's events and the service's notes, in two bounded lists. Thread-safe.
+"""Event log for clients: the control process's events and the service's notes, bounded. Thread-safe.
 
-One list has every event, for the service itself. Clients see the other list, which has the notes but omits
-routine events (`_routine`), because the thousands of motions of a calibration must not displace yesterday's
-stop. `EventLogger` writes the log lines of the control process, which itself writes none.
+It omits routine events (`_routine`), because the thousands of motions of a calibration must not displace
+yesterday's stop. `EventLogger` writes the log lines of the control process, which itself writes none.
 """
 
 import logging
@@ -11,7 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from itertools import takewhile
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 from hdbridge.daemon.loop.faultlog import fault_of
 from hdbridge.daemon.loop.states import AxisState
@@ -37,27 +36,21 @@ class Entry(NamedTuple):
     text: str
 
 
-Numbered = TypeVar("Numbered", Event, Entry)
-
-
 class EventLog:
-    """Newest `ENTRIES_KEPT` events of the control process, and as many entries for clients."""
+    """Newest `ENTRIES_KEPT` entries for clients."""
 
     def __init__(self, reader: RingReader[Event]) -> None:
         self._reader = reader
         self._lock = threading.Lock()
-        self._events: deque[Event] = deque(maxlen=ENTRIES_KEPT)
-        self._public: deque[Entry] = deque(maxlen=ENTRIES_KEPT)
-        self.newest = self.newest_public = 0
-        """Numbers of the newest event, and of the newest entry for clients; 0 before the first."""
+        self._entries: deque[Entry] = deque(maxlen=ENTRIES_KEPT)
+        self.newest = 0
+        """Number of the newest entry; 0 before the first."""
 
     def poll(self) -> list[Event]:
         """Reads new events of the control process and returns them."""
         with self._lock:
             events, _ = self._reader.read()
             for event in events:
-                self._events.append(event)
-                self.newest = event.sequence
                 if not _routine(event):
                     self._add(event.axis, event, event.text)
         return events
@@ -67,25 +60,16 @@ class EventLog:
         with self._lock:
             self._add(axis, None, text)
 
-    def since(self, sequence: int) -> list[Event]:
-        """Returns the retained events after number ``sequence``, oldest first."""
+    def since(self, sequence: int) -> list[Entry]:
+        """Returns the retained entries after number ``sequence``, oldest first."""
         with self._lock:
-            return _after(self._events, sequence)
-
-    def public(self, sequence: int) -> list[Entry]:
-        """Returns the entries for clients after number ``sequence``, oldest first."""
-        with self._lock:
-            return _after(self._public, sequence)
+            new = list(takewhile(lambda each: each.sequence > sequence, reversed(self._entries)))
+        new.reverse()
+        return new
 
     def _add(self, axis: int, event: Event | None, text: str) -> None:
-        self.newest_public += 1
-        self._public.append(Entry(self.newest_public, datetime.now(UTC), axis, event, text))
-
-
-def _after(entries: deque[Numbered], sequence: int) -> list[Numbered]:
-    new = list(takewhile(lambda each: each.sequence > sequence, reversed(entries)))
-    new.reverse()
-    return new
+        self.newest += 1
+        self._entries.append(Entry(self.newest, datetime.now(UTC), axis, event, text))
 
 
 def _routine(event: Event) -> bool:

@@ -145,7 +145,7 @@ class OuterMaster:
 
         try:
             # A master may enable again while the axis still brakes from the last time.
-            await link.until(
+            await link.core.until(
                 lambda: (
                     link.state is not AxisState.STOPPING and link.power is not State.NOT_READY_TO_SWITCH_ON
                 ),
@@ -168,7 +168,7 @@ class OuterMaster:
         try:
             if holds:
                 link = axis.link
-                await link.until(lambda: link.state is not AxisState.STOPPING, SETTLES_S)
+                await link.core.until(lambda: link.state is not AxisState.STOPPING, SETTLES_S)
                 if link.state in _STOPPED or link.power is State.FAULT:
                     await axis.reset(self._token)
         finally:

@@ -29,7 +29,8 @@ DEMO = Path("profiles/demo/axis.yaml")
 
 
 def changes(bridge: ServiceBridge) -> int:
-    return sum(each.kind is EventKind.CHANGED for each in bridge.core.log.since(0))
+    events = [each.event for each in bridge.core.log.since(0)]
+    return sum(each is not None and each.kind is EventKind.CHANGED for each in events)
 
 
 async def test_a_disabled_adaptation_learns_and_writes_nothing(service: Service, tmp_path: Path) -> None:
