@@ -14,8 +14,8 @@ from typing import Any, Final
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.client import messages
-from hdbridge.daemon.following.follower import NO_OUTCOME, Follower, Outcome
-from hdbridge.daemon.following.judging import WINDOW_S, Verdict
+from hdbridge.daemon.following.follower import Follower
+from hdbridge.daemon.following.judging import WINDOW_S, RaisedVerdict, Verdict
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import Event, SampleArray
@@ -148,16 +148,15 @@ class Following:
     def _process(self, samples: SampleArray) -> None:
         try:
             follower = self._follower
-            if follower is not None and (outcome := follower.take(samples)) is not NO_OUTCOME:
-                self._report(outcome, follower.model)
+            if follower is not None and (raised := follower.take(samples)) is not None:
+                self._report(raised, follower.model)
                 self._publish()
         finally:
             self._taken += 1
 
     def _revert(self) -> None:
-        follower = self._follower
-        if follower is not None and (proposal := follower.revert()) is not None:
-            self._report(Outcome([], proposal), follower.model)
+        if self._follower is not None:
+            self._follower.revert()
             self._publish()
 
     def _save(self) -> None:
@@ -171,21 +170,15 @@ class Following:
         else:
             self.state = messages.AdaptationState(mode=self._settings.mode, frozen=self._problem or None)
 
-    def _report(self, outcome: Outcome, model: TransmissionModel) -> None:
-        """Logs a proposal; notes, logs and diagnoses verdicts."""
-        name, proposal = self._axis.name, outcome.proposal
-        if proposal is not None:
-            changes = {each.parameter: round(each.after, 4) for each in proposal.changes}
-            event = "adaptation" if proposal.apply else "adaptation would change"
-            _log.info(event, {"axis": name, **changes})
-        for raised in outcome.raised:
-            verdict = [] if raised.verdict is Verdict.HOLDS else [raised.text]
+    def _report(self, raised: Sequence[RaisedVerdict], model: TransmissionModel) -> None:
+        """Notes, logs and diagnoses verdicts."""
+        for each in raised:
+            verdict = [] if each.verdict is Verdict.HOLDS else [each.text]
             self.advice = verdict + self._unwatched()
-            self._note("WATCH", raised.text)
-            if self._diagnosis is not None and raised.verdict in DIAGNOSED:
-                self._diagnosis.start(
-                    name, model.dump(), WINDOW_S / 60.0, raised.text, partial(self._note, "DIAGNOSIS")
-                )
+            self._note("WATCH", each.text)
+            if self._diagnosis is not None and each.verdict in DIAGNOSED:
+                report = partial(self._note, "DIAGNOSIS")
+                self._diagnosis.start(self._axis.name, model.dump(), WINDOW_S / 60.0, each.text, report)
 
     def _unwatched(self) -> list[str]:
         follower = self._follower
