@@ -62,7 +62,7 @@ async def serve(start: Start, memory: Memory) -> None:
         timing = Timing(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS, clock)
         stack.callback(timing.close)
         bridge = ServiceBridge(machine, memory, timing, simulated=simulated, forced=start.force)
-        metrics = Metrics()
+        metrics = Metrics(bridge)
         recorder = FlightRecorder(
             machine.recorder_folder(),
             About(machine.name, machine.cycle_s, tuple(AxisAbout.of(each.config) for each in machine.axes)),
