@@ -38,8 +38,6 @@ THREADS_PER_AXIS: Final = 2
 SPARE_THREADS: Final = 4
 LOOK_S: Final = 1.0
 """Interval between checks for the socket file."""
-FOLLOW_S: Final = 1.0
-"""Interval between checks for adapted models."""
 LAST_WORDS_S: Final = 35.0
 """Maximum wait for the control process to bring its axes to rest, so that the stop is recorded."""
 
@@ -81,14 +79,10 @@ async def serve(start: Start, memory: Memory) -> None:
         async with asyncio.TaskGroup() as group:
             group.create_task(server.run())
             group.create_task(_say_when_served(server, memory))
-            background_tasks = [
-                group.create_task(_apply(following)),
-                group.create_task(_keep_socket(start, server, bridge.core.log.note)),
-            ]
+            keeping = group.create_task(_keep_socket(start, server, bridge.core.log.note))
             await terminated.wait()
             await _last_words(bridge, memory)
-            for task in background_tasks:
-                task.cancel()
+            keeping.cancel()
             server.stop()
 
 
@@ -112,14 +106,6 @@ def follow(
         following.append(made)
         stack.callback(made.close)
     return following
-
-
-async def _apply(following: Sequence[Following]) -> None:
-    """Applies adapted models to the control process."""
-    while True:
-        for each in following:
-            await each.apply()
-        await asyncio.sleep(FOLLOW_S)
 
 
 def listeners(machine: Machine, descriptors: Sequence[int], page_token: str | None = None) -> list[Listener]:

@@ -28,7 +28,6 @@ from hdbridge.enums import Scheme
 from hdbridge.errors import DriveError, HdbridgeError, InputError, RefusedError
 
 if TYPE_CHECKING:
-    from hdbridge.axis.model import TransmissionModel
     from hdbridge.daemon.machine import Axis
     from hdbridge.daemon.memory import Event
     from hdbridge.daemon.service.core import Core
@@ -272,11 +271,6 @@ class ServiceAxis:
         async with self._changing:
             if not self.models.settled:
                 await self._use(self.models.chosen)
-
-    async def follow(self, model: TransmissionModel) -> None:
-        """Compensates with the adapted parameters of the chosen model, whose version does not change."""
-        async with self._changing:
-            await self._use(await self._work(self.models.with_adapted, model))
 
     def following_for(self, holder: str) -> Following:
         """Returns the adaptation, for a change by ``holder``; raises InputError if the axis has none."""

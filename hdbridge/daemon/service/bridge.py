@@ -111,7 +111,7 @@ class ServiceBridge:
             self.core.start(self._take_over(axis))
             # The drive is booted and verified whenever necessary; the axis stays disabled.
             for is_due, attempt, pauses_s, failure in (
-                (self._is_unsettled, axis.settle, SETTLE_AGAIN_S, "the compensation could not be put back"),
+                (self._is_unsettled, axis.settle, SETTLE_AGAIN_S, "the compensation could not be changed"),
                 (self._is_unverified, axis.verify, VERIFY_AGAIN_S, "the drive could not be verified"),
             ):
                 self.core.start(self._persist(axis, is_due, attempt, pauses_s, failure))

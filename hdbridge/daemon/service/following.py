@@ -8,6 +8,8 @@ import asyncio
 import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -60,18 +62,24 @@ class Following:
         self._worker, self._recorder, self._diagnosis = worker, recorder, diagnosis
         self._model: TransmissionModel | None = None
         """Committed model that is followed."""
+        self._used: TransmissionModel | None = None
+        """Model that the control process uses, adapted or not."""
         self._sent = self._taken = 0
-        self._not_applied = ""
         # These belong to the worker's thread.
         self._follower: Follower | None = None
         self._problem = ""
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
         """Takes samples from the observer. Lost samples appear as a gap in the cycle numbers."""
-        model = self._axis.models.chosen.model
-        if model is not self._model:
-            self._model = model
-            self._do(self._begin, model)
+        models = self._axis.models
+        if models.chosen.model is not self._model:
+            self._model = self._used = models.chosen.model
+            self._do(self._begin, self._model)
+        self._choose()
+        used = models.in_use.adapted or models.in_use.model
+        if used is not self._used and models.in_use.model is self._model:
+            self._used = used
+            self._do(self._use, used)
         if len(samples) and self._sent - self._taken < MAX_BATCHES:
             self._sent += 1
             self._do(self._process, samples)
@@ -84,27 +92,20 @@ class Following:
     async def revert(self) -> None:
         """Restores the committed model and switches the adaptation to observation only."""
         await asyncio.wrap_future(self._do(self._revert))
-        await self.apply()
+        self._choose()
+        with suppress(HdbridgeError):  # repeated by the axis
+            await self._axis.settle()
 
-    async def apply(self) -> None:
-        """Makes the control process compensate with the adapted model if it does not yet."""
-        chosen, follower = self._axis.models.chosen, self._follower
+    def _choose(self) -> None:
+        """Chooses the adapted model, which the axis then sends to the control process."""
+        models, follower = self._axis.models, self._follower
+        chosen = models.chosen
         if follower is None or follower.adaptation is None or chosen.model is not follower.model:
             return
         model = follower.adaptation.model
         used = chosen.adapted or chosen.model
-        if (model.effects, model.response) == (used.effects, used.response):
-            return
-        try:
-            await self._axis.follow(model)
-        except HdbridgeError as problem:  # refused in this state; retried later
-            if str(problem) != self._not_applied:
-                _log.warning("adaptation not applied", {"axis": self._axis.name, "why": str(problem)})
-            self._not_applied = str(problem)
-        else:
-            self._not_applied = ""
-            self._do(follower.use_model, model)
-            _log.info("adaptation applied", {"axis": self._axis.name})
+        if (model.effects, model.response) != (used.effects, used.response):
+            models.chosen = replace(chosen, adapted=model)
 
     def close(self) -> None:
         """Stores the adaptation's state, after processing the waiting samples."""
@@ -158,6 +159,10 @@ class Following:
         if self._follower is not None:
             self._follower.revert()
             self._publish()
+
+    def _use(self, model: TransmissionModel) -> None:
+        if self._follower is not None:
+            self._follower.use_model(model)
 
     def _save(self) -> None:
         if self._follower is not None:

@@ -23,6 +23,7 @@ from hdbridge.daemon.recorder.flightlog import Note
 from hdbridge.daemon.serve import follow
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
+from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.enums import Scheme
 
 DEMO = Path("profiles/demo/axis.yaml")
@@ -39,7 +40,6 @@ async def test_a_disabled_adaptation_learns_and_writes_nothing(service: Service,
         made = service.follow(bridge, AdaptationSettings())
         before = changes(bridge)
         await until(bridge, lambda: bridge.core.observer.cycle > 100)
-        await made.apply()
         assert made.state.mode is AdaptationMode.OFF
         assert changes(bridge) == before
         assert not folder.exists()
@@ -55,7 +55,6 @@ async def test_without_a_model_a_calibration_is_requested(service: Service) -> N
         made = service.follow(bridge, AdaptationSettings(mode="on"))
         await until(bridge, lambda: made.state.frozen is not None)
         assert made.state.frozen == "there is no model to follow: calibrate first"
-        await made.apply()
 
 
 async def test_an_unwritable_folder_is_reported_and_the_axis_works(service: Service, tmp_path: Path) -> None:
@@ -94,6 +93,7 @@ def test_a_verdict_gives_advice_note_and_diagnosis_until_a_new_model(tmp_path: P
     samples = SampleMaker(config, model, truth).make(moves_and_rests(900.0, config.drive.cycle_s))
     axis, recorder, diagnosis = MagicMock(), MagicMock(), MagicMock()
     axis.name, axis.axis.config, axis.models.chosen.model = "demo", config, model
+    axis.models.in_use = CompensationSetting(model, Scheme.EXTENDED)
     with ThreadPoolExecutor(1) as worker:
         made = Following(0, axis, AdaptationSettings(), tmp_path, worker, recorder, diagnosis)
         for batch in np.array_split(samples, 100):
