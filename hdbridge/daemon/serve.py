@@ -26,7 +26,6 @@ from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
 from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.eventlog import EventLogger
 from hdbridge.daemon.service.following import Following
 from hdbridge.daemon.service.observer import Sink
 from hdbridge.daemon.service.timing import SimulatedClock, Timing
@@ -71,7 +70,7 @@ async def serve(start: Start, memory: Memory) -> None:
         bridge.recorder = recorder
         stack.callback(recorder.close)
         following = follow(machine, bridge, recorder, stack)
-        sinks: list[Sink] = [EventLogger([*bridge.axes]), metrics, recorder, *following]
+        sinks: list[Sink] = [metrics, recorder, *following]
         for sink in sinks:
             bridge.core.observer.add(sink)
         await stack.enter_async_context(bridge)

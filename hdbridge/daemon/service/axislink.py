@@ -6,13 +6,12 @@ from typing import Final, Unpack
 from weakref import WeakSet
 
 from hdbridge.axis import AxisConfig
-from hdbridge.daemon.loop.faultlog import fault_of
 from hdbridge.daemon.loop.states import STOPPED, AxisState
 from hdbridge.daemon.memory import CommandKind, Event, EventKind
 from hdbridge.daemon.service.core import ANSWER_S, Arguments, Core
+from hdbridge.daemon.service.eventlog import stop_hint
 from hdbridge.daemon.service.timing import POLL_S
 from hdbridge.drive.states import State
-from hdbridge.drive.supervision import EXPLAINED_HINT, ROWS
 from hdbridge.errors import DaemonError, HdbridgeError, InputError, RefusedError, SafetyStop
 from hdbridge.motion import MotionMode
 
@@ -160,16 +159,3 @@ class AxisLink:
                     "the drive stops automatically, and the axis will be disabled"
                 )
             await self.core.timing.sleep(POLL_S)
-
-
-def stop_hint(stopped: Event, axis: str) -> str:
-    """Returns advice on how to recover from a stop."""
-    fault = fault_of(stopped.code)
-    if stopped.id:
-        return EXPLAINED_HINT
-    return ROWS[fault].hint if fault is not None else reset_hint(axis)
-
-
-def reset_hint(axis: str) -> str:
-    """Returns advice on how to recover from a commanded stop."""
-    return f"reset it when the axis may move again: hdbridge ctl reset {axis}"

@@ -68,7 +68,7 @@ class ServiceBridge:
     ) -> None:
         """``forced`` states that the daemon does not hold the lock of its interface."""
         self.machine = machine
-        self.core = Core(memory, timing, machine.lease_s)
+        self.core = Core(memory, timing, machine.lease_s, [axis.name for axis in machine.axes])
         against = "the daemon was started with --force and does not hold the interface" if forced else ""
         if simulated:
             against = "its axes are simulated; a command has a simulated axis of its own with --simulate"
@@ -273,7 +273,7 @@ class ServiceBridge:
         events = self.core.log.since(since)[-EVENTS_RETURNED:]
         newest = events[-1].sequence if events else self.core.log.newest
         return messages.Events(
-            events=[reports.event_message(each, self._names) for each in events],
+            events=events,
             lost=max(newest - since - len(events), 0),
             newest=newest,
         )

@@ -34,12 +34,13 @@ class Arguments(TypedDict, total=False):
 class Core:
     """Access to the control process, the clock and the lease. Commands may be sent from any thread."""
 
-    def __init__(self, memory: Memory, timing: Timing, lease_s: float) -> None:
-        """``lease_s`` is the time-out of the lease."""
+    def __init__(self, memory: Memory, timing: Timing, lease_s: float, names: Sequence[str] = ()) -> None:
+        """``lease_s`` is the time-out of the lease; ``names`` are those of the axes."""
         self.memory = memory
         self.timing = timing
-        self.log = EventLog(memory.event_reader())
-        self.observer = Observer(memory, self.log, timing.clock)
+        self.log = EventLog(names)
+        self.observer = Observer(memory, timing.clock)
+        self.observer.add(self.log)
         self.observer.add(self)
         self.lease = Lease(lease_s, timing.clock.now)
         self.refuse: Callable[[CommandKind | None], None] = lambda _: None

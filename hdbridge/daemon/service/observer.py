@@ -1,4 +1,4 @@
-"""Distribution of samples and events to the recorder, the watch, the adaptation and the metrics."""
+"""Distribution of samples and events to the event log, recorder, watch, adaptation and metrics."""
 
 import logging
 from collections.abc import Sequence
@@ -6,7 +6,6 @@ from typing import Protocol
 
 from hdbridge.clock import Clock
 from hdbridge.daemon.memory import Cell, Event, Memory, SampleArray
-from hdbridge.daemon.service.eventlog import EventLog
 
 PERIOD_S = 0.02
 DEAD_S = 3.0
@@ -25,13 +24,12 @@ class Sink(Protocol):
 class Observer:
     """Reads the rings every `PERIOD_S` and passes new samples and events to the sinks."""
 
-    def __init__(self, memory: Memory, log: EventLog, clock: Clock) -> None:
-        self._reader = memory.reader()
+    def __init__(self, memory: Memory, clock: Clock) -> None:
+        self._reader, self._events = memory.reader(), memory.event_reader()
         self._clock = clock
         self._status = memory.status
         self._turns = -1
         self._turned_s = clock.now()
-        self._log = log
         self._sinks: list[Sink] = []
         self._failed_sinks: set[int] = set()
         self.newest: SampleArray | None = None
@@ -55,7 +53,7 @@ class Observer:
     def poll(self) -> None:
         """Reads the rings and calls the sinks. An error of a sink is logged once and affects no other."""
         samples, lost = self._reader.read()
-        events = self._log.poll()
+        events, _ = self._events.read()
         turns = self._status[Cell.LOOP_COUNT]
         if turns != self._turns:
             self._turns, self._turned_s = turns, self._clock.now()

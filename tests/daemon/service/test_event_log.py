@@ -1,22 +1,15 @@
 """Clients receive the newest events, however many legs of streams have ended meanwhile."""
 
+import numpy as np
 from support.service import Service
 
-from hdbridge.daemon.memory import Event, EventKind
+from hdbridge.client import messages
+from hdbridge.daemon.memory import Event, EventKind, sample_dtype
 from hdbridge.daemon.service.bridge import EVENTS_RETURNED
 from hdbridge.daemon.service.eventlog import ENTRIES_KEPT, EventLog
 from hdbridge.motion import MotionMode
 
-
-class EventReader:
-    """Reader of events supplied by a test."""
-
-    def __init__(self) -> None:
-        self.events: list[Event] = []
-
-    def read(self) -> tuple[list[Event], int]:
-        events, self.events = self.events, []
-        return [each._replace(sequence=number) for number, each in enumerate(events, 1)], 0
+NO_SAMPLES = np.zeros(0, sample_dtype(1))
 
 
 def event(kind: EventKind, code: int = 0, text: str = "") -> Event:
@@ -24,18 +17,14 @@ def event(kind: EventKind, code: int = 0, text: str = "") -> Event:
 
 
 def test_routine_events_do_not_displace_stops() -> None:
-    reader = EventReader()
-    log = EventLog(reader)
-    reader.events = [event(EventKind.STOPPED, text="cycle 1: lost")]
+    log = EventLog(["axis1"])
     leg = [event(EventKind.DONE), event(EventKind.MOTION_ENDED, MotionMode.STREAM)]
-    reader.events += leg * ENTRIES_KEPT
-    reader.events.append(event(EventKind.MOTION_ENDED, MotionMode.GOTO))
-    log.poll()
-    assert [(each.sequence, each.text) for each in log.since(0)] == [(1, "cycle 1: lost"), (2, "")]
+    log.take(NO_SAMPLES, [event(EventKind.STOPPED, text="cycle 1: lost"), *leg * ENTRIES_KEPT], 0)
+    log.take(NO_SAMPLES, [event(EventKind.MOTION_ENDED, MotionMode.GOTO)], 0)
+    assert [(each.sequence, each.text) for each in log.since(0)] == [(1, "cycle 1: lost"), (2, "goto")]
     assert log.newest == 2
-    ended = log.since(1)[0].event
-    assert ended is not None
-    assert (ended.kind, ended.code) == (EventKind.MOTION_ENDED, MotionMode.GOTO)
+    (ended,) = log.since(1)
+    assert (ended.kind, ended.axis) == (messages.EventKind.MOTION_ENDED, "axis1")
     assert log.since(2) == log.since(99) == []
 
 

@@ -16,9 +16,9 @@ from support.service import Service, until
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Hysteresis
 from hdbridge.axis.model import TransmissionModel
+from hdbridge.client import messages
 from hdbridge.client.messages import AdaptationMode
 from hdbridge.daemon.machinefile import AdaptationSettings
-from hdbridge.daemon.memory import EventKind
 from hdbridge.daemon.recorder.flightlog import Note
 from hdbridge.daemon.serve import follow
 from hdbridge.daemon.service.bridge import ServiceBridge
@@ -30,8 +30,7 @@ DEMO = Path("profiles/demo/axis.yaml")
 
 
 def changes(bridge: ServiceBridge) -> int:
-    events = [each.event for each in bridge.core.log.since(0)]
-    return sum(each is not None and each.kind is EventKind.CHANGED for each in events)
+    return sum(each.kind is messages.EventKind.CHANGED for each in bridge.core.log.since(0))
 
 
 async def test_a_disabled_adaptation_learns_and_writes_nothing(service: Service, tmp_path: Path) -> None:
