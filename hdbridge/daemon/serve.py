@@ -67,7 +67,7 @@ async def serve(start: Start, memory: Memory) -> None:
             notify=bridge.core.log.note,
             in_use=lambda: {name: axis.models.in_use for name, axis in bridge.axes.items()},
         )
-        bridge.recorder = recorder
+        bridge.recorder, bridge.core.log.record = recorder, recorder.note
         stack.callback(recorder.close)
         following = follow(machine, bridge, recorder, stack)
         sinks: list[Sink] = [metrics, recorder, *following]
@@ -100,7 +100,7 @@ def follow(
         given = axis.adaptation.folder
         folder = machine.resolve_path(given) if given is not None else machine.axis_folder(axis, "adaptation")
         worker = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix=f"following-{axis.name}"))
-        made = Following(index, port, axis.adaptation, folder, worker, recorder, diagnosis)
+        made = Following(index, port, axis.adaptation, folder, worker, diagnosis)
         port.following = made
         following.append(made)
         stack.callback(made.close)

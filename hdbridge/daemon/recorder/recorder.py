@@ -15,7 +15,7 @@ from hdbridge.client import messages
 from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.memory import Event, SampleArray
 from hdbridge.daemon.recorder.flightfile import About, ModelUse
-from hdbridge.daemon.recorder.flightlog import MARK, Batch, FlightLog, Note, free_bytes
+from hdbridge.daemon.recorder.flightlog import Batch, FlightLog, Note, free_bytes
 from hdbridge.daemon.setting import CompensationSetting
 
 FLUSH_S: Final = 1.0
@@ -85,9 +85,9 @@ class FlightRecorder:
         if self.flight is not None:
             self.flight.put(item)
 
-    def mark(self, text: str = "") -> None:
-        """Records a mark and keeps the time around it, like that around a fault."""
-        self.put(Note(MARK, text))
+    def note(self, kind: str, text: str) -> None:
+        """Records a note; the time around a `flightlog.MARK` is kept, like that around a fault."""
+        self.put(Note(kind, text))
 
     def state(self) -> messages.RecorderState:
         """Returns the state of the recorder for clients."""

@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Final, Self
 from hdbridge.client import messages
 from hdbridge.daemon.loop.states import UNKNOWN
 from hdbridge.daemon.memory import Cell, CommandKind, EventKind
+from hdbridge.daemon.recorder.flightlog import MARK
 from hdbridge.daemon.service import reports
 from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.daemon.service.core import ANSWER_S, Core
@@ -116,7 +117,7 @@ class ServiceBridge:
             ):
                 self.core.start(self._persist(axis, is_due, attempt, pauses_s, failure))
         if (gateway := self.machine.gateway) is not None:
-            master = OuterMaster(self.core, gateway, self.mark)
+            master = OuterMaster(self.core, gateway)
             self.core.start(master.keep())
             for name in gateway.nodes:
                 self.core.start(master.serve(self.axes[name]))
@@ -299,8 +300,6 @@ class ServiceBridge:
             raise InputError(f"there is no axis '{name}'; expected one of: {', '.join(self.axes)}")
         await run_together(holder, [self.axes[name] for name in moves], moves, speed, wait=wait)
 
-    def mark(self, text: str, axis: int = -1) -> None:
+    def mark(self, text: str) -> None:
         """Adds a remark to the event log and the flight recorder, which keeps the time around it."""
-        self.core.log.note(text, axis)
-        if self.recorder is not None:
-            self.recorder.mark(text)
+        self.core.log.note(text, kind=MARK)

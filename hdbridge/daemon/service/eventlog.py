@@ -8,7 +8,7 @@ displace yesterday's stop.
 import logging
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from itertools import takewhile
 from typing import Final
@@ -36,6 +36,8 @@ class EventLog:
         self._entries: deque[messages.Event] = deque(maxlen=ENTRIES_KEPT)
         self.newest = 0
         """Number of the newest entry, counted from the start of the service; 0 before the first."""
+        self.record: Callable[[str, str], None] = lambda *_: None
+        """Adds a note to the flight recorder, if there is one."""
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
         """Logs the events and the loss of cycles, and keeps the events for clients."""
@@ -48,10 +50,16 @@ class EventLog:
             if not _routine(event):
                 self._add(event)
 
-    def note(self, text: str, axis: int = -1) -> None:
-        """Adds a note of the service on the machine, or on the axis of this index."""
+    def note(self, text: str, axis: int = -1, kind: str = "") -> None:
+        """Adds a note of the service on the machine, or on the axis of this index.
+
+        A note with a ``kind``, such as a mark, is recorded as well.
+        """
+        name = self._name(axis)
         with self._lock:
-            self._append(messages.EventKind.NOTE, self._name(axis), text)
+            self._append(messages.EventKind.NOTE, name, text)
+        if kind:
+            self.record(kind, f"{name}: {text}" if name is not None else text)
 
     def since(self, sequence: int) -> list[messages.Event]:
         """Returns the retained entries after number ``sequence``, oldest first."""

@@ -22,8 +22,6 @@ from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import Event, SampleArray
 from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
-from hdbridge.daemon.recorder.flightlog import Note
-from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.enums import AdaptationMode
 from hdbridge.errors import HdbridgeError
@@ -45,13 +43,11 @@ class Following:
         settings: AdaptationSettings,
         folder: Path,
         worker: Executor,
-        recorder: FlightRecorder | None = None,
         diagnosis: AutoDiagnosis | None = None,
     ) -> None:
         """``index`` is the index of the axis in a sample; ``folder`` contains the files of its adaptation.
 
-        ``worker`` has one thread. Verdicts are noted in ``recorder``; those in `DIAGNOSED` start
-        ``diagnosis``.
+        ``worker`` has one thread. The verdicts in `DIAGNOSED` start ``diagnosis``.
         """
         self.state = messages.AdaptationState(mode=settings.mode)
         """State of the adaptation."""
@@ -59,7 +55,7 @@ class Following:
         """Current verdict of the watch unless the model is valid; the reason if the axis is not watched."""
         self._index, self._axis = index, axis
         self._settings, self._folder = settings, folder
-        self._worker, self._recorder, self._diagnosis = worker, recorder, diagnosis
+        self._worker, self._diagnosis = worker, diagnosis
         self._model: TransmissionModel | None = None
         """Committed model that is followed."""
         self._used: TransmissionModel | None = None
@@ -190,9 +186,7 @@ class Following:
         return [follower.unwatched] if follower is not None and follower.unwatched else []
 
     def _note(self, kind: str, text: str) -> None:
-        if self._recorder is not None:
-            self._recorder.put(Note(kind, f"{self._axis.name}: {text}"))
-        self._axis.core.log.note(text, self._index)
+        self._axis.core.log.note(text, self._index, kind)
         _log.warning("watch", {"axis": self._axis.name, "text": text})
 
 

@@ -28,6 +28,19 @@ def test_routine_events_do_not_displace_stops() -> None:
     assert log.since(2) == log.since(99) == []
 
 
+def test_a_note_with_a_kind_is_recorded_with_the_name_of_its_axis() -> None:
+    log = EventLog(["axis1"])
+    recorded: list[tuple[str, str]] = []
+    log.record = lambda kind, text: recorded.append((kind, text))
+    log.note("plain", 0)
+    log.note("it squeaks", 0, "MARK")
+    log.note("all squeak", kind="MARK")
+    assert recorded == [("MARK", "axis1: it squeaks"), ("MARK", "all squeak")]
+    assert [(each.axis, each.text) for each in log.since(0)] == [
+        ("axis1", "plain"), ("axis1", "it squeaks"), (None, "all squeak"),
+    ]  # fmt: skip
+
+
 async def test_the_newest_events_are_returned_and_the_others_counted(service: Service) -> None:
     async with service.ready() as bridge:
         before = bridge.events(0).newest

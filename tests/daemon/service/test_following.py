@@ -19,7 +19,6 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.client import messages
 from hdbridge.client.messages import AdaptationMode
 from hdbridge.daemon.machinefile import AdaptationSettings
-from hdbridge.daemon.recorder.flightlog import Note
 from hdbridge.daemon.serve import follow
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
@@ -90,18 +89,17 @@ def test_a_verdict_gives_advice_note_and_diagnosis_until_a_new_model(tmp_path: P
     worn = loop.model_copy(update={"offset_arcsec": 1.4 * loop.offset_arcsec})
     truth = replace(model, effects=tuple(worn if each is loop else each for each in model.effects))
     samples = SampleMaker(config, model, truth).make(moves_and_rests(900.0, config.drive.cycle_s))
-    axis, recorder, diagnosis = MagicMock(), MagicMock(), MagicMock()
+    axis, diagnosis = MagicMock(), MagicMock()
     axis.name, axis.axis.config, axis.models.chosen.model = "demo", config, model
     axis.models.in_use = CompensationSetting(model, Scheme.EXTENDED)
     with ThreadPoolExecutor(1) as worker:
-        made = Following(0, axis, AdaptationSettings(), tmp_path, worker, recorder, diagnosis)
+        made = Following(0, axis, AdaptationSettings(), tmp_path, worker, diagnosis)
         for batch in np.array_split(samples, 100):
             made.take(batch, [], 0)
         made.close()
         (advice,) = made.advice
         assert advice.startswith("recalibrate: hysteresis.offset_arcsec ")
-        recorder.put.assert_called_once_with(Note("WATCH", f"demo: {advice}"))
-        axis.core.log.note.assert_called_once_with(advice, 0)
+        axis.core.log.note.assert_called_once_with(advice, 0, "WATCH")
         assert diagnosis.start.call_args.args[:4] == ("demo", model.dump(), 15.0, advice)
 
         axis.models.chosen.model = truth
