@@ -26,8 +26,8 @@ from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
 from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.core import Sink
 from hdbridge.daemon.service.following import Following
-from hdbridge.daemon.service.observer import Sink
 from hdbridge.daemon.service.timing import SimulatedClock, Timing
 from hdbridge.daemon.start import Start, run_child, runtime_folder
 from hdbridge.errors import HdbridgeError
@@ -72,7 +72,7 @@ async def serve(start: Start, memory: Memory) -> None:
         following = follow(machine, bridge, recorder, stack)
         sinks: list[Sink] = [metrics, recorder, *following]
         for sink in sinks:
-            bridge.core.observer.add(sink)
+            bridge.core.add_sink(sink)
         await stack.enter_async_context(bridge)
         server = ApiServer(bridge, listeners(machine, start.api_fds, start.page_token), metrics)
         async with asyncio.TaskGroup() as group:
@@ -156,9 +156,9 @@ async def _last_words(bridge: ServiceBridge, memory: Memory) -> None:
     """Keeps serving while the axes are brought to rest, so that clients see the stop and it is recorded."""
     end_s = asyncio.get_running_loop().time() + LAST_WORDS_S
     status = memory.status
-    while bridge.core.observer.alive and status[Cell.LOOP_PID] and asyncio.get_running_loop().time() < end_s:
+    while bridge.core.alive and status[Cell.LOOP_PID] and asyncio.get_running_loop().time() < end_s:
         await asyncio.sleep(0.05)
-    bridge.core.observer.poll()
+    bridge.core.poll()
 
 
 if __name__ == "__main__":

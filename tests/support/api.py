@@ -82,7 +82,7 @@ def running(server: ApiServer) -> Iterator[None]:
 async def served_in_loop(bridge: ServiceBridge, path: Path) -> AsyncIterator[None]:
     """Serves a real service at a Unix socket, in its own event loop, until the end of the block."""
     metrics = Metrics(bridge)
-    bridge.core.observer.add(metrics)
+    bridge.core.add_sink(metrics)
     server = ApiServer(bridge, [Listener(unix_socket(path), Policy())], metrics)
     serving = asyncio.ensure_future(server.run())
     try:

@@ -1,6 +1,6 @@
 """`/metrics` for Prometheus: loop timing, faults, axes and API requests.
 
-`Metrics` is a sink of the observer, and counts the requests. Everything else is read on each scrape.
+`Metrics` is a sink of `Core`, and counts the requests. Everything else is read on each scrape.
 """
 
 import math
@@ -82,7 +82,7 @@ class Metrics(Collector):
         registry.register(self)
 
     def take(self, samples: NDArray[np.void], events: Iterable[Any], lost: int) -> None:
-        """Takes samples and events of the loop from the observer; ignores times that are not finite."""
+        """Takes samples and events of the loop from the service's core; ignores times that are not finite."""
         for histogram, field in ((self._late, "late_us"), (self._busy, "busy_us")):
             for value_us in samples[field].tolist():
                 if math.isfinite(value_us):
@@ -124,7 +124,7 @@ class Metrics(Collector):
         dropped = [((), state.recorder.dropped)]
         yield _counter("recorder_dropped", "Samples that the recorder dropped.", dropped)
         yield _gauge("lease_held", "1 if a client holds the lease.", [((), state.lease.held)])
-        lost = [((), self._bridge.core.observer.lost)]
+        lost = [((), self._bridge.core.lost)]
         yield _counter("samples_lost", "Cycles lost because the service was too slow.", lost)
         for name, about, field in _AXIS:
             values = [((each.name,), _field(each, field)) for each in state.axes]

@@ -1,6 +1,6 @@
 """Flight recorder: all samples and events of the loop, on disk within a second.
 
-`FlightRecorder` is a sink of the observer. It never blocks and uses bounded memory. Data that arrives faster
+`FlightRecorder` is a sink of `Core`. It never blocks and uses bounded memory. Data that arrives faster
 than its thread can process is dropped, counted and reported. `flightlog` does the thread's work.
 """
 
@@ -65,7 +65,7 @@ class FlightRecorder:
             self._threads.append(thread)
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """Takes samples and events from the observer; never waits."""
+        """Takes samples and events from the service's core; never waits."""
         for axis, setting in self._in_use().items():
             if self._recorded.get(axis) is not setting:
                 self._recorded[axis] = setting

@@ -200,7 +200,7 @@ class ServiceAxis:
         """Takes over the axis from an earlier service process; stops a drive that was lent to it."""
         link = self.link
         async with self._drive:
-            await self.core.until(lambda: self.core.observer.newest is not None, ANSWER_S)
+            await self.core.until(lambda: self.core.newest is not None, ANSWER_S)
             if link.state is AxisState.LENT:
                 await self._work(self.commissioning.abandon_homing)
                 await link.do(CommandKind.RELEASE)

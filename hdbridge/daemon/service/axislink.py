@@ -90,7 +90,7 @@ class AxisLink:
 
     def value(self, field: str) -> float:
         """Returns a field of `AXIS_SAMPLE` in the newest cycle; 0 before the first."""
-        newest = self.core.observer.newest
+        newest = self.core.newest
         return float(newest[0]["axes"][self.index][field]) if newest is not None else 0.0
 
     @property
@@ -101,7 +101,7 @@ class AxisLink:
     @property
     def power(self) -> State:
         """The drive's power state."""
-        newest = self.core.observer.newest
+        newest = self.core.newest
         return _POWER[int(self.value("power"))] if newest is not None else State.UNKNOWN
 
     def seeds(self) -> Arguments:
@@ -143,9 +143,9 @@ class AxisLink:
         SafetyStop if the supervision stopped the motion, RefusedError if another activity replaced it,
         InputError if one of its set-points was refused, and DaemonError if the control process is gone.
         """
-        observer = self.core.observer
+        core = self.core
         while True:
-            observer.poll()
+            core.poll()
             if activity.error is not None:
                 raise activity.error
             if activity.over == COMPLETE:
@@ -153,9 +153,9 @@ class AxisLink:
             why = activity.over or (waiting.over if waiting is not None else "")
             if why and not activity.stopping:
                 raise RefusedError(f"{self.name}: {why}")
-            if not observer.alive:
+            if not core.alive:
                 raise DaemonError(
                     f"{self.name}: the control process has completed no cycle lately: it hangs or has died; "
                     "the drive stops automatically, and the axis will be disabled"
                 )
-            await self.core.timing.sleep(POLL_S)
+            await core.timing.sleep(POLL_S)

@@ -34,10 +34,9 @@ from hdbridge.daemon.memory import Cell, CommandKind, EventKind
 from hdbridge.daemon.recorder.flightlog import MARK
 from hdbridge.daemon.service import reports
 from hdbridge.daemon.service.axis import ServiceAxis
-from hdbridge.daemon.service.core import ANSWER_S, Core
+from hdbridge.daemon.service.core import ANSWER_S, PERIOD_S, Core
 from hdbridge.daemon.service.lending import Lending
 from hdbridge.daemon.service.moves import run_together
-from hdbridge.daemon.service.observer import PERIOD_S
 from hdbridge.daemon.service.outermaster import Latency, OuterMaster
 from hdbridge.daemon.service.timing import Timing
 from hdbridge.errors import HdbridgeError, InputError
@@ -85,10 +84,10 @@ class ServiceBridge:
         self._simulated = simulated
         self._started = datetime.now(UTC)
         self._bus_up = True
-        self.core.observer.add(self)
+        self.core.add_sink(self)
         self._latency = Latency(memory.axes)
         if machine.gateway is not None:
-            self.core.observer.add(self._latency)
+            self.core.add_sink(self._latency)
         self.lease = self.core.lease
         """Right to move."""
         self.lease.doing = self._doing
@@ -143,7 +142,7 @@ class ServiceBridge:
         core, status = self.core, self.core.memory.status
         known = status[Cell.LOOP_PID]
         while True:
-            core.observer.poll()
+            core.poll()
             status[Cell.SERVICE_TIME_NS] = time.monotonic_ns()
             if (pid := status[Cell.LOOP_PID]) and pid != known:
                 if known:
@@ -158,7 +157,7 @@ class ServiceBridge:
             await core.timing.sleep(PERIOD_S)
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """Takes the loop's events from the observer: those of an axis, and failures of the bus."""
+        """Takes the loop's events from the core: those of an axis, and failures of the bus."""
         for event in events:
             if event.axis >= 0:
                 self.axes[self._names[event.axis]].on_event(event)
@@ -210,7 +209,7 @@ class ServiceBridge:
     def state(self) -> messages.MachineState:
         """Returns the state of the machine in the newest cycle."""
         core = self.core
-        newest = core.observer.newest
+        newest = core.newest
         head = newest[0] if newest is not None else None
         return messages.MachineState(
             name=self.machine.name,
@@ -228,8 +227,8 @@ class ServiceBridge:
             ),
             cycle=messages.CycleState(
                 period_s=core.memory.period_s,
-                cycle=core.observer.cycle,
-                alive=core.observer.alive,
+                cycle=core.cycle,
+                alive=core.alive,
                 pid=core.memory.status[Cell.LOOP_PID],
                 skipped=int(head["skipped"]) if head is not None else 0,
                 late_us=float(head["late_us"]) if head is not None else None,
@@ -257,16 +256,14 @@ class ServiceBridge:
                 f"the bus is lent to {borrower}, for {self.lending.lent_s or 0.0:.0f} s now; its axes will "
                 "be disabled when it ends"
             )
-        elif not core.observer.alive:
+        elif not core.alive:
             warnings.append(
                 "the control process completes no cycles: it hangs or has died; it is restarted automatically"
             )
         if not self._bus_up:
             warnings.append("the bus is down: bring the interface up; it is reopened automatically")
-        if core.observer.lost:
-            warnings.append(
-                f"{core.observer.lost} cycles were lost before they were read: this machine is too busy"
-            )
+        if core.lost:
+            warnings.append(f"{core.lost} cycles were lost before they were read: this machine is too busy")
         return warnings
 
     def events(self, since: int = 0) -> messages.Events:

@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 
 
 class EventLog:
-    """Newest `ENTRIES_KEPT` events and notes for clients; a sink of the observer. Thread-safe."""
+    """Newest `ENTRIES_KEPT` events and notes for clients; a sink of `Core`. Thread-safe."""
 
     def __init__(self, names: Sequence[str]) -> None:
         """``names`` are those of the axes."""

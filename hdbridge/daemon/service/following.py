@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 
 
 class Following:
-    """Follows one axis: a sink of the observer that never blocks."""
+    """Follows one axis: a sink of `Core` that never blocks."""
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class Following:
         self._problem = ""
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """Takes samples from the observer. Lost samples appear as a gap in the cycle numbers."""
+        """Takes samples from the service's core. Lost samples appear as a gap in the cycle numbers."""
         models = self._axis.models
         if models.chosen.model is not self._model:
             self._model = self._used = models.chosen.model

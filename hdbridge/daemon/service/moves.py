@@ -211,7 +211,7 @@ async def run_together(
     async with AsyncExitStack() as stack:
         for axis in sorted(axes, key=lambda each: each.link.index):
             await stack.enter_async_context(axis.motion.commanding)
-        core.observer.poll()
+        core.poll()
         plan = await core.timing.work(
             coordinated,
             {axis.name: axis.link.value("load_target_deg") for axis in axes},

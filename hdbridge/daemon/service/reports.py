@@ -97,7 +97,7 @@ def axis_state(axis: ServiceAxis, outer: messages.OuterState | None) -> messages
     """Returns the state of an axis; ``outer`` is that of its node in a gateway."""
     link, config, following = axis.link, axis.axis.config, axis.following
     flags = int(link.value("flags"))
-    known = link.core.observer.newest is not None
+    known = link.core.newest is not None
     in_use = axis.models.in_use
 
     def number(field: str) -> float | None:
@@ -141,7 +141,7 @@ def axis_state(axis: ServiceAxis, outer: messages.OuterState | None) -> messages
 def _fault(axis: ServiceAxis) -> messages.Fault | None:
     """Returns the cause of a latched stop or a drive fault; None without either."""
     link, (event, date) = axis.link, axis.stopped or (None, None)
-    code = int(link.value("fault")) if link.core.observer.newest is not None else NO_FAULT
+    code = int(link.value("fault")) if link.core.newest is not None else NO_FAULT
     fault = fault_of(code)
     latched = link.state in STOPPED
     if not latched and link.power is not State.FAULT:

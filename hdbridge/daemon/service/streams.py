@@ -105,7 +105,7 @@ class ServiceStream:
         """Passes on set-points; waits while the buffer is full. Raises if the stream has ended."""
         self._check_open()
         if self._knots is None:
-            self._link.core.observer.poll()
+            self._link.core.poll()
             self._knots = Knots(self._number, self._link.value("load_target_deg"))
         await self._hand_over(self._knots.add(points))
         if not self._has_begun and self._last_s >= LEAD_S:
@@ -145,7 +145,7 @@ class ServiceStream:
     def _check_open(self) -> None:
         """Raises RefusedError with the reason if the stream has ended, LeaseError if the lease has."""
         self._link.core.lease.check(self._activity.holder)
-        self._link.core.observer.poll()
+        self._link.core.poll()
         if self._activity.error is not None:
             raise self._activity.error
         if self._activity.over or self._ended:

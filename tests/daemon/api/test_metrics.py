@@ -31,7 +31,7 @@ def test_lateness_buckets_are_cumulative():
     samples = bridge.samples(range(1, 5))
     samples["late_us"] = [5.0, 15.0, 2e6, np.nan]
     metrics.take(samples, (), 3)
-    bridge.core.observer.lost = 3
+    bridge.core.lost = 3
     metrics.take(samples[:0], (), 0)
     found = scraped(metrics)
     assert figure(found, "cycle_late_seconds_bucket", le="1e-05") == 1

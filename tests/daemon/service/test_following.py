@@ -37,7 +37,7 @@ async def test_a_disabled_adaptation_learns_and_writes_nothing(service: Service,
     async with service.ready() as bridge:
         made = service.follow(bridge, AdaptationSettings())
         before = changes(bridge)
-        await until(bridge, lambda: bridge.core.observer.cycle > 100)
+        await until(bridge, lambda: bridge.core.cycle > 100)
         assert made.state.mode is AdaptationMode.OFF
         assert changes(bridge) == before
         assert not folder.exists()
@@ -71,12 +71,12 @@ async def test_each_axis_is_watched_in_its_own_thread_that_ends(
     with caplog.at_level(logging.ERROR):
         async with service.enabled() as (bridge, _, token), AsyncExitStack() as stack:
             for each in follow(service.machine, bridge, None, stack):
-                bridge.core.observer.add(each)
+                bridge.core.add_sink(each)
             first, second = bridge.axes.values()
             await first.motion.move(token, 5.0)
             await second.compensate(token, Scheme.SYNCHRONOUS)
-            begun = bridge.core.observer.cycle
-            await until(bridge, lambda: bridge.core.observer.cycle > begun + 500)
+            begun = bridge.core.cycle
+            await until(bridge, lambda: bridge.core.cycle > begun + 500)
             assert (first.state().advice, second.state().advice) == ([], [])
     assert caplog.records == []
     assert not [each for each in threading.enumerate() if each.name.startswith("following")]
