@@ -26,7 +26,6 @@ from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
 from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.core import Sink
 from hdbridge.daemon.service.following import Following
 from hdbridge.daemon.service.timing import SimulatedClock, Timing
 from hdbridge.daemon.start import Start, run_child, runtime_folder
@@ -69,10 +68,9 @@ async def serve(start: Start, memory: Memory) -> None:
         )
         bridge.recorder, bridge.core.log.record = recorder, recorder.note
         stack.callback(recorder.close)
-        following = follow(machine, bridge, recorder, stack)
-        sinks: list[Sink] = [metrics, recorder, *following]
-        for sink in sinks:
-            bridge.core.add_sink(sink)
+        bridge.core.add_sink(metrics)
+        bridge.core.add_sink(recorder)
+        follow(bridge, stack)
         await stack.enter_async_context(bridge)
         server = ApiServer(bridge, listeners(machine, start.api_fds, start.page_token), metrics)
         async with asyncio.TaskGroup() as group:
@@ -85,26 +83,23 @@ async def serve(start: Start, memory: Memory) -> None:
             server.stop()
 
 
-def follow(
-    machine: Machine, bridge: ServiceBridge, recorder: FlightRecorder | None, stack: AsyncExitStack
-) -> list[Following]:
-    """Returns a `Following` for each axis, with its own thread each.
+def follow(bridge: ServiceBridge, stack: AsyncExitStack) -> None:
+    """Starts a `Following` for each axis, with its own thread each.
 
     If flights are recorded, the watch's verdicts are diagnosed automatically.
     """
-    diagnosis = AutoDiagnosis(recorder.folder) if recorder is not None and recorder.flight else None
-    if diagnosis is not None:
+    machine, recorder, diagnosis = bridge.machine, bridge.recorder, None
+    if recorder is not None and recorder.flight is not None:
+        diagnosis = AutoDiagnosis(recorder.folder)
         stack.callback(diagnosis.close)
-    following: list[Following] = []
-    for index, (axis, port) in enumerate(zip(machine.axes, bridge.axes.values(), strict=True)):
+    for port in bridge.axes.values():
+        axis = port.axis
         given = axis.adaptation.folder
         folder = machine.resolve_path(given) if given is not None else machine.axis_folder(axis, "adaptation")
         worker = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix=f"following-{axis.name}"))
-        made = Following(index, port, axis.adaptation, folder, worker, diagnosis)
-        port.following = made
-        following.append(made)
-        stack.callback(made.close)
-    return following
+        port.following = Following(port, axis.adaptation, folder, worker, diagnosis)
+        bridge.core.add_sink(port.following)
+        stack.callback(port.following.close)
 
 
 def listeners(machine: Machine, descriptors: Sequence[int], page_token: str | None = None) -> list[Listener]:

@@ -90,7 +90,7 @@ class Service:
     def follow(self, bridge: ServiceBridge, settings: AdaptationSettings) -> Following:
         """Adds watch and adaptation of the first axis, as in the service process, but in the same thread."""
         axis = bridge.axes["axis1"]
-        axis.following = Following(0, axis, settings, self.folder / "adaptation", AtOnce())
+        axis.following = Following(axis, settings, self.folder / "adaptation", AtOnce())
         bridge.core.add_sink(axis.following)
         return axis.following
 

@@ -38,14 +38,13 @@ class Following:
 
     def __init__(
         self,
-        index: int,
         axis: ServiceAxis,
         settings: AdaptationSettings,
         folder: Path,
         worker: Executor,
         diagnosis: AutoDiagnosis | None = None,
     ) -> None:
-        """``index`` is the index of the axis in a sample; ``folder`` contains the files of its adaptation.
+        """``folder`` contains the files of the adaptation.
 
         ``worker`` has one thread. The verdicts in `DIAGNOSED` start ``diagnosis``.
         """
@@ -53,7 +52,7 @@ class Following:
         """State of the adaptation."""
         self.advice: list[str] = []
         """Current verdict of the watch unless the model is valid; the reason if the axis is not watched."""
-        self._index, self._axis = index, axis
+        self._axis = axis
         self._settings, self._folder = settings, folder
         self._worker, self._diagnosis = worker, diagnosis
         self._model: TransmissionModel | None = None
@@ -117,7 +116,7 @@ class Following:
     def _begin(self, model: TransmissionModel) -> None:
         """Starts to follow another committed model."""
         self._save()
-        self._follower = Follower(self._axis.axis.config, model, self._index, self._settings)
+        self._follower = Follower(self._axis.axis.config, model, self._axis.link.index, self._settings)
         self.advice = self._unwatched()
         self._adapt()
 
@@ -186,7 +185,7 @@ class Following:
         return [follower.unwatched] if follower is not None and follower.unwatched else []
 
     def _note(self, kind: str, text: str) -> None:
-        self._axis.core.log.note(text, self._index, kind)
+        self._axis.core.log.note(text, self._axis.link.index, kind)
         _log.warning("watch", {"axis": self._axis.name, "text": text})
 
 

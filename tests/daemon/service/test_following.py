@@ -70,8 +70,7 @@ async def test_each_axis_is_watched_in_its_own_thread_that_ends(
 ) -> None:
     with caplog.at_level(logging.ERROR):
         async with service.enabled() as (bridge, _, token), AsyncExitStack() as stack:
-            for each in follow(service.machine, bridge, None, stack):
-                bridge.core.add_sink(each)
+            follow(bridge, stack)
             first, second = bridge.axes.values()
             await first.motion.move(token, 5.0)
             await second.compensate(token, Scheme.SYNCHRONOUS)
@@ -91,9 +90,10 @@ def test_a_verdict_gives_advice_note_and_diagnosis_until_a_new_model(tmp_path: P
     samples = SampleMaker(config, model, truth).make(moves_and_rests(900.0, config.drive.cycle_s))
     axis, diagnosis = MagicMock(), MagicMock()
     axis.name, axis.axis.config, axis.models.chosen.model = "demo", config, model
+    axis.link.index = 0
     axis.models.in_use = CompensationSetting(model, Scheme.EXTENDED)
     with ThreadPoolExecutor(1) as worker:
-        made = Following(0, axis, AdaptationSettings(), tmp_path, worker, diagnosis)
+        made = Following(axis, AdaptationSettings(), tmp_path, worker, diagnosis)
         for batch in np.array_split(samples, 100):
             made.take(batch, [], 0)
         made.close()
