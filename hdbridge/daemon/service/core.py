@@ -43,7 +43,7 @@ class Sink(Protocol):
 
 
 class Core:
-    """Access to the control process, the clock and the lease. Commands may be sent from any thread."""
+    """Access to the control process, the clock and the lease, for use in one event loop."""
 
     def __init__(self, memory: Memory, timing: Timing, lease_s: float, names: Sequence[str] = ()) -> None:
         """``lease_s`` is the time-out of the lease; ``names`` are those of the axes."""
