@@ -83,7 +83,7 @@ SIMULATED: Final = Times(begin_s=600.0, gateway_hung_s=120.0, stop_s=300.0, serv
 """Time-outs with simulated drives, long enough for a busy computer."""
 
 
-class Child:
+class Child(subprocess.Popen[bytes]):
     """A child process, from its start to its end."""
 
     def __init__(self, program: Sequence[str], start_fd: int, handed: Sequence[int], now_s: float) -> None:
@@ -93,42 +93,28 @@ class Child:
         terminal reach only the keeper.
         """
         self.started_s = now_s
-        self._process = subprocess.Popen(
+        super().__init__(
             [sys.executable, "-P", *program, str(start_fd)],
             pass_fds=(start_fd, *handed),
             stdin=subprocess.DEVNULL,
             start_new_session=True,
         )
-        self.pid = self._process.pid
         self.pidfd = os.pidfd_open(self.pid)
         """Descriptor that becomes readable when the process has ended."""
 
     @property
-    def ended(self) -> int | None:
-        """Exit status, negative after a signal; None while it runs."""
-        return self._process.poll()
-
-    @property
     def end_description(self) -> str:
-        """Exit status or signal in words."""
-        status = self.ended
-        if status is None:
-            return "runs"
-        if status >= 0:
-            return f"exit status {status}"
+        """Exit status or signal of the ended process in words."""
+        if self.returncode >= 0:
+            return f"exit status {self.returncode}"
         with suppress(ValueError):
-            return f"ended by {signal.Signals(-status).name}"
-        return f"ended by signal {-status}"
-
-    def send(self, number: signal.Signals) -> None:
-        """Sends a signal unless the process has ended; its id is not reused before `ended` is read."""
-        self._process.send_signal(number)
+            return f"ended by {signal.Signals(-self.returncode).name}"
+        return f"ended by signal {-self.returncode}"
 
     def close(self) -> None:
         """Kills the process if it still runs, and closes the descriptor."""
-        if self.ended is None:
-            self._process.kill()
-            self._process.wait()
+        self.kill()
+        self.wait()
         os.close(self.pidfd)
 
 
@@ -341,19 +327,17 @@ class Keeper:
 
     def _turn(self, now_s: float) -> None:
         self._handle_signals(now_s)
-        if self._control.child is not None and self._control.child.ended is not None:
-            self._control_ended(self._control.child, now_s)
-        for helper in self._helpers:
-            if helper.child is not None and helper.child.ended is not None:
-                self._helper_ended(helper, helper.child, now_s)
+        for process in self._processes:
+            if process.child is not None and process.child.poll() is not None:
+                self._ended(process, process.child, now_s)
         if self._stopping_since_s is not None:
-            self._continue_stopping(now_s)
+            self._continue_stopping(self._stopping_since_s, now_s)
             return
+        for process in self._processes:
+            if process.due_s is not None and now_s >= process.due_s:
+                self._begin(process, now_s)
         if self._loan is not None:
             self._lend(self._loan, now_s)
-        for helper in self._helpers:
-            if helper.due_s is not None and now_s >= helper.due_s:
-                self._begin(helper, now_s)
         self._supervise(now_s)
 
     # ------------------------------------------------------------------ children
@@ -376,46 +360,38 @@ class Keeper:
             process.child.close()
             process.child = None
 
-    def _control_ended(self, child: Child, now_s: float) -> None:
-        status, end = child.ended, child.end_description
-        assert status is not None
-        self._forget(self._control)
-        self._memory.status[Cell.LOOP_PID] = 0
-        if self._stopping_since_s is not None:
-            self._status = self._status or max(status, 0)
-            return
-        if self._loan is not None and self._loan.requested_s is not None:
-            self._loan.begin(now_s)
-            self._memory.status[Cell.BUS_LENT] = time.monotonic_ns()
-            _log.info("the bus is lent", {"how": end})
-            return
-        _log.error("control process died", {"how": end, "lived_s": round(now_s - child.started_s, 1)})
-        known = status if status in _ERRORS else HdbridgeError.exit_status
-        if status in _ERRORS and not self._memory.status[Cell.LOOP_COUNT]:
-            self._stop(now_s, known, f"the control process cannot start ({end})")
-        elif not self._budget.spend(now_s):
-            self._stop(now_s, known, "the control process keeps dying")
-        else:
-            self._control.restarts += 1
-            self._begin(self._control, now_s)
-
-    def _helper_ended(self, helper: _Process, child: Child, now_s: float) -> None:
-        name, status, end = helper.name, child.ended, child.end_description
-        assert status is not None
-        self._forget(helper)
-        self._memory.status[helper.alive] = 0
-        if self._stopping_since_s is not None:
-            return
-        lived_s = now_s - child.started_s
-        _log.error(f"{name} process died", {"how": end, "lived_s": round(lived_s, 1)})
-        helper.restarts += 1
-        if not self._ready and (status in _ERRORS or helper.restarts >= _MAX_START_ATTEMPTS):
-            known = status if status in _ERRORS else HdbridgeError.exit_status
-            self._stop(now_s, known, f"the {name} cannot start ({end})")
-        else:
-            helper.due_s = now_s + helper.back_off.delay_s(lived_s)
-        if helper.alive is Cell.GATEWAY_TIME_NS:
+    def _ended(self, process: _Process, child: Child, now_s: float) -> None:
+        """Schedules the restart of an ended process, or ends the daemon if it cannot start or keeps dying."""
+        cells, status, how = self._memory.status, child.returncode, child.end_description
+        is_control, lived_s = process is self._control, now_s - child.started_s
+        self._forget(process)
+        cells[Cell.LOOP_PID if is_control else process.alive] = 0
+        if process.alive is Cell.GATEWAY_TIME_NS:
             self._memory.forget_gateway()
+        if self._stopping_since_s is not None:
+            if is_control:
+                self._status = self._status or max(status, 0)
+            return
+        if is_control and self._loan is not None and self._loan.requested_s is not None:
+            self._loan.begin(now_s)
+            cells[Cell.BUS_LENT] = time.monotonic_ns()
+            _log.info("the bus is lent", {"how": how})
+            return
+        _log.error(f"{process.name} process died", {"how": how, "lived_s": round(lived_s, 1)})
+        process.restarts += 1
+        known = status if status in _ERRORS else HdbridgeError.exit_status
+        if is_control:
+            hopeless = status in _ERRORS and not cells[Cell.LOOP_COUNT]
+        else:
+            hopeless = not self._ready and (status in _ERRORS or process.restarts >= _MAX_START_ATTEMPTS)
+        if hopeless:
+            self._stop(now_s, known, f"the {process.name} process cannot start ({how})")
+        elif not is_control:
+            process.due_s = now_s + process.back_off.delay_s(lived_s)
+        elif self._budget.spend(now_s):
+            process.due_s = now_s
+        else:
+            self._stop(now_s, known, "the control process keeps dying")
 
     def _lend(self, loan: Loan, now_s: float) -> None:
         """Ends the control process if a loan is requested; starts a new one when the bus is free again."""
@@ -425,9 +401,7 @@ class Keeper:
                 loan.requested_s = now_s
                 status[Cell.STOP_REQUESTED] = 1
         elif self._control.child is not None:
-            if now_s - loan.requested_s > self._times.stop_s:
-                _log.error("the axes do not come to rest", {"after_s": self._times.stop_s})
-                self._control.child.send(signal.SIGKILL)
+            self._kill_moving(self._control.child, loan.requested_s, now_s)
         elif loan.is_over(now_s):
             _log.info("the bus is taken back")
             for cell in (Cell.BUS_LENT, Cell.STOP_REQUESTED):
@@ -465,7 +439,15 @@ class Keeper:
         limit_s = process.hung_s if heartbeat.begun else self._times.begin_s
         if child is not None and heartbeat.misses * TICK_S >= limit_s:
             _log.error("process hangs", {"pid": child.pid, "for_s": heartbeat.misses * TICK_S})
-            child.send(signal.SIGKILL)
+            child.kill()
+
+    def _kill_moving(self, control: Child, since_s: float, now_s: float) -> bool:
+        """Kills a control process that was to stop ``since_s`` if it is overdue; returns True if it is."""
+        if now_s - since_s <= self._times.stop_s:
+            return False
+        _log.error("the axes do not come to rest", {"after_s": self._times.stop_s})
+        control.kill()
+        return True
 
     # ------------------------------------------------------------------ the end
 
@@ -485,19 +467,16 @@ class Keeper:
         if self._stopping_since_s is not None:
             return
         self._stopping_since_s, self._status = now_s, status
-        for helper in self._helpers:
-            helper.due_s = None
+        for process in self._processes:
+            process.due_s = None
         _log.info("stopping", {"why": why})
         self._notifier.stopping()
         self._memory.status[Cell.STOP_REQUESTED] = 1
 
-    def _continue_stopping(self, now_s: float) -> None:
-        assert self._stopping_since_s is not None
+    def _continue_stopping(self, since_s: float, now_s: float) -> None:
         if self._control.child is not None:
-            if now_s - self._stopping_since_s > self._times.stop_s:
-                _log.error("the axes do not come to rest", {"after_s": self._times.stop_s})
+            if self._kill_moving(self._control.child, since_s, now_s):
                 self._status = self._status or HdbridgeError.exit_status
-                self._control.child.send(signal.SIGKILL)
             return
         number, terminated_s = signal.SIGTERM, self._helpers_terminated_s
         if terminated_s is None:
@@ -510,7 +489,7 @@ class Keeper:
             if helper.child is not None:
                 if number is signal.SIGKILL:
                     _log.error(f"the {helper.name} does not end", {"after_s": self._times.service_stop_s})
-                helper.child.send(number)
+                helper.child.send_signal(number)
 
     def _end_all(self) -> None:
         for process in self._processes:

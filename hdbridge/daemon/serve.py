@@ -26,9 +26,7 @@ from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
 from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.eventlog import EventLogger
 from hdbridge.daemon.service.following import Following
-from hdbridge.daemon.service.observer import Sink
 from hdbridge.daemon.service.timing import SimulatedClock, Timing
 from hdbridge.daemon.start import Start, run_child, runtime_folder
 from hdbridge.errors import HdbridgeError
@@ -38,8 +36,6 @@ THREADS_PER_AXIS: Final = 2
 SPARE_THREADS: Final = 4
 LOOK_S: Final = 1.0
 """Interval between checks for the socket file."""
-FOLLOW_S: Final = 1.0
-"""Interval between checks for adapted models."""
 LAST_WORDS_S: Final = 35.0
 """Maximum wait for the control process to bring its axes to rest, so that the stop is recorded."""
 
@@ -62,7 +58,7 @@ async def serve(start: Start, memory: Memory) -> None:
         timing = Timing(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS, clock)
         stack.callback(timing.close)
         bridge = ServiceBridge(machine, memory, timing, simulated=simulated, forced=start.force)
-        metrics = Metrics()
+        metrics = Metrics(bridge)
         recorder = FlightRecorder(
             machine.recorder_folder(),
             About(machine.name, machine.cycle_s, tuple(AxisAbout.of(each.config) for each in machine.axes)),
@@ -70,56 +66,40 @@ async def serve(start: Start, memory: Memory) -> None:
             notify=bridge.core.log.note,
             in_use=lambda: {name: axis.models.in_use for name, axis in bridge.axes.items()},
         )
-        bridge.recorder = recorder
+        bridge.recorder, bridge.core.log.record = recorder, recorder.note
         stack.callback(recorder.close)
-        following = follow(machine, bridge, recorder, stack)
-        sinks: list[Sink] = [EventLogger([*bridge.axes]), metrics, recorder, *following]
-        for sink in sinks:
-            bridge.core.observer.add(sink)
+        bridge.core.add_sink(metrics)
+        bridge.core.add_sink(recorder)
+        follow(bridge, stack)
         await stack.enter_async_context(bridge)
         server = ApiServer(bridge, listeners(machine, start.api_fds, start.page_token), metrics)
         async with asyncio.TaskGroup() as group:
             group.create_task(server.run())
             group.create_task(_say_when_served(server, memory))
-            background_tasks = [
-                group.create_task(_apply(following)),
-                group.create_task(_keep_socket(start, server, bridge.core.log.note)),
-            ]
+            keeping = group.create_task(_keep_socket(start, server, bridge.core.log.note))
             await terminated.wait()
             await _last_words(bridge, memory)
-            for task in background_tasks:
-                task.cancel()
+            keeping.cancel()
             server.stop()
 
 
-def follow(
-    machine: Machine, bridge: ServiceBridge, recorder: FlightRecorder | None, stack: AsyncExitStack
-) -> list[Following]:
-    """Returns a `Following` for each axis, with its own thread each.
+def follow(bridge: ServiceBridge, stack: AsyncExitStack) -> None:
+    """Starts a `Following` for each axis, with its own thread each.
 
     If flights are recorded, the watch's verdicts are diagnosed automatically.
     """
-    diagnosis = AutoDiagnosis(recorder.folder) if recorder is not None and recorder.flight else None
-    if diagnosis is not None:
+    machine, recorder, diagnosis = bridge.machine, bridge.recorder, None
+    if recorder is not None and recorder.flight is not None:
+        diagnosis = AutoDiagnosis(recorder.folder)
         stack.callback(diagnosis.close)
-    following: list[Following] = []
-    for index, (axis, port) in enumerate(zip(machine.axes, bridge.axes.values(), strict=True)):
+    for port in bridge.axes.values():
+        axis = port.axis
         given = axis.adaptation.folder
         folder = machine.resolve_path(given) if given is not None else machine.axis_folder(axis, "adaptation")
         worker = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix=f"following-{axis.name}"))
-        made = Following(index, port, axis.adaptation, folder, worker, recorder, diagnosis)
-        port.following = made
-        following.append(made)
-        stack.callback(made.close)
-    return following
-
-
-async def _apply(following: Sequence[Following]) -> None:
-    """Applies adapted models to the control process."""
-    while True:
-        for each in following:
-            await each.apply()
-        await asyncio.sleep(FOLLOW_S)
+        port.following = Following(port, axis.adaptation, folder, worker, diagnosis)
+        bridge.core.add_sink(port.following)
+        stack.callback(port.following.close)
 
 
 def listeners(machine: Machine, descriptors: Sequence[int], page_token: str | None = None) -> list[Listener]:
@@ -171,9 +151,9 @@ async def _last_words(bridge: ServiceBridge, memory: Memory) -> None:
     """Keeps serving while the axes are brought to rest, so that clients see the stop and it is recorded."""
     end_s = asyncio.get_running_loop().time() + LAST_WORDS_S
     status = memory.status
-    while bridge.core.observer.alive and status[Cell.LOOP_PID] and asyncio.get_running_loop().time() < end_s:
+    while bridge.core.alive and status[Cell.LOOP_PID] and asyncio.get_running_loop().time() < end_s:
         await asyncio.sleep(0.05)
-    bridge.core.observer.poll()
+    bridge.core.poll()
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ import errno
 import shutil
 import struct
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from support.raised import without_load_encoder
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.client.messages import RecorderState
 from hdbridge.daemon.gateway.objects import rest_deg
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import Cell, CommandKind
@@ -203,8 +201,8 @@ async def test_a_lost_sync_is_the_cause_even_if_the_set_points_end_before_it_is_
 
 
 async def test_a_fault_of_the_gateway_is_reported_once_with_its_cause_and_recorded(bench):
-    kept: list[str] = []
-    bench.bridge.recorder = SimpleNamespace(mark=kept.append, state=lambda: RecorderState(on=False))
+    kept: list[tuple[str, str]] = []
+    bench.bridge.core.log.record = lambda kind, text: kept.append((kind, text))
     await bench.enable()
     await swing(bench)
     await bench.wait(0.6)
@@ -215,7 +213,8 @@ async def test_a_fault_of_the_gateway_is_reported_once_with_its_cause_and_record
     status[Cell.LOOP_PID] = pid
     await bench.wait(0.2)
     notes = [each.text for each in bench.bridge.events().events if each.kind == "note"]
-    assert notes[1:] == kept == ["gateway fault 6010h: the control process is dead, hung or late"]
+    assert notes[1:] == [fault := "gateway fault 6010h: the control process is dead, hung or late"]
+    assert kept == [("MARK", f"axis1: {fault}")]
 
 
 async def test_a_client_takes_the_axis_by_force_and_returns_it(bench):

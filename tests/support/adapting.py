@@ -16,7 +16,7 @@ from hdbridge.axis.effects import Moment, Motion, Start
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scatter, quantisation_floor_arcsec
 from hdbridge.control.bench import Bench
-from hdbridge.daemon.following.adaptation import Adaptation, Entry, Learned, Proposal
+from hdbridge.daemon.following.adaptation import Adaptation, Entry, Learned
 from hdbridge.daemon.following.follower import Follower
 from hdbridge.daemon.following.health import EncoderFault, EncoderStatus
 from hdbridge.daemon.following.measuring import DriftModel
@@ -157,7 +157,6 @@ class WorkingAxis:
         assert self.follower.adaptation is not None
         self.adaptation = self.follower.adaptation
         self.time_s = 0.0
-        self.proposals: list[Proposal] = []
         self.used: list[tuple[float, np.ndarray]] = []
         self.path = [0.0]
 
@@ -176,10 +175,8 @@ class WorkingAxis:
     def takes(self, times: np.ndarray, samples: np.ndarray, fault: str = "") -> None:
         status = EncoderStatus(EncoderFault.NOISY, fault) if fault else EncoderStatus()
         for part in np.array_split(np.arange(len(times)), max(len(times) // 50, 1)):
-            proposal = self.follower.advance(packed(times[part], samples[part]), status).proposal
+            self.follower.advance(packed(times[part], samples[part]), status)
             self.used.append((float(times[part][-1]), used_arcsec(self.adaptation)))
-            if proposal is not None:
-                self.proposals.append(proposal)
         self.time_s = float(times[-1]) + PERIOD_S
 
 
@@ -299,17 +296,17 @@ class Work:
             self._loads_deg.append(self._machine.true_load_deg)
             return False
 
-        self._bench = Bench(self._drive, model, interrupted=look)
+        self._model, self._bench = model, Bench(self._drive, model, interrupted=look)
         self._sampler.use(model)
 
     def _adapt(self, samples: SampleArray) -> None:
         for part in np.array_split(samples, max(len(samples) // 125, 1)):  # half a second
-            proposal = self.follower.take(part).proposal
+            self.follower.take(part)
             reason = self.follower.health.status.reason
             if reason and reason not in self.encoder_faults:
                 self.encoder_faults.append(reason)
-            if proposal is not None and proposal.apply:
-                self._use(proposal.model)
+            if self.adaptation is not None and self.adaptation.model is not self._model:
+                self._use(self.adaptation.model)
                 self.follower.health.restart()
 
 

@@ -81,8 +81,8 @@ def running(server: ApiServer) -> Iterator[None]:
 @asynccontextmanager
 async def served_in_loop(bridge: ServiceBridge, path: Path) -> AsyncIterator[None]:
     """Serves a real service at a Unix socket, in its own event loop, until the end of the block."""
-    metrics = Metrics()
-    bridge.core.observer.add(metrics)
+    metrics = Metrics(bridge)
+    bridge.core.add_sink(metrics)
     server = ApiServer(bridge, [Listener(unix_socket(path), Policy())], metrics)
     serving = asyncio.ensure_future(server.run())
     try:

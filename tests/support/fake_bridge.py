@@ -215,7 +215,7 @@ class FakeBridge:
         self.stopped: list[tuple[str, str]] = []
         self.streams: list[FakeStream] = []
         self.logged: list[messages.Event] = []
-        self.core = SimpleNamespace(observer=SimpleNamespace(lost=0))
+        self.core = SimpleNamespace(lost=0)
         self.alive = True
         self.batch_s = 0.005
         self.rows = 5

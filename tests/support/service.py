@@ -90,8 +90,8 @@ class Service:
     def follow(self, bridge: ServiceBridge, settings: AdaptationSettings) -> Following:
         """Adds watch and adaptation of the first axis, as in the service process, but in the same thread."""
         axis = bridge.axes["axis1"]
-        axis.following = Following(0, axis, settings, self.folder / "adaptation", AtOnce())
-        bridge.core.observer.add(axis.following)
+        axis.following = Following(axis, settings, self.folder / "adaptation", AtOnce())
+        bridge.core.add_sink(axis.following)
         return axis.following
 
 
@@ -100,7 +100,7 @@ async def until(bridge: ServiceBridge, done: Callable[[], bool], timeout_s: floa
     timing = bridge.core.timing
     end_s = timing.clock.now() + timeout_s
     while not done():
-        bridge.core.observer.poll()
+        bridge.core.poll()
         states = {name: each.state().state for name, each in bridge.axes.items()}
         texts = [each.text for each in bridge.events().events[-5:]]
         assert timing.clock.now() < end_s, f"not within {timeout_s} s: {states}, {texts}"

@@ -10,8 +10,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from hdbridge import __version__
 from hdbridge.client.messages import CONTENT_TYPE
 from hdbridge.daemon.api import problems
-from hdbridge.daemon.api.guard import Traffic
-from hdbridge.daemon.api.metrics import Metrics, exposition
+from hdbridge.daemon.api.metrics import Metrics
 from hdbridge.daemon.api.routes import axis, machine, sockets
 from hdbridge.daemon.page import PAGE, PageFiles
 from hdbridge.daemon.service.bridge import ServiceBridge
@@ -36,7 +35,7 @@ _ABOUT: Final = (
 )
 
 
-def create_app(bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> FastAPI:
+def create_app(bridge: ServiceBridge, metrics: Metrics) -> FastAPI:
     """Returns the ASGI application. The guard of each listener controls the access to it."""
     app = FastAPI(
         title="hdbridge",
@@ -54,12 +53,12 @@ def create_app(bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> Fas
     app.state.bridge = bridge
     for each in (machine, axis, sockets):
         app.include_router(each.routes, prefix=PREFIX)
-    _add_pages(app, bridge, metrics, traffic)
+    _add_pages(app, bridge, metrics)
     app.openapi = lambda: _schema(app)  # type: ignore[method-assign]
     return app
 
 
-def _add_pages(app: FastAPI, bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> None:
+def _add_pages(app: FastAPI, bridge: ServiceBridge, metrics: Metrics) -> None:
     page = PageFiles()
     app.mount("/page", page)
 
@@ -76,7 +75,7 @@ def _add_pages(app: FastAPI, bridge: ServiceBridge, metrics: Metrics, traffic: T
     @app.get("/metrics", include_in_schema=False)
     async def get_metrics() -> Response:
         """Returns metrics for Prometheus."""
-        return Response(exposition(bridge, metrics, traffic), media_type=CONTENT_TYPE_LATEST)
+        return Response(metrics.exposition(), media_type=CONTENT_TYPE_LATEST)
 
     @app.get("/healthz", include_in_schema=False)
     async def get_health() -> Response:

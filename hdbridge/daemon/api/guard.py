@@ -14,10 +14,8 @@ import ipaddress
 import logging
 import re
 import time
-from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass
 from hmac import compare_digest
 from typing import Any, Final
 
@@ -26,6 +24,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
 from hdbridge.client.messages import Problem
+from hdbridge.daemon.api.metrics import Metrics
 from hdbridge.daemon.api.problems import answer, refusal
 
 BODY_MAXIMUM: Final = 256 << 10
@@ -101,37 +100,13 @@ class Policy:
         return any(compare_digest(each.encode("utf-8", "replace"), expected) for each in candidates)
 
 
-@dataclass(slots=True)
-class Traffic:
-    """Answered requests and open connections."""
-
-    answered: Counter[tuple[str, int]] = field(default_factory=Counter)
-    """Number of answers by method and status."""
-    open: Counter[str] = field(default_factory=Counter)
-    """Number of requests in progress (``http``) and of WebSockets (``websocket``)."""
-
-    @contextmanager
-    def in_progress(self, kind: str) -> Iterator[None]:
-        """Counts a request or WebSocket as open within the block."""
-        self.open[kind] += 1
-        try:
-            yield
-        finally:
-            self.open[kind] -= 1
-
-    def count(self, method: str, status: int) -> None:
-        """Counts an answer. Unknown methods count as OTHER, which bounds the number of counters."""
-        known = method in {"GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH"}
-        self.answered[method if known else "OTHER", status] += 1
-
-
 class Guard:
     """ASGI middleware that applies a policy."""
 
-    def __init__(self, app: ASGIApp, policy: Policy, traffic: Traffic) -> None:
+    def __init__(self, app: ASGIApp, policy: Policy, metrics: Metrics) -> None:
         self._app = app
         self._policy = policy
-        self._traffic = traffic
+        self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles a request, a WebSocket, or the application's start and end."""
@@ -166,10 +141,10 @@ class Guard:
             if problem is not None:
                 await _answer(problem, scope, receive, sending)
             else:
-                with self._traffic.in_progress("http"):
+                with self._metrics.in_progress("http"):
                     await self._app(scope, receive if stops else _replayed(body, receive), sending)
         finally:
-            self._traffic.count(scope["method"], status)
+            self._metrics.count(scope["method"], status)
             is_read = scope["method"] in {"GET", "HEAD"} and status < 400
             about = {**_about(scope), "status": status, "ms": round(1e3 * (time.monotonic() - began), 1)}
             _log.log(logging.DEBUG if is_read else logging.INFO, "request", about)
@@ -179,12 +154,12 @@ class Guard:
         if problem is None:
             _log.info("websocket", _about(scope))
             # A client may disconnect at any moment, even while it receives the reason for a close.
-            with self._traffic.in_progress("websocket"), suppress(WebSocketDisconnect):
+            with self._metrics.in_progress("websocket"), suppress(WebSocketDisconnect):
                 await self._app(scope, receive, send)
             _log.info("websocket ended", _about(scope))
             return
         _log.info("websocket", {**_about(scope), "status": problem.status})
-        self._traffic.count("GET", problem.status)
+        self._metrics.count("GET", problem.status)
         await receive()  # websocket.connect
         await _answer(problem, scope, receive, send)
 
@@ -210,7 +185,7 @@ class Guard:
         kind, most = ("http", REQUESTS_MAXIMUM) if scope["type"] == "http" else (
             "websocket", WEBSOCKETS_MAXIMUM
         )  # fmt: skip
-        if self._traffic.open[kind] >= most:
+        if self._metrics.open[kind] >= most:
             return refusal(503, f"too many requests ({most}) in progress; close some, or try again later")
         return None
 

@@ -1,21 +1,20 @@
 """`/metrics` for Prometheus: loop timing, faults, axes and API requests.
 
-`Metrics` is a sink of the observer. Everything else is read on each scrape.
+`Metrics` is a sink of `Core`, and counts the requests. Everything else is read on each scrape.
 """
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from prometheus_client import CollectorRegistry, Histogram, disable_created_metrics, generate_latest
+from prometheus_client import CollectorRegistry, Counter, Histogram, disable_created_metrics, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from hdbridge.client.messages import ControlState
-from hdbridge.daemon.api.guard import Traffic
 from hdbridge.daemon.loop.faultlog import fault_of
 from hdbridge.daemon.memory import EventKind
 from hdbridge.daemon.service.bridge import ServiceBridge
@@ -23,38 +22,7 @@ from hdbridge.daemon.service.bridge import ServiceBridge
 BOUNDS_S: Final = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2, 5e-2, 1e-1)
 """Upper bounds of the histogram buckets; the last bucket is unbounded."""
 _PREFIX: Final = "hdbridge_"
-disable_created_metrics()  # type: ignore[no-untyped-call]  # omits the start time of each histogram
-
-
-class Metrics:
-    """Counts accumulated for the scrapes."""
-
-    def __init__(self) -> None:
-        self.late = _histogram("cycle_late_seconds", "Delay of the start of cycles.")
-        self.busy = _histogram("cycle_busy_seconds", "Duration of cycles.")
-        self.faults: Counter[tuple[int, str]] = Counter()
-        """Number of events by axis index and name of the fault."""
-
-    def take(self, samples: NDArray[np.void], events: Iterable[Any], lost: int) -> None:
-        """Takes samples and events of the loop from the observer; ignores times that are not finite."""
-        for histogram, field in ((self.late, "late_us"), (self.busy, "busy_us")):
-            for value_us in samples[field].tolist():
-                if math.isfinite(value_us):
-                    histogram.observe(value_us / 1e6)
-        for each in events:
-            if each.kind == EventKind.FAULT and (fault := fault_of(each.code)) is not None:
-                self.faults[each.axis, fault.name] += 1
-
-
-def _histogram(name: str, about: str) -> Histogram:
-    return Histogram(_PREFIX + name, about, registry=None, buckets=BOUNDS_S)
-
-
-def exposition(bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> bytes:
-    """Returns all metrics in Prometheus' text format, from a separate registry."""
-    registry = CollectorRegistry()
-    registry.register(_Scrape(bridge, metrics, traffic))
-    return generate_latest(registry)
+disable_created_metrics()  # type: ignore[no-untyped-call]  # omits the start time of each metric
 
 
 _AXIS: Final = (
@@ -85,18 +53,66 @@ _AXIS: Final = (
 """Name, description and field of each axis metric."""
 
 
-class _Scrape(Collector):
-    """Collector of one scrape."""
+class Metrics(Collector):
+    """Metrics of one machine: counts accumulated for the scrapes, and its state at each scrape."""
 
-    def __init__(self, bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> None:
-        self._state, self._lost = bridge.state(), bridge.core.observer.lost
-        self._metrics, self._traffic = metrics, traffic
+    def __init__(self, bridge: ServiceBridge) -> None:
+        self._bridge, self._names = bridge, [*bridge.axes]
+        self._registry = registry = CollectorRegistry()
+        self._late = Histogram(
+            f"{_PREFIX}cycle_late_seconds",
+            "Delay of the start of cycles.",
+            registry=registry,
+            buckets=BOUNDS_S,
+        )
+        self._busy = Histogram(
+            f"{_PREFIX}cycle_busy_seconds", "Duration of cycles.", registry=registry, buckets=BOUNDS_S
+        )
+        self._faults = Counter(
+            f"{_PREFIX}faults",
+            "Faults by axis; without an axis those of the machine.",
+            ("axis", "fault"),
+            registry=registry,
+        )
+        self._answered = Counter(
+            f"{_PREFIX}api_requests", "Requests answered.", ("method", "status"), registry=registry
+        )
+        self.open = {"http": 0, "websocket": 0}
+        """Number of requests in progress and of WebSockets."""
+        registry.register(self)
+
+    def take(self, samples: NDArray[np.void], events: Iterable[Any], lost: int) -> None:
+        """Takes samples and events of the loop from the service's core; ignores times that are not finite."""
+        for histogram, field in ((self._late, "late_us"), (self._busy, "busy_us")):
+            for value_us in samples[field].tolist():
+                if math.isfinite(value_us):
+                    histogram.observe(value_us / 1e6)
+        for each in events:
+            if each.kind == EventKind.FAULT and (fault := fault_of(each.code)) is not None:
+                axis = self._names[each.axis] if 0 <= each.axis < len(self._names) else ""
+                self._faults.labels(axis, fault.name).inc()
+
+    @contextmanager
+    def in_progress(self, kind: str) -> Iterator[None]:
+        """Counts a request or WebSocket as open within the block."""
+        self.open[kind] += 1
+        try:
+            yield
+        finally:
+            self.open[kind] -= 1
+
+    def count(self, method: str, status: int) -> None:
+        """Counts an answer. Unknown methods count as OTHER, which bounds the number of counters."""
+        known = method in {"GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH"}
+        self._answered.labels(method if known else "OTHER", str(status)).inc()
+
+    def exposition(self) -> bytes:
+        """Returns all metrics in Prometheus' text format."""
+        return generate_latest(self._registry)
 
     def collect(self) -> Iterator[Metric]:
-        """Yields the metrics of loop, faults, axes and API."""
-        state, metrics, traffic = self._state, self._metrics, self._traffic
-        yield from metrics.late.collect()
-        yield from metrics.busy.collect()
+        """Yields the metrics of the machine's present state."""
+        state = self._bridge.state()
         yield _gauge("info", "1.", [((state.name, state.version), 1)], ("machine", "version"))
         yield _gauge("loop_alive", "1 if the control loop is running.", [((), state.cycle.alive)])
         yield _gauge("cycle_period_seconds", "Period of the cycle.", [((), state.cycle.period_s)])
@@ -108,14 +124,8 @@ class _Scrape(Collector):
         dropped = [((), state.recorder.dropped)]
         yield _counter("recorder_dropped", "Samples that the recorder dropped.", dropped)
         yield _gauge("lease_held", "1 if a client holds the lease.", [((), state.lease.held)])
-        yield _counter("samples_lost", "Cycles lost because the service was too slow.", [((), self._lost)])
-        names = [each.name for each in state.axes]
-        faults = [
-            ((names[axis] if 0 <= axis < len(names) else "", fault), count)
-            for (axis, fault), count in sorted(metrics.faults.items())
-        ]
-        about = "Faults by axis; without an axis those of the machine."
-        yield _counter("faults", about, faults, ("axis", "fault"))
+        lost = [((), self._bridge.core.lost)]
+        yield _counter("samples_lost", "Cycles lost because the service was too slow.", lost)
         for name, about, field in _AXIS:
             values = [((each.name,), _field(each, field)) for each in state.axes]
             yield _gauge(name, about, [row for row in values if row[1] is not None], ("axis",))
@@ -123,9 +133,7 @@ class _Scrape(Collector):
         yield _gauge("axis_state", "1 for the present state of an axis.", states, ("axis", "state"))
         latched = [((each.name,), each.fault is not None) for each in state.axes]
         yield _gauge("axis_fault_latched", "1 if a stop is latched.", latched, ("axis",))
-        answered = [((method, str(status)), n) for (method, status), n in sorted(traffic.answered.items())]
-        yield _counter("api_requests", "Requests answered.", answered, ("method", "status"))
-        open_now = [((kind,), traffic.open[kind]) for kind in ("http", "websocket")]
+        open_now = [((kind,), number) for kind, number in self.open.items()]
         yield _gauge("api_clients", "Requests and WebSockets in progress.", open_now, ("kind",))
 
 

@@ -20,7 +20,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from hdbridge.daemon.api.app import create_app
-from hdbridge.daemon.api.guard import BODY_MAXIMUM, Guard, Policy, Traffic
+from hdbridge.daemon.api.guard import BODY_MAXIMUM, Guard, Policy
 from hdbridge.daemon.api.metrics import Metrics
 from hdbridge.daemon.api.sockets import BACKLOG, peer_of
 from hdbridge.daemon.service.bridge import ServiceBridge
@@ -55,8 +55,8 @@ class ApiServer:
     def __init__(
         self, bridge: ServiceBridge, listeners: Sequence[Listener], metrics: Metrics | None = None
     ) -> None:
-        self.traffic = Traffic()
-        self._app = create_app(bridge, metrics or Metrics(), self.traffic)
+        self.metrics = metrics or Metrics(bridge)
+        self._app = create_app(bridge, self.metrics)
         self._servers = [(self._server(each), each) for each in listeners]
         self._group = asyncio.TaskGroup()
 
@@ -82,7 +82,7 @@ class ApiServer:
         self._group.create_task(server.serve(sockets=[listener.socket]))
 
     def _server(self, listener: Listener) -> _Server:
-        return _Server(_config(self._app, listener, self.traffic))
+        return _Server(_config(self._app, listener, self.metrics))
 
     def stop(self) -> None:
         """Ends the server soon. May be called from a signal handler or another thread."""
@@ -197,9 +197,9 @@ def _client(transport: asyncio.BaseTransport) -> tuple[str, int] | None:
     return (f"uid={peer.uid}", peer.pid) if peer is not None else None
 
 
-def _config(app: Any, listener: Listener, traffic: Traffic) -> uvicorn.Config:
+def _config(app: Any, listener: Listener, metrics: Metrics) -> uvicorn.Config:
     return uvicorn.Config(
-        Guard(app, listener.policy, traffic),
+        Guard(app, listener.policy, metrics),
         http=_Connection,
         ws=cast(Any, _WebSocket),
         loop="asyncio",

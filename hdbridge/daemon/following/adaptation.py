@@ -65,18 +65,6 @@ class Freeze:
     """True if the freeze does not end automatically, but only with a new zero or by command."""
 
 
-@dataclass(frozen=True, slots=True)
-class Proposal:
-    """Proposed model for the compensation."""
-
-    model: TransmissionModel
-    changes: tuple[Change, ...]
-    apply: bool
-    """False if the model is only reported (``observe``)."""
-    time_s: float
-    """Time of the proposal on the clock of the axis's samples, s."""
-
-
 class Learned(Strict):
     """State that survives a restart of the service."""
 
@@ -106,7 +94,7 @@ class Adaptation:
         self.settings = settings
         self.mode: AdaptationMode = settings.mode
         self.committed = self.model = whole.model
-        """Committed model, and the model that should be in use: the last one proposed for application."""
+        """Committed model, and the model that should be in use."""
         self.freeze_reason: Freeze | None = None
         self.windows = 0
         """Number of learned windows."""
@@ -139,14 +127,14 @@ class Adaptation:
 
     def take(
         self, observations: Sequence[Observation], now_s: float, fault: str, rates: Sequence[Rate]
-    ) -> Proposal | None:
-        """Takes observations in order; returns a proposal when due.
+    ) -> None:
+        """Takes observations in order; changes the model, or reports the change, when due.
 
         ``fault`` is a reason for not learning now, such as a fault of the load encoder, or empty. ``rates``
         are those of the zero.
         """
         if self.mode == "off":
-            return None
+            return
         self._now_s = now_s
         if fault:
             self.freeze(Freeze(fault))
@@ -155,7 +143,7 @@ class Adaptation:
             if self._complete():
                 window, self._window = self._window, []
                 self._close(window, rates)
-        return self._proposal()
+        self._propose()
 
     def set_mode(self, mode: AdaptationMode) -> None:
         """Changes the mode. ``on`` ends a freeze, whatever the load encoder reads."""
@@ -174,7 +162,7 @@ class Adaptation:
             self._log_event("mode", mode=mode)
             self.mode = mode
 
-    def revert(self) -> Proposal:
+    def revert(self) -> None:
         """Restores the committed model and only observes from now on, until `set_mode`."""
         changes = changes_between(self.committed, self.model, self.committed)
         self._estimator = calibrated_estimator(self._drift, self.settings)
@@ -184,7 +172,6 @@ class Adaptation:
         self.model = self.committed
         self.mode = AdaptationMode.OBSERVE
         self._log_event("back", changes=_changes_json(changes))
-        return Proposal(self.committed, changes, True, self._now_s)
 
     @property
     def may_refine(self) -> bool:
@@ -192,22 +179,20 @@ class Adaptation:
         recent = self._now_s - self._refined_s < self.settings.interval_s
         return not (self.mode == "off" or self.freeze_reason is not None or recent)
 
-    def refine(self, response: Response) -> Proposal:
+    def refine(self, response: Response) -> None:
         """Takes a refined response in motion, without a rate limit, because retuning a servo is sudden."""
-        model, apply = replace(self.model, response=response), self.mode == "on"
+        apply = self.mode == "on"
         self._refined_s = self._now_s if apply else math.inf  # only observed: reported once
         if apply:
-            self.model = model
+            self.model = replace(self.model, response=response)
         self._log_event("refined" if apply else "would refine", following_lag_ms=response.following_lag_ms)
-        return Proposal(model, (), apply, self._now_s)
 
-    def withdraw(self) -> Proposal:
+    def withdraw(self) -> None:
         """Restores the committed response after a refinement that increased the ripple, and freezes."""
         self.model = replace(self.model, response=self.committed.response)
         self.freeze(
             Freeze("the refined response in motion increased the ripple and was withdrawn", lasting=True)
         )
-        return Proposal(self.model, (), True, self._now_s)
 
     def forget_window(self) -> None:
         """Discards the incomplete window, for example after lost samples."""
@@ -408,34 +393,34 @@ class Adaptation:
 
     # ------------------------------------------------------------------ proposals
 
-    def _proposal(self) -> Proposal | None:
+    def _propose(self) -> None:
+        """Changes the model in use towards the estimate, or reports that it would change."""
         settings = self.settings
         if self._learning_since_s is None or self._window_s is None:
-            return None
+            return
         since_s = max(self._learning_since_s, self._changed_s)
         passed_s = min(self._window_s - since_s, RATE_INTERVALS * settings.interval_s)
         if passed_s < settings.interval_s:
-            return None
+            return
         self._changed_s = self._window_s
         most = settings.rate_arcsec_per_hour * passed_s / 3600.0
         step = np.clip(self.estimate_arcsec - self._proposed, -most, most)
         threshold = min(settings.smallest_arcsec, MIN_RATE_LIMITED_SHARE * most)
         if not len(step) or float(np.max(np.abs(step))) < threshold:
-            return None
+            return
         change = self._proposed + step
         model = self._changed(change)
         try:
             Inverse(model)
         except InputError as error:
             self._log_event("refused", reason=str(error))
-            return None
+            return
         changes = changes_between(self.committed, self._changed(self._proposed), model)
         self._proposed = change
         apply = self.mode == "on"
         if apply:
             self._used, self.model = change, model
         self._log_event("changed" if apply else "would change", changes=_changes_json(changes))
-        return Proposal(model, changes, apply, self._now_s)
 
     def _changed(self, change: FloatArray) -> TransmissionModel:
         """Returns the committed model with changed coefficients and their current intervals."""

@@ -8,7 +8,7 @@ Uses no thread and no clock: samples contain the time. Only the adaptation's fil
 
 import math
 from datetime import datetime
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from hdbridge.axis.channels import BY_KEY
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import Response
 from hdbridge.client import messages
-from hdbridge.daemon.following.adaptation import Adaptation, Proposal
+from hdbridge.daemon.following.adaptation import Adaptation
 from hdbridge.daemon.following.health import (
     DRIVEN,
     UNTESTED_ARCSEC,
@@ -49,18 +49,9 @@ UNIFORM: Final = 12.0**0.5
 """Range of a uniform distribution, relative to its standard deviation."""
 
 
-class Outcome(NamedTuple):
-    """Result of the samples taken: new verdicts, and a proposal if due."""
-
-    raised: list[RaisedVerdict]
-    proposal: Proposal | None = None
-
-
 NO_LOAD_ENCODER: Final = (
     "the axis has no encoder at its load: neither gear nor encoder are watched, and the model is not adapted"
 )
-NO_OUTCOME: Final = Outcome([])
-"""Outcome of samples that are not evaluated yet."""
 
 
 class Follower:
@@ -119,26 +110,28 @@ class Follower:
             self.adaptation.set_mode(mode)
             self.save()
 
-    def revert(self) -> Proposal | None:
-        """Restores the committed model and only observes; None without an adaptation."""
-        if self.adaptation is None:
-            return None
-        self._zero.forget()
-        proposal = self.adaptation.revert()
-        self._applied(proposal)
-        return proposal
+    def revert(self) -> None:
+        """Restores the committed model and only observes; does nothing without an adaptation."""
+        if (adaptation := self.adaptation) is not None:
+            self._zero.forget()
+            used = adaptation.model
+            adaptation.revert()
+            self._changed(adaptation, used)
 
-    def take(self, samples: SampleArray) -> Outcome:
-        """Takes the next samples of the loop, oldest first; evaluates several batches together."""
+    def take(self, samples: SampleArray) -> list[RaisedVerdict] | None:
+        """Takes the next samples of the loop, oldest first; evaluates several batches together.
+
+        Returns the new verdicts; None if the samples are not evaluated yet.
+        """
         if len(samples):
             self._waiting.append(samples)
         if sum(map(len, self._waiting)) < MIN_BATCH_SAMPLES:
-            return NO_OUTCOME
+            return None
         together, self._waiting = joined_samples(self._waiting), []
         status = EncoderStatus() if self.unwatched else self.health.take(together)
         return self.advance(together, status)
 
-    def advance(self, samples: SampleArray, status: EncoderStatus) -> Outcome:
+    def advance(self, samples: SampleArray, status: EncoderStatus) -> list[RaisedVerdict]:
         """Measures, judges and adapts with these samples; ``status`` is that of the load encoder."""
         axis: Any = samples["axes"][:, self._index]
         cycle, times_s = samples["cycle"], 1e-9 * samples["time_ns"].astype(np.float64)
@@ -151,7 +144,7 @@ class Follower:
             verdict = Verdict.RETUNED if self._servo.retuned else self.watch.verdict
             raised.append(RaisedVerdict(verdict, servo))
         if self.unwatched:
-            return Outcome(raised)
+            return raised
         axis, times_s = axis[first:], times_s[first:]
         stopped = axis["fault"] != NO_FAULT
         usable = ((axis["flags"] & NEEDED) == NEEDED) & (axis["state"] == AxisState.ENABLED) & ~stopped
@@ -163,33 +156,35 @@ class Follower:
             status = self.health.set_fault(*zero_fault)
         settled = [each for each in observations if each.settled]
         raised = [*self.watch.take(settled, status, self._zero.displacement, self._now_s), *raised]
-        proposal = None
         if self.adaptation is not None:
             fault = "the supervision has stopped the axis" if np.any(stopped) else status.reason
-            proposal = self.adaptation.take(settled, self._now_s, fault, self._zero.rates)
-            proposal = proposal or self._refinement(self.adaptation)
-            if proposal is not None and proposal.apply:
-                self._applied(proposal)
-            elif self.adaptation.entries or self._now_s - self._saved_s >= SAVE_S:
+            adaptation, used = self.adaptation, self.adaptation.model
+            adaptation.take(settled, self._now_s, fault, self._zero.rates)
+            if adaptation.model is used:
+                self._refine(adaptation)
+            if adaptation.model is not used:
+                self._changed(adaptation, used)
+            elif adaptation.entries or self._now_s - self._saved_s >= SAVE_S:
                 self.save()
-        return Outcome(raised, proposal)
+        return raised
 
     def use_model(self, model: TransmissionModel) -> None:
         """Switches to another model, which the control process uses from now on."""
         self.health.restart()
         self._servo.use(model.response)
 
-    def _refinement(self, adaptation: Adaptation) -> Proposal | None:
-        """Returns the proposal of a refined response if due."""
+    def _refine(self, adaptation: Adaptation) -> None:
+        """Refines the response if due, or withdraws a refinement."""
         if adaptation.freeze_reason is not None:
             self._servo.forget_load()
         if not adaptation.may_refine:
-            return None
+            return
         refined = self._servo.refined(self._settings.bound_share)
         # The first refinement assumes the load of the calibration; the second knows the effect of the first.
         if self._servo.worse and (refined is None or self._servo.refinements > 1):
-            return adaptation.withdraw()
-        return None if refined is None else adaptation.refine(refined)
+            adaptation.withdraw()
+        elif refined is not None:
+            adaptation.refine(refined)
 
     def state(self) -> messages.AdaptationState:
         """Returns the state of the adaptation, which has begun, for clients."""
@@ -247,8 +242,9 @@ class Follower:
         last = int(interrupted[-1])
         return last if driven[last] else last + 1
 
-    def _applied(self, proposal: Proposal) -> None:
+    def _changed(self, adaptation: Adaptation, before: TransmissionModel) -> None:
+        """Notes the time at which the model in use replaced ``before``."""
         self.updated = self._files.now() if self._files is not None else None
-        if not proposal.changes:
+        if adaptation.model.response is not before.response:
             self._refined_at = self.updated
         self.save()

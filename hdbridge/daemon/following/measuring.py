@@ -28,8 +28,6 @@ from hdbridge.axis.effects import (
     IntArray,
     Moment,
     Motion,
-    Start,
-    Tracker,
     readings,
     refreshed,
 )
@@ -43,8 +41,6 @@ from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 LOAD_ORDERS = (1, 2)
 """Orders per turn of the load: eccentricity and ovality of the encoder's disc."""
-SAME_ARCSEC = 1e-6
-"""Maximum difference of two trackers, started in opposite directions, at which the state counts as known."""
 SETTLE_S = 0.05
 """Settling time of the load after a fast move, and after a reversal in a slow move."""
 SHORTEST_S = 0.04
@@ -116,27 +112,33 @@ class DriftColumns:
         self._drift = drift
         followed = {each.number for each in drift.terms}
         self._fixed = [
-            _Tracked(each) for number, each in enumerate(drift.model.effects) if number not in followed
+            each.tracker() for number, each in enumerate(drift.model.effects) if number not in followed
         ]
         self._units = {
-            at: _Tracked(_unit(each.effect, number))
+            at: _unit(each.effect, number).tracker()
             for each in drift.terms
             if each.memory
             for number, at in enumerate(range(each.columns.start, each.columns.stop))
         }
+        trackers = (*self._fixed, *self._units.values())
+        self._memory_deg = max((each.memory_deg for each in trackers), default=0.0)
+        self.known = not self._memory_deg
+        """True if the trackers no longer depend on the state before the start."""
+        self._last_deg = self._turn_deg = math.nan
+        """Last angle, and angle of the last reversal."""
+        self.state: tuple[float, ...] = ()
+        """Path-dependent values: the sum of the fixed effects, and the columns with memory."""
 
     def advance(self, motor_deg: float, moment: Moment) -> None:
         """Advances all trackers to this commanded angle."""
-        for each in (*self._fixed, *self._units.values()):
-            each.advance(motor_deg, moment)
-
-    def known(self) -> bool:
-        """Returns True if the trackers no longer depend on the state before the start."""
-        return all(each.known for each in (*self._fixed, *self._units.values()))
-
-    def state(self) -> tuple[float, ...]:
-        """Returns the path-dependent values: the sum of the fixed effects, and the columns with memory."""
-        return (sum(each.value for each in self._fixed), *(each.value for each in self._units.values()))
+        fixed = sum(each.advance(motor_deg, moment) for each in self._fixed)
+        self.state = (fixed, *(each.advance(motor_deg, moment) for each in self._units.values()))
+        if self.known:
+            return
+        last_deg, self._last_deg = self._last_deg, motor_deg
+        if not (motor_deg - last_deg) * (last_deg - self._turn_deg) >= 0.0:
+            self._turn_deg = motor_deg if math.isnan(last_deg) else last_deg
+        self.known = abs(motor_deg - self._turn_deg) >= self._memory_deg
 
     def rows(self, motor_deg: FloatArray, states: FloatArray) -> FloatArray:
         """Returns all columns at motor angles (n,) with `state` values (n, s); shape (n, count)."""
@@ -151,24 +153,6 @@ class DriftColumns:
         load = np.deg2rad(motor_deg / drift.model.ratio)
         rows[:, drift.zero + 1 :] = cosines_and_sines(load, LOAD_ORDERS)
         return rows
-
-
-class _Tracked:
-    """Tracker of an effect, and a second one started in the opposite direction until both agree."""
-
-    def __init__(self, effect: Effect) -> None:
-        self._tracker = effect.tracker(Start.FORWARD)
-        memoryless = isinstance(self._tracker, Memoryless)
-        self._other: Tracker | None = None if memoryless else effect.tracker(Start.BACKWARD)
-        self.known = memoryless
-        self.value = 0.0
-
-    def advance(self, motor_deg: float, moment: Moment) -> None:
-        self.value = self._tracker.advance(motor_deg, moment)
-        if self._other is not None:
-            other = self._other.advance(motor_deg, moment)
-            if abs(other - self.value) <= SAME_ARCSEC:
-                self.known, self._other = True, None
 
 
 def _terms(model: TransmissionModel, parameters: Sequence[str] | None) -> tuple[Term, ...]:
@@ -262,7 +246,7 @@ class Measuring:
     @property
     def known(self) -> bool:
         """True if the hysteresis state no longer depends on the unknown past."""
-        return self._columns.known()
+        return self._columns.known
 
     def take(self, times_s: FloatArray, axis: NDArray[Any], usable: BoolArray) -> list[Observation]:
         """Takes samples of `AXIS_SAMPLE`, shape (n,); returns the observations that they complete.
@@ -291,10 +275,10 @@ class Measuring:
                 self._collected.clear()
                 self._steady_since_s = time_s
                 continue
-            if time_s - self._steady_since_s < SETTLE_S or not columns.known():
+            if time_s - self._steady_since_s < SETTLE_S or not columns.known:
                 continue
             error = (load_deg - position_deg / self._ratio) * ARCSEC_PER_DEG
-            self._collected.append(_Reading(time_s, position_deg, speed_deg_s, error, columns.state()))
+            self._collected.append(_Reading(time_s, position_deg, speed_deg_s, error, columns.state))
             if time_s - self._collected[0].time_s >= self._longest_s:
                 found.append(self._observation())
         return found

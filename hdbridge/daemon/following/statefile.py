@@ -77,9 +77,11 @@ class AdaptationFiles:
         return file
 
     def write(self, entries: Sequence[Entry], learned: Learned) -> None:
-        """Appends lines to the history and stores the state; an error is logged once."""
+        """Logs lines and appends them to the history, and stores the state; an error is logged once."""
         try:
             for entry in entries:
+                facts = {name: value for name, value in entry.items() if name != "event"}
+                _log.info(f"adaptation: {entry['event']}", {"axis": self._axis, **facts})
                 self._append(entry)
             file = _State(schema=SCHEMA, model=self._fingerprint, saved=self.now(), **dict(learned))
             write_atomically(self._state, file.model_dump_json(by_alias=True))

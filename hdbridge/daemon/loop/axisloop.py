@@ -86,7 +86,6 @@ class AxisLoop:
         """Ids of the pending commands of `_MULTI_TURN_COMMANDS`."""
         self._motion_id = 0
         self._mode = MotionMode.HOLD
-        self._powering_off = False
         self._turns_left = 0
         """Number of cycles left before the drive's time-out."""
         self._why = ""
@@ -195,9 +194,7 @@ class AxisLoop:
     def _end_motion(self) -> None:
         """Ends the motion: stops following set-points, and leaves the stream and its group."""
         self.cycle.command = None
-        self._powering_off = False
         self._mode = MotionMode.HOLD
-        self._feed.leave()
         self._break_group()
         self.set_point.reset(self.set_point.position_deg)
 
@@ -319,7 +316,6 @@ class AxisLoop:
 
     def _power_off(self) -> None:
         self.cycle.command = None
-        self._powering_off = True
         self._turns_left = self._turns(STOP_TIMEOUT_S)
         self._request_power_off()
 
@@ -376,7 +372,6 @@ class AxisLoop:
             if self._mode is MotionMode.FOLLOW:
                 self.cycle.command = self._follow
             if mode is not MotionMode.STREAM:
-                self._feed.leave()
                 if mode is not MotionMode.HOLD:
                     self._break_group()
                 self.group = frozenset()
@@ -401,7 +396,7 @@ class AxisLoop:
             self._report(EventKind.CHANGED, 0, 0)
 
     def _after_stopping(self) -> None:
-        if not self._powering_off:
+        if self.cycle.command is not None:  # it brakes, and still has its power
             self._after_motion()
             if self.set_point.at_rest:
                 self._power_off()

@@ -75,7 +75,6 @@ class Controller:
         self._ending = self._at_once = False
         self._ending_turns_left = 0
         self._released: set[int] = set()
-        self._turns = memory.status[Cell.LOOP_COUNT]
         cycle.on_frame = self._relay_incoming
         cycle.outgoing = self._relay_outgoing
         # Waiting commands, frames and knots were meant for an earlier loop with the axes in other states.
@@ -120,8 +119,7 @@ class Controller:
             cycle.skipped & 0xFFFF_FFFF,
             *values,
         ))  # fmt: skip
-        self._turns += 1
-        self.memory.status[Cell.LOOP_COUNT] = self._turns
+        self.memory.status[Cell.LOOP_COUNT] += 1
 
     def _report(self, axis: int, kind: EventKind, id_: int = 0, code: int = 0, text: str = "") -> None:
         cycle = self.cycle

@@ -6,7 +6,7 @@ from typing import Final
 from hdbridge.daemon.memory.channels import Queue
 from hdbridge.daemon.memory.layout import Knot, OuterKnot
 from hdbridge.errors import InputError
-from hdbridge.motion import SetPoint
+from hdbridge.motion import MotionMode, SetPoint
 
 KNOTS_PER_TURN: Final = 4
 """Number of knots passed to the set-point before each cycle."""
@@ -31,7 +31,6 @@ class KnotFeed:
         self._knots, self._set_point = knots, set_point
         self._stream = 0
         """Number of the current stream; between streams, that of the last one."""
-        self._following = False
         self._ending = False
 
     def begin(self, stream: int, timeout_s: float) -> None:
@@ -44,25 +43,22 @@ class KnotFeed:
             raise InputError(f"stream number {stream} follows {self._stream}; expected a larger number")
         self._set_point.stream(timeout_s)
         self._set_point.begin_stream()
-        self._stream, self._following, self._ending = stream, True, False
+        self._stream, self._ending = stream, False
 
     def end(self) -> None:
         """Announces the end of the knots; the stream ends at the last knot."""
         self._ending = True
 
-    def leave(self) -> None:
-        """Leaves the stream and discards its waiting knots."""
-        self._following = False
-
     def feed(self) -> str | None:
         """Passes on the next knots. If one is refused, brakes the axis and returns the reason, else None."""
         knots, set_point, stream = self._knots, self._set_point, self._stream
+        following = set_point.mode is MotionMode.STREAM
         taken = 0
         for _ in range(STALE_KNOTS_PER_TURN):
             knot = knots.peek()
             if knot is None or knot.stream > stream:
                 break
-            if knot.stream < stream or not self._following:
+            if knot.stream < stream or not following:
                 knots.drop()
                 continue
             if taken == KNOTS_PER_TURN or not set_point.room:
@@ -72,10 +68,9 @@ class KnotFeed:
             try:
                 set_point.knot(knot.time_s, knot.position_deg, knot.velocity_deg_s)
             except InputError as error:
-                self.leave()
                 set_point.stop()
                 return str(error)
-        if self._following and self._ending and not taken and set_point.at_rest:
+        if following and self._ending and not taken and set_point.at_rest:
             set_point.stop()
         return None
 

@@ -44,7 +44,7 @@ _NS: Final = 1_000_000_000
 
 
 class Batch(NamedTuple):
-    """Data received from the observer in one call."""
+    """Data received from the service's core in one call."""
 
     samples: SampleArray
     events: tuple[Event, ...] = ()

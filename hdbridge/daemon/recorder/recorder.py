@@ -1,6 +1,6 @@
 """Flight recorder: all samples and events of the loop, on disk within a second.
 
-`FlightRecorder` is a sink of the observer. It never blocks and uses bounded memory. Data that arrives faster
+`FlightRecorder` is a sink of `Core`. It never blocks and uses bounded memory. Data that arrives faster
 than its thread can process is dropped, counted and reported. `flightlog` does the thread's work.
 """
 
@@ -15,7 +15,7 @@ from hdbridge.client import messages
 from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.memory import Event, SampleArray
 from hdbridge.daemon.recorder.flightfile import About, ModelUse
-from hdbridge.daemon.recorder.flightlog import MARK, Batch, FlightLog, Note, free_bytes
+from hdbridge.daemon.recorder.flightlog import Batch, FlightLog, Note, free_bytes
 from hdbridge.daemon.setting import CompensationSetting
 
 FLUSH_S: Final = 1.0
@@ -65,7 +65,7 @@ class FlightRecorder:
             self._threads.append(thread)
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """Takes samples and events from the observer; never waits."""
+        """Takes samples and events from the service's core; never waits."""
         for axis, setting in self._in_use().items():
             if self._recorded.get(axis) is not setting:
                 self._recorded[axis] = setting
@@ -85,9 +85,9 @@ class FlightRecorder:
         if self.flight is not None:
             self.flight.put(item)
 
-    def mark(self, text: str = "") -> None:
-        """Records a mark and keeps the time around it, like that around a fault."""
-        self.put(Note(MARK, text))
+    def note(self, kind: str, text: str) -> None:
+        """Records a note; the time around a `flightlog.MARK` is kept, like that around a fault."""
+        self.put(Note(kind, text))
 
     def state(self) -> messages.RecorderState:
         """Returns the state of the recorder for clients."""

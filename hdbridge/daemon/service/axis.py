@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from hdbridge.client import messages
 from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, UNKNOWN, AxisState
-from hdbridge.daemon.memory import CommandKind, EventKind
+from hdbridge.daemon.memory import CommandKind, EventKind, SampleFlag
 from hdbridge.daemon.service import reports
 from hdbridge.daemon.service.axislink import AxisLink
 from hdbridge.daemon.service.commissioning import Commissioning
@@ -28,7 +28,6 @@ from hdbridge.enums import Scheme
 from hdbridge.errors import DriveError, HdbridgeError, InputError, RefusedError
 
 if TYPE_CHECKING:
-    from hdbridge.axis.model import TransmissionModel
     from hdbridge.daemon.machine import Axis
     from hdbridge.daemon.memory import Event
     from hdbridge.daemon.service.core import Core
@@ -81,6 +80,7 @@ class ServiceAxis:
 
     def on_event(self, event: Event) -> None:
         """Takes an event of the axis."""
+        self.link.on_event(event)
         if event.kind is EventKind.STOPPED:
             self.stopped = event, datetime.now(UTC)
         elif event.kind is EventKind.STATE and event.code in STOPPED:
@@ -186,10 +186,10 @@ class ServiceAxis:
             elif link.state is AxisState.QUICK_STOPPED:
                 await link.do(CommandKind.RESET)
                 stopping = {AxisState.STOPPING, AxisState.QUICK_STOPPED}
-                await link.until(lambda: link.state not in stopping, POWER_S)
+                await self.core.until(lambda: link.state not in stopping, POWER_S)
             if link.state is AxisState.DISABLED and link.power is State.FAULT:
                 await link.do(CommandKind.DRIVE_FAULT_RESET)
-                if not await link.until(lambda: link.power is not State.FAULT, FAULT_RESET_S):
+                if not await self.core.until(lambda: link.power is not State.FAULT, FAULT_RESET_S):
                     raise DriveError(
                         f"{self.name}: the drive's fault stays after a reset; remove its cause (see 603Fh "
                         f"and the drive's manual), then reset it again: hdbridge ctl reset {self.name}"
@@ -200,7 +200,7 @@ class ServiceAxis:
         """Takes over the axis from an earlier service process; stops a drive that was lent to it."""
         link = self.link
         async with self._drive:
-            await link.until(lambda: self.core.observer.newest is not None, ANSWER_S)
+            await self.core.until(lambda: self.core.newest is not None, ANSWER_S)
             if link.state is AxisState.LENT:
                 await self._work(self.commissioning.abandon_homing)
                 await link.do(CommandKind.RELEASE)
@@ -272,11 +272,6 @@ class ServiceAxis:
             if not self.models.settled:
                 await self._use(self.models.chosen)
 
-    async def follow(self, model: TransmissionModel) -> None:
-        """Compensates with the adapted parameters of the chosen model, whose version does not change."""
-        async with self._changing:
-            await self._use(await self._work(self.models.with_adapted, model))
-
     def following_for(self, holder: str) -> Following:
         """Returns the adaptation, for a change by ``holder``; raises InputError if the axis has none."""
         self.core.lease.check(holder)
@@ -292,14 +287,10 @@ class ServiceAxis:
 
     async def _use(self, setting: CompensationSetting) -> None:
         """Sends a setting to the control process and waits until it is in effect."""
-        log, index = self.core.log, self.link.index
-        since = log.newest
-        await self.link.do(CommandKind.CHANGE, i=self.models.send(setting))
+        link = self.link
+        await link.do(CommandKind.CHANGE, i=self.models.send(setting))
         self.models.chosen = setting
-        await self.link.until(
-            lambda: any(each.kind is EventKind.CHANGED and each.axis == index for each in log.since(since)),
-            CHANGE_S,
-        )
+        await self.core.until(lambda: not int(link.value("flags")) & SampleFlag.CHANGING, CHANGE_S)
 
     # ---------------------------------------------------------------- objects of the drive
 

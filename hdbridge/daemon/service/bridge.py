@@ -31,12 +31,12 @@ from typing import TYPE_CHECKING, Final, Self
 from hdbridge.client import messages
 from hdbridge.daemon.loop.states import UNKNOWN
 from hdbridge.daemon.memory import Cell, CommandKind, EventKind
+from hdbridge.daemon.recorder.flightlog import MARK
 from hdbridge.daemon.service import reports
 from hdbridge.daemon.service.axis import ServiceAxis
-from hdbridge.daemon.service.core import ANSWER_S, Core
+from hdbridge.daemon.service.core import ANSWER_S, PERIOD_S, Core
 from hdbridge.daemon.service.lending import Lending
 from hdbridge.daemon.service.moves import run_together
-from hdbridge.daemon.service.observer import PERIOD_S
 from hdbridge.daemon.service.outermaster import Latency, OuterMaster
 from hdbridge.daemon.service.timing import Timing
 from hdbridge.errors import HdbridgeError, InputError
@@ -68,7 +68,7 @@ class ServiceBridge:
     ) -> None:
         """``forced`` states that the daemon does not hold the lock of its interface."""
         self.machine = machine
-        self.core = Core(memory, timing, machine.lease_s)
+        self.core = Core(memory, timing, machine.lease_s, [axis.name for axis in machine.axes])
         against = "the daemon was started with --force and does not hold the interface" if forced else ""
         if simulated:
             against = "its axes are simulated; a command has a simulated axis of its own with --simulate"
@@ -84,10 +84,10 @@ class ServiceBridge:
         self._simulated = simulated
         self._started = datetime.now(UTC)
         self._bus_up = True
-        self.core.observer.add(self)
+        self.core.add_sink(self)
         self._latency = Latency(memory.axes)
         if machine.gateway is not None:
-            self.core.observer.add(self._latency)
+            self.core.add_sink(self._latency)
         self.lease = self.core.lease
         """Right to move."""
         self.lease.doing = self._doing
@@ -111,12 +111,12 @@ class ServiceBridge:
             self.core.start(self._take_over(axis))
             # The drive is booted and verified whenever necessary; the axis stays disabled.
             for is_due, attempt, pauses_s, failure in (
-                (self._is_unsettled, axis.settle, SETTLE_AGAIN_S, "the compensation could not be put back"),
+                (self._is_unsettled, axis.settle, SETTLE_AGAIN_S, "the compensation could not be changed"),
                 (self._is_unverified, axis.verify, VERIFY_AGAIN_S, "the drive could not be verified"),
             ):
                 self.core.start(self._persist(axis, is_due, attempt, pauses_s, failure))
         if (gateway := self.machine.gateway) is not None:
-            master = OuterMaster(self.core, gateway, self.mark)
+            master = OuterMaster(self.core, gateway)
             self.core.start(master.keep())
             for name in gateway.nodes:
                 self.core.start(master.serve(self.axes[name]))
@@ -142,7 +142,7 @@ class ServiceBridge:
         core, status = self.core, self.core.memory.status
         known = status[Cell.LOOP_PID]
         while True:
-            core.observer.poll()
+            core.poll()
             status[Cell.SERVICE_TIME_NS] = time.monotonic_ns()
             if (pid := status[Cell.LOOP_PID]) and pid != known:
                 if known:
@@ -157,7 +157,7 @@ class ServiceBridge:
             await core.timing.sleep(PERIOD_S)
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """Takes the loop's events from the observer: those of an axis, and failures of the bus."""
+        """Takes the loop's events from the core: those of an axis, and failures of the bus."""
         for event in events:
             if event.axis >= 0:
                 self.axes[self._names[event.axis]].on_event(event)
@@ -209,7 +209,7 @@ class ServiceBridge:
     def state(self) -> messages.MachineState:
         """Returns the state of the machine in the newest cycle."""
         core = self.core
-        newest = core.observer.newest
+        newest = core.newest
         head = newest[0] if newest is not None else None
         return messages.MachineState(
             name=self.machine.name,
@@ -227,8 +227,8 @@ class ServiceBridge:
             ),
             cycle=messages.CycleState(
                 period_s=core.memory.period_s,
-                cycle=core.observer.cycle,
-                alive=core.observer.alive,
+                cycle=core.cycle,
+                alive=core.alive,
                 pid=core.memory.status[Cell.LOOP_PID],
                 skipped=int(head["skipped"]) if head is not None else 0,
                 late_us=float(head["late_us"]) if head is not None else None,
@@ -256,24 +256,22 @@ class ServiceBridge:
                 f"the bus is lent to {borrower}, for {self.lending.lent_s or 0.0:.0f} s now; its axes will "
                 "be disabled when it ends"
             )
-        elif not core.observer.alive:
+        elif not core.alive:
             warnings.append(
                 "the control process completes no cycles: it hangs or has died; it is restarted automatically"
             )
         if not self._bus_up:
             warnings.append("the bus is down: bring the interface up; it is reopened automatically")
-        if core.observer.lost:
-            warnings.append(
-                f"{core.observer.lost} cycles were lost before they were read: this machine is too busy"
-            )
+        if core.lost:
+            warnings.append(f"{core.lost} cycles were lost before they were read: this machine is too busy")
         return warnings
 
     def events(self, since: int = 0) -> messages.Events:
         """Returns at most the newest `EVENTS_RETURNED` events after number ``since``, oldest first."""
-        events = self.core.log.public(since)[-EVENTS_RETURNED:]
-        newest = events[-1].sequence if events else self.core.log.newest_public
+        events = self.core.log.since(since)[-EVENTS_RETURNED:]
+        newest = events[-1].sequence if events else self.core.log.newest
         return messages.Events(
-            events=[reports.event_message(each, self._names) for each in events],
+            events=events,
             lost=max(newest - since - len(events), 0),
             newest=newest,
         )
@@ -299,8 +297,6 @@ class ServiceBridge:
             raise InputError(f"there is no axis '{name}'; expected one of: {', '.join(self.axes)}")
         await run_together(holder, [self.axes[name] for name in moves], moves, speed, wait=wait)
 
-    def mark(self, text: str, axis: int = -1) -> None:
+    def mark(self, text: str) -> None:
         """Adds a remark to the event log and the flight recorder, which keeps the time around it."""
-        self.core.log.note(text, axis)
-        if self.recorder is not None:
-            self.recorder.mark(text)
+        self.core.log.note(text, kind=MARK)

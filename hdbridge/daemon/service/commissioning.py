@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Container, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
@@ -18,6 +18,8 @@ import can
 
 from hdbridge.axis import AxisConfig
 from hdbridge.client import messages
+from hdbridge.daemon.loop.relay import refusal_reason
+from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import RelayedFrame
 from hdbridge.daemon.service.core import Arguments, Core
 from hdbridge.drive import objects
@@ -28,8 +30,6 @@ from hdbridge.errors import DaemonError, InputError, RefusedError
 
 POLL_S: Final = 0.001
 """Interval between checks for a frame, shorter than any cycle."""
-_FUNCTION: Final = 0x780
-_NODE: Final = 0x7F
 _FROM_NODES: Final = frozenset({objects.COB_EMCY, objects.COB_SDO_ANSWER, objects.COB_HEARTBEAT})
 BUSY_S = 3.0
 """Maximum wait for a drive that is busy with another request."""
@@ -46,14 +46,15 @@ class RelayBus(can.BusABC):
     `interrupt` may be called from any thread.
     """
 
-    def __init__(self, core: Core, nodes: Container[int], name: str) -> None:
+    def __init__(self, core: Core, nodes: Iterable[int], name: str) -> None:
         super().__init__(channel=name)
         self.channel_info = name
         self._clock = core.timing.clock
         self._core = core
         self._outgoing = core.memory.outgoing
         self._incoming = core.memory.incoming_reader()
-        self._nodes = nodes
+        self._nodes = dict.fromkeys(nodes, AxisState.DISABLED)  # the loop knows the actual states
+        self._identifiers = {base + node for node in self._nodes for base in _FROM_NODES}
         self._waiting: deque[RelayedFrame] = deque()
         self._interruption = ""
         """Reason with which the current operation is to fail; empty if it is not to fail."""
@@ -65,15 +66,12 @@ class RelayBus(can.BusABC):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Sends a frame. Drops the master's heartbeat, which the control process sends."""
         self._core.refuse(None)
-        can_id = msg.arbitration_id
-        function, node = can_id & _FUNCTION, can_id & _NODE
-        if function == objects.COB_HEARTBEAT:
+        can_id, data = msg.arbitration_id, bytes(msg.data)
+        if objects.COB_HEARTBEAT <= can_id <= objects.COB_HEARTBEAT + 0x7F:
             return
-        to_node = function == objects.COB_SDO_REQUEST and node in self._nodes
-        nmt = can_id == objects.COB_NMT and len(msg.data) == 2 and msg.data[1] in self._nodes
-        if not (to_node or nmt):
-            raise can.CanOperationError(f"{can_id:03X}h is not for the service to send")
-        if not self._outgoing.add(RelayedFrame(int(1e9 * self._clock.now()), can_id, bytes(msg.data))):
+        if (reason := refusal_reason(can_id, data, self._nodes)) is not None:
+            raise can.CanOperationError(reason)
+        if not self._outgoing.add(RelayedFrame(int(1e9 * self._clock.now()), can_id, data)):
             raise can.CanOperationError("the control process takes no frames: it hangs or is gone")
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
@@ -103,7 +101,7 @@ class RelayBus(can.BusABC):
             self._waiting.extend(frames)
         while self._waiting:
             frame = self._waiting.popleft()
-            if frame.can_id & _FUNCTION in _FROM_NODES and frame.can_id & _NODE in self._nodes:
+            if frame.can_id in self._identifiers:
                 return frame
         return None
 

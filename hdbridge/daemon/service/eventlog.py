@@ -1,91 +1,120 @@
-"""Event log: the control process's events and the service's notes, in two bounded lists. Thread-safe.
+"""Event log of the service: the control process's events and the service's own notes, in words.
 
-One list has every event, for the service itself. Clients see the other list, which has the notes but omits
-routine events (`_routine`), because the thousands of motions of a calibration must not displace yesterday's
-stop. `EventLogger` writes the log lines of the control process, which itself writes none.
+The control process itself logs nothing, so its events are logged here, one line each. For clients, the newest
+are kept without routine events (`_routine`), because the thousands of motions of a calibration must not
+displace yesterday's stop.
 """
 
 import logging
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from itertools import takewhile
-from typing import NamedTuple, TypeVar
+from typing import Final
 
+from hdbridge.client import messages
 from hdbridge.daemon.loop.faultlog import fault_of
-from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import Event, EventKind, RingReader, SampleArray
+from hdbridge.daemon.memory import Event, EventKind, SampleArray
 from hdbridge.daemon.memory.layout import LEVELS
-from hdbridge.drive.supervision import Reaction
+from hdbridge.drive.supervision import EXPLAINED_HINT, ROWS, Reaction
 from hdbridge.motion import MotionMode
 
 ENTRIES_KEPT = 4096
+STATES: Final = tuple(messages.ControlState)
+MODES: Final = tuple(messages.MotionMode)
 _log = logging.getLogger(__name__)
 
 
-class Entry(NamedTuple):
-    """Entry for clients."""
-
-    sequence: int
-    """Number of the entry, from 1 at the start of the service."""
-    date: datetime
-    axis: int
-    """Index of the axis; -1 is the machine."""
-    event: Event | None
-    """Event of the control process; None for a note of the service."""
-    text: str
-
-
-Numbered = TypeVar("Numbered", Event, Entry)
-
-
 class EventLog:
-    """Newest `ENTRIES_KEPT` events of the control process, and as many entries for clients."""
+    """Newest `ENTRIES_KEPT` events and notes for clients; a sink of `Core`. Thread-safe."""
 
-    def __init__(self, reader: RingReader[Event]) -> None:
-        self._reader = reader
+    def __init__(self, names: Sequence[str]) -> None:
+        """``names`` are those of the axes."""
+        self._names = names
         self._lock = threading.Lock()
-        self._events: deque[Event] = deque(maxlen=ENTRIES_KEPT)
-        self._public: deque[Entry] = deque(maxlen=ENTRIES_KEPT)
-        self.newest = self.newest_public = 0
-        """Numbers of the newest event, and of the newest entry for clients; 0 before the first."""
+        self._entries: deque[messages.Event] = deque(maxlen=ENTRIES_KEPT)
+        self.newest = 0
+        """Number of the newest entry, counted from the start of the service; 0 before the first."""
+        self.record: Callable[[str, str], None] = lambda *_: None
+        """Adds a note to the flight recorder, if there is one."""
 
-    def poll(self) -> list[Event]:
-        """Reads new events of the control process and returns them."""
+    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
+        """Logs the events and the loss of cycles, and keeps the events for clients."""
+        if lost:
+            _log.warning("cycles lost", {"cycles": lost})
+        for event in events:
+            level = LEVELS.get(event.kind, logging.INFO)
+            if _log.isEnabledFor(level):
+                _log.log(level, event.kind.name.lower().replace("_", " "), self._fields(event))
+            if not _routine(event):
+                self._add(event)
+
+    def note(self, text: str, axis: int = -1, kind: str = "") -> None:
+        """Adds a note of the service on the machine, or on the axis of this index.
+
+        A note with a ``kind``, such as a mark, is recorded as well.
+        """
+        name = self._name(axis)
         with self._lock:
-            events, _ = self._reader.read()
-            for event in events:
-                self._events.append(event)
-                self.newest = event.sequence
-                if not _routine(event):
-                    self._add(event.axis, event, event.text)
-        return events
+            self._append(messages.EventKind.NOTE, name, text)
+        if kind:
+            self.record(kind, f"{name}: {text}" if name is not None else text)
 
-    def note(self, text: str, axis: int = -1) -> None:
-        """Adds a note of the service."""
+    def since(self, sequence: int) -> list[messages.Event]:
+        """Returns the retained entries after number ``sequence``, oldest first."""
         with self._lock:
-            self._add(axis, None, text)
+            new = list(takewhile(lambda each: each.sequence > sequence, reversed(self._entries)))
+        new.reverse()
+        return new
 
-    def since(self, sequence: int) -> list[Event]:
-        """Returns the retained events after number ``sequence``, oldest first."""
+    def _add(self, event: Event) -> None:
+        axis, text, hint, fault = self._name(event.axis), event.text, None, fault_of(event.code)
+        match event.kind:
+            case EventKind.STATE:
+                text = STATES[event.code].value
+            case EventKind.MOTION_ENDED:
+                text = MODES[event.code].value
+            case EventKind.FAULT if fault is not None:
+                detail = f" ({text})" if text else ""
+                text = f"{fault.value}{detail}: {Reaction(event.id).name.lower().replace('_', ' ')}"
+                hint = ROWS[fault].hint
+            case EventKind.STOPPED:
+                hint = stop_hint(event, axis or "AXIS")
         with self._lock:
-            return _after(self._events, sequence)
+            self._append(messages.EventKind[event.kind.name], axis, text, event.cycle, hint)
 
-    def public(self, sequence: int) -> list[Entry]:
-        """Returns the entries for clients after number ``sequence``, oldest first."""
-        with self._lock:
-            return _after(self._public, sequence)
+    def _append(
+        self,
+        kind: messages.EventKind,
+        axis: str | None,
+        text: str,
+        cycle: int | None = None,
+        hint: str | None = None,
+    ) -> None:
+        self.newest += 1
+        date = datetime.now(UTC)
+        self._entries.append(
+            messages.Event(
+                sequence=self.newest, kind=kind, date=date, cycle=cycle, axis=axis, text=text, hint=hint
+            )
+        )
 
-    def _add(self, axis: int, event: Event | None, text: str) -> None:
-        self.newest_public += 1
-        self._public.append(Entry(self.newest_public, datetime.now(UTC), axis, event, text))
+    def _name(self, axis: int) -> str | None:
+        return self._names[axis] if 0 <= axis < len(self._names) else None
 
-
-def _after(entries: deque[Numbered], sequence: int) -> list[Numbered]:
-    new = list(takewhile(lambda each: each.sequence > sequence, reversed(entries)))
-    new.reverse()
-    return new
+    def _fields(self, event: Event) -> dict[str, object]:
+        facts: dict[str, object] = {"cycle": event.cycle}
+        if (axis := self._name(event.axis)) is not None:
+            facts["axis"] = axis
+        if event.kind is EventKind.STATE:
+            facts["state"] = STATES[event.code].value
+        if event.kind is EventKind.FAULT and (fault := fault_of(event.code)) is not None:
+            facts["fault"] = fault.name
+            facts["reaction"] = Reaction(event.id).name.lower()
+        if event.text:
+            facts["text"] = event.text
+        return facts
 
 
 def _routine(event: Event) -> bool:
@@ -94,29 +123,14 @@ def _routine(event: Event) -> bool:
     return stream or event.kind is EventKind.DONE
 
 
-class EventLogger:
-    """Sink of the observer that logs one line per event, with the name of its axis."""
+def stop_hint(stopped: Event, axis: str) -> str:
+    """Returns advice on how to recover from a stop."""
+    fault = fault_of(stopped.code)
+    if stopped.id:
+        return EXPLAINED_HINT
+    return ROWS[fault].hint if fault is not None else reset_hint(axis)
 
-    def __init__(self, names: Sequence[str]) -> None:
-        self._names = names
 
-    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        if lost:
-            _log.warning("cycles lost", {"cycles": lost})
-        for event in events:
-            level = LEVELS.get(event.kind, logging.INFO)
-            if _log.isEnabledFor(level):
-                _log.log(level, event.kind.name.lower().replace("_", " "), self._fields(event))
-
-    def _fields(self, event: Event) -> dict[str, object]:
-        facts: dict[str, object] = {"cycle": event.cycle}
-        if 0 <= event.axis < len(self._names):
-            facts["axis"] = self._names[event.axis]
-        if event.kind is EventKind.STATE:
-            facts["state"] = AxisState(event.code).name.lower().replace("_", "-")
-        if event.kind is EventKind.FAULT and (fault := fault_of(event.code)) is not None:
-            facts["fault"] = fault.name
-            facts["reaction"] = Reaction(event.id).name.lower()
-        if event.text:
-            facts["text"] = event.text
-        return facts
+def reset_hint(axis: str) -> str:
+    """Returns advice on how to recover from a commanded stop."""
+    return f"reset it when the axis may move again: hdbridge ctl reset {axis}"

@@ -8,20 +8,20 @@ import asyncio
 import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.client import messages
-from hdbridge.daemon.following.follower import NO_OUTCOME, Follower, Outcome
-from hdbridge.daemon.following.judging import WINDOW_S, Verdict
+from hdbridge.daemon.following.follower import Follower
+from hdbridge.daemon.following.judging import WINDOW_S, RaisedVerdict, Verdict
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import Event, SampleArray
 from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
-from hdbridge.daemon.recorder.flightlog import Note
-from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.enums import AdaptationMode
 from hdbridge.errors import HdbridgeError
@@ -34,44 +34,47 @@ _log = logging.getLogger(__name__)
 
 
 class Following:
-    """Follows one axis: a sink of the observer that never blocks."""
+    """Follows one axis: a sink of `Core` that never blocks."""
 
     def __init__(
         self,
-        index: int,
         axis: ServiceAxis,
         settings: AdaptationSettings,
         folder: Path,
         worker: Executor,
-        recorder: FlightRecorder | None = None,
         diagnosis: AutoDiagnosis | None = None,
     ) -> None:
-        """``index`` is the index of the axis in a sample; ``folder`` contains the files of its adaptation.
+        """``folder`` contains the files of the adaptation.
 
-        ``worker`` has one thread. Verdicts are noted in ``recorder``; those in `DIAGNOSED` start
-        ``diagnosis``.
+        ``worker`` has one thread. The verdicts in `DIAGNOSED` start ``diagnosis``.
         """
         self.state = messages.AdaptationState(mode=settings.mode)
         """State of the adaptation."""
         self.advice: list[str] = []
         """Current verdict of the watch unless the model is valid; the reason if the axis is not watched."""
-        self._index, self._axis = index, axis
+        self._axis = axis
         self._settings, self._folder = settings, folder
-        self._worker, self._recorder, self._diagnosis = worker, recorder, diagnosis
+        self._worker, self._diagnosis = worker, diagnosis
         self._model: TransmissionModel | None = None
         """Committed model that is followed."""
+        self._used: TransmissionModel | None = None
+        """Model that the control process uses, adapted or not."""
         self._sent = self._taken = 0
-        self._not_applied = ""
         # These belong to the worker's thread.
         self._follower: Follower | None = None
         self._problem = ""
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """Takes samples from the observer. Lost samples appear as a gap in the cycle numbers."""
-        model = self._axis.models.chosen.model
-        if model is not self._model:
-            self._model = model
-            self._do(self._begin, model)
+        """Takes samples from the service's core. Lost samples appear as a gap in the cycle numbers."""
+        models = self._axis.models
+        if models.chosen.model is not self._model:
+            self._model = self._used = models.chosen.model
+            self._do(self._begin, self._model)
+        self._choose()
+        used = models.in_use.adapted or models.in_use.model
+        if used is not self._used and models.in_use.model is self._model:
+            self._used = used
+            self._do(self._use, used)
         if len(samples) and self._sent - self._taken < MAX_BATCHES:
             self._sent += 1
             self._do(self._process, samples)
@@ -84,27 +87,20 @@ class Following:
     async def revert(self) -> None:
         """Restores the committed model and switches the adaptation to observation only."""
         await asyncio.wrap_future(self._do(self._revert))
-        await self.apply()
+        self._choose()
+        with suppress(HdbridgeError):  # repeated by the axis
+            await self._axis.settle()
 
-    async def apply(self) -> None:
-        """Makes the control process compensate with the adapted model if it does not yet."""
-        chosen, follower = self._axis.models.chosen, self._follower
+    def _choose(self) -> None:
+        """Chooses the adapted model, which the axis then sends to the control process."""
+        models, follower = self._axis.models, self._follower
+        chosen = models.chosen
         if follower is None or follower.adaptation is None or chosen.model is not follower.model:
             return
         model = follower.adaptation.model
         used = chosen.adapted or chosen.model
-        if (model.effects, model.response) == (used.effects, used.response):
-            return
-        try:
-            await self._axis.follow(model)
-        except HdbridgeError as problem:  # refused in this state; retried later
-            if str(problem) != self._not_applied:
-                _log.warning("adaptation not applied", {"axis": self._axis.name, "why": str(problem)})
-            self._not_applied = str(problem)
-        else:
-            self._not_applied = ""
-            self._do(follower.use_model, model)
-            _log.info("adaptation applied", {"axis": self._axis.name})
+        if (model.effects, model.response) != (used.effects, used.response):
+            models.chosen = replace(chosen, adapted=model)
 
     def close(self) -> None:
         """Stores the adaptation's state, after processing the waiting samples."""
@@ -120,7 +116,7 @@ class Following:
     def _begin(self, model: TransmissionModel) -> None:
         """Starts to follow another committed model."""
         self._save()
-        self._follower = Follower(self._axis.axis.config, model, self._index, self._settings)
+        self._follower = Follower(self._axis.axis.config, model, self._axis.link.index, self._settings)
         self.advice = self._unwatched()
         self._adapt()
 
@@ -148,17 +144,20 @@ class Following:
     def _process(self, samples: SampleArray) -> None:
         try:
             follower = self._follower
-            if follower is not None and (outcome := follower.take(samples)) is not NO_OUTCOME:
-                self._report(outcome, follower.model)
+            if follower is not None and (raised := follower.take(samples)) is not None:
+                self._report(raised, follower.model)
                 self._publish()
         finally:
             self._taken += 1
 
     def _revert(self) -> None:
-        follower = self._follower
-        if follower is not None and (proposal := follower.revert()) is not None:
-            self._report(Outcome([], proposal), follower.model)
+        if self._follower is not None:
+            self._follower.revert()
             self._publish()
+
+    def _use(self, model: TransmissionModel) -> None:
+        if self._follower is not None:
+            self._follower.use_model(model)
 
     def _save(self) -> None:
         if self._follower is not None:
@@ -171,30 +170,22 @@ class Following:
         else:
             self.state = messages.AdaptationState(mode=self._settings.mode, frozen=self._problem or None)
 
-    def _report(self, outcome: Outcome, model: TransmissionModel) -> None:
-        """Logs a proposal; notes, logs and diagnoses verdicts."""
-        name, proposal = self._axis.name, outcome.proposal
-        if proposal is not None:
-            changes = {each.parameter: round(each.after, 4) for each in proposal.changes}
-            event = "adaptation" if proposal.apply else "adaptation would change"
-            _log.info(event, {"axis": name, **changes})
-        for raised in outcome.raised:
-            verdict = [] if raised.verdict is Verdict.HOLDS else [raised.text]
+    def _report(self, raised: Sequence[RaisedVerdict], model: TransmissionModel) -> None:
+        """Notes, logs and diagnoses verdicts."""
+        for each in raised:
+            verdict = [] if each.verdict is Verdict.HOLDS else [each.text]
             self.advice = verdict + self._unwatched()
-            self._note("WATCH", raised.text)
-            if self._diagnosis is not None and raised.verdict in DIAGNOSED:
-                self._diagnosis.start(
-                    name, model.dump(), WINDOW_S / 60.0, raised.text, partial(self._note, "DIAGNOSIS")
-                )
+            self._note("WATCH", each.text)
+            if self._diagnosis is not None and each.verdict in DIAGNOSED:
+                report = partial(self._note, "DIAGNOSIS")
+                self._diagnosis.start(self._axis.name, model.dump(), WINDOW_S / 60.0, each.text, report)
 
     def _unwatched(self) -> list[str]:
         follower = self._follower
         return [follower.unwatched] if follower is not None and follower.unwatched else []
 
     def _note(self, kind: str, text: str) -> None:
-        if self._recorder is not None:
-            self._recorder.put(Note(kind, f"{self._axis.name}: {text}"))
-        self._axis.core.log.note(text, self._index)
+        self._axis.core.log.note(text, self._axis.link.index, kind)
         _log.warning("watch", {"axis": self._axis.name, "text": text})
 
 

@@ -95,10 +95,6 @@ class AxisModels:
             number = store.activate(folder, int(version), "through the daemon", date, identity)
         self.chosen = replace(self.chosen, version=number, file=self._axis.profile.model)
 
-    def with_adapted(self, model: TransmissionModel) -> CompensationSetting:
-        """Returns the chosen setting with adapted parameters; ``model`` is the complete adapted model."""
-        return self._checked(replace(self.chosen, adapted=model))
-
     def _checked(self, setting: CompensationSetting) -> CompensationSetting:
         setting.compensation(self._axis.config)
         return setting

@@ -174,17 +174,13 @@ class AxisMotion:
                 async with self.commanding:
                     if activity.over or not self._points:
                         return
-                    point = self._points[0]
-                    await self._goto(
-                        activity, point.target_deg, point.velocity_deg_s, point.acceleration_deg_s2
-                    )
+                    point, move = self._points[0], Activity(Kind.MOVE, activity.holder)
+                    await self._goto(move, point.target_deg, point.velocity_deg_s, point.acceleration_deg_s2)
                     # The queue may have been cleared while this move was being sent.
                     if not activity.over and self._points and self._points[0] is point:
                         self._points.popleft()
-                # Waits for this move only; the activity of the queue continues.
-                move = Activity(Kind.MOVE, activity.holder, activity.command_id, activity.since)
                 await link.arrival(move, activity)
-                await link.until(lambda: bool(activity.over), point.dwell_s)
+                await link.core.until(lambda: bool(activity.over), point.dwell_s)
         except HdbridgeError as error:
             if self.activity is activity:
                 self._points.clear()
@@ -215,7 +211,7 @@ async def run_together(
     async with AsyncExitStack() as stack:
         for axis in sorted(axes, key=lambda each: each.link.index):
             await stack.enter_async_context(axis.motion.commanding)
-        core.observer.poll()
+        core.poll()
         plan = await core.timing.work(
             coordinated,
             {axis.name: axis.link.value("load_target_deg") for axis in axes},
@@ -226,12 +222,14 @@ async def run_together(
         )
         stream = core.next_stream()
         waiting = {axis: [Knot(stream, *row) for row in plan.knots[axis.name].tolist()] for axis in axes}
-        activities = {axis: Activity(Kind.COORDINATED, holder, since=core.log.newest) for axis in axes}
         _hand_over(waiting)
-        mask = sum(1 << axis.link.index for axis in axes)
-        answer = await axes[0].link.do(CommandKind.STREAM_BEGIN, a=STREAM_TIMEOUT_S, i=mask, j=stream)
+        begin, mask = CommandKind.STREAM_BEGIN, sum(1 << axis.link.index for axis in axes)
+        id_ = core.post(begin, axes[0].link.index, a=STREAM_TIMEOUT_S, i=mask, j=stream)
+        activities = {axis: Activity(Kind.COORDINATED, holder, id_) for axis in axes}
         for axis, activity in activities.items():
-            activity.command_id = answer.id
+            axis.link.follow(activity)
+        await core.answer(begin, id_)
+        for axis, activity in activities.items():
             axis.motion.replace(activity, "it was replaced by a coordinated move")
     following = asyncio.ensure_future(_follow(waiting, activities))
     if wait:

@@ -10,13 +10,14 @@ from __future__ import annotations
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import Cell, CommandKind, Event, OuterCell, OuterCells, SampleArray
+from hdbridge.daemon.recorder.flightlog import MARK
 from hdbridge.daemon.service.timing import POLL_S
 from hdbridge.drive.emergencies import gateway_error
 from hdbridge.drive.states import State
@@ -70,9 +71,8 @@ class Latency:
 class OuterMaster:
     """Holds the lease for the gateway and serves its axes."""
 
-    def __init__(self, core: Core, settings: GatewaySettings, mark: Callable[[str, int], None]) -> None:
-        """``mark`` reports a fault and makes the recorder keep the time around it."""
-        self._core, self._mark = core, mark
+    def __init__(self, core: Core, settings: GatewaySettings) -> None:
+        self._core = core
         self._timeout_s = 1e-3 * settings.timeout_ms
         self._name = f"the master on {settings.bus.interface}:{settings.bus.channel}"
         self._token = ""
@@ -98,7 +98,7 @@ class OuterMaster:
             if error_code not in (0, before):
                 fault = gateway_error(error_code)
                 _log.error("gateway fault", {"axis": axis.name, "error": fault})
-                self._mark(f"gateway fault {fault}", axis.link.index)
+                self._core.log.note(f"gateway fault {fault}", axis.link.index, MARK)
             if not self._core.memory.status[Cell.LOOP_PID]:
                 continue  # the requests below wait for the control process
             holds = self._core.lease.holds(self._token)
@@ -145,7 +145,7 @@ class OuterMaster:
 
         try:
             # A master may enable again while the axis still brakes from the last time.
-            await link.until(
+            await link.core.until(
                 lambda: (
                     link.state is not AxisState.STOPPING and link.power is not State.NOT_READY_TO_SWITCH_ON
                 ),
@@ -168,7 +168,7 @@ class OuterMaster:
         try:
             if holds:
                 link = axis.link
-                await link.until(lambda: link.state is not AxisState.STOPPING, SETTLES_S)
+                await link.core.until(lambda: link.state is not AxisState.STOPPING, SETTLES_S)
                 if link.state in _STOPPED or link.power is State.FAULT:
                     await axis.reset(self._token)
         finally:

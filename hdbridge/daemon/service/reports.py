@@ -1,4 +1,4 @@
-"""Conversion of the service's state and events to messages of the API."""
+"""Conversion of the service's state to messages of the API."""
 
 from __future__ import annotations
 
@@ -11,24 +11,19 @@ from hdbridge.axis.channels import BY_KEY
 from hdbridge.client import messages
 from hdbridge.daemon.loop.faultlog import fault_of
 from hdbridge.daemon.loop.states import STOPPED, AxisState
-from hdbridge.daemon.memory import NO_FAULT, EventKind, OuterCell, SampleFlag
-from hdbridge.daemon.service.axislink import reset_hint, stop_hint
-from hdbridge.daemon.service.eventlog import Entry
+from hdbridge.daemon.memory import NO_FAULT, OuterCell, SampleFlag
+from hdbridge.daemon.service.eventlog import MODES, STATES, reset_hint, stop_hint
 from hdbridge.drive.emergencies import gateway_error
 from hdbridge.drive.states import State
-from hdbridge.drive.supervision import ROWS, Fault, Reaction
+from hdbridge.drive.supervision import ROWS, Fault
 from hdbridge.units import ARCSEC_PER_DEG
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from hdbridge.daemon.memory import OuterCells
     from hdbridge.daemon.service.axis import ServiceAxis
     from hdbridge.daemon.service.lease import Lease
     from hdbridge.daemon.setting import CompensationSetting
 
-STATES: Final = tuple(messages.ControlState)
-MODES: Final = tuple(messages.MotionMode)
 GATEWAY_DEAD_NS: Final = 2_000_000_000
 _NUMBERS: Final = (
     "velocity_deg_s", "motor_target_deg", "motor_position_deg", "motor_torque_nm", "correction_arcsec",
@@ -41,28 +36,6 @@ _FLAGS: Final = {
     if each.name in {"AT_REST", "COMPENSATING", "LIMITED", "MEMORY_KNOWN", "CHANGING", "UNDERRUN"}
 }
 """Flags of a sample that `messages.AxisState` has under the same name, in lower case."""
-
-
-def event_message(entry: Entry, names: Sequence[str]) -> messages.Event:
-    """Returns the message for an entry of the event log; ``names`` are those of the axes."""
-    axis = names[entry.axis] if 0 <= entry.axis < len(names) else None
-    event, kind, cycle, text, hint = entry.event, messages.EventKind.NOTE, None, entry.text, None
-    if event is not None:
-        kind, cycle, fault = messages.EventKind[event.kind.name], event.cycle, fault_of(event.code)
-        match event.kind:
-            case EventKind.STATE:
-                text = STATES[event.code].value
-            case EventKind.MOTION_ENDED:
-                text = MODES[event.code].value
-            case EventKind.FAULT if fault is not None:
-                detail = f" ({text})" if text else ""
-                text = f"{fault.value}{detail}: {Reaction(event.id).name.lower().replace('_', ' ')}"
-                hint = ROWS[fault].hint
-            case EventKind.STOPPED:
-                hint = stop_hint(event, axis or "AXIS")
-    return messages.Event(
-        sequence=entry.sequence, kind=kind, date=entry.date, cycle=cycle, axis=axis, text=text, hint=hint
-    )
 
 
 def lease_state(lease: Lease, now_s: float) -> messages.LeaseState:
@@ -124,7 +97,7 @@ def axis_state(axis: ServiceAxis, outer: messages.OuterState | None) -> messages
     """Returns the state of an axis; ``outer`` is that of its node in a gateway."""
     link, config, following = axis.link, axis.axis.config, axis.following
     flags = int(link.value("flags"))
-    known = link.core.observer.newest is not None
+    known = link.core.newest is not None
     in_use = axis.models.in_use
 
     def number(field: str) -> float | None:
@@ -168,7 +141,7 @@ def axis_state(axis: ServiceAxis, outer: messages.OuterState | None) -> messages
 def _fault(axis: ServiceAxis) -> messages.Fault | None:
     """Returns the cause of a latched stop or a drive fault; None without either."""
     link, (event, date) = axis.link, axis.stopped or (None, None)
-    code = int(link.value("fault")) if link.core.observer.newest is not None else NO_FAULT
+    code = int(link.value("fault")) if link.core.newest is not None else NO_FAULT
     fault = fault_of(code)
     latched = link.state in STOPPED
     if not latched and link.power is not State.FAULT:

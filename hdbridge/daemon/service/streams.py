@@ -12,7 +12,7 @@ from typing import Final, Self
 
 from hdbridge.client.messages import StreamPoint
 from hdbridge.daemon.memory import CommandKind, Knot
-from hdbridge.daemon.service.axislink import Activity, AxisLink
+from hdbridge.daemon.service.axislink import COMPLETE, Activity, AxisLink
 from hdbridge.errors import InputError, RefusedError
 
 LEAD_S: Final = 0.1
@@ -105,7 +105,7 @@ class ServiceStream:
         """Passes on set-points; waits while the buffer is full. Raises if the stream has ended."""
         self._check_open()
         if self._knots is None:
-            self._link.core.observer.poll()
+            self._link.core.poll()
             self._knots = Knots(self._number, self._link.value("load_target_deg"))
         await self._hand_over(self._knots.add(points))
         if not self._has_begun and self._last_s >= LEAD_S:
@@ -116,7 +116,7 @@ class ServiceStream:
         self._check_open()
         if self._knots is None:
             self._ended = True
-            self._activity.end("it is complete")
+            self._activity.end(COMPLETE)
             return
         await self._hand_over(self._knots.end())
         if not self._has_begun:
@@ -145,8 +145,9 @@ class ServiceStream:
     def _check_open(self) -> None:
         """Raises RefusedError with the reason if the stream has ended, LeaseError if the lease has."""
         self._link.core.lease.check(self._activity.holder)
-        if self._has_begun and not self._ended:
-            self._link.check(self._activity)
+        self._link.core.poll()
+        if self._activity.error is not None:
+            raise self._activity.error
         if self._activity.over or self._ended:
             why = self._activity.over or "it was ended"
             raise RefusedError(f"{self._link.name}: the stream has ended: {why}")

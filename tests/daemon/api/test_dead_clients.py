@@ -83,7 +83,7 @@ def test_a_client_that_dies_leaves_no_traceback(api, path, over, caplog, monkeyp
                     f"Sec-WebSocket-Version: 13\r\nAuthorization: Bearer {TOKEN}\r\n\r\n".encode()
                 )
                 death(raw)
-    until(lambda: not api.server.traffic.open["websocket"], lambda: "a dead client is still there")
+    until(lambda: not api.server.metrics.open["websocket"], lambda: "a dead client is still there")
     bad = [each for each in caplog.records if each.exc_info or each.levelno >= logging.ERROR]
     assert [each.getMessage() for each in bad] == []
     with api.over_socket() as client:

@@ -18,12 +18,11 @@ from support.fake_bridge import FakeBridge
 
 from hdbridge.client import messages
 from hdbridge.daemon.api.app import create_app
-from hdbridge.daemon.api.guard import Traffic
 from hdbridge.daemon.api.metrics import Metrics
 
 BRIDGE = FakeBridge()
 LIMIT_DEG = 180.0
-schema = schemathesis.openapi.from_asgi("/api/v1/openapi.json", create_app(BRIDGE, Metrics(), Traffic()))
+schema = schemathesis.openapi.from_asgi("/api/v1/openapi.json", create_app(BRIDGE, Metrics(BRIDGE)))
 schema.config.phases.coverage.enabled = "FUZZ_EXAMPLES" in os.environ
 checks = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
 # A bounded number of examples of each operation, the same in every run.

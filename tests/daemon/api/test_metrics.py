@@ -6,15 +6,14 @@ from prometheus_client.parser import text_string_to_metric_families
 from support.fake_bridge import FakeBridge
 
 from hdbridge.client.messages import ControlState, OuterState
-from hdbridge.daemon.api.guard import Traffic
-from hdbridge.daemon.api.metrics import BOUNDS_S, Metrics, exposition
+from hdbridge.daemon.api.metrics import BOUNDS_S, Metrics
 from hdbridge.daemon.memory import Event, EventKind
 from hdbridge.drive.supervision import Fault
 
 
-def scraped(bridge, metrics, traffic=None) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
+def scraped(metrics) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
     """Each figure by its name and labels."""
-    text = exposition(bridge, metrics, traffic or Traffic()).decode()
+    text = metrics.exposition().decode()
     return {
         (sample.name, frozenset(sample.labels.items())): sample.value
         for family in text_string_to_metric_families(text)
@@ -27,13 +26,14 @@ def figure(found, name, **labels) -> float:
 
 
 def test_lateness_buckets_are_cumulative():
-    bridge, metrics = FakeBridge(), Metrics()
+    bridge = FakeBridge()
+    metrics = Metrics(bridge)
     samples = bridge.samples(range(1, 5))
     samples["late_us"] = [5.0, 15.0, 2e6, np.nan]
     metrics.take(samples, (), 3)
-    bridge.core.observer.lost = 3
+    bridge.core.lost = 3
     metrics.take(samples[:0], (), 0)
-    found = scraped(bridge, metrics)
+    found = scraped(metrics)
     assert figure(found, "cycle_late_seconds_bucket", le="1e-05") == 1
     assert figure(found, "cycle_late_seconds_bucket", le="2e-05") == 2
     assert figure(found, "cycle_late_seconds_bucket", le="0.1") == 2
@@ -46,7 +46,8 @@ def test_lateness_buckets_are_cumulative():
 
 
 def test_faults_are_counted_by_axis_and_name():
-    bridge, metrics = FakeBridge(), Metrics()
+    bridge = FakeBridge()
+    metrics = Metrics(bridge)
     code = list(Fault).index(Fault.OVERRUN)
     events = [
         Event(1, 10, 0, 1, EventKind.FAULT, 0, code, ""),
@@ -56,7 +57,7 @@ def test_faults_are_counted_by_axis_and_name():
         Event(5, 12, 0, 0, EventKind.STATE, 0, 3, ""),
     ]
     metrics.take(bridge.samples([1]), events, 0)
-    found = scraped(bridge, metrics)
+    found = scraped(metrics)
     assert figure(found, "faults_total", axis="joint-2", fault="OVERRUN") == 2
     assert figure(found, "faults_total", axis="", fault="LOST_TPDO") == 1
     assert sum(value for (name, _), value in found.items() if name == "hdbridge_faults_total") == 3
@@ -68,7 +69,7 @@ def test_each_axis_has_one_state_and_its_figures():
     bridge.axes["joint-1"].target_deg = 30.0
     times = {"period_s": 0.004, "jitter_s": 2e-5, "latency_s": 0.006, "latency_99_s": 0.008}
     bridge.axes["joint-1"].outer = OuterState(node_id=5, alive=True, nmt=5, statusword=0x1237, **times)
-    found = scraped(bridge, Metrics())
+    found = scraped(Metrics(bridge))
     for name, state in (("joint-1", "enabled"), ("joint-2", "disabled")):
         states = {each: figure(found, "axis_state", axis=name, state=each.value) for each in ControlState}
         assert [each.value for each, value in states.items() if value] == [state]

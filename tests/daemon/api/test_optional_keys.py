@@ -159,8 +159,7 @@ def call_everything(machine: Machine, folder: Path) -> list[str]:
         path = folder / "cell.sock"
         async with AsyncExitStack() as stack:
             bridge = await stack.enter_async_context(service.ready(simulated=True))
-            for each in follow(machine, bridge, None, stack):
-                bridge.core.observer.add(each)
+            follow(bridge, stack)
             await stack.enter_async_context(served_in_loop(bridge, path))
             await asyncio.to_thread(program, path)
 

@@ -81,13 +81,13 @@ def test_a_stop_gets_through_a_flood_of_new_connections(api):
 
 
 def test_too_many_pending_requests_leave_room_for_a_stop(api):
-    api.server.traffic.open["http"] += 64
+    api.server.metrics.open["http"] += 64
     try:
         with api.over_socket() as client:
             assert client.get("/state").status_code == 503
             assert client.post("/quick-stop").status_code == 200
     finally:
-        api.server.traffic.open["http"] -= 64
+        api.server.metrics.open["http"] -= 64
 
 
 @pytest.mark.parametrize("length", ["9", "300000", "99999999999"])

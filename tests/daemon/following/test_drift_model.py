@@ -31,8 +31,8 @@ def test_on_line_columns_equal_those_of_a_record():
     known = []
     for angle in motor.tolist():
         columns.advance(angle, Moment())
-        states.append(columns.state())
-        known.append(columns.known())
+        states.append(columns.state)
+        known.append(columns.known)
     rows = columns.rows(motor, np.array(states))
     after = known.index(True)
     assert 0 < after < len(motor) // 2

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.adapting import History
 from support.daemon import stepped_daemon
 from support.keys import changed
 from support.raised import measured_response, raised_profile
@@ -17,7 +18,6 @@ from hdbridge import AxisConfig, TransmissionModel
 from hdbridge.analysis.response import answers
 from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.client import messages
-from hdbridge.daemon.following.adaptation import Proposal
 from hdbridge.daemon.following.follower import Follower
 from hdbridge.daemon.following.judging import Verdict
 from hdbridge.daemon.machinefile import AdaptationSettings
@@ -38,26 +38,31 @@ def profile(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 class Seen(NamedTuple):
     verdicts: list[Verdict]
-    proposals: list[Proposal]
+    events: list[str]
+    """Events of the adaptation's history about the response."""
+    responses: list[Response | None]
+    """Responses that have replaced the committed one."""
     state: messages.AdaptationState
 
 
 def seen(
     profile: Path, mode: AdaptationMode = AdaptationMode.ON, stuck: bool = False, **servo: float
 ) -> Seen:
-    """Returns verdicts and proposals over moves in both directions, with these servo parameters."""
+    """Returns verdicts and refinements over moves in both directions, with these servo parameters."""
     axis = AxisConfig.load(profile)
     model = replace(TransmissionModel.load(profile / "model.yaml"), response=measured_response(profile))
     truth = changed(Truth.load(profile / "truth.yaml"), **{f"servo__{key}": servo[key] for key in servo})
     verdicts: list[Verdict] = []
-    proposals: list[Proposal] = []
+    responses: list[Response | None] = []
+    history = History()
     with stepped_daemon([axis], model=model, truth=truth) as daemon:
         daemon.verify()
         daemon.enable()
         daemon.run(0.6)
         samples = daemon.memory.reader()
         follower = Follower(axis, model, settings=AdaptationSettings(interval_s=1.0))
-        follower.adapt(mode)
+        follower.adapt(mode, history)  # type: ignore[arg-type]
+        assert follower.adaptation is not None
         if stuck:
             daemon.nodes[0].faults.load_reading = lambda _: 0
         for speed in SPEEDS_DEG_S:
@@ -66,14 +71,16 @@ def seen(
                 daemon.turn()
                 while not daemon.axes[0].set_point.at_rest:
                     daemon.turn(25)
-                    outcome = follower.take(samples.read()[0])
-                    verdicts += [each.verdict for each in outcome.raised]
-                    proposals += [outcome.proposal] if outcome.proposal is not None else []
-        return Seen(verdicts, proposals, follower.state())
+                    verdicts += [each.verdict for each in follower.take(samples.read()[0]) or ()]
+                    used = follower.adaptation.model.response
+                    if used is not (responses[-1] if responses else model.response):
+                        responses.append(used)
+        events = [each["event"] for each in history.entries if "refine" in each["event"]]
+        return Seen(verdicts, events, responses, follower.state())
 
 
 def test_the_same_servo_is_neither_reported_nor_refined(profile: Path) -> None:
-    assert seen(profile)[:2] == ([], [])
+    assert seen(profile)[:3] == ([], [], [])
 
 
 @pytest.mark.parametrize(
@@ -83,13 +90,13 @@ def test_a_retuned_servo_is_reported_and_the_response_refined(profile: Path, ser
     found = seen(profile, **servo)
     assert Verdict.RETUNED in found.verdicts
     committed = measured_response(profile)
-    assert found.proposals
-    for each in found.proposals:
-        assert each.apply
-        assert each.model.response is not None
-        change = abs(without_lag(committed) / without_lag(each.model.response) - 1.0)
+    assert found.responses
+    assert found.events == ["refined"] * len(found.responses)
+    for each in found.responses:
+        assert each is not None
+        change = abs(without_lag(committed) / without_lag(each) - 1.0)
         assert 0.02 < change.max() < 1.01 * AdaptationSettings().bound_share
-    shown, last = found.state.response, found.proposals[-1].model.response
+    shown, last = found.state.response, found.responses[-1]
     assert shown is not None
     assert last is not None
     change = abs(without_lag(last) / without_lag(committed) - 1.0)
@@ -115,8 +122,8 @@ def test_refinement_needs_a_trusted_encoder_and_permission(
 ) -> None:
     found = seen(profile, mode, stuck, position_gain_per_s=130.0)
     assert Verdict.RETUNED in found.verdicts
-    assert not any(each.apply for each in found.proposals)
-    assert len(found.proposals) == (mode is AdaptationMode.OBSERVE)
+    assert not found.responses
+    assert found.events == ["would refine"] * (mode is AdaptationMode.OBSERVE)
     assert ("load encoder" in (found.state.frozen or "")) == stuck
     assert found.state.response is None
 

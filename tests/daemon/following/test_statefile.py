@@ -30,11 +30,12 @@ def test_every_change_is_logged_and_the_state_survives_a_restart(tmp_path):
         axis.works(worn(4.0), seed=seed)
     used = axis.follower.adaptation.model
     changes = [each for each in history(tmp_path) if each["event"] == "changed"]
-    assert len(changes) == len(axis.proposals) > 1
+    assert len(changes) > 1
     assert changes[0]["time"] == NOON.isoformat()
     offsets = [each["changes"]["hysteresis.offset_arcsec"] for each in changes]
     assert offsets[0]["before"] == offsets[0]["committed"] == 40.0
     assert [each["before"] for each in offsets[1:]] == [each["after"] for each in offsets[:-1]]
+    assert offsets[-1]["after"] == used.effects[1].offset_arcsec
     axis.follower.save()
 
     again = on(tmp_path)
@@ -71,7 +72,8 @@ def test_reverting_takes_one_call_and_survives_a_restart(tmp_path):
     axis = on(tmp_path)
     for seed in range(3):
         axis.works(worn(4.0), seed=seed)
-    assert axis.follower.revert().model == MODEL
+    axis.follower.revert()
+    assert axis.adaptation.model == MODEL
     assert axis.follower.state().mode == messages.AdaptationMode.OBSERVE
     assert on(tmp_path).adaptation.model == MODEL
     assert history(tmp_path)[-2]["event"] == "back"
@@ -88,7 +90,7 @@ def test_a_full_disk_loses_only_the_history(tmp_path, monkeypatch):
     monkeypatch.setattr("hdbridge.daemon.following.statefile.write_atomically", full)
     for seed in range(3):
         axis.works(worn(4.0), seed=seed)
-    assert axis.proposals
+    assert axis.adaptation.model != MODEL
     assert not (tmp_path / "article.json").exists()
     monkeypatch.undo()
     axis.works(worn(4.0), seed=4)

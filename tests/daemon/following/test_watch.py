@@ -58,7 +58,7 @@ def watched(truth, duration_s=900.0, seed=0, change=None, model=MODEL, batch=250
 
 def raised_over(follower, samples, batch):
     batches = (samples[first : first + batch] for first in range(0, len(samples), batch))
-    return [each for batch in batches for each in follower.take(batch).raised]
+    return [each for batch in batches for each in follower.take(batch) or ()]
 
 
 def test_normal_work_raises_nothing():

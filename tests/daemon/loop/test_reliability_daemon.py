@@ -306,9 +306,9 @@ def test_a_full_disk_does_not_disturb_the_loop(moving: DaemonBench, tmp_path: Pa
 
     async def story() -> None:
         async with moving.service.bridge() as bridge:
-            bridge.core.observer.add(recorder)
+            bridge.core.add_sink(recorder)
             await bridge.core.timing.sleep(1.0)
-            await until(bridge, lambda: bridge.core.observer.newest is not None)
+            await until(bridge, lambda: bridge.core.newest is not None)
 
     play(story())
     recorder.close()

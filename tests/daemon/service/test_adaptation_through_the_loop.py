@@ -1,8 +1,7 @@
 """The adaptation through the whole daemon: samples come from the loop, and a changed model goes to it."""
 
-import asyncio
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,20 +36,8 @@ async def adapting(service: Service) -> AsyncIterator[tuple[ServiceBridge, str, 
     """Adaptation assembled as in the service process."""
     async with service.enabled() as (bridge, _, token):
         made = service.follow(bridge, service.machine.axes[0].adaptation)
-        task = asyncio.get_running_loop().create_task(follow(bridge, made))
-        try:
-            yield bridge, token, made
-        finally:
-            task.cancel()
-            with suppress(asyncio.CancelledError):
-                await task
-            made.close()
-
-
-async def follow(bridge: ServiceBridge, made: Following) -> None:
-    while True:
-        await made.apply()
-        await bridge.core.timing.sleep(1.0)
+        yield bridge, token, made
+        made.close()
 
 
 async def work(bridge: ServiceBridge, token: str, stands: int, seed: int = 0) -> None:

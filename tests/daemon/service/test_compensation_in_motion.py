@@ -82,14 +82,13 @@ def test_every_kind_of_motion_removes_the_ripple(motion, profile: Path, tmp_path
 def test_adaptation_removes_the_ripple_of_a_retuned_servo(profile: Path, tmp_path: Path) -> None:
     async def story(service: Service) -> tuple[float, float]:
         async with service.enabled() as (bridge, axis, token):
-            following = service.follow(bridge, AdaptationSettings(mode="on", interval_s=1.0))
+            service.follow(bridge, AdaptationSettings(mode="on", interval_s=1.0))
             await axis.motion.move(token, -FAR_DEG)
             before = await ripple(service, bridge, token, goto)
             for speed in (60.0, 45.0) * 2:
                 for target in (0.0, FAR_DEG):
                     bridge.lease.check(token)
                     await axis.motion.move(token, target, speed)
-                    await following.apply()
             await axis.motion.move(token, -FAR_DEG)
             return before, await ripple(service, bridge, token, goto)
 

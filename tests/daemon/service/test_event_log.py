@@ -1,22 +1,15 @@
 """Clients receive the newest events, however many legs of streams have ended meanwhile."""
 
+import numpy as np
 from support.service import Service
 
-from hdbridge.daemon.memory import Event, EventKind
+from hdbridge.client import messages
+from hdbridge.daemon.memory import Event, EventKind, sample_dtype
 from hdbridge.daemon.service.bridge import EVENTS_RETURNED
 from hdbridge.daemon.service.eventlog import ENTRIES_KEPT, EventLog
 from hdbridge.motion import MotionMode
 
-
-class EventReader:
-    """Reader of events supplied by a test."""
-
-    def __init__(self) -> None:
-        self.events: list[Event] = []
-
-    def read(self) -> tuple[list[Event], int]:
-        events, self.events = self.events, []
-        return [each._replace(sequence=number) for number, each in enumerate(events, 1)], 0
+NO_SAMPLES = np.zeros(0, sample_dtype(1))
 
 
 def event(kind: EventKind, code: int = 0, text: str = "") -> Event:
@@ -24,23 +17,28 @@ def event(kind: EventKind, code: int = 0, text: str = "") -> Event:
 
 
 def test_routine_events_do_not_displace_stops() -> None:
-    reader = EventReader()
-    log = EventLog(reader)
-    reader.events = [event(EventKind.STOPPED, text="cycle 1: lost")]
+    log = EventLog(["axis1"])
     leg = [event(EventKind.DONE), event(EventKind.MOTION_ENDED, MotionMode.STREAM)]
-    reader.events += leg * ENTRIES_KEPT
-    reader.events.append(event(EventKind.MOTION_ENDED, MotionMode.GOTO))
-    log.poll()
-    assert [(each.sequence, each.text) for each in log.public(0)] == [(1, "cycle 1: lost"), (2, "")]
-    assert log.newest_public == 2
-    ended = log.public(1)[0].event
-    assert ended is not None
-    assert (ended.kind, ended.code) == (EventKind.MOTION_ENDED, MotionMode.GOTO)
-    assert log.public(2) == log.public(99) == []
-    # The service itself reads all events, public or not.
-    assert log.newest == 2 * ENTRIES_KEPT + 2
-    assert len(log.since(0)) == ENTRIES_KEPT
-    assert [each.sequence for each in log.since(2 * ENTRIES_KEPT)] == [log.newest - 1, log.newest]
+    log.take(NO_SAMPLES, [event(EventKind.STOPPED, text="cycle 1: lost"), *leg * ENTRIES_KEPT], 0)
+    log.take(NO_SAMPLES, [event(EventKind.MOTION_ENDED, MotionMode.GOTO)], 0)
+    assert [(each.sequence, each.text) for each in log.since(0)] == [(1, "cycle 1: lost"), (2, "goto")]
+    assert log.newest == 2
+    (ended,) = log.since(1)
+    assert (ended.kind, ended.axis) == (messages.EventKind.MOTION_ENDED, "axis1")
+    assert log.since(2) == log.since(99) == []
+
+
+def test_a_note_with_a_kind_is_recorded_with_the_name_of_its_axis() -> None:
+    log = EventLog(["axis1"])
+    recorded: list[tuple[str, str]] = []
+    log.record = lambda kind, text: recorded.append((kind, text))
+    log.note("plain", 0)
+    log.note("it squeaks", 0, "MARK")
+    log.note("all squeak", kind="MARK")
+    assert recorded == [("MARK", "axis1: it squeaks"), ("MARK", "all squeak")]
+    assert [(each.axis, each.text) for each in log.since(0)] == [
+        ("axis1", "plain"), ("axis1", "it squeaks"), (None, "all squeak"),
+    ]  # fmt: skip
 
 
 async def test_the_newest_events_are_returned_and_the_others_counted(service: Service) -> None:

@@ -16,20 +16,20 @@ from support.service import Service, until
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Hysteresis
 from hdbridge.axis.model import TransmissionModel
+from hdbridge.client import messages
 from hdbridge.client.messages import AdaptationMode
 from hdbridge.daemon.machinefile import AdaptationSettings
-from hdbridge.daemon.memory import EventKind
-from hdbridge.daemon.recorder.flightlog import Note
 from hdbridge.daemon.serve import follow
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
+from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.enums import Scheme
 
 DEMO = Path("profiles/demo/axis.yaml")
 
 
 def changes(bridge: ServiceBridge) -> int:
-    return sum(each.kind is EventKind.CHANGED for each in bridge.core.log.since(0))
+    return sum(each.kind is messages.EventKind.CHANGED for each in bridge.core.log.since(0))
 
 
 async def test_a_disabled_adaptation_learns_and_writes_nothing(service: Service, tmp_path: Path) -> None:
@@ -37,8 +37,7 @@ async def test_a_disabled_adaptation_learns_and_writes_nothing(service: Service,
     async with service.ready() as bridge:
         made = service.follow(bridge, AdaptationSettings())
         before = changes(bridge)
-        await until(bridge, lambda: bridge.core.observer.cycle > 100)
-        await made.apply()
+        await until(bridge, lambda: bridge.core.cycle > 100)
         assert made.state.mode is AdaptationMode.OFF
         assert changes(bridge) == before
         assert not folder.exists()
@@ -54,7 +53,6 @@ async def test_without_a_model_a_calibration_is_requested(service: Service) -> N
         made = service.follow(bridge, AdaptationSettings(mode="on"))
         await until(bridge, lambda: made.state.frozen is not None)
         assert made.state.frozen == "there is no model to follow: calibrate first"
-        await made.apply()
 
 
 async def test_an_unwritable_folder_is_reported_and_the_axis_works(service: Service, tmp_path: Path) -> None:
@@ -72,13 +70,12 @@ async def test_each_axis_is_watched_in_its_own_thread_that_ends(
 ) -> None:
     with caplog.at_level(logging.ERROR):
         async with service.enabled() as (bridge, _, token), AsyncExitStack() as stack:
-            for each in follow(service.machine, bridge, None, stack):
-                bridge.core.observer.add(each)
+            follow(bridge, stack)
             first, second = bridge.axes.values()
             await first.motion.move(token, 5.0)
             await second.compensate(token, Scheme.SYNCHRONOUS)
-            begun = bridge.core.observer.cycle
-            await until(bridge, lambda: bridge.core.observer.cycle > begun + 500)
+            begun = bridge.core.cycle
+            await until(bridge, lambda: bridge.core.cycle > begun + 500)
             assert (first.state().advice, second.state().advice) == ([], [])
     assert caplog.records == []
     assert not [each for each in threading.enumerate() if each.name.startswith("following")]
@@ -91,17 +88,18 @@ def test_a_verdict_gives_advice_note_and_diagnosis_until_a_new_model(tmp_path: P
     worn = loop.model_copy(update={"offset_arcsec": 1.4 * loop.offset_arcsec})
     truth = replace(model, effects=tuple(worn if each is loop else each for each in model.effects))
     samples = SampleMaker(config, model, truth).make(moves_and_rests(900.0, config.drive.cycle_s))
-    axis, recorder, diagnosis = MagicMock(), MagicMock(), MagicMock()
+    axis, diagnosis = MagicMock(), MagicMock()
     axis.name, axis.axis.config, axis.models.chosen.model = "demo", config, model
+    axis.link.index = 0
+    axis.models.in_use = CompensationSetting(model, Scheme.EXTENDED)
     with ThreadPoolExecutor(1) as worker:
-        made = Following(0, axis, AdaptationSettings(), tmp_path, worker, recorder, diagnosis)
+        made = Following(axis, AdaptationSettings(), tmp_path, worker, diagnosis)
         for batch in np.array_split(samples, 100):
             made.take(batch, [], 0)
         made.close()
         (advice,) = made.advice
         assert advice.startswith("recalibrate: hysteresis.offset_arcsec ")
-        recorder.put.assert_called_once_with(Note("WATCH", f"demo: {advice}"))
-        axis.core.log.note.assert_called_once_with(advice, 0)
+        axis.core.log.note.assert_called_once_with(advice, 0, "WATCH")
         assert diagnosis.start.call_args.args[:4] == ("demo", model.dump(), 15.0, advice)
 
         axis.models.chosen.model = truth

@@ -199,7 +199,7 @@ async def test_lost_settings_are_sent_again(pair: Service, lost: int) -> None:
         begin_uncompensated(pair)
         for _ in range(lost):  # each time the new control process dies before it has read a command
             await bridge.core.timing.sleep(0.0)
-            bridge.core.observer.poll()
+            bridge.core.poll()
             begin_uncompensated(pair)
         await until(bridge, lambda: settled(bridge))
         assert used(pair) == [["synchronous"], ["hysteresis"]]

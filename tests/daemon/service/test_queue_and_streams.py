@@ -198,3 +198,11 @@ async def test_coordinated_axes_arrive_together(service: Service) -> None:
             await bridge.coordinated(token, {"axis1": 0.0, "axis3": 1.0})
         with pytest.raises(InputError, match="limits"):
             await bridge.coordinated(token, {"axis1": 0.0, "axis2": 1e5})
+
+
+async def test_a_queue_is_accepted_once_a_jog_has_timed_out(service: Service) -> None:
+    async with service.enabled() as (bridge, axis, token):
+        await axis.motion.jog(token, 5.0, 0.1)
+        await until(bridge, lambda: axis.state().mode == "hold")
+        await axis.motion.queue(token, [way_point(2.0)])
+        await until(bridge, lambda: axis.state().load_target_deg == 2.0)

@@ -14,7 +14,6 @@ from hdbridge.daemon.api.routes.parts import (
     KeptHolder,
     port,
     refusals,
-    stopped,
 )
 from hdbridge.drive.values import Object, Value
 
@@ -52,7 +51,6 @@ async def reset(axis: FoundAxis, holder: KeptHolder) -> messages.AxisState:
 async def quick_stop(axis: FoundAxis) -> messages.AxisState:
     """Stop as fast as the drive can, latched until a reset. Needs no lease."""
     await axis.quick_stop()
-    await stopped(axis)
     return axis.state()
 
 

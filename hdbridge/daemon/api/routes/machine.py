@@ -13,7 +13,6 @@ from hdbridge.daemon.api.routes.parts import (
     KeptHolder,
     port,
     refusals,
-    stopped,
 )
 from hdbridge.drive.interfacelock import user_name
 
@@ -77,7 +76,6 @@ async def release_lease(bridge: Bridge, holder: Holder = "") -> messages.LeaseSt
 async def quick_stop_all(bridge: Bridge) -> messages.MachineState:
     """Stop every axis as fast as its drive can, latched until a reset. Needs no lease."""
     await bridge.quick_stop()
-    await stopped(*bridge.axes.values())
     return bridge.state()
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 from fastapi import Depends, Header, Path, Request
 from starlette.requests import HTTPConnection
 
-from hdbridge.client.messages import ControlState, Problem
+from hdbridge.client.messages import Problem
 from hdbridge.daemon.api.problems import UnknownError
 from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.daemon.service.bridge import ServiceBridge
@@ -16,10 +16,6 @@ from hdbridge.errors import LeaseError
 
 RENEWALS: Final = 3
 """Lease renewals per time-out while a request of the lease holder is in progress."""
-
-STOP_LOOKS: Final = 25
-STOP_LOOK_S: Final = 0.01
-_ON: Final = frozenset({ControlState.ENABLING, ControlState.ENABLED, ControlState.STOPPING})
 
 
 async def _bridge(connection: HTTPConnection) -> ServiceBridge:
@@ -66,14 +62,6 @@ def port(bridge: ServiceBridge, axis: str) -> ServiceAxis:
     if found is None:
         raise UnknownError(f"there is no axis {axis[:80]!a}; expected one of: {', '.join(bridge.axes)}")
     return found
-
-
-async def stopped(*axes: ServiceAxis) -> None:
-    """Waits briefly until a quick stop shows in the axes' states, because samples arrive in batches."""
-    for _ in range(STOP_LOOKS):
-        if all(each.state().state not in _ON for each in axes):
-            return
-        await asyncio.sleep(STOP_LOOK_S)
 
 
 async def _found(bridge: Bridge, axis: AxisName) -> ServiceAxis:

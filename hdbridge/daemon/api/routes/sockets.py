@@ -26,7 +26,7 @@ from hdbridge.client.messages import (
 from hdbridge.daemon.api.guard import SUBPROTOCOL
 from hdbridge.daemon.api.routes.parts import Bridge, port
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.reports import STATES
+from hdbridge.daemon.service.eventlog import STATES
 from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.units import ARCSEC_PER_DEG
 
