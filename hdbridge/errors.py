@@ -18,10 +18,16 @@ A message says what is wrong, where (file:line:column, node and object), what wa
 Exit status 1 is an error in hdbridge itself; 130 is Ctrl-C.
 """
 
+import shlex
 from typing import ClassVar, Final
 
 RESET: Final = "'hdbridge reset PROFILE', or 'hdbridge ctl reset AXIS' if a daemon holds the drive"
 """Commands that reset a fault, for all messages that request a reset."""
+
+
+def command(*words: object) -> str:
+    """Returns a command line of hdbridge for a message or a page, quoted for a shell."""
+    return shlex.join(["hdbridge", *map(str, words)])
 
 
 class HdbridgeError(Exception):

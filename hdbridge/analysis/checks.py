@@ -42,6 +42,7 @@ def check_records(records: Mapping[Path, Record], ratio: float) -> None:
     at least one record. The paths are used in the messages.
     """
     for path, record in records.items():
+        record.check_values()
         if len(record) > 1 and float(np.ptp(record.time_s)) == 0.0:
             raise InputError(
                 f"{path}: time_s: {record.time_s[0]:g} in all {len(record)} rows; expected increasing times"

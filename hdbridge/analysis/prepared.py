@@ -22,7 +22,7 @@ from hdbridge.analysis.driving import kinematics, reading_of_all, reversals, set
 from hdbridge.analysis.readings import Reading, quantum_deg, third_deviation
 from hdbridge.axis.effects import BoolArray, FloatArray, IntArray, Motion, Start
 from hdbridge.errors import InputError
-from hdbridge.records.record import OPTIONAL, REQUIRED, Record
+from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
@@ -241,22 +241,10 @@ def observe(
     it.
     """
     record = measured.record
-    name = f"{record.source}: " if record.source else ""
     time, position, target = record.time_s, record.motor_position_deg, record.motor_target_deg
-    for column in sorted(record.columns.keys() & {*REQUIRED, *OPTIONAL}):
-        bad = np.flatnonzero(~np.isfinite(record.columns[column]))
-        if len(bad):
-            raise InputError(
-                f"{name}{column} of sample {bad[0]} is {record.columns[column][bad[0]]}; expected a finite "
-                "number: remove the sample or repair the file"
-            )
-    for row in np.setdiff1d(np.flatnonzero(np.diff(time) < 0.0) + 1, record.starts)[:1].tolist():
-        raise InputError(
-            f"{name}time_s of sample {row} is earlier than that of sample {row - 1}; expected increasing "
-            f"times: sort the samples, or split the record"
-        )
+    record.check_values()
     if not ratio > 0:
-        raise InputError(f"{name}the ratio is {ratio:g}; expected more than 0")
+        raise InputError(f"the ratio is {ratio:g}; expected a number above 0")
     rows_of = [slice(first, last) for first, last in pairwise([*record.starts, len(time)])]
     for part in record.parts():
         part.check_ratio(ratio)

@@ -12,6 +12,7 @@ import io
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -171,14 +172,32 @@ def _replaced(error: UnicodeError) -> tuple[str, int]:
 codecs.register_error(_HANDLER, _replaced)
 
 
-def main() -> None:
-    """Runs the command line; an error of hdbridge becomes one line and its exit status."""
+class _Remarks(io.FileIO):
+    """Standard error; discards what cannot be written, because no remark is worth a measurement."""
+
+    def write(self, data: Any) -> int:
+        """Writes the data, or discards them (full disk)."""
+        with suppress(OSError):
+            return super().write(data)
+        return len(data)
+
+
+def _prepare_streams() -> None:
+    """Makes both standard streams usable, whatever their state and encoding."""
     for name in ("stdout", "stderr"):  # closed by the parent process: output is discarded
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors=_HANDLER)
+    if sys.stderr is sys.__stderr__ and isinstance(sys.stderr, io.TextIOWrapper):
+        remarks = io.BufferedWriter(_Remarks(sys.stderr.fileno(), "w", closefd=False))
+        sys.stderr = io.TextIOWrapper(remarks, sys.stderr.encoding, _HANDLER, line_buffering=True)
+
+
+def main() -> None:
+    """Runs the command line; an error of hdbridge becomes one line and its exit status."""
+    _prepare_streams()
     try:
         status = app(prog_name="hdbridge", standalone_mode=False)
         sys.stdout.flush()

@@ -17,7 +17,7 @@ from hdbridge.cli.session import BusOptions, Session, deferred_interrupt, on_axi
 from hdbridge.clock import MonotonicClock
 from hdbridge.commissioning.bringup import ASK_TIMEOUT_S, LISTEN_S, TORQUE_PERCENT
 from hdbridge.commissioning.bringup.checks import Check, Outcome, Verdict, failed, not_possible, passed
-from hdbridge.errors import DriveError, InputError
+from hdbridge.errors import DriveError, InputError, command
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def new(
         AxisConfig.load(name)
     except InputError as problem:
         say(f"to be completed: {problem}")
-    say(f"next: hdbridge check {name}")
+    say(f"next: {command('check', name)}")
 
 
 def _scanned(

@@ -15,7 +15,7 @@ from hdbridge.cli import options as opt
 from hdbridge.cli.options import taking
 from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_result
 from hdbridge.cli.session import Session, model_file
-from hdbridge.errors import InputError
+from hdbridge.errors import InputError, command
 from hdbridge.files.atomic import make_folder, new_folder
 from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
@@ -212,8 +212,8 @@ def measure(session: Session, measured: Measured) -> None:
     recording = journal.recording()
     say(f"recording: {work.folder}, {len(journal.done)} tasks, {len(recording.record)} samples")
     if files.model.exists():
-        say(f"what the model lacks: hdbridge diagnose {work.folder} --model {files.model}")
-    say(f"what the simulated drive gets wrong: hdbridge twin {session.profile} {work.folder}")
+        say(f"what the model lacks: {command('diagnose', work.folder, '--model', files.model)}")
+    say(f"what the simulated drive gets wrong: {command('twin', session.profile, work.folder)}")
 
 
 @taking(opt.CsvFormat)
@@ -352,9 +352,9 @@ def print_next(offer: Offer | None, session: Session) -> None:
     """Prints the next commands for a pending model; a daemon that lent its bus commits the model itself."""
     if offer is not None and offer.made:
         folder = session.files.axis.parent
-        daemon = f"hdbridge ctl model {session.axis.name} pending"
-        use = daemon if session.borrow else f"hdbridge model commit {folder}"
-        say(f"pending: {offer.pending}\nreview it: hdbridge model diff {folder}\nuse it: {use}")
+        daemon = command("ctl", "model", session.axis.name, "pending")
+        use = daemon if session.borrow else command("model", "commit", folder)
+        say(f"pending: {offer.pending}\nreview it: {command('model', 'diff', folder)}\nuse it: {use}")
 
 
 def print_stepping(checked: Validation) -> None:

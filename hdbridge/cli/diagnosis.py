@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -15,7 +14,7 @@ from hdbridge.cli.options import need_extra, taking
 from hdbridge.cli.printing import note, print_table, say, write_json, write_result
 from hdbridge.cli.recordings import Part, is_flight, remarks
 from hdbridge.cli.session import Session, model_file
-from hdbridge.errors import InputError
+from hdbridge.errors import InputError, command
 from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
 from hdbridge.units import figure
@@ -103,10 +102,10 @@ def diagnose(
         path = flights[0] / f"model {used.version}"
         known = TransmissionModel.from_text(used.text, path)
     elif model is None:
-        given = shlex.join(map(str, records)) if records else "RECORD"
+        first = command("fit", *(records or [Path("RECORD")]), "--ratio", "N", "--out", "model.yaml")
         raise InputError(
             "--model is missing; pass the profile of a calibrated axis (--model PROFILE), or fit a model "
-            f"first: 'hdbridge fit {given} --ratio N --out model.yaml', then pass --model model.yaml"
+            f"first: {first}, then pass --model model.yaml"
         )
     else:
         path = model_file(model)
@@ -145,7 +144,7 @@ def diagnose(
             result,
             title=_title(recording, records),
             provenance=_provenance(recording, records, path),
-            command=shlex.join(["hdbridge", "diagnose", *map(str, records), *said]),
+            command=command("diagnose", *records, *said),
         )
         write_result(html_file, render(page))
     if extend is not None:
@@ -386,8 +385,8 @@ def _active(files: Profile) -> TransmissionModel:
 
     if not files.model.exists():
         raise InputError(
-            f"{files.model}: there is no active model to improve; calibrate first: hdbridge calibrate "
-            f"{files.folder}"
+            f"{files.model}: there is no active model to improve; calibrate first: "
+            f"{command('calibrate', files.folder)}"
         )
     return TransmissionModel.load(files.model)
 

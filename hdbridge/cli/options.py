@@ -316,7 +316,10 @@ def _options_of(command: Callable[..., Any]) -> Iterator[tuple[str, tuple[str, K
 
 
 def _option(name: str, metadata: tuple[Any, ...]) -> str:
+    """Returns the name of a parameter on the command line: its option, or the placeholder of an argument."""
     for info in metadata:
+        if isinstance(info, ArgumentInfo):
+            return str(info.metavar or name.upper())
         if isinstance(info, OptionInfo):
             # In an Annotated hint the first name is stored in place of the default.
             for each in (info.default, *(info.param_decls or ())):

@@ -16,7 +16,7 @@ from hdbridge.cli.calibration import phases, print_steps
 from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_result
 from hdbridge.cli.session import Session, compensating_model, note_clamped, on_axis
 from hdbridge.enums import Scheme
-from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.errors import HdbridgeError, InputError, command
 from hdbridge.files.atomic import make_folder, new_folder
 from hdbridge.files.outputs import Kind, writing
 from hdbridge.files.profile import Profile
@@ -374,7 +374,7 @@ def motion(
             datetime.now().astimezone(),
             identity,
         )
-        say(f"pending: {pending}; commit it with: hdbridge model commit {session.profile}")
+        say(f"pending: {pending}; commit it with: {command('model', 'commit', session.profile)}")
         if result.wind_up is not None:
             say("calibrate again after that: with the wind-up compensated, the hysteresis at rest differs")
 

@@ -15,7 +15,7 @@ from hdbridge.cli import options as opt
 from hdbridge.cli.options import taking
 from hdbridge.cli.printing import note
 from hdbridge.clock import Clock, MonotonicClock
-from hdbridge.errors import DaemonError, InputError
+from hdbridge.errors import DaemonError, InputError, command
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
@@ -244,9 +244,10 @@ def model_file(text: str) -> Path:
         )
     if not files.model.is_file():
         raise InputError(
-            f"{files.folder}: there is no model.yaml; make one: hdbridge calibrate {files.folder}, and "
-            f"commit it: hdbridge model commit {files.folder}; or fit one to a record: hdbridge fit RECORD "
-            f"--axis {files.folder} --out model.yaml, and pass --model model.yaml"
+            f"{files.folder}: there is no model.yaml; make one: {command('calibrate', files.folder)}, and "
+            f"commit it: {command('model', 'commit', files.folder)}; or fit one to a record: "
+            f"{command('fit', 'RECORD', '--axis', files.folder, '--out', 'model.yaml')}, and pass "
+            "--model model.yaml"
         )
     return files.model
 
@@ -258,8 +259,8 @@ def compensating_model(files: Profile, profile: str, model: Path | None, otherwi
     """
     if model is None and not files.model.exists():
         raise InputError(
-            f"{files.model}: there is no model to compensate with; calibrate first: hdbridge calibrate "
-            f"{profile}{otherwise}"
+            f"{files.model}: there is no model to compensate with; calibrate first: "
+            f"{command('calibrate', profile)}{otherwise}"
         )
     return model or files.model
 

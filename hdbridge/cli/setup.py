@@ -3,7 +3,6 @@
 import hashlib
 import json
 import re
-import shlex
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ from typer import Argument, Option
 
 from hdbridge.cli import options as opt
 from hdbridge.cli.printing import note, say
-from hdbridge.errors import BusError, DriveError, HdbridgeError, InputError
+from hdbridge.errors import BusError, DriveError, HdbridgeError, InputError, command
 from hdbridge.files.atomic import write_atomically
 
 STATE: Final = "setup.json"
@@ -77,7 +76,7 @@ def setup(
         work.complete("commit", work.commit)
         work.complete("move", work.move)
     except (HdbridgeError, KeyboardInterrupt, typer.Abort, typer.Exit):
-        note(f"resume: hdbridge setup {shlex.quote(str(folder))}")
+        note(f"resume: {command('setup', folder)}")
         raise
     work.print_next()
 
@@ -208,11 +207,11 @@ class _Setup:
 
     def print_next(self) -> None:
         """Prints the path of the calibration's page and the commands for daily use."""
-        how = " --simulate" if self.simulated else ""
+        how = ["--simulate"] if self.simulated else []
         say(
             f"\nthe axis is set up. Its page: {self._folder / RECORDING / 'report.html'}\n"
-            f"every day: hdbridge run {self._folder} --page{how}\n"
-            f"by hand:   hdbridge move {self._folder} ANGLE{how}"
+            f"every day: {command('run', self._folder, '--page', *how)}\n"
+            f"by hand:   {command('move', self._folder, 'ANGLE', *how)}"
         )
 
     # ---------------------------------------------------------------- parts of the steps
@@ -226,7 +225,7 @@ class _Setup:
         from hdbridge.cli import app
 
         words = [str(each) for each in arguments]
-        say(f"\n$ hdbridge {shlex.join(words)}", style="bold")
+        say(f"\n$ {command(*words)}", style="bold")
         status = app(words, prog_name="hdbridge", standalone_mode=False)
         if status:
             raise typer.Exit(status)

@@ -11,7 +11,7 @@ from typer import Argument, Option
 from hdbridge.cli import options as opt
 from hdbridge.cli.options import taking
 from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_result
-from hdbridge.errors import InputError
+from hdbridge.errors import InputError, command
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def _learned(
             kept = TwinFile(twin.truth).with_provenance(recordings=[str(each) for each in paths])
             reason = f"learned from {', '.join(each.name for each in paths)}"
             TWINS.propose(files.folder, kept, reason, datetime.now().astimezone(), recording.drive)
-    commit = Command(f"hdbridge model commit {files.folder} --twin", "makes it what --simulate uses")
+    commit = Command(command("model", "commit", files.folder, "--twin"), "makes it what --simulate uses")
     return TwinReport(
         axis.name,
         twin.before,
@@ -162,7 +162,7 @@ def _check(
     if twin is None:
         raise InputError(
             f"{files.folder}: there is no active twin to check; make one with 'hdbridge twin', and commit it "
-            f"with 'hdbridge model commit {files.folder} --twin'"
+            f"with: {command('model', 'commit', files.folder, '--twin')}"
         )
     twin.check_bound_to(axis, recording.drive)
     with progress_bar() as bar:
@@ -222,7 +222,7 @@ def _beginning(files: Profile, axis: AxisConfig, truth: Path | None, *, afresh: 
         note(
             "no transmission error is simulated: neither a model nor the plant's file has one. Its effect on "
             "torque and following error may be attributed to motor or loops; calibrate first "
-            f"(hdbridge calibrate {files.folder})"
+            f"({command('calibrate', files.folder)})"
         )
     return begun
 

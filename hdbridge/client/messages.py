@@ -50,7 +50,8 @@ class Request(BaseModel):
         except ValidationError as problem:
             first = problem.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"]))
-            raise InputError(f"{where}: found {first['input']!r}; {first['msg']}") from None
+            expected = first["msg"].replace("Input should be", "expected")
+            raise InputError(f"{where}: found {first['input']!r}; {expected}") from None
 
 
 class Report(BaseModel):

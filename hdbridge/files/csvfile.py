@@ -233,8 +233,8 @@ class CsvFile:
         """Yields each row of data, with one cell per column, and its line number."""
         layout, count = self._layout, len(self.names)
         paired = layout.decimal_comma and layout.separator == ","
-        for cells, at in _parsed(self.path, _lines(content, layout.first_line), self._delimiter):
-            row, line = cells, at + layout.first_line
+        for cells, line in _parsed(self.path, content, layout.first_line, self._delimiter):
+            row = cells
             if paired and len(row) == 2 * count:
                 row = [f"{whole},{part}" for whole, part in zip(row[::2], row[1::2], strict=True)]
             if len(row) == count + 1 and not row[-1].strip():
@@ -485,15 +485,17 @@ def _is_paired(cells: Sequence[str], count: int) -> bool:
     )
 
 
-def _parsed(path: Path, lines: io.TextIOWrapper, delimiter: str) -> Iterator[tuple[list[str], int]]:
-    """Yields each non-blank row with the number of its last line."""
-    reader = csv.reader(lines, delimiter=delimiter)
+def _parsed(path: Path, content: bytes, skipped: int, delimiter: str) -> Iterator[tuple[list[str], int]]:
+    """Yields each non-blank row after the ``skipped`` lines, with the number of its first line."""
+    reader = csv.reader(_lines(content, skipped), delimiter=delimiter)
+    line = skipped + 1
     try:
         for row in reader:
             if row and (len(row) > 1 or row[0].strip()):
-                yield row, reader.line_num
+                yield row, line
+            line = skipped + reader.line_num + 1
     except csv.Error as problem:
-        raise _wrong(f"{path}: not CSV: {problem}") from None
+        raise _wrong(f"{path}:{line}: not CSV: {problem}; expected quotes in pairs") from None
 
 
 def _column(cells: Sequence[str], *, blanks: bool, comma: bool) -> Column:

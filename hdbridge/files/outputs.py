@@ -16,7 +16,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Final
 
-from hdbridge.errors import InputError, OutputError
+from hdbridge.errors import InputError, OutputError, command
 from hdbridge.files.atomic import check_writable, descriptor_of, is_stream
 
 _HEAD_BYTES: Final = 4096
@@ -129,7 +129,7 @@ def _check_belongs_to_no_folder(output: Output) -> None:
                 return
             raise InputError(
                 f"{output.path}: {output.option} would overwrite a file of a profile; write the model to "
-                f"{folder / 'pending.yaml'}, then use it: hdbridge model commit {folder}"
+                f"{folder / 'pending.yaml'}, then use it: {command('model', 'commit', folder)}"
             )
         raise InputError(
             f"{output.path}: {output.option} would overwrite a file of the profile {profile}; "

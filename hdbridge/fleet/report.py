@@ -2,7 +2,6 @@
 
 import hashlib
 import re
-import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
@@ -12,7 +11,7 @@ from typing import Final
 from urllib.parse import quote
 
 from hdbridge import __version__
-from hdbridge.errors import InputError
+from hdbridge.errors import InputError, command
 from hdbridge.files.atomic import make_folder, write_atomically
 from hdbridge.fleet.diagnosing import local_model, read
 from hdbridge.fleet.sources import Source
@@ -52,7 +51,7 @@ def fleet_page(summary: Summary, folder: Path, pages: Mapping[str, str] = NO_PAG
     without = next((each.joint for each in summary.first if each.joint not in pages), None)
     commands = []
     if without is not None:
-        line = shlex.join(["hdbridge", "fleet", "report", str(folder), "--joint", without])
+        line = command("fleet", "report", folder, "--joint", without)
         about = f"writes the page of {without}; with --pages, those of all listed joints"
         commands.append(Command(line, about))
     return Page(
@@ -262,7 +261,7 @@ def write_page(folder: Path, row: Row) -> None:
         result,
         title=f"Diagnosis of joint {source.joint}",
         provenance=[(name, value) for name, value in known.items() if value],
-        command=shlex.join(["hdbridge", "diagnose", source.path, *options]),
+        command=command("diagnose", source.path, *options),
     )
     if row["mistaken"]:
         about = f"This is {Path(source.path).name}, the last recording of {source.joint} itself."

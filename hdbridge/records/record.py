@@ -138,6 +138,8 @@ __all__ = ["MINIMUM_SAMPLES", "OPTIONAL", "REQUIRED", "Record", "concatenate", "
 
 MINIMUM_SAMPLES: Final = 2
 
+LARGEST: Final = 1e10
+"""Largest plausible value of a channel in the record's unit; beyond it the precision of a float is lost."""
 WRONG_RATIO: Final = 0.003
 """Relative deviation of a ratio that indicates a different gear; common ratios are at least 0.6 % apart."""
 WRONG_RATIO_ARCSEC: Final = 900.0
@@ -201,14 +203,7 @@ class Record:
         if len(record) < minimum_samples:
             count = f"{len(record)} sample{'s' * (len(record) != 1)}"
             raise InputError(f"{path}: {count}; expected at least {minimum_samples}")
-        backwards = np.flatnonzero(np.diff(record.time_s) < 0.0)
-        if len(backwards):
-            row = int(backwards[0]) + 1
-            cure = origin.clock_cure(record.time_s)
-            raise InputError(
-                f"{origin.place(row)}: time_s: {record.time_s[row]:g} after {record.time_s[row - 1]:g}; "
-                f"expected times that do not decrease{f': {cure}' if cure else ''}"
-            )
+        record._check_times()
         return record
 
     def write_csv(self, path: Path | str) -> None:
@@ -279,6 +274,31 @@ class Record:
         motor = self.motor_position_deg - np.mean(self.motor_position_deg)
         square = float(motor @ motor)
         return float(motor @ self.load_position_deg) / square if square else None
+
+    def check_values(self) -> None:
+        """Raises `InputError` if time decreases, or if a value is not finite or beyond `LARGEST`."""
+        for name in sorted(self.columns.keys() & {*REQUIRED, *OPTIONAL}):
+            for row in np.flatnonzero(~(np.abs(self.columns[name]) <= LARGEST))[:1].tolist():
+                raise InputError(
+                    f"{self._place(row)}: {name}: {self.columns[name][row]:g}; expected a finite number of "
+                    f"at most {LARGEST:g}: remove the sample, or state the unit of its column"
+                )
+        self._check_times()
+
+    def _check_times(self) -> None:
+        time_s, origin = self.time_s, self.origin
+        for row in np.setdiff1d(np.flatnonzero(np.diff(time_s) < 0.0) + 1, self.starts)[:1].tolist():
+            cure = origin.clock_cure(time_s) if origin else "sort the samples, or split the record"
+            raise InputError(
+                f"{self._place(row)}: time_s: {time_s[row]:g} after {time_s[row - 1]:g}; "
+                f"expected times that do not decrease{f': {cure}' if cure else ''}"
+            )
+
+    def _place(self, row: int) -> str:
+        """Returns file and line of a row; without a file, the number of the sample (from 0)."""
+        if self.origin is not None:
+            return self.origin.place(row)
+        return f"{self.source}: sample {row}" if self.source else f"sample {row}"
 
     def check_ratio(self, ratio: float) -> None:
         """Raises `InputError` if the record's own angles contradict a ratio.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
+import math
 import platform
 import posixpath
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -273,7 +274,7 @@ def by_name(given: Given) -> dict[Path, Recording]:
 def agreed_ratio(recordings: Mapping[Path, Recording], said: Iterable[tuple[str, float | None]]) -> float:
     """Returns the gear ratio on which the recordings and ``said`` (pairs of source and value) agree.
 
-    Raises `InputError` if they disagree, or if none of them states a ratio.
+    Raises `InputError` if they disagree, if one is not positive, or if none of them states a ratio.
     """
     said = [*said, *((f"{name}", each.ratio) for name, each in recordings.items())]
     known = [(where, value) for where, value in said if value is not None]
@@ -282,7 +283,9 @@ def agreed_ratio(recordings: Mapping[Path, Recording], said: Iterable[tuple[str,
             f"{next(iter(recordings))}: the ratio of the gear is unknown; state it, or name the axis (on the "
             "command line: --ratio N or --axis PROFILE)"
         )
-    for where, value in known[1:]:
+    for where, value in known:
+        if not 0.0 < value < math.inf:
+            raise InputError(f"{where}: the ratio is {value:g}; expected a number above 0")
         if abs(value / known[0][1] - 1.0) > 1e-9:
             raise InputError(
                 f"{where} has a ratio of {value:g}, but {known[0][0]} says {known[0][1]:g}; expected one "

@@ -13,6 +13,7 @@ from hdbridge.analysis.identification import Traces
 from hdbridge.axis.effects import FloatArray
 from hdbridge.axis.model.difference import diff
 from hdbridge.commissioning.calibration import Calibration
+from hdbridge.errors import command
 from hdbridge.report.motion import motion_sections
 from hdbridge.report.page import (
     SIGMA,
@@ -108,12 +109,8 @@ def calibration_page(result: Calibration) -> Page:
 def _status(result: Calibration) -> tuple[Status, tuple[Command, ...]]:
     if result.offer is not None:
         return of_offer(result.offer)
-    records = " ".join(result.recordings)
-    return Status.MEASURED, (
-        Command(
-            f"hdbridge diagnose {records} --model MODEL.yaml", "lists the causes that the fitted model lacks"
-        ),
-    )
+    line = command("diagnose", *result.recordings, "--model", "MODEL.yaml")
+    return Status.MEASURED, (Command(line, "lists the causes that the fitted model lacks"),)
 
 
 def _verdict(result: Calibration) -> str:

@@ -9,6 +9,7 @@ from hdbridge.commissioning.calibration.pipeline import Offer
 from hdbridge.commissioning.calibration.validation import Validation
 from hdbridge.commissioning.evaluation.stepping import Stepped
 from hdbridge.enums import Scheme
+from hdbridge.errors import command
 from hdbridge.report.page import (
     SCATTER,
     SIGMA,
@@ -128,8 +129,8 @@ def of_offer(offer: Offer) -> tuple[Status, tuple[Command, ...]]:
         )
     profile = offer.pending.parent
     return Status.PENDING, (
-        Command(f"hdbridge model diff {profile}", "shows what would change"),
-        Command(f"hdbridge model commit {profile}", "makes it the active model"),
+        Command(command("model", "diff", profile), "shows what would change"),
+        Command(command("model", "commit", profile), "makes it the active model"),
     )
 
 

@@ -60,6 +60,22 @@ def test_each_command_sends_its_request(ctl, machine, line, asked):
     assert not machine.state().lease.held
 
 
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("jog", "joint-1", "1e9"), "SPEED: found 1000000000.0; expected less than or equal to 100000"),
+        (
+            ("move", "joint-1", "3", "--velocity", "1e9"),
+            "--velocity: found 1000000000.0; expected less than or equal to 100000",
+        ),
+        (("mark", "two\nlines"), "TEXT: found 'two\\nlines'"),
+    ],
+)
+def test_a_refused_value_is_named_as_on_the_command_line(ctl, machine, words, complaint):
+    assert complaint in ctl(*words, status=2)
+    assert not machine.moved
+
+
 def test_status_prints_a_table_or_json(ctl, machine, tmp_path):
     machine.axes["joint-2"].at = messages.ControlState.QUICK_STOPPED
     doubt = "the load encoder moved by 19.0 arcsec without the motor"

@@ -78,3 +78,14 @@ def test_a_full_standard_output_ends_in_one_line(process):
     assert done.stderr.splitlines() == [
         "hdbridge: the standard output cannot be written: No space left on device"
     ]
+
+
+def test_a_full_standard_error_costs_neither_result_nor_exit_status(process):
+    with open("/dev/full", "w") as full:  # noqa: PTH123
+        step = process(
+            "step", "article", "--simulate", "--count", 2, "--scheme", "none", "--record", "kept", stderr=full
+        )
+        wrong = process("check", "absent", stderr=full)
+    assert step.returncode == 0
+    assert "quantisation floor" in step.stdout
+    assert wrong.returncode == 2

@@ -123,12 +123,12 @@ def segment(**changes):
         (
             lambda: segment(load_deg=np.full(400, np.nan)),
             20.0,
-            r"a\.csv: load_position_deg of sample 0 is nan",
+            r"a\.csv: sample 0: load_position_deg: nan; expected a finite number",
         ),
         (
             lambda: segment(time_s=np.arange(400)[::-1] / 50.0),
             20.0,
-            r"a\.csv: time_s of sample 1 is earlier than",
+            r"a\.csv: sample 1: time_s: .* expected times that do not decrease",
         ),
         (segment, 21.0, r"a\.csv: the motor makes 20 turns per turn of the load .*; expected a ratio of 21"),
         (segment, -20.0, "ratio"),

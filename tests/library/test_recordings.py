@@ -15,6 +15,13 @@ def changed(record, **columns):
     return Record({**record.columns, **columns})
 
 
+def spoilt_at(record, sample, **values):
+    columns = {name: record.columns[name].copy() for name in values}
+    for name, value in values.items():
+        columns[name][sample] = value
+    return changed(record, **columns)
+
+
 def test_a_run_is_a_recording_with_its_legs(run, axis, tmp_path):
     run.save(tmp_path / "kept")
     kept = Recording.load(tmp_path / "kept")
@@ -49,6 +56,15 @@ def test_a_diagnosis_of_a_run_is_the_document_of_the_command(run, fitted):
             lambda record: changed(record, load_position_deg=(record.load_position_deg - 5) % 360),
             "multi-turn",
         ),
+        (lambda record: spoilt_at(record, 7, time_s=-1.0), "sample 7: time_s: .* do not decrease"),
+        *(
+            (
+                lambda record, name=name, value=value: spoilt_at(record, 7, **{name: value}),
+                f"sample 7: {name}",
+            )
+            for name in ("motor_position_deg", "load_position_deg", "motor_target_deg")
+            for value in (np.nan, -np.inf, 1e300)
+        ),
     ],
 )
 def test_impossible_records_are_refused_by_both(run, model, axis, spoil, complaint):
@@ -56,7 +72,7 @@ def test_impossible_records_are_refused_by_both(run, model, axis, spoil, complai
     with pytest.raises(InputError, match=complaint):
         fit(spoilt, axis=axis)
     with pytest.raises(InputError, match=complaint):
-        diagnose([run, spoilt] if "never" not in complaint else spoilt, model)
+        diagnose(spoilt if "never" in complaint or "sample" in complaint else [run, spoilt], model)
 
 
 def test_another_gear_is_refused(run):
@@ -64,6 +80,12 @@ def test_another_gear_is_refused(run):
         fit(run, ratio=100)
     with pytest.raises(InputError, match="has a ratio of 50, but the model says 100"):
         diagnose(run, TransmissionModel(100.0))
+
+
+@pytest.mark.parametrize("ratio", [0.0, -50.0, np.nan, np.inf])
+def test_an_impossible_ratio_is_refused(run, ratio):
+    with pytest.raises(InputError, match=r"the ratio is .*; expected a number above 0"):
+        fit(run.record, ratio=ratio)
 
 
 def test_a_bare_record_needs_a_ratio(run):

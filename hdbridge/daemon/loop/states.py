@@ -139,7 +139,8 @@ def target_of(state: AxisState, cause: Cause) -> AxisState | None:
 
 def refusal(state: AxisState, kind: CommandKind) -> str:
     """Returns the message for a command that is refused in a state."""
-    return f"{label(kind)} is not possible while the axis is {label(state)}: {_WAY_OUT[state]}"
+    what = "homing" if kind is _C.LEND else label(kind)
+    return f"{what} is not possible while the axis is {label(state)}: {_WAY_OUT[state]}"
 
 
 def label(name: AxisState | CommandKind) -> str:

@@ -58,6 +58,12 @@ def test_refusals_state_the_remedy() -> None:
     )
 
 
+def test_a_refused_homing_is_called_homing() -> None:
+    assert refusal(S.ENABLED, CommandKind.LEND) == (
+        "homing is not possible while the axis is enabled: disable it first"
+    )
+
+
 def test_the_documented_diagram_matches_the_table() -> None:
     page = Path(__file__).resolve().parents[3] / "docs" / "architecture.md"
     assert mermaid() in page.read_text(encoding="utf-8")
