@@ -10,7 +10,10 @@ similar functions are those of the C library that Python uses. An axis that cann
 (`Uncompilable`) runs in Python.
 """
 
+from __future__ import annotations
+
 import ast
+import copy
 import hashlib
 import inspect
 import math
@@ -104,6 +107,11 @@ class CompiledAxis:
         _fill(self._record[0], axis)
         self._entry_point = partial(_entry_point, plant, room)
         self._drive = self._entry_point("drive")
+
+    def __deepcopy__(self, _: Any) -> CompiledAxis:
+        other = copy.copy(self)
+        other._record = self._record.view(np.uint8).copy().view(self._record.dtype)  # in one piece: faster
+        return other
 
     def drive(self, *inputs: float) -> Measured:
         measured: Measured = self._drive(self._record, *inputs)

@@ -315,10 +315,15 @@ SHORTENING = 0.1
 `MAX_RESIDUAL_CHANGE`."""
 STEPS_PER_ROUND = 4
 """Number of steps between two estimates of the residuals' scales."""
+STEPS_PER_RIVAL_ROUND = 2
+"""The same for a fit that is compared with a rival after each round."""
 BOUND_MARGIN = 1e-6
 """Minimum distance to the bounds, in spreads, as required by `scipy.optimize.least_squares`."""
 MIN_COST_DECREASE = 1.0
-"""Decrease of half the sum of squares in a round below which a fit ends."""
+"""Decrease of half the sum of squares in a round below which a fit ends. A round ends at a step with less
+than its share of this decrease."""
+MIN_RELATIVE_DECREASE = 0.01
+"""The same, relative to the sum of squares, for a fit whose scales are not those of its residuals."""
 HUBER_THRESHOLD = 4.0
 """Residuals above this multiple of their scale are down-weighted, because a motor that breaks away at a
 different position is not evidence."""
@@ -366,12 +371,7 @@ class Fitted:
         The likelihood ratio of two fits to the same readings is the exponential of the difference between
         their losses.
         """
-        half, outlier_probability = (
-            each[self.rows] for each in self.scales.halves(len(self.rows) // len(CHANNELS))
-        )
-        size = np.abs(self.scales.scaled(self.residuals)[self.rows])
-        wide = np.maximum(half, FINE)
-        return float(np.sum(surprisal(size, wide, outlier_probability) - np.log(half / wide)))
+        return loss_of(self.residuals, self.scales, self.rows)
 
     def intervals(self) -> dict[str, tuple[float, float]]:
         """Returns 95 % intervals by parameter name."""
@@ -419,6 +419,11 @@ class _Problem:
         left = softened(self.found(place), self.scale, self.rows)
         return np.concatenate([left, (place - self.prior) / self.spread])
 
+    def cost(self, place: FloatArray) -> float:
+        """Returns half the sum of squares of `residuals`."""
+        left = self.residuals(place)
+        return 0.5 * float(left @ left)
+
     def slopes(self, place: FloatArray, *, wide: bool = False) -> FloatArray:
         """Returns the derivatives of the softened residuals with respect to the coordinates, shape (n, p)."""
         moves = np.diag(STEP * self.spread) if self.along is None else _moves(self.along, self.spread)
@@ -427,9 +432,10 @@ class _Problem:
         self.along = slopes * robust_residuals(now, self.scale, self.rows)[1][:, None]
         return self.along
 
-    def stepped(self, place: FloatArray, steps: int) -> FloatArray:
+    def stepped(self, place: FloatArray, steps: int, relevant: float) -> FloatArray:
         """Returns the best point after up to ``steps`` trust-region steps, the first of which has the length
-        of a spread.
+        of a spread; ends at a step with a smaller decrease of the cost, relative to the cost, than
+        ``relevant``.
         """
         left, prior = 1 + steps, np.eye(len(place))
 
@@ -456,6 +462,7 @@ class _Problem:
                 (self.high - place) / self.spread + BOUND_MARGIN,
             ),
             max_nfev=1 + steps,
+            ftol=relevant,
             gtol=None,
         )
         return at(np.asarray(end.x, dtype=np.float64))
@@ -478,6 +485,8 @@ def solve(
     near: Fitted | None = None,
     wide: bool = False,
     linear: bool = True,
+    rival: float | None = None,
+    share: float = 0.0,
 ) -> Fitted:
     """Fits parameters by `scipy.optimize.least_squares` in up to ``steps`` steps; with 0 steps, linearises.
 
@@ -486,7 +495,9 @@ def solve(
     each round. Held-out legs count only with ``everything``. ``near`` is a fit of the same parameters that
     provides the directions of the first differences. With ``wide``, the covariance uses wide differences.
     Without ``linear``, the covariance is that of the prior, and the Jacobian that of the point before the
-    last step.
+    last step. With a ``rival``, the loss of a fit to the same readings, the fit is given up before a round if
+    the decrease of the last round, once more, would not reach the rival. ``share`` is the smallest relevant
+    decrease of the cost in a round, relative to the cost, if that is more than `MIN_COST_DECREASE`.
     """
     data = replays.data
     rows = fitted_rows(data, everything=everything)
@@ -494,15 +505,19 @@ def solve(
     prior = place if prior is None else prior
     along = None if near is None else near.jacobian
     problem = _Problem(replays, start, parameters, prior, rows, along, Scales({}))
-    done = 0
+    done, loss = 0, math.inf
     while done < steps:
         found = problem.found(place)
         problem.scale = scales(data, found) if known is None else _tempered(known, found, rows)
-        before = problem.residuals(place)
-        taken = min(STEPS_PER_ROUND, steps - done)
-        place = problem.stepped(place, taken)
-        after = problem.residuals(place)
-        done = done + taken if 0.5 * float(before @ before - after @ after) >= MIN_COST_DECREASE else steps
+        if rival is not None:
+            last, loss = loss, loss_of(found, problem.scale, rows)
+            if loss - rival > last - loss:
+                break
+        before = problem.cost(place)
+        relevant = max(MIN_COST_DECREASE, share * before)
+        taken = min(STEPS_PER_ROUND if rival is None else STEPS_PER_RIVAL_ROUND, steps - done)
+        place = problem.stepped(place, taken, relevant / STEPS_PER_ROUND / before)
+        done = done + taken if before - problem.cost(place) >= relevant else steps
     found = problem.found(place)
     problem.scale = known or scales(data, found)
     left = softened(found, problem.scale, rows)
@@ -536,6 +551,15 @@ def fitted_rows(data: Data, *, everything: bool = False) -> Mask:
 def legs_of_rows(data: Data, rows: Mask) -> NDArray[np.intp]:
     """Returns the leg number of each fitted row."""
     return np.concatenate([data.leg] * len(CHANNELS))[rows]
+
+
+def loss_of(found: dict[str, FloatArray], scale: Scales, rows: Mask) -> float:
+    """Returns the negative log likelihood of the readings of some rows; the scales must include
+    resolutions.
+    """
+    half, outlier_probability = (each[rows] for each in scale.halves(len(rows) // len(CHANNELS)))
+    size, wide = np.abs(scale.scaled(found)[rows]), np.maximum(half, FINE)
+    return float(np.sum(surprisal(size, wide, outlier_probability) - np.log(half / wide)))
 
 
 def softened(found: dict[str, FloatArray], scale: Scales, rows: Mask) -> FloatArray:
@@ -689,26 +713,41 @@ def in_best_structure(
 
 
 def by_halving(
-    few: Replays, begun: Iterable[Start], known: Scales, keep: Callable[[Fitted], None] = lambda _: None
+    few: Replays,
+    begun: Iterable[Start],
+    known: Scales,
+    keep: Callable[[Fitted], None] = lambda _: None,
+    suffices: Callable[[Fitted], bool] = lambda _: False,
 ) -> Fitted:
-    """Fits from each start for a few steps, continues with the better half, and repeats until one is left.
+    """Fits from each start for a few steps, continues with the better half, and repeats until one is left,
+    which is fitted to the neighbourhood of its minimum.
 
     Successive halving (Jamieson and Talwalkar, AISTATS 2016) does not drop a start that is far from a better
     minimum in favour of one that is already near its own minimum. All legs count, because a few held-out legs
-    do not decide between servos with equally many parameters.
+    do not decide between servos with equally many parameters. Of starts that have come together, only the
+    best is continued. No other start is tried after one that ``suffices``.
     """
 
-    def led(start: Start) -> Fitted:
-        return solve(few, *start, FEW_STEPS, known=known, linear=False)
+    def led(start: Start, steps: int = FEW_STEPS) -> Fitted:
+        return solve(few, *start, steps, known=known, linear=False, share=MIN_RELATIVE_DECREASE)
 
-    tried = [led(each) for each in begun]
+    tried: list[Fitted] = []
+    for start in begun:
+        tried.append(led(start))
+        if suffices(tried[-1]):
+            tried = tried[-1:]
+            break
     while True:
-        tried = sorted(tried, key=lambda each: each.cost)[: (len(tried) + 1) // 2]
-        tried = [each for each in tried if each.cost <= MAX_COST_RATIO * tried[0].cost]
-        keep(tried[0])
-        tried = [led((each.truth, each.parameters)) for each in tried]
+        best, *others = sorted(tried, key=lambda each: each.cost)[: (len(tried) + 1) // 2]
+        tried = [best]
+        for each in others:
+            apart = each.cost - tried[-1].cost > MIN_LOG_LIKELIHOOD_RATIO
+            if apart and each.cost <= MAX_COST_RATIO * best.cost:
+                tried.append(each)
+        keep(best)
         if len(tried) == 1:
-            return tried[0]
+            return led((best.truth, best.parameters), MORE_STEPS)
+        tried = [led((each.truth, each.parameters)) for each in tried]
 
 
 def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
@@ -924,11 +963,13 @@ def with_optional_groups(replays: Replays, best: Fitted) -> Fitted:
             continue
         wider, there = (*best.parameters, *extra), with_sections(best.truth, extra)
         around = np.append(best.prior, coordinates(there, extra))
-        tried = solve(replays, there, wider, TRIAL_STEPS, around, known=best.scales)
+        tried = solve(replays, there, wider, TRIAL_STEPS, around, known=best.scales, linear=False)
+        if best.cost - tried.cost <= MIN_LOG_LIKELIHOOD_RATIO:
+            continue
+        tried = continued(replays, tried, 0, known=best.scales, near=tried)
         new = len(best.parameters)
         off = abs(float(tried.place[new] - around[new]))
-        sure = off > MIN_Z_SCORE * math.sqrt(float(tried.covariance[new, new]))
-        if sure and best.cost - tried.cost > MIN_LOG_LIKELIHOOD_RATIO:
+        if off > MIN_Z_SCORE * math.sqrt(float(tried.covariance[new, new])):
             best = tried
     return best
 
@@ -959,7 +1000,7 @@ def with_loop(replays: Replays, best: Fitted) -> Fitted | None:
     rest = [number for number, each in enumerate(best.parameters) if each.cause != ELASTIC]
     parameters = (*(best.parameters[number] for number in rest), *nearest.parameters)
     prior = np.append(best.prior[rest], nearest.prior)
-    return solve(replays, nearest.truth, parameters, STEPS, prior)
+    return solve(replays, nearest.truth, parameters, STEPS, prior, linear=False)
 
 
 def with_limit(replays: Replays, best: Fitted, usual: Truth) -> Fitted:
@@ -1040,15 +1081,15 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
     begun, noise = start_of(data.base, data), expected(few.data)
     parameters = free_parameters(begun)
     progress(0.05)
-    usual = [(each, parameters) for each in (begun, *springs(begun), *lags(begun))]
-    best = by_halving(few, usual, noise, keep)
-    best = replace(best, prior=np.array(coordinates(begun, parameters)))
-    progress(0.2)
     rows = fitted_rows(few.data)
 
     def near(fitted: Fitted) -> bool:
         return bool(np.mean(np.square(softened(fitted.residuals, noise, rows))) < HUBER_THRESHOLD**2)
 
+    usual = [(each, parameters) for each in (begun, *springs(begun), *lags(begun))]
+    best = by_halving(few, usual, noise, keep, near)  # near the noise, `_polished` compares minima
+    best = replace(best, prior=np.array(coordinates(begun, parameters)))
+    progress(0.2)
     if not near(best):
         others = starts(begun, 1e3 * data.pieces[0].commands.cycle_s)
         best = in_best_structure(few, best, others, keep)
@@ -1066,7 +1107,9 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
             break
     progress(0.8)
     scale = Scales(units(data))
-    whole = solve(replays, best.truth, best.parameters, STEPS, known=scale, linear=False)
+    whole = solve(
+        replays, best.truth, best.parameters, STEPS, known=scale, linear=False, share=MIN_RELATIVE_DECREASE
+    )
     if polished is not None and misfit(data, polished.residuals) <= misfit(data, whole.residuals):
         return polished
     rough = replace(_linearised(replays, whole), rough=True)
@@ -1083,7 +1126,7 @@ def _polished(replays: Replays, near: Fitted, begun: Truth, keep: Callable[[Fitt
     data = replays.data
     # The expected scales are used, because the residuals of a wrong simulation do not estimate the noise and
     # would reduce the weight of the very channel that shows the error.
-    best = continued(replays, near, STEPS, known=expected(data), near=near)
+    best = continued(replays, near, STEPS, known=expected(data), near=near, linear=False)
     best = _ended(replays, best)
     keep(best)
     laws = len(LAWS)  # maximum number of changes of the law
@@ -1099,7 +1142,8 @@ def _polished(replays: Replays, near: Fitted, begun: Truth, keep: Callable[[Fitt
         if other is None:
             break
         laws, best = laws - 1, other
-    best = _ended(replays, with_limit(replays, best, data.base))
+    limited = with_limit(replays, best, data.base)
+    best = best if limited is best else _ended(replays, limited)
     keep(best)
     # Wide differences are used for the covariance only, because the servo loops may be unstable near a
     # minimum.
@@ -1119,22 +1163,30 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
     """
     few, noise = replays.rough, expected(replays.rough.data)
     least = least_deviation(replays.data) | {LOAD: noise.deviation[LOAD]}
+
+    def moved(places: Iterable[Truth]) -> Fitted:
+        found = best
+        for place in places:
+            other = continued(replays, found, MORE_STEPS, place, rival=found.loss)
+            if other.loss + MIN_LOG_LIKELIHOOD_RATIO < found.loss:
+                found = _ended(replays, other)
+        return found
+
     while True:
+        last = best
         # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
         # the next substep increases the residuals too little for any channel to show it.
-        places = [exchanged(best.truth), *neighbours(best.truth)]
-        if any(best.scales.deviation[name] > EXCESS_RATIO * least[name] for name in CHANNELS):
+        best = moved([exchanged(best.truth), *neighbours(best.truth)])
+        excess = any(best.scales.deviation[name] > EXCESS_RATIO * least[name] for name in CHANNELS)
+        if best is last and excess:
             tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
-            places.append(by_halving(few, tried, noise).truth)
-        last = best
-        for place in places:
-            other = continued(replays, best, MORE_STEPS, place)
-            if other.loss + MIN_LOG_LIKELIHOOD_RATIO < best.loss:
-                best = _ended(replays, other)
+            here, other = (by_halving(few, each, noise) for each in ([(best.truth, best.parameters)], tried))
+            if other.cost + MIN_COST_DECREASE < here.cost:
+                best = moved([other.truth])
         if best is last:
             return best
 
 
 def _ended(replays: Replays, near: Fitted) -> Fitted:
     """Continues a fit to its minimum."""
-    return continued(replays, near, STEPS, near=near)
+    return continued(replays, near, STEPS, near=near, linear=False)

@@ -192,9 +192,8 @@ def _replayed_s(piece: Piece) -> float:
 
 def traces_of(data: Data, truth: Truth) -> dict[str, FloatArray]:
     """Replays a truth smoothly; returns its traces by channel, like `Data.measured`."""
-    simulated, shown = smooth(truth), []
-    for piece in data.pieces:
-        traces = run(piece.commands, data.axis, simulated, smooth=True)
+    parts, shown = [each.commands for each in data.pieces], []
+    for piece, traces in zip(data.pieces, run(parts, data.axis, smooth(truth), smooth=True), strict=True):
         following = demand_deg(piece.commands, data.axis) - traces["motor_position_deg"]
         shown.append((following, traces["motor_torque_nm"], traces["load_position_deg"] * ARCSEC_PER_DEG))
     return {name: np.concatenate(each) for name, each in zip(CHANNELS, zip(*shown, strict=True), strict=True)}

@@ -13,7 +13,7 @@ simulated load in place of its own weight, and the recorded temperature sets its
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -441,10 +441,9 @@ def replay(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) 
     InputError if the recording has no command.
     """
     records = []
-    for rows in continuous(recording.record):
-        part = recording.record.rows(rows.start, rows.stop)
-        commands = commands_of(part, axis, truth)
-        signals = run(commands, axis, truth, seed)
+    parts = [recording.record.rows(each.start, each.stop) for each in continuous(recording.record)]
+    played = [commands_of(part, axis, truth) for part in parts]
+    for part, commands, signals in zip(parts, played, run(played, axis, truth, seed), strict=True):
         for channel in (Channel.TEMPERATURE, Channel.LOAD_TORQUE):
             if channel.value not in part.columns and all(BY_KEY[key] is not channel for key in axis.channels):
                 del signals[channel.value]
@@ -454,22 +453,42 @@ def replay(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) 
 
 
 def run(
-    commands: Commands, axis: AxisConfig, truth: Truth, seed: int = 0, *, smooth: bool = False
-) -> dict[str, FloatArray]:
-    """Runs the commands through the machine alone; returns a record's columns, unrounded if ``smooth``."""
-    mass, outer_nm = truth.load_.gravity, np.zeros(len(commands.counts))
+    parts: Iterable[Commands], axis: AxisConfig, truth: Truth, seed: int = 0, *, smooth: bool = False
+) -> Iterator[dict[str, FloatArray]]:
+    """Runs each part's commands through a machine alone; yields a record's columns, unrounded if
+    ``smooth``.
+    """
+    fresh: dict[tuple[float | None, bool], Machine] = {}
+    for commands in parts:
+        start = commands.start_c, commands.torque_on_load_nm is not None
+        if start not in fresh:
+            fresh[start] = _machine(commands, axis, truth, seed)
+        yield _columns(commands, axis, fresh[start].copy(), smooth=smooth)
+
+
+def _machine(commands: Commands, axis: AxisConfig, truth: Truth, seed: int) -> Machine:
+    """Returns the machine, just switched on, with the temperature and the load of these commands."""
     if commands.start_c is not None:
         heat = truth.temperature.model_copy(update={"start_c": commands.start_c})
         truth = truth.model_copy(update={"temperature": heat})
-    if commands.torque_on_load_nm is not None:
-        outer_nm = truth.load_.torque_sense * commands.torque_on_load_nm
+    mass, loaded = truth.load_.gravity, commands.torque_on_load_nm is not None
+    if mass and loaded:
         # The recorded torque contains the weight, so the hanging mass contributes only its inertia.
-        upright = mass and mass.model_copy(update={"tilt_deg": 90.0})
+        upright = mass.model_copy(update={"tilt_deg": 90.0})
         truth = truth.model_copy(update={"load_": truth.load_.model_copy(update={"gravity": upright})})
-    machine = Machine(truth, seed, may_compile=True, loaded=commands.torque_on_load_nm is not None)
-    machine.torque_limit_permille = (
-        10.0 * axis.limits.torque_percent
-    )  # the torque limit that the master sets in the drive
+    machine = Machine(truth, seed, may_compile=True, loaded=loaded)
+    # the torque limit that the master sets in the drive
+    machine.torque_limit_permille = 10.0 * axis.limits.torque_percent
+    return machine
+
+
+def _columns(
+    commands: Commands, axis: AxisConfig, machine: Machine, *, smooth: bool
+) -> dict[str, FloatArray]:
+    """Returns a record's columns from a run of the machine."""
+    outer_nm, load_truth = np.zeros(len(commands.counts)), machine.truth.load_
+    if commands.torque_on_load_nm is not None:
+        outer_nm = load_truth.torque_sense * commands.torque_on_load_nm
     permille_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
     sense = float(axis.motor_encoder.direction)
     substeps = _substeps(len(commands.counts), commands.cycle_s, machine.dt_s)
@@ -480,7 +499,7 @@ def run(
     torque = sense * measured.torque_nm if smooth else measured.torque_permille * permille_nm
     encoder = axis.motor_encoder
     motor = encoder.direction * motor * 360.0 / encoder.counts_per_turn
-    load = axis.load_encoder.direction * load * 360.0 / truth.load_.encoder.counts_per_turn
+    load = axis.load_encoder.direction * load * 360.0 / load_truth.encoder.counts_per_turn
     columns = {
         "motor_position_deg": motor,
         "load_position_deg": load,

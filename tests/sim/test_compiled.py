@@ -296,6 +296,17 @@ def test_every_attribute_of_a_state_has_its_declared_type_or_is_a_float(known: T
             assert kind not in {float, int, bool} or type(getattr(each, name)) is kind
 
 
+@pytest.mark.parametrize("may_compile", [False, True])
+def test_a_copy_of_a_machine_moves_like_it_and_alone(may_compile: bool) -> None:
+    known = truth({"load__encoder__noise_arcsec": 1.0})
+    machine = Machine(known, 7, may_compile=may_compile)
+    machine.follow(0.0, 900.0, 8)
+    copies = [machine.copy(), machine.copy()]
+    assert [type(each._axis) for each in copies] == [type(machine._axis)] * 2
+    found = [led(each, 3, 20) for each in (copies[0], machine, copies[1])]
+    assert found[0] == found[1] == found[2]
+
+
 def test_an_external_torque_acts_alike_compiled_or_not() -> None:
     """The load yields with the spring alone, because this torque does not break the motor away."""
     made = truth({})

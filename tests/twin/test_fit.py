@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -15,10 +15,12 @@ from support.demo import AXIS
 from support.demo import TRUTH as DEMO
 from support.exercised import moved, record_of
 
+from hdbridge.axis.effects import FloatArray
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import (
+    Fitted,
     Jackknife,
     by_halving,
     continued,
@@ -162,6 +164,47 @@ def test_a_load_feed_forward_that_was_fitted_at_a_wrong_frequency_is_found_at_th
     assert free_value(found.truth, parameters[2]) == pytest.approx(
         free_value(true.truth, parameters[2]), rel=0.1
     )
+
+
+class Counted(Replays):
+    """Replays that count themselves."""
+
+    count = 0
+
+    def __call__(self, truths: Iterable[Truth]) -> list[dict[str, FloatArray]]:
+        truths = list(truths)
+        self.count += len(truths)
+        return super().__call__(truths)
+
+
+def test_no_start_is_tried_after_one_that_suffices() -> None:
+    parameters = (BY_NAME["load feed-forward"],)
+    begun = [(with_values(SPRUNG, {"load feed-forward": each}), parameters) for each in (1e-6, 2e-6, 4e-6)]
+    seen: list[Fitted] = []
+
+    def suffices(fitted: Fitted) -> bool:
+        seen.append(fitted)
+        return len(seen) == 2
+
+    with Counted(data(), 1) as replays:
+        found = by_halving(replays, begun, expected(data()), suffices=suffices)
+    assert len(seen) == 2
+    assert found.cost <= seen[1].cost
+    assert found.truth != seen[0].truth
+
+
+def test_a_fit_that_does_not_approach_its_rival_is_given_up() -> None:
+    """At a wrong frequency, both feed-forward inertias approach a minimum far from the true one."""
+    parameters = (BY_NAME["inertia feed-forward"], BY_NAME["load feed-forward"])
+    begun, needed = with_values(SPRUNG, {"load feed-forward frequency": 20.0}), []
+    with Replays(data(), 1) as replays:
+        true = solve(replays, SPRUNG, parameters, 0)
+    for rival in (None, math.inf, true.loss):
+        with Counted(data(), 1) as replays:
+            found = solve(replays, begun, parameters, 12, rival=rival)
+        assert found.loss > true.loss
+        needed.append(replays.count)
+    assert needed[2] < min(needed[:2])
 
 
 LATE = with_values(
