@@ -176,8 +176,7 @@ class Finding:
     @property
     def explained_arcsec(self) -> float:
         """Rms of the held-out error that the finding accounts for; 0 without a gain."""
-        gain = self.gain
-        return 0.0 if gain is None else math.sqrt(max(gain.before_arcsec**2 - gain.after_arcsec**2, 0.0))
+        return 0.0 if self.gain is None else self.gain.explained_arcsec
 
     @property
     def refuted(self) -> bool:

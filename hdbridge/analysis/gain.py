@@ -65,6 +65,11 @@ class Gain:
         return 1.0 - (self.after_arcsec / max(self.before_arcsec, 1e-12)) ** 2
 
     @property
+    def explained_arcsec(self) -> float:
+        """Rms of the prediction error that the tested part removes; 0 if the error increases."""
+        return math.sqrt(max(self.before_arcsec**2 - self.after_arcsec**2, 0.0))
+
+    @property
     def _fall(self) -> FloatArray:
         plain = self.before_arcsec2 - self.after_arcsec2
         return plain if self.weighted_fall is None else self.weighted_fall

@@ -219,7 +219,7 @@ def _with_best_law(state: State, solution: Solution, system: System) -> tuple[St
                 continue
             gain = gain_of_law((state, solution), (trial, found))
             least = state.options.smallest_arcsec
-            if gain.sure and gain.before_arcsec**2 - gain.after_arcsec**2 > least**2:
+            if gain.sure and gain.explained_arcsec > least:
                 return _settle(trial.after(found))
     return state, solution, system
 

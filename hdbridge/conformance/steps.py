@@ -31,7 +31,7 @@ def refuses(index: int, sub: int, data: bytes, codes: tuple[int, ...]) -> Step:
 
 
 def holds(index: int, sub: int, expected: int, digits: int = 0) -> Step:
-    """An object has this value; with ``digits``, only so many hexadecimal digits are compared."""
+    """An object has this value. Only the last ``digits`` hexadecimal digits are compared; 0 compares all."""
 
     def step(t: NodeTester) -> None:
         found = t.read(index, sub)

@@ -33,7 +33,7 @@ from hdbridge.sim.truth import Truth
 
 K = CommandKind
 COUNTS_PER_TURN = 1 << 20
-"""Of the motor encoder; high, so that the rounding of targets hides no jump."""
+"""Resolution of the motor encoder. It is high, because coarse counts would hide small jumps."""
 TRAVEL_DEG = 3.0
 """Short, so that the limits are reached often."""
 KINDS = list(K)
