@@ -11,7 +11,7 @@ import random
 import shutil
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -21,13 +21,14 @@ from blind.axes import EVERYDAY_LAWS, OTHER_LAWS, BlindAxis, EverydayAxis, drawn
 from blind.fullbench import Bench, drawn_plan, run_of
 from blind.plant import Plant, PlantRig, calibrated
 from blind.work import KINDS as WORK_KINDS
-from blind.work import drawn_work
-from support.hidden import CAUSES, UNKNOWN, Hidden, Run, hide, hide_all
+from blind.work import Burst, drawn_work
+from support.hidden import CAUSES, UNKNOWN, Hidden, Run, hide_all
 from support.hidden.site import ARCSEC_PER_RAD, ARCSEC_PER_TURN
 
 from hdbridge import InputError
 from hdbridge.commissioning.calibration.measure import remaining_plan
 from hdbridge.control.bench import axis_view
+from hdbridge.motion.procedures.moves import Dwell, MoveTo
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording, Segment
@@ -42,7 +43,7 @@ KINDS: Mapping[str, str] = MappingProxyType(
         "single": "bench suite", "pair": "bench suite", "triple": "bench suite",
         "none": "bench suite", "other_law": "bench suite", "unknown": "bench suite",
         "healthy_bench": "everyday", "healthy_work": "everyday", "fault": "everyday", "law": "everyday",
-        "outside": "everyday", "flicker": "everyday",
+        "outside": "everyday", "flicker": "everyday", "faults": "everyday", "repeats": "everyday",
     }
 )  # fmt: skip
 """Kinds of cases, and the family that each belongs to."""
@@ -54,6 +55,9 @@ SLOW_S = 300.0
 NEED_ROLLING = ("hysteresis_memory", "hysteresis_parameters")
 RECORDS_PER_AXIS = 4
 LARGEST_ARCSEC = 40.0
+LONGEST_PROGRAM_S = 120.0
+BETWEEN_PROGRAMS_S = 5.0
+"""Pause between two runs of a repeated program, in the recording's time."""
 BETWEEN_TASKS_S = 1.0
 """Pause between two tasks of a plan, in the recording's time."""
 MOST_BENCH_SAMPLES = 1_000_000
@@ -127,6 +131,11 @@ def _everyday_cases(kind: str, number: int, seed: int) -> Iterator[Case]:
             yield Case(name, kind, axis=axis, bench=kind == "healthy_bench")
         elif kind == "fault":
             yield Case(name, kind, (cause,), axis=axis, bench=index % 4 == 0)
+        elif kind == "faults":
+            yield Case(name, kind, _together(rng, rng.choice((2, 2, 3))), axis=axis, bench=index % 4 == 0)
+        elif kind == "repeats":
+            beyond = tuple(unknown[index % len(unknown) :][: rng.choice((0, 1))])
+            yield Case(name, kind, (*_together(rng, rng.choice((1, 2, 3))), *beyond), axis=axis)
         elif kind == "outside":
             yield Case(name, kind, (unknown[index % len(unknown)],), axis=axis, bench=index % 2 == 0)
         elif kind == "law":
@@ -333,9 +342,12 @@ def _everyday(case: Case, seed: int, folder: Path, axes: Path) -> dict[str, Any]
         kind = rng.choice([each for each in WORK_KINDS if each != "steps" or not slow])
         compensated = rng.random() < (0.6 if kind == "daemon" else 0.2)
         bench = rig.compensated(model) if compensated else rig.bench()
-        course = _work_course(rig, bench, kind, rng, SLOW_S if slow else 10.0)
+        if case.kind == "repeats":
+            course = _repeated_course(rig, bench, rng)
+        else:
+            course = _work_course(rig, bench, kind, rng, SLOW_S if slow else 10.0)
     run = course.run(axis.config.gear.ratio)
-    truth, hidden, seen, healthy = _with_cause(case, axis, course, run, rng)
+    truth, hidden, seen, healthy = _with_causes(case, axis, course, run, rng)
     # Drawn last, so that a case without the cause has the same draws.
     period_s = axis.config.drive.cycle_s
     as_recorded = (case.bench and rng.random() < 0.6) or (course.motion == "daemon" and rng.random() < 0.6)
@@ -404,45 +416,59 @@ def _work_course(rig: PlantRig, bench: Any, kind: str, rng: random.Random, short
     return course
 
 
-def _with_cause(
+def _repeated_course(rig: PlantRig, bench: Any, rng: random.Random) -> Course:
+    """Runs one program several times, each time from the same place; the way back is not recorded."""
+    kind = rng.choice(("moves", "pick and place", "stream"))
+    course = Course(rig, f"{kind}, repeated", [], [], BETWEEN_PROGRAMS_S)
+    way, program = drawn_work(rng, axis_view(rig.axis), kind, longest_s=LONGEST_PROGRAM_S)
+    start = next(each for each in reversed(way.legs) if isinstance(each, MoveTo))
+    for _ in range(rng.randint(3, 6)):
+        bench.run(Burst((*(way.legs if not course.parts else ()), start, Dwell(0.5))))
+        first = len(rig.counts)
+        bench.run(program)
+        course.parts.append((first, len(rig.counts)))
+    return course
+
+
+def _with_causes(
     case: Case, axis: EverydayAxis, course: Course, run: Run, rng: random.Random
 ) -> tuple[Truth, list[Hidden], dict[str, Any], dict[str, Any]]:
-    """Returns the truth with the cause, and the readings with and without it.
+    """Returns the truth with the causes, and the readings with and without them.
 
-    The size is drawn from barely visible to large, and halved if the motor cannot carry it.
+    Sizes are drawn from barely visible to large, and halved if the motor cannot carry them.
     """
     seed, hiding = rng.randrange(2**31), rng.randrange(2**31)
     healthy = Plant(axis, axis.truth, seed).run(course.rig.counts)
     count = ARCSEC_PER_TURN / 2**16 / axis.truth.gear.ratio if case.pair else axis.count_arcsec
     smallest = max(0.5, 0.3 * count, 0.3 * axis.truth.load_.encoder.noise_arcsec)
-    size = math.exp(rng.uniform(math.log(smallest), math.log(LARGEST_ARCSEC)))
+    sizes = [
+        math.exp(rng.uniform(math.log(smallest), math.log(LARGEST_ARCSEC))) for _ in case.causes or ("",)
+    ]
     if not case.causes:
         return axis.truth, [], healthy, healthy
-    (cause,) = case.causes
     most_nm = 0.95 * 3.0 * axis.truth.motor.rated_torque_nm
     first_s = course.parts[0][0] * course.rig.axis.drive.cycle_s
-    for _ in range(12):
-        wanted = size / 3.0 if cause == "subdivisional_error" else size
-        if cause == "inertial_windup":
-            wanted += _wind_up_arcsec(axis.truth, run.load_acceleration_deg_s2)
-        size *= 0.5
+    # A subdivisional error of one arcsec is as visible as three of others; every axis has some wind-up.
+    factor = {"subdivisional_error": 1.0 / 3.0}
+    added = {"inertial_windup": _wind_up_arcsec(axis.truth, run.load_acceleration_deg_s2)}
+    for halvings in range(12):
+        wanted = [
+            (each, size * 0.5**halvings * factor.get(each, 1.0) + added.get(each, 0.0))
+            for each, size in zip(case.causes, sizes, strict=True)
+        ]
         try:
-            truth, one = hide(axis.truth, cause, random.Random(hiding), wanted, run)
+            truth, hidden = hide_all(axis.truth, wanted, random.Random(hiding), run)
         except (ValueError, InputError):
             continue  # out of the plant's ranges
         truth = _later(truth, first_s)
         seen = Plant(axis, truth, seed).run(course.rig.counts)
         if np.max(np.abs(seen["motor_torque_nm"])) < most_nm:
-            parameters = dict(one.parameters)
-            if cause == "count_loss":
-                parameters["time_s"] += first_s
-            return (
-                truth,
-                [Hidden(one.cause, one.size_arcsec, one.size_is, one.text, parameters, one.brings)],
-                seen,
-                healthy,
-            )
-    raise RuntimeError(f"{case.name}: {cause} cannot be put into this axis")
+            hidden = [replace(each, parameters=dict(each.parameters)) for each in hidden]
+            for each in hidden:
+                if each.cause == "count_loss":
+                    each.parameters["time_s"] += first_s
+            return truth, hidden, seen, healthy
+    raise RuntimeError(f"{case.name}: {', '.join(case.causes)} cannot be put into this axis")
 
 
 def _later(truth: Truth, seconds: float) -> Truth:

@@ -105,7 +105,9 @@ class Draft:
         return Burst(legs, pause_s)
 
 
-def drawn_work(rng: random.Random, view: AxisView, kind: str, shortest_s: float = 10.0) -> list[Burst]:
+def drawn_work(
+    rng: random.Random, view: AxisView, kind: str, shortest_s: float = 10.0, longest_s: float = LONGEST_S
+) -> list[Burst]:
     """Draws the bursts of a work record; the first moves to the start and is not recorded."""
     draft = Draft(rng, view)
     draft.go(rng.uniform(draft.low_deg, draft.high_deg))
@@ -114,7 +116,7 @@ def drawn_work(rng: random.Random, view: AxisView, kind: str, shortest_s: float 
     draft.rest(rng.choice((0.0, 0.5)))
     bursts = [draft.burst()]
     if kind != "daemon":
-        _draw(draft, kind, draft.stretched(shortest_s, LONGEST_S))
+        _draw(draft, kind, draft.stretched(shortest_s, longest_s))
         return [*bursts, draft.burst()]
     end_s = draft.elapsed_s + draft.stretched(max(shortest_s, 120.0), LONGEST_DAY_S)
     while draft.elapsed_s < end_s:
