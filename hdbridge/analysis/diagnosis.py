@@ -28,7 +28,7 @@ from hdbridge.analysis.findings import (
 from hdbridge.analysis.gain import held_out, of_written
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.identifiability import identifiability
-from hdbridge.analysis.linear import Nuisances
+from hdbridge.analysis.linear import Nuisances, on_one_thread
 from hdbridge.analysis.parameters import confounded, covariance, parameters_of, precisely
 from hdbridge.analysis.prepared import Observed, gather
 from hdbridge.analysis.probability import Context, Prior, weighed
@@ -76,6 +76,7 @@ UNWRITTEN = "it cannot be written into the model"
 FIT_FIRST = "none yet: fit a model first (hdbridge fit), then diagnose with it"
 
 
+@on_one_thread
 def diagnose(
     recording: Given,
     model: TransmissionModel,

@@ -14,7 +14,7 @@ from hdbridge.analysis.acceptance import Gate, gate, gate_of_change
 from hdbridge.analysis.capability import Capability, Identifiability, capability
 from hdbridge.analysis.changes import causes_of
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis, with_memory
-from hdbridge.analysis.linear import Effort, orthonormal, side_by_side
+from hdbridge.analysis.linear import Effort, on_one_thread, orthonormal, side_by_side
 from hdbridge.analysis.orders import NOT_APART
 from hdbridge.analysis.prepared import gather
 from hdbridge.analysis.probability import Context, features, probability
@@ -260,6 +260,7 @@ def _correlation(one: FloatArray, other: FloatArray) -> float:
     return float(np.min(values)) if len(values) else 0.0
 
 
+@on_one_thread
 def examined(
     record: Record, model: TransmissionModel, legs: Sequence[Segment] = (), start: Start = Start.VIRGIN
 ) -> tuple[dict[str, Identifiability], Capability]:

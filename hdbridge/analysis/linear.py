@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, wraps
 from itertools import compress
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, ParamSpec, Protocol, TypeVar
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from hdbridge.axis.effects import BoolArray, Effect, FloatArray, IntArray
 from hdbridge.axis.effects.described import Moves
@@ -22,6 +23,25 @@ SEEN = 1e-9
 """Minimum eigenvalue of a determined direction, relative to the largest eigenvalue of the scaled matrix."""
 SUSPECT = 1e-6
 """Squared diagonal element of the Cholesky factor below which eigenvalues are used instead."""
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorates a function: its linear algebra runs on one thread.
+
+    The matrices are small, so threads mostly wait for each other: next to other work, a diagnosis took 40
+    times the processor time.
+    """
+
+    @wraps(function)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        with threadpool_limits(limits=1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return run
 
 
 def solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
@@ -138,3 +139,20 @@ def test_rounded_digits_yield_no_cause(
     record = {"time_s": values["time_s"], "load_position_deg": values["load_position_deg"]}
     record["motor_position_deg"] = np.array([float(f"{each:.{digits}g}") for each in read.tolist()])
     assert diagnose(Record(record), model).findings == ()
+
+
+def test_a_diagnosis_uses_one_thread_and_restores_the_caller_s(
+    columns: Callable[..., dict[str, Any]], model: TransmissionModel
+) -> None:
+    """A program that uses the library may have loaded numpy with any number of threads."""
+
+    def threads() -> list[int]:
+        return [each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"]
+
+    during: list[int] = []
+    with threadpool_limits(2, "blas"):
+        before = threads()
+        diagnose(Record(columns()), model, progress=lambda _: during.extend(threads()))
+        assert threads() == before
+    assert set(before) == {2}
+    assert set(during) == {1}

@@ -10,6 +10,7 @@ from typing import Any
 
 from hdbridge.analysis.checks import check_once, check_records
 from hdbridge.analysis.identification import FitResult
+from hdbridge.analysis.linear import on_one_thread
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.difference import diff
@@ -319,6 +320,7 @@ def save_result(
         write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
+@on_one_thread
 def fit(
     recording: Given,
     *,
