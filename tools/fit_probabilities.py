@@ -34,7 +34,7 @@ from hdbridge.records.recording import Recording
 RIDGE = 1.0
 FOLDS = 10
 FREE = frozenset({"constant"})
-AGAINST = frozenset({"excess", "unexplained"})
+AGAINST = frozenset({"unexplained"})
 PRIOR = {"unexplained": -1.0}
 """Coefficients to which the ridge penalty shrinks if the records are uninformative; 0 for all others."""
 Row = dict[str, Any]

@@ -31,7 +31,7 @@ from hdbridge.analysis.identifiability import identifiability
 from hdbridge.analysis.linear import Nuisances, on_one_thread
 from hdbridge.analysis.parameters import confounded, covariance, parameters_of, precisely
 from hdbridge.analysis.prepared import Observed, gather
-from hdbridge.analysis.probability import Context, Prior, weighed
+from hdbridge.analysis.probability import Prior, weighed
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.search import (
     Search,
@@ -66,10 +66,6 @@ from hdbridge.records.record import Record
 from hdbridge.records.recording import Given, Recording, agreed_ratio, by_name
 from hdbridge.units import figure
 
-UNCALIBRATED = (
-    "the probabilities are calibrated on bench plans (hdbridge measure); for any other record they may be "
-    "too high"
-)
 LOSES = "it does not predict what is left out"
 UNDETERMINED = "the record does not determine its size"
 UNWRITTEN = "it cannot be written into the model"
@@ -185,7 +181,7 @@ class _Judged:
     """Fit without a free-form loop."""
     findings: list[Finding]
     left: Rest
-    context: Context
+    unexplained: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,7 +223,7 @@ class _Judge:
         cleared.observed = estimator.observed - before + after
 
         def visible() -> tuple[Mapping[str, Identifiability], Capability]:
-            causes = identifiability(cleared, cleared.fit(refitted.hypothesis), given, judged.context)
+            causes = identifiability(cleared, cleared.fit(refitted.hypothesis), given, judged.unexplained)
             return causes, capability(estimator.data, given, causes, estimator.scales)
 
         return Diagnosis(
@@ -238,10 +234,7 @@ class _Judge:
             findings=tuple(findings),
             visible=visible,
             by_kind=self._by_kind(before, after),
-            remarks=(
-                *estimator.data.remarks,
-                *filter(None, (judged.left.remark, self._uncalibrated(findings))),
-            ),
+            remarks=(*estimator.data.remarks, *filter(None, [judged.left.remark])),
             model=extended,
             traces=Traces(
                 measured_arcsec=measured,
@@ -312,10 +305,6 @@ class _Judge:
         ]
         gains = dict(zip(tested, of_written(self.estimator, fitted, given, others, written), strict=True))
         return [replace(each, gain=gains.get(at, each.gain)) for at, each in enumerate(findings)]
-
-    def _uncalibrated(self, findings: Sequence[Finding]) -> str:
-        """Returns a remark if the probability formula was not fitted to this kind of record; else empty."""
-        return UNCALIBRATED if findings and len(self.estimator.data.full.kinds) == 1 else ""
 
     def _stopped(self, fitted: Fitted) -> tuple[int, str] | None:
         """Returns the index of the first cause to reject, and the reason; None if all causes pass.
@@ -389,16 +378,14 @@ class _Judge:
         plain = estimator.lawful(fitted)
         findings += changes.findings(self.search, self.model, fitted, plain, precise, spread)
         findings.sort(key=lambda each: -each.robust)
-        excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
         # A model cannot contain a free-form loop, so the results exclude it.
         whole, fitted = fitted, plain
         left = rest(estimator, fitted)
         unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
-        context = Context(left.arcsec, excess, unknown)
-        findings = weighed(findings, context, estimator.scales, self.prior)
+        findings = weighed(findings, unknown, estimator.scales, self.prior)
         if estimator.data.reversals < 2:  # speed, torque, position and time are correlated
             findings = [self._one_way(each) for each in findings]
-        return _Judged(whole, fitted, findings, left, context)
+        return _Judged(whole, fitted, findings, left, unknown)
 
     def _one_way(self, finding: Finding) -> Finding:
         """Limits the probability of a cause in a record with motion in one direction only."""

@@ -17,7 +17,7 @@ from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis, with_mem
 from hdbridge.analysis.linear import Effort, on_one_thread, orthonormal, side_by_side
 from hdbridge.analysis.orders import NOT_APART
 from hdbridge.analysis.prepared import gather
-from hdbridge.analysis.probability import Context, features, probability
+from hdbridge.analysis.probability import features, probability
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.screening import SHARE_LEFT, candidates
 from hdbridge.analysis.search import lookalikes, waves_alike
@@ -46,12 +46,12 @@ margin, noise hides 2 % of causes at the limit."""
 
 
 def identifiability(
-    estimator: Estimator, fitted: Fitted, base: Sequence[Effect], context: Context
+    estimator: Estimator, fitted: Fitted, base: Sequence[Effect], unexplained: bool
 ) -> dict[str, Identifiability]:
     """Returns the detection limit and aliases of each cause of the catalogue.
 
     ``estimator`` contains the record less the errors found in it, and ``fitted`` is the fit of the model to
-    that record. ``context`` contains the evidence against all findings.
+    that record. ``unexplained`` is True if the record has an unexplained residual.
     """
     best, reasons = _examples(estimator, fitted, base)
     scales, spans = estimator.scales, {name: orthonormal(each.rest) for name, each in best.items()}
@@ -72,7 +72,7 @@ def identifiability(
         limit = max(
             (math.sqrt(scales.penalty * example.rest.shape[1] + scales.enter) + POWER) / visible,
             estimator.floor_arcsec + POWER / visible,
-            _named_from(_injected(estimator, fitted, example, base), context, scales),
+            _named_from(_injected(estimator, fitted, example, base), unexplained, scales),
             usual.get(cause, 0.0),
         )
         own = [*type(example.effect).proposals(estimator.data, ())]  # each is a possible instance
@@ -184,12 +184,12 @@ def _injected(estimator: Estimator, fitted: Fitted, example: _Example, base: Seq
     return gate(record, trial, len(fitted.hypothesis.effects))
 
 
-def _named_from(injected: Gate, context: Context, scales: Scales) -> float:
+def _named_from(injected: Gate, unexplained: bool, scales: Scales) -> float:
     """Returns the smallest peak, arcsec, at which a cause passes its tests and is probable; or infinity."""
     per_arcsec = VISIBLE * math.sqrt(max(injected.robust, 0.0)) / WORST_ARCSEC
     for peak_arcsec in np.geomspace(scales.floor_arcsec, WORST_ARCSEC, PEAKS).tolist():
         robust = max(peak_arcsec * per_arcsec - POWER, 0.0) ** 2
-        terms = features(replace(injected, robust=robust), peak_arcsec, context, scales)
+        terms = features(replace(injected, robust=robust), unexplained)
         if robust >= injected.needed and probability(terms, scales) > 0.5:
             return float(peak_arcsec)
     return math.inf
@@ -268,7 +268,7 @@ def examined(
     data = gather(record, model.ratio, legs, expected=lambda motion: model.predict(motion, start))
     estimator = Estimator(data)
     fitted = estimator.fit(Hypothesis(model.effects, start), effort=Effort(steps=2))
-    found = identifiability(estimator, fitted, model.effects, Context(0.0, 1.0, False))
+    found = identifiability(estimator, fitted, model.effects, False)
     return found, capability(data, model.effects, found, estimator.scales)
 
 

@@ -1,8 +1,8 @@
 """Probability of a finding: a logistic function of the evidence for and against it.
 
 `Scales` contains the coefficients. tools/fit_probabilities.py fits them, by ridge regression with fixed
-signs, to findings with known causes from blind suites (the current ones also from records computed from
-formulas). docs/how-well.md has the figures.
+signs, to findings with known causes from blind suites of bench plans and everyday records. docs/how-well.md
+has the figures.
 """
 
 from __future__ import annotations
@@ -17,17 +17,6 @@ from hdbridge.analysis.scales import Scales
 
 UNPROVEN = 0.5
 """Maximum probability of a cause that does not predict held-out data."""
-
-
-@dataclass(frozen=True, slots=True)
-class Context:
-    """Evidence against all findings of a record."""
-
-    left_arcsec: float
-    """Rms residual of the complete fit beyond the noise."""
-    excess: float
-    """Chi square of the complete fit per degree of freedom."""
-    unexplained: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,31 +52,26 @@ def coefficients(scales: Scales) -> dict[str, float]:
         "constant": scales.odds,
         "strength": scales.odds_strength,
         "rank": scales.odds_rank,
-        "size": scales.odds_size,
-        "excess": scales.odds_excess,
         "unexplained": scales.odds_unexplained,
     }
 
 
-def features(
-    gate: Gate, peak_arcsec: float, context: Context, scales: Scales, rank: float = 1.0
-) -> dict[str, float]:
+def features(gate: Gate, unexplained: bool, rank: float = 1.0) -> dict[str, float]:
     """Returns the terms of the formula by name.
 
-    ``rank`` is the finding's decrease in chi square relative to that of the largest finding.
+    ``unexplained`` is True if the record has an unexplained residual. ``rank`` is the finding's decrease in
+    chi square relative to that of the largest finding.
     """
     return {
         "constant": 1.0,
-        "strength": math.log(min(max(gate.robust, 1e-9) / gate.needed, scales.strong)),
+        "strength": math.log(max(gate.robust, 1e-9) / gate.needed),
         "rank": math.log10(max(rank, 1e-4)),
-        "size": math.log(max(peak_arcsec, 1e-3) / max(scales.floor_arcsec, context.left_arcsec)),
-        "excess": math.log(min(max(context.excess, 1.0), scales.large)),
-        "unexplained": float(context.unexplained),
+        "unexplained": float(unexplained),
     }
 
 
 def weighed(
-    findings: Sequence[Finding], context: Context, scales: Scales, prior: Prior | None = None
+    findings: Sequence[Finding], unexplained: bool, scales: Scales, prior: Prior | None = None
 ) -> list[Finding]:
     """Returns the findings with the probability that each, or one of its aliases, is present."""
     largest = max((each.robust for each in findings), default=0.0)
@@ -95,7 +79,7 @@ def weighed(
     for each in findings:
         assert each.gate is not None, "only an unexplained residual has no gate"
         rank = each.robust / max(largest, 1e-9)
-        terms = features(each.gate, each.peak_arcsec, context, scales, rank)
+        terms = features(each.gate, unexplained, rank)
         more = prior.log_odds(each.cause, scales) if prior else 0.0
         most = 0.0 if each.refuted else 1.0 if each.gains else UNPROVEN
         likely = min(probability(terms, scales, more), most)

@@ -108,22 +108,15 @@ class Scales:
         "sidebands of a full modulation are a half each, the third partial of a sawtooth is a third",
     )
 
-    # Probability of a finding (`hdbridge.analysis.probability`): fitted to 128 findings, 115 of them right.
-    odds: float = _scale(-2.80, "log odds", 0.0, FITTED)
-    odds_strength: float = _scale(1.88, "log odds per log of robust evidence over the needed", 0.0, FITTED)
-    odds_rank: float = _scale(0.42, "log odds per decade of the largest one's chi square", 0.0, FITTED)
-    odds_size: float = _scale(1.22, "log odds per log of peak over residual", 0.0, FITTED)
-    odds_excess: float = _scale(-1.19, "log odds per log of chi square per point", 0.0, FITTED)
-    odds_unexplained: float = _scale(-1.30, "log odds", 0.0, FITTED)
-    right: float = _scale(115 / 128, "fraction of the names that the formula is fitted to", 0.5, FITTED)
-    strong: float = _scale(
-        12.0,
-        "times the needed evidence",
-        math.inf,
-        "stronger evidence shows that a cause is there, not which one",
-    )
+    # Probability of a finding (`hdbridge.analysis.probability`): fitted to 533 findings of bench plans and
+    # everyday records, 391 of them right.
+    odds: float = _scale(0.33, "log odds", 0.0, FITTED)
+    odds_strength: float = _scale(0.40, "log odds per log of robust evidence over the needed", 0.0, FITTED)
+    odds_rank: float = _scale(0.71, "log odds per decade of the largest one's chi square", 0.0, FITTED)
+    odds_unexplained: float = _scale(-1.17, "log odds", 0.0, FITTED)
+    right: float = _scale(391 / 533, "fraction of the names that the formula is fitted to", 0.5, FITTED)
     surest: float = _scale(0.97, "probability", 1.0, "the rules were made on records that it is fitted to")
-    named_from: float = _scale(0.3, "probability", 0.0, "of the names below it one in eleven was right")
+    named_from: float = _scale(0.2, "probability", 0.0, "of 29 names below it 7 were right")
     one_way: float = _scale(
         0.6, "probability", 1.0, "without reversals place, speed, torque and time are aliases"
     )

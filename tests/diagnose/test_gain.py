@@ -14,7 +14,7 @@ from hdbridge.analysis.findings import Diagnosis
 from hdbridge.analysis.gain import Gain, held_out
 from hdbridge.analysis.hypothesis import Estimator, Hypothesis
 from hdbridge.analysis.prepared import gather
-from hdbridge.analysis.probability import Context, weighed
+from hdbridge.analysis.probability import weighed
 from hdbridge.axis.effects import Start, Synchronous, VelocityWindup
 from hdbridge.axis.effects.orders import orders_from
 from hdbridge.axis.model import TransmissionModel
@@ -100,9 +100,8 @@ def test_a_change_without_a_gain_is_refused(
 @pytest.mark.parametrize("gain", [WORSE, None], ids=["worse", "none made"])
 def test_a_cause_without_a_gain_is_not_more_likely_than_not(wider: Diagnosis, gain: Gain | None) -> None:
     (found,) = wider.findings
-    context = Context(left_arcsec=0.1, excess=1.0, unexplained=False)
-    (known,) = weighed([found], context, wider.scales)
-    (unproven,) = weighed([replace(found, gain=gain)], context, wider.scales)
+    (known,) = weighed([found], False, wider.scales)
+    (unproven,) = weighed([replace(found, gain=gain)], False, wider.scales)
     assert unproven.probability <= 0.5 < known.probability
 
 

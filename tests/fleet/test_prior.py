@@ -12,7 +12,7 @@ from support.fleet import MODEL, record
 
 from hdbridge.analysis.acceptance import Gate
 from hdbridge.analysis.findings import UNWEIGHED, Finding, Parameter
-from hdbridge.analysis.probability import Context, Prior, weighed
+from hdbridge.analysis.probability import Prior, weighed
 from hdbridge.analysis.scales import Scales
 from hdbridge.fleet.prior import read_prior, write_prior
 from hdbridge.fleet.summary import summarise
@@ -28,7 +28,7 @@ def finding(peak_arcsec=2.0, robust=400.0, parameters=None):
 
 
 def weigh(each, prior=None):
-    return weighed([each], Context(0.1, 1.0, False), SCALES, prior)[0]
+    return weighed([each], False, SCALES, prior)[0]
 
 
 @given(SHARES, SHARES, st.floats(0.01, 30.0), st.floats(1.0, 1e5))
