@@ -21,7 +21,6 @@ from hdbridge.commissioning.calibration.motion import MotionTest, motion_test, w
 from hdbridge.commissioning.calibration.validation import Validation, floor_of, validate
 from hdbridge.control.caps import cap_remark
 from hdbridge.control.realtime import suspended_realtime
-from hdbridge.control.rig import Rig
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError, OutputError
 from hdbridge.files.atomic import write_atomically
@@ -144,7 +143,7 @@ ACTIVE_NAME = "active.yaml"
 
 @suspended_realtime()  # fitting takes long; a bench resumes real-time priority for each motion
 def calibrate(
-    drive: Drive | Rig,
+    drive: Drive,
     journal: Journal,
     profile: Path,
     date: datetime,
@@ -201,9 +200,7 @@ def calibrate(
     return _kept(journal.folder, replace(result, offer=proposed(profile, result.model, reason, date, drive)))
 
 
-def proposed(
-    profile: Path, model: TransmissionModel, reason: str, date: datetime, drive: Drive | Rig
-) -> Offer:
+def proposed(profile: Path, model: TransmissionModel, reason: str, date: datetime, drive: Drive) -> Offer:
     """Makes the model pending; if its file cannot be written, the offer's reason still states the results."""
     try:
         return Offer(True, reason, propose(profile, model, reason, date, drive.identity))
@@ -281,7 +278,7 @@ def concluded(folder: Path) -> Calibration:
 
 
 def active_model(
-    profile: Path, axis: AxisConfig, drive: Drive | Rig, notify: Callable[[str], None] = lambda _: None
+    profile: Path, axis: AxisConfig, drive: Drive, notify: Callable[[str], None] = lambda _: None
 ) -> TransmissionModel | None:
     """Returns the profile's active model if it belongs to this axis and drive, else None."""
     path = profile / "model.yaml"

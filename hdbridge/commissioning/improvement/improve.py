@@ -20,7 +20,6 @@ from hdbridge.commissioning.improvement.trial import Trial, run_trial
 from hdbridge.control.bench import axis_view
 from hdbridge.control.caps import cap_remark
 from hdbridge.control.realtime import suspended_realtime
-from hdbridge.control.rig import Rig
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
 from hdbridge.motion.procedures.plan import Plan
@@ -109,7 +108,7 @@ class Source:
 
 @suspended_realtime()  # fitting takes long; a bench resumes real-time priority for each motion
 def improve(
-    drive: Drive | Rig,
+    drive: Drive,
     source: Source,
     profile: Path,
     active: TransmissionModel,
@@ -176,7 +175,7 @@ def improve(
 class _Bench:
     """Drive, date and callbacks shared by all measurements of an improvement."""
 
-    drive: Drive | Rig
+    drive: Drive
     date: datetime
     callbacks: Callbacks
 
