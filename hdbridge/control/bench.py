@@ -110,18 +110,8 @@ def lost_channels(axis: AxisConfig, record: Record) -> tuple[str, ...]:
 
 def axis_view(axis: AxisConfig) -> AxisView:
     """Returns the axis properties available to procedures."""
-    limits = axis.limits
-    return AxisView(
-        axis.gear.ratio,
-        MotionLimits(
-            limits.position_min_deg,
-            limits.position_max_deg,
-            limits.velocity_deg_s,
-            limits.acceleration_deg_s2,
-            limits.jerk_deg_s3,
-        ),
-        abs(axis.motor_encoder.degrees(1)),
-    )
+    limits = MotionLimits(**axis.limits.model_dump(exclude={"torque_percent"}))
+    return AxisView(axis.gear.ratio, limits, abs(axis.motor_encoder.degrees(1)))
 
 
 def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation:

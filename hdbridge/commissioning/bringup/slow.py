@@ -20,6 +20,7 @@ from hdbridge.cia301 import wrap_int32
 from hdbridge.clock import Clock
 from hdbridge.commissioning.bringup import TORQUE_PERCENT
 from hdbridge.commissioning.bringup.judge import Turned
+from hdbridge.control.bench import axis_view
 from hdbridge.control.runner import AxisRunner
 from hdbridge.drive import objects
 from hdbridge.drive.drive import Drive
@@ -30,7 +31,7 @@ from hdbridge.drive.objects import COB_EMCY
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.supervision import Event
 from hdbridge.errors import SafetyStop
-from hdbridge.motion.procedures.moves import MotionLimits, MoveTo, Path
+from hdbridge.motion.procedures.moves import MoveTo, Path
 
 MOTOR_SPEED_DEG_S: Final = 120.0
 """Speed of the moves, motor degrees per second, if the limits allow four times as much."""
@@ -160,14 +161,8 @@ class SlowAxis(AxisRunner):
         speed = min(MOTOR_SPEED_DEG_S, 0.25 * limits.velocity_deg_s * ratio)
         if least_s > 0.0:
             speed = min(speed, abs(motor_deg - self.place_deg) / least_s)
-        slow = MotionLimits(
-            limits.position_min_deg,
-            limits.position_max_deg,
-            speed / ratio,
-            0.5 * limits.acceleration_deg_s2,
-            limits.jerk_deg_s3,
-        )
-        return MoveTo(motor_deg / ratio).path(self.place_deg / ratio, slow)
+        slow = MoveTo(motor_deg / ratio, speed / ratio, acceleration_deg_s2=0.5 * limits.acceleration_deg_s2)
+        return slow.path(self.place_deg / ratio, axis_view(self.axis).limits)
 
     def _follow(self, motor_deg: float, least_s: float = 0.0) -> Iterator[Feedback]:
         path, period_s, ratio = self._path(motor_deg, least_s), self.cycle.period_s, self.axis.gear.ratio
@@ -299,6 +294,11 @@ class BringUpContext(ExitStack):
     file's own limit. With ``force``, frames are sent even if another master is heard on the bus.
     """
 
+    axis: AxisConfig
+    """Axis file, from `admit` on."""
+    drive: Drive
+    """Drive, not necessarily booted, from `connect` on."""
+
     def __init__(
         self,
         load: Callable[[], AxisConfig],
@@ -323,29 +323,15 @@ class BringUpContext(ExitStack):
         self.rest_begins = 0
         self._connect = connect
         self._force = force
-        self._axis: AxisConfig | None = None
-        self._od: ObjectDictionary | None = None
-        self._drive: Drive | None = None
 
     def admit(self, axis: AxisConfig, od: ObjectDictionary) -> None:
         """Stores the axis file and the EDS after they have been read."""
-        self._axis, self._od = axis, od
+        self.axis, self._od = axis, od
 
     def connect(self) -> None:
         """Opens the bus without sending. Raises `BusError`."""
         bus, clock = self.enter_context(self._connect(self.axis))
-        self._drive = self.enter_context(Drive(bus, self.axis, clock, self._od, force=self._force))
-
-    @property
-    def axis(self) -> AxisConfig:
-        assert self._axis is not None, "checks that need the files come after them"
-        return self._axis
-
-    @property
-    def drive(self) -> Drive:
-        """Drive, not necessarily booted."""
-        assert self._drive is not None, "checks that need the bus come after it"
-        return self._drive
+        self.drive = self.enter_context(Drive(bus, self.axis, clock, self._od, force=self._force))
 
     def boot(self) -> Drive:
         """Boots the drive again, resets a fault left by an earlier check, and returns the drive, disabled."""
