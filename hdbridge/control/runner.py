@@ -59,8 +59,11 @@ class AxisRunner:
         except BaseException:
             with suppress(HdbridgeError):
                 self.brake()
-            with suppress(HdbridgeError):
-                self._drive.disable()
+            if self.supervision.stop is None or self.cycle.axes[0].confirmed:
+                with suppress(HdbridgeError):
+                    self._drive.disable()
+            else:
+                self._drive.power_off()
             raise
         self._drive.disable()
 

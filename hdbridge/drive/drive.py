@@ -298,6 +298,16 @@ class Drive:
         left = self.report.left if self.report is not None else ()
         return variable is not None and variable.writable and (address.index, address.sub) not in left
 
+    def power_off(self) -> list[str]:
+        """Stops and disables a drive that may be unable to answer; returns the problems as text."""
+        self._mode = None
+        try:
+            self._power_off()
+        except HdbridgeError as error:
+            self._power_off_blindly()
+            return [str(error)]
+        return []
+
     def close(self) -> list[str]:
         """Stops and disables the drive and takes it out of OPERATIONAL; returns the problems as text.
 
@@ -306,13 +316,7 @@ class Drive:
         if not self._touched:
             return []
         self._touched = False
-        self._mode = None
-        problems = []
-        try:
-            self._power_off()
-        except HdbridgeError as error:
-            problems.append(str(error))
-            self._power_off_blindly()
+        problems = self.power_off()
         with suppress(HdbridgeError):
             for node_id in self._clients:
                 self.link.send(objects.COB_NMT, bytes((NmtCommand.PRE_OPERATIONAL, node_id)))

@@ -175,6 +175,22 @@ def test_a_drive_that_falls_silent_during_the_stop(runner: str) -> None:
         run.check()
 
 
+def test_a_drive_that_can_no_longer_send_is_switched_off(runner: str) -> None:
+    """It still receives, so it stops and loses its power without an answer."""
+
+    def mute(node: DriveNode) -> None:
+        node.faults.muted_ids = frozenset({0x181, 0x281, 0x581, 0x701})
+
+    with stop(moving, mute) as run:
+        begin_s = run.drive.link.now()
+        with pytest.raises(SafetyStop, match="the drive did not confirm it"):
+            run.run(runner)
+        assert run.drive.link.now() - begin_s < 3.5
+        assert decode(run.node.firmware.statusword()) is State.SWITCH_ON_DISABLED
+        run.check()
+        run.node.faults.muted_ids = frozenset()
+
+
 def test_a_fault_during_the_stop(runner: str) -> None:
     def fail(node: DriveNode) -> bool:
         node.faults.raise_error(0x3210)
