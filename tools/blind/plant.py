@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from hdbridge import InputError, TransmissionModel, fit
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment
-from hdbridge.commissioning.calibration import remaining_plan, start_journal
+from hdbridge.commissioning.calibration import start_journal
+from hdbridge.commissioning.calibration.measure import remaining_plan
 from hdbridge.control.bench import Run, axis_view, compensation_for, record_of, run_moves
 from hdbridge.control.compensation import Compensation
 from hdbridge.motion.procedures.moves import Move, Procedure, Sample, Settle

@@ -14,7 +14,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.difference import diff
 from hdbridge.axis.model.store import propose
-from hdbridge.commissioning.calibration.identification import identify, provenance, standings, with_provenance
+from hdbridge.commissioning.calibration.identification import identify, provenance, standings
 from hdbridge.commissioning.calibration.journal import Journal, fault_notes_in, tasks_of
 from hdbridge.commissioning.calibration.measure import SILENT, Callbacks, measure
 from hdbridge.commissioning.calibration.motion import MotionTest, motion_test, wind_up_of
@@ -225,9 +225,8 @@ def conclude(
     fit = identify(measured, ratio, active, independent_zeros=independent_zeros)
     fit = replace(fit, warnings=(*_lost(recordings), *fault_notes_in(recordings), *fit.warnings))
     gain = fit.held_out.gain
-    model = with_provenance(
-        fit.model, provenance(recordings, measured, gain.as_dict() if gain else fit.held_out.text)
-    )
+    held_out = gain.as_dict() if gain else fit.held_out.text
+    model = fit.model.with_provenance(**provenance(recordings, measured, held_out))
     first = measured[0]
     return Calibration(
         recordings=tuple(map(str, recordings)),

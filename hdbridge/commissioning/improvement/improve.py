@@ -9,7 +9,7 @@ from typing import Any
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.calibration.identification import provenance, with_provenance
+from hdbridge.commissioning.calibration.identification import provenance
 from hdbridge.commissioning.calibration.journal import Journal, check_is_of, fault_notes_in, tasks_of
 from hdbridge.commissioning.calibration.measure import SILENT, Callbacks, measure, start_journal
 from hdbridge.commissioning.calibration.pipeline import Offer, proposed, save_result
@@ -236,7 +236,7 @@ def _concluded(
         return replace(result, offer=Offer(False, f"nothing proposed: {'; '.join(extension.left)}"))
     if not extension.improves:
         return replace(result, offer=Offer(False, f"not offered: {'; '.join(extension.refused)}"))
-    model = with_provenance(extension.model, _provenance(result, recording))
+    model = extension.model.with_provenance(**_provenance(result, recording))
     if remark := cap_remark(drive.axis, model):
         notify(remark)
     notify("stepping with the active and the extended model alternately")
