@@ -151,7 +151,8 @@ class Bench(AxisRunner):
     ) -> None:
         """Prepares the bench; a model is converted by `compensation_for`, with its InputErrors.
 
-        ``interrupted`` is called in each cycle and stops the axis by returning True (KeyboardInterrupt).
+        ``interrupted`` is called in each cycle, those of the power-on included, and stops the axis by
+        returning True (KeyboardInterrupt).
         """
         super().__init__(drive, interrupted)
         axis = drive.axis

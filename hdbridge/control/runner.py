@@ -22,8 +22,8 @@ _STANDING: Final = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, State.REA
 class AxisRunner:
     """Axis whose power is on only inside `powered`, in the control cycle with full supervision.
 
-    ``interrupted`` is called in each cycle and stops the axis by returning True (KeyboardInterrupt). ``link``
-    replaces the drive's own link for the cycle.
+    ``interrupted`` is called in each cycle from the power-on to the end of the motion, and stops the axis by
+    returning True (KeyboardInterrupt). ``link`` replaces the drive's own link for the cycle.
     """
 
     def __init__(self, drive: Drive, interrupted: Callable[[], bool], link: Link | None = None) -> None:
