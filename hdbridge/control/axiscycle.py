@@ -122,10 +122,6 @@ class AxisCycle:
         self._commanded = False
         self.changed()
 
-    def reset(self, *, verified: bool = False) -> None:
-        """Releases the latch (`Supervision.reset`); after a `Reaction.LATCH` also call `begin`."""
-        self.supervision.reset(verified=verified)
-
     @property
     def stopping(self) -> bool:
         """True while a quick stop is under way: neither confirmed by the drive nor timed out."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Generic, NamedTuple, TypeVar
 
@@ -20,17 +19,15 @@ from hdbridge.axis.effects import Channel, Moment, compensable, missing_channels
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.channelstate import ChannelState
 from hdbridge.control.compensation import Compensation, CompensationLimits
-from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.control.faultcounts import FaultCount, FaultCounter
 from hdbridge.control.realtime import resumed_realtime
+from hdbridge.control.runner import AxisRunner
 from hdbridge.drive.drive import Drive
-from hdbridge.drive.feedback import ENABLE_TIMEOUT_S, STANDING, STOP_TIMEOUT_S, until_enabled
+from hdbridge.drive.feedback import ENABLE_TIMEOUT_S, Feedback
 from hdbridge.drive.layout import layouts
 from hdbridge.drive.link import new_tuple
 from hdbridge.drive.objects import TORQUE_ACTUAL
-from hdbridge.drive.states import State
-from hdbridge.drive.supervision import Supervision
-from hdbridge.errors import DriveError, HdbridgeError, InputError, SafetyStop
+from hdbridge.errors import DriveError, InputError
 from hdbridge.motion.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
 from hdbridge.motion.procedures.rehearsal import Rehearsal, rehearse
 from hdbridge.records.record import Record
@@ -113,18 +110,8 @@ def lost_channels(axis: AxisConfig, record: Record) -> tuple[str, ...]:
 
 def axis_view(axis: AxisConfig) -> AxisView:
     """Returns the axis properties available to procedures."""
-    limits = axis.limits
-    return AxisView(
-        axis.gear.ratio,
-        MotionLimits(
-            limits.position_min_deg,
-            limits.position_max_deg,
-            limits.velocity_deg_s,
-            limits.acceleration_deg_s2,
-            limits.jerk_deg_s3,
-        ),
-        abs(axis.motor_encoder.degrees(1)),
-    )
+    limits = MotionLimits(**axis.limits.model_dump(exclude={"torque_percent"}))
+    return AxisView(axis.gear.ratio, limits, abs(axis.motor_encoder.degrees(1)))
 
 
 def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation:
@@ -147,7 +134,7 @@ def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation
     return Compensation(model, limits, axis.drive.cycle_s)
 
 
-class Bench:
+class Bench(AxisRunner):
     """Drive in cyclic position mode, with or without compensation.
 
     Power is on only while a procedure runs. `run` enables the drive at standstill, and always brings it to
@@ -164,28 +151,17 @@ class Bench:
     ) -> None:
         """Prepares the bench; a model is converted by `compensation_for`, with its InputErrors.
 
-        ``interrupted`` is called in each cycle and stops the axis by returning True (KeyboardInterrupt).
+        ``interrupted`` is called in each cycle, those of the power-on included, and stops the axis by
+        returning True (KeyboardInterrupt).
         """
+        super().__init__(drive, interrupted)
         axis = drive.axis
         if compensation is None:
             compensation = TransmissionModel(axis.gear.ratio)
         if isinstance(compensation, TransmissionModel):
             compensation = compensation_for(axis, compensation)
-        self.axis = axis
         self.view = axis_view(axis)
-        self.supervision = Supervision()
-        self.cycle = Cycle(
-            drive.link,
-            drive.link.clock,
-            drive.image,
-            self.supervision,
-            axis.drive.cycle_s,
-            monitor=drive.monitor,
-        )
-        self._drive = drive
-        self._image = drive.image
         self._compensation = compensation
-        self._interrupted = interrupted
         self._channel_state = ChannelState(axis)
         self._place = 0.0
         self._most = math.inf
@@ -222,8 +198,9 @@ class Bench:
         _log.info("run begins", {"procedure": type(procedure).__name__, "ideally_s": rehearsal.duration_s})
         self._fault_counter = FaultCounter(self.supervision, self.cycle.skipped)
         try:
-            with resumed_realtime():
-                outcome = self._powered(procedure, rehearsal, progress)
+            with resumed_realtime(), self.powered() as feedback:
+                self._begin(feedback)
+                outcome = run_moves(procedure, self.view, rehearsal, progress, lambda: self._place, self._leg)
         finally:
             self._log_end()
         axis = self._drive.axis
@@ -238,24 +215,6 @@ class Bench:
             outcome=outcome,
             fault_counts=self.fault_counts,
         )
-
-    def _powered(
-        self, procedure: Procedure[Outcome], rehearsal: Rehearsal, progress: Callable[[float], None]
-    ) -> Outcome:
-        """Runs the procedure, from power on to power off."""
-        self._enable()
-        try:
-            outcome = run_moves(procedure, self.view, rehearsal, progress, lambda: self._place, self._leg)
-        except SafetyStop:
-            raise  # the drive is at rest, or stops on its own; the latch remains
-        except BaseException:
-            with suppress(HdbridgeError):
-                self._image.power.quick_stop()
-                self._rest()
-            raise
-        self._image.power.go(State.SWITCH_ON_DISABLED)
-        self._rest()
-        return outcome
 
     def _log_end(self) -> None:
         """Logs the events of the run once the axis is at rest, because the cycle itself does not log."""
@@ -274,7 +233,7 @@ class Bench:
         A channel that failed during the run is left out, because held values would look like measurements.
         """
         # Converted to arrays only here: on a real bus there is no time for it between two legs.
-        return record_of([sample for samples in self._measured for sample in samples], self._image.axis)
+        return record_of([sample for samples in self._measured for sample in samples], self.image.axis)
 
     @property
     def legs(self) -> tuple[Segment, ...]:
@@ -286,39 +245,34 @@ class Bench:
         """Faults of the current procedure so far, including the one that stopped it, and skipped periods."""
         return self._fault_counter.fault_counts(self.cycle.skipped)
 
-    def _enable(self) -> None:
-        """Enables the drive by PDO at standstill, with the compensation starting from its position."""
-        self._drive.enable()
-        self.cycle.restart()
-        feedback = until_enabled(self.cycle.tick, self._image.power, self.cycle.period_s)
+    def _begin(self, feedback: Feedback) -> None:
+        """Starts the compensation from the position at rest, once every channel has a reading."""
         feedback = self._await_channels(feedback)
-        motor_deg = self._image.motor_deg(feedback.motor_counts)
+        motor_deg = self.image.motor_deg(feedback.motor_counts)
         self._place = motor_deg / self.view.ratio
         self._channel_state.begin(feedback, motor_deg, self._compensation)
         self._compensation.engage()
 
     def _await_channels(self, feedback: Feedback) -> Feedback:
         """Waits at standstill until every channel of the axis file has a reading; DriveError on time-out."""
-        image, period_s = self._image, self.cycle.period_s
-        rarest = max((each.every_cycles for each in image.axis.channels.values()), default=0)
-        for _ in range(math.ceil(ENABLE_TIMEOUT_S / period_s) + 2 * rarest):
+        image = self.image
+        rarest = max((each.every_cycles for each in self.axis.channels.values()), default=0)
+        for _ in range(math.ceil(ENABLE_TIMEOUT_S / self.cycle.period_s) + 2 * rarest):
             waiting = [each for each in image.channels if each.value is None]
             if not waiting:
                 return feedback
             if waiting[0].lost:
                 break
-            feedback = self.cycle.tick()
-        image.power.go(State.SWITCH_ON_DISABLED)
-        self._rest()
+            feedback = self.tick()
         raise DriveError(
-            f"{image.axis.where(waiting[0].key)}: no plausible reading arrived ({waiting[0].why}); "
+            f"{self.axis.where(waiting[0].key)}: no plausible reading arrived ({waiting[0].why}); "
             "check the sensor, or leave the key out"
         )
 
     def _leg(self, move: Move, path: Path) -> Sequence[Sample]:
         """Runs one move, cycle by cycle, from the current load target; returns its samples."""
         samples: list[Sample] = []
-        tick, image, interrupted = self.cycle.tick, self._image, self._interrupted
+        tick, image, interrupted = self.cycle.tick, self.image, self._interrupted
         command, hold, counts_for = (
             self._compensation.command,
             self._compensation.hold,
@@ -368,13 +322,3 @@ class Bench:
             if samples:
                 self._measured.append(samples)
                 self._legs.append(_Leg(move.kind, samples[0].time_s, samples[-1].time_s))
-
-    def _rest(self) -> None:
-        """Waits until the drive is at rest with power off or in quick stop, then disables it."""
-        power = self._image.power
-        for _ in range(math.ceil(STOP_TIMEOUT_S / self.cycle.period_s)):
-            before = self._image.motor_counts
-            self.cycle.tick()
-            if power.state in STANDING and abs(self._image.motor_counts - before) <= 1:
-                break
-        self._drive.disable()

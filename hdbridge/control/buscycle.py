@@ -165,7 +165,7 @@ class BusCycle:
     def relink(self, link: Link) -> None:
         """Continues on a new link, after the bus failed and was reopened.
 
-        The axes stay latched: each must be verified, released (`AxisCycle.reset`) and begun.
+        The axes stay latched: each must be verified, released (`Supervision.reset`) and begun.
         """
         fast = fast_link(link)
         self._send, self._recv, self._dropped = fast.send, fast.recv, fast.dropped

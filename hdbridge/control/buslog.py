@@ -75,7 +75,7 @@ def import_log(
             buses[name] = _Bus(axis, all_states=all_states)
         buses[name].take(message.arbitration_id, bytes(message.data), message.timestamp)
     for bus in buses.values():
-        bus.end()
+        bus.end_window()
     found = {name: bus for name, bus in buses.items() if bus.samples}
     if not found:
         reasons = [bus.why_empty() for bus in buses.values() if bus.has_heard]
@@ -183,7 +183,7 @@ class _Bus:
             if len(data) == 8:
                 self._take_sdo(can_id, data)
         elif can_id == self._held.get((self._axis.drive.node_id, 0x1005, 0), objects.COB_SYNC) & 0x7FF:
-            self._end_window()
+            self.end_window()
             self._sync_s = time_s
         elif can_id in self._boots or can_id == objects.COB_NMT:
             booted = can_id in self._boots and data[:1] == bytes([NmtState.BOOT_UP])
@@ -192,9 +192,6 @@ class _Bus:
                 self._begin(unseated=True)
         else:
             self._take_pdo(can_id, data, time_s)
-
-    def end(self) -> None:
-        self._end_window()
 
     # -- SDO ----------------------------------------------------------------------------------------------
 
@@ -319,7 +316,7 @@ class _Bus:
         elif self._needed == {can_id}:
             self._sample(image, time_s)
 
-    def _end_window(self) -> None:
+    def end_window(self) -> None:
         """Ends a SYNC period; it becomes a sample if both encoders were received."""
         image = self._image
         if image is None or self._sync_s is None or self._is_free:

@@ -32,7 +32,7 @@ from hdbridge.drive.nameplate import (
 )
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.sdo import SdoAbortError, SdoClient
-from hdbridge.drive.states import State, decode
+from hdbridge.drive.states import OFF, State, decode
 from hdbridge.drive.writes import PlannedWrite
 from hdbridge.errors import DriveError, IdentityError, SdoError
 
@@ -222,13 +222,12 @@ class BootUp:
 
     def _power_off(self) -> None:
         """Switches off a drive that an earlier master left powered, before any change."""
-        off = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
         state = decode(self._sdo.fetch(objects.STATUSWORD))
-        if state in off:
+        if state in OFF:
             return
         self._sdo.store(objects.CONTROLWORD, 0)
         deadline_s = self._link.now() + STATE_TIMEOUT_S
-        while state not in off:
+        while state not in OFF:
             if self._link.now() >= deadline_s:
                 raise DriveError(
                     f"{self._sdo.describe(0x6041, 0)}: the drive stays in '{state.value}' after 'disable "

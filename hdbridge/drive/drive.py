@@ -26,17 +26,16 @@ from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
 from hdbridge.drive.dictionary import dictionary_of, find
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
-from hdbridge.drive.masterdetection import DEFAULT_MASTER_ID, MasterDetector, listening_s
+from hdbridge.drive.masterdetection import refuse_other_masters
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import Address, IntegerType, Mode
 from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoAbortError, SdoClient
-from hdbridge.drive.states import Command, State, decode, row_for
+from hdbridge.drive.states import OFF, Command, State, decode, row_for
 from hdbridge.drive.writes import master_heartbeat
 from hdbridge.errors import DriveError, HdbridgeError, InputError, TransitionError
 
 _log = logging.getLogger(__name__)
 _CLOSING_TIMEOUT_S: Final = 0.2
-_OFF: Final = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
 
 
 class Positions(NamedTuple):
@@ -90,15 +89,10 @@ class Drive:
         Takes two heartbeat periods, and at least the 0.51 s in which the slowest master sends two SYNCs.
         Called by `boot`; must be called before reading objects of a drive that is not booted.
         """
-        if self._may_speak:
-            return
-        drive = self.axis.drive
-        detector = MasterDetector({drive.node_id}, {drive.master_node_id, DEFAULT_MASTER_ID}, self._clients)
-        duration_s = listening_s(drive.heartbeat_ms)
-        detector.listen(self.link, duration_s, self.monitor.dispatch)
-        detector.raise_if_heard(self.link.name, duration_s)
-        self._heard = frozenset(detector.nodes.difference(self._clients))
-        self._may_speak = True
+        if not self._may_speak:
+            heard = refuse_other_masters(self.link, (self.axis,), self.monitor.dispatch)
+            self._heard = frozenset(heard.difference(self._clients))
+            self._may_speak = True
 
     def boot(self, *, reset: bool = True) -> BootReport:
         """Boots the drive up to OPERATIONAL with power off; docs/architecture.md describes each step.
@@ -200,7 +194,7 @@ class Drive:
             self._commander.walk(State.SWITCHED_ON)
         if state is State.QUICK_STOP_ACTIVE:
             self._commander.wait_for_standstill()
-        if self._commander.state() not in _OFF:
+        if self._commander.state() not in OFF:
             self._commander.walk(State.SWITCH_ON_DISABLED)
         self._expect_master(False)
         self._mode = None
@@ -304,6 +298,16 @@ class Drive:
         left = self.report.left if self.report is not None else ()
         return variable is not None and variable.writable and (address.index, address.sub) not in left
 
+    def power_off(self) -> list[str]:
+        """Stops and disables a drive that may be unable to answer; returns the problems as text."""
+        self._mode = None
+        try:
+            self._power_off()
+        except HdbridgeError as error:
+            self._power_off_blindly()
+            return [str(error)]
+        return []
+
     def close(self) -> list[str]:
         """Stops and disables the drive and takes it out of OPERATIONAL; returns the problems as text.
 
@@ -312,13 +316,7 @@ class Drive:
         if not self._touched:
             return []
         self._touched = False
-        self._mode = None
-        problems = []
-        try:
-            self._power_off()
-        except HdbridgeError as error:
-            problems.append(str(error))
-            self._power_off_blindly()
+        problems = self.power_off()
         with suppress(HdbridgeError):
             for node_id in self._clients:
                 self.link.send(objects.COB_NMT, bytes((NmtCommand.PRE_OPERATIONAL, node_id)))
@@ -362,10 +360,10 @@ class Drive:
             if commander.quick_stop() is State.QUICK_STOP_ACTIVE:
                 commander.wait_for_standstill()
             state = commander.state()
-        if state not in _OFF:
+        if state not in OFF:
             commander.control(0x0000)
             commander.wait_for(
-                "'switch on disabled'", lambda word: decode(word) in _OFF, STEP_TIMEOUT_S, allow_fault=True
+                "'switch on disabled'", lambda word: decode(word) in OFF, STEP_TIMEOUT_S, allow_fault=True
             )
         if self.can_set(objects.HEARTBEAT_CONSUMER):
             # The master leaves on purpose; its silence from now on is not a fault.

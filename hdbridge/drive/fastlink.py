@@ -1,9 +1,7 @@
-"""Fast link for the control cycle: the same frames and errors as `Link`, with less CPU time.
+"""Fast link for the control cycle on SocketCAN: the same frames and errors as `Link`, with less CPU time.
 
-Building and copying messages in python-can would take half the time of a cycle. Two shortcuts avoid this and
-change nothing else. On SocketCAN, frames are read and written on the bus's own socket. On other interfaces,
-sent messages are copied by their constructor rather than by the deep copy that python-can's virtual bus makes
-for each receiver.
+Building messages in python-can would take half the time of a cycle. Frames are therefore read and written on
+the bus's own socket.
 """
 
 import select
@@ -14,7 +12,6 @@ from typing import Any, Final
 import can
 from can.interfaces.socketcan import SocketcanBus
 
-from hdbridge.canframe import DataFrame
 from hdbridge.drive.link import Frame, Link, TransmitBufferFull, new_tuple
 from hdbridge.errors import BusError
 
@@ -32,23 +29,11 @@ _DONTWAIT: Final = socket.MSG_DONTWAIT
 
 def fast_link(link: Link) -> Link:
     """Returns a link for the cycle on the same bus and clock, with the same count of dropped frames."""
-    if type(link) is not Link:
+    if type(link) is not Link or type(link.bus) is not SocketcanBus:
         return link
-    fast = _SocketLink(link) if type(link.bus) is SocketcanBus else _MessageLink(link.bus, link.clock)
+    fast = _SocketLink(link)
     fast.dropped = link.dropped
     return fast
-
-
-class _MessageLink(Link):
-    """Link that sends messages that are cheap to copy."""
-
-    def send(self, can_id: int, data: bytes) -> None:
-        if self.down is not None:
-            raise BusError(self.down)
-        try:
-            self._send(DataFrame(can_id, data, self.mark))
-        except (can.CanError, OSError) as error:
-            raise self._failure("send", error) from error
 
 
 class _SocketLink(Link):

@@ -115,7 +115,7 @@ class Link:
         if self.down is not None:
             raise BusError(self.down)
         try:
-            self._send(can.Message(arbitration_id=can_id, is_extended_id=False, data=data, channel=self.mark))
+            self._send(DataFrame(can_id, data, self.mark))
         except (can.CanError, OSError) as error:
             raise self._failure("send", error) from error
 

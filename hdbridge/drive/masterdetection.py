@@ -6,9 +6,10 @@ that would stop the axis while this master runs: SYNC, NMT commands, a master's 
 """
 
 from collections import Counter
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Sequence
 from typing import Final
 
+from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
 from hdbridge.drive.link import Frame, Link
 from hdbridge.errors import BusInUseError
@@ -34,6 +35,24 @@ def heartbeat_of(frame: Frame) -> int | None:
     """Returns the node of a heartbeat or boot-up message, or None."""
     node_id = frame.can_id - objects.COB_HEARTBEAT
     return node_id if 0 < node_id <= _NODE else None
+
+
+def refuse_other_masters(
+    link: Link, axes: Sequence[AxisConfig], then: Callable[[Frame], object] = lambda _: None
+) -> set[int]:
+    """Listens for another master of these axes before the first frame; returns the nodes that were heard.
+
+    ``then`` also receives every frame. Raises `BusInUseError` if there is another master.
+    """
+    detector = MasterDetector(
+        {axis.drive.node_id for axis in axes},
+        {axis.drive.master_node_id for axis in axes} | {DEFAULT_MASTER_ID},
+        {node for axis in axes for node in axis.nodes},
+    )
+    duration_s = listening_s(max(axis.drive.heartbeat_ms for axis in axes))
+    detector.listen(link, duration_s, then)
+    detector.raise_if_heard(link.name, duration_s)
+    return detector.nodes
 
 
 class MasterDetector:

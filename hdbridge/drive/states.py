@@ -110,6 +110,10 @@ _STATE_BITS: Final = 0x6F
 _DECODED: Final = tuple(_decoded(bits) for bits in range(_STATE_BITS + 1))
 
 
+OFF: Final = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
+"""States with power off, in which a drive can be left."""
+
+
 def decode(statusword: int | None) -> State:
     """Returns the state in a statusword; UNKNOWN for None, beyond 16 bits and for undefined bits."""
     if statusword is None or not 0 <= statusword <= 0xFFFF:

@@ -268,11 +268,12 @@ class Work:
         self._loads_deg.clear()
         run = self._bench.run(Stepping(count=count, step_deg=step_deg, start_deg=start_deg))
         ends = [each.end_s for each in run.segments if each.kind == "settle"]
+        loads_deg = self._loads_deg[-len(run.record) :]  # without the cycles of the power-on
         rows = np.searchsorted(run.record.columns["time_s"], np.array(ends) - 1e-9)
         targets = [each.target_deg for each in (*run.outcome.cw, *run.outcome.ccw)]
         self.errors_arcsec.append(
             [
-                (self._loads_deg[row] - target) * ARCSEC_PER_DEG
+                (loads_deg[row] - target) * ARCSEC_PER_DEG
                 for row, target in zip(rows.tolist(), targets, strict=True)
             ]
         )

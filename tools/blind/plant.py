@@ -1,6 +1,6 @@
 """Runs a simulated axis without a bus, far faster than its own time: procedures, calibrations, records.
 
-`PlantRig` takes the place of a drive, so a calibration runs on it as on a bench. Loops, mechanics and
+A calibration runs on a `PlantRig` as on a bench. Loops, mechanics and
 encoders are those behind the simulated drive's firmware. The command is in whole counts, one for each SYNC,
 and the encoders are read at its end. The command is kept: `Plant.run` repeats it on an axis that has changed,
 or with other noise.
@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from hdbridge import InputError, TransmissionModel, fit
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment
-from hdbridge.commissioning.calibration import measure, start_journal
+from hdbridge.commissioning.calibration import start_journal
+from hdbridge.commissioning.calibration.measure import remaining_plan
 from hdbridge.control.bench import Run, axis_view, compensation_for, record_of, run_moves
 from hdbridge.control.compensation import Compensation
 from hdbridge.motion.procedures.moves import Move, Procedure, Sample, Settle
@@ -70,7 +71,7 @@ class Plant:
 
 
 class PlantRig:
-    """Rig for procedures on a plant (`hdbridge.control.rig.Rig`)."""
+    """Plant on which procedures run."""
 
     def __init__(self, axis: EverydayAxis, seed: int) -> None:
         self.axis: AxisConfig = axis.config
@@ -81,10 +82,8 @@ class PlantRig:
         self.counts: list[float] = []
         """Commands, motor counts."""
 
-    def bench(
-        self, compensation: Compensation | None = None, *, interrupted: Callable[[], bool] = lambda: False
-    ) -> PlantBench:
-        """Returns a bench without compensation: the motor target is the ratio times the load target."""
+    def bench(self, compensation: Compensation | None = None) -> PlantBench:
+        """Returns a bench; without compensation, the motor target is the ratio times the load target."""
         return PlantBench(self, compensation)
 
     def compensated(self, model: TransmissionModel) -> PlantBench:
@@ -98,9 +97,7 @@ class PlantRig:
 
 
 class PlantBench:
-    """Runs procedures on a `PlantRig` (`hdbridge.control.rig.ProcedureBench`)."""
-
-    fault_counts = ()
+    """Runs procedures on a `PlantRig`."""
 
     def __init__(self, rig: PlantRig, compensation: Compensation | None) -> None:
         self._rig = rig
@@ -175,7 +172,11 @@ def calibrated(axis: EverydayAxis, folder: Path, seed: int) -> TransmissionModel
         shutil.rmtree(folder, ignore_errors=True)
         rig = PlantRig(axis, seed)
         journal = start_journal(folder / "recording", axis.config, Plan.load(axis.plan), DATE, rig.identity)
-        measure(rig, journal)
+        journal.begin_session()
+        bench = rig.bench()
+        for task in remaining_plan(journal.plan, axis.config).tasks:
+            bench.run(task.procedure)
+            journal.add(task.name, bench.record(), bench.legs, complete=True)
         model = fit(journal.recording(), axis=axis.config).model
         shutil.rmtree(folder / "recording")
         model.save(kept)

@@ -6,16 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, pstdev
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
 from hdbridge.commissioning.bringup.checks import Verdict, failed, judged, passed
 from hdbridge.units import ARCSEC_PER_DEG
-
-if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
-
 
 TOOTH_SHARE: Final = 0.35
 """Maximum error of a ratio, relative to the distance to its neighbour (N and N + 1 differ by 1/N)."""

@@ -6,7 +6,7 @@ off again. Everything runs in the control cycle with full supervision.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from statistics import fmean
@@ -20,17 +20,18 @@ from hdbridge.cia301 import wrap_int32
 from hdbridge.clock import Clock
 from hdbridge.commissioning.bringup import TORQUE_PERCENT
 from hdbridge.commissioning.bringup.judge import Turned
-from hdbridge.control.cycle import Cycle, Feedback
+from hdbridge.control.bench import axis_view
+from hdbridge.control.runner import AxisRunner
 from hdbridge.drive import objects
 from hdbridge.drive.drive import Drive
-from hdbridge.drive.feedback import STANDING, STOP_TIMEOUT_S, until_enabled
+from hdbridge.drive.feedback import STOP_TIMEOUT_S, Feedback
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.monitor import Emergency
 from hdbridge.drive.objects import COB_EMCY
 from hdbridge.drive.states import State, decode
-from hdbridge.drive.supervision import Event, Supervision
-from hdbridge.errors import HdbridgeError, SafetyStop
-from hdbridge.motion.procedures.moves import MotionLimits, MoveTo, Path
+from hdbridge.drive.supervision import Event
+from hdbridge.errors import SafetyStop
+from hdbridge.motion.procedures.moves import MoveTo, Path
 
 MOTOR_SPEED_DEG_S: Final = 120.0
 """Speed of the moves, motor degrees per second, if the limits allow four times as much."""
@@ -40,7 +41,6 @@ hysteresis loop."""
 MARGIN_DEG: Final = 1.0
 """Motor travel kept clear of the axis limits, degrees."""
 LEAST_TRAVEL_DEG: Final = 20.0
-STILL_CYCLES: Final = 3
 
 
 class TravelPlan(NamedTuple):
@@ -116,76 +116,32 @@ class Silence:
     """True if the drive entered the quick stop and the master's own controlword took it out again."""
 
 
-class SlowAxis:
-    """Axis in slow motion. ``interrupted`` is called in each cycle; the axis stops if it returns True."""
+class SlowAxis(AxisRunner):
+    """Axis in slow motion, with limited torque. Raises like `AxisRunner`."""
 
     def __init__(self, drive: Drive, torque_percent: float, interrupted: Callable[[], bool]) -> None:
-        self.axis = drive.axis
-        self.image = drive.image
-        self.supervision = Supervision()
         self.link = QuietLink(drive.link.bus, drive.link.clock)
-        self.cycle = Cycle(
-            self.link,
-            drive.link.clock,
-            drive.image,
-            self.supervision,
-            drive.axis.drive.cycle_s,
-            monitor=drive.monitor,
-        )
+        super().__init__(drive, interrupted, self.link)
         self.torque_percent = min(torque_percent, drive.axis.limits.torque_percent)
-        self._drive = drive
-        self._interrupted = interrupted
         self.place_deg = 0.0
         """Target motor angle, degrees."""
 
-    # -- power --------------------------------------------------------------------------------------------
-
     @contextmanager
     def enabled(self) -> Iterator[Feedback]:
-        """Switches power on at rest and off again at the end; yields the first feedback under power."""
-        drive, power = self._drive, self.image.power
+        """Enters `powered` with the limited torque; quick-stops the axis at the end of the block."""
+        drive = self._drive
         if drive.can_set(objects.MAX_TORQUE):
             drive.sdo.store(objects.MAX_TORQUE, round(10.0 * self.torque_percent))
-        drive.enable()
-        self.cycle.restart()
-        try:
-            feedback = until_enabled(lambda: self._tick(None), power, self.cycle.period_s)
+        with self.powered() as feedback:
             self.place_deg = self.image.motor_deg(feedback.motor_counts)
             yield feedback
-            self._rest()
-        except BaseException:
-            # On any failure, Ctrl-C included, the axis is stopped before the error propagates.
-            with suppress(HdbridgeError):
-                self._rest()
-            with suppress(HdbridgeError):
-                drive.disable()
-            raise
-        drive.disable()
-
-    def _rest(self) -> None:
-        if self.supervision.stop is None and self.image.power.state is State.OPERATION_ENABLED:
-            self.stop()
-
-    def stop(self) -> list[Feedback]:
-        """Quick-stops the axis and runs cycles until the motor is at rest; returns their feedback."""
-        power = self.image.power
-        power.quick_stop()
-        seen: list[Feedback] = []
-        still = 0
-        for _ in range(math.ceil(STOP_TIMEOUT_S / self.cycle.period_s)):
-            before = self.image.motor_counts
-            seen.append(self.cycle.tick())
-            rests = power.state in STANDING and abs(self.image.motor_counts - before) <= 1
-            still = still + 1 if rests else 0
-            if still >= STILL_CYCLES:
-                break
-        return seen
+            self.brake()
 
     # -- motion -------------------------------------------------------------------------------------------
 
     def sit(self, duration_s: float) -> list[Feedback]:
         """Runs cycles without motion, with or without power; returns their feedback."""
-        return [self._tick(None) for _ in range(math.ceil(duration_s / self.cycle.period_s))]
+        return [self.tick() for _ in range(math.ceil(duration_s / self.cycle.period_s))]
 
     def travel(self, motor_deg: float) -> list[Feedback]:
         """Moves slowly to a motor angle; returns the feedback of each cycle."""
@@ -205,32 +161,18 @@ class SlowAxis:
         speed = min(MOTOR_SPEED_DEG_S, 0.25 * limits.velocity_deg_s * ratio)
         if least_s > 0.0:
             speed = min(speed, abs(motor_deg - self.place_deg) / least_s)
-        slow = MotionLimits(
-            limits.position_min_deg,
-            limits.position_max_deg,
-            speed / ratio,
-            0.5 * limits.acceleration_deg_s2,
-            limits.jerk_deg_s3,
-        )
-        return MoveTo(motor_deg / ratio).path(self.place_deg / ratio, slow)
+        slow = MoveTo(motor_deg / ratio, speed / ratio, acceleration_deg_s2=0.5 * limits.acceleration_deg_s2)
+        return slow.path(self.place_deg / ratio, axis_view(self.axis).limits)
 
     def _follow(self, motor_deg: float, least_s: float = 0.0) -> Iterator[Feedback]:
         path, period_s, ratio = self._path(motor_deg, least_s), self.cycle.period_s, self.axis.gear.ratio
         elapsed_s = 0.0
         while True:
             self.place_deg = path.at(elapsed_s) * ratio
-            yield self._tick(self.image.target_counts_for(self.place_deg))
+            yield self.tick(self.image.target_counts_for(self.place_deg))
             if elapsed_s >= path.duration_s:
                 return
             elapsed_s += period_s
-
-    def _tick(self, target: int | None) -> Feedback:
-        feedback = self.cycle.tick(target)
-        if self._interrupted():
-            if self.image.power.state is State.OPERATION_ENABLED:
-                self.stop()
-            raise KeyboardInterrupt
-        return feedback
 
     # -- stops --------------------------------------------------------------------------------------------
 
@@ -291,7 +233,7 @@ class SlowAxis:
         noticed_s: float | None = None
         while self.link.now() - last_s <= patience_s:
             if self._interrupted():
-                raise KeyboardInterrupt  # leaving `enabled` and the drive's own exit stop it
+                raise KeyboardInterrupt  # leaving `powered` stops it
             drive.wait(0.002)
             if decode(drive.sdo.fetch(objects.STATUSWORD)) is not State.OPERATION_ENABLED:
                 noticed_s = self.link.now() - last_s
@@ -352,6 +294,11 @@ class BringUpContext(ExitStack):
     file's own limit. With ``force``, frames are sent even if another master is heard on the bus.
     """
 
+    axis: AxisConfig
+    """Axis file, from `admit` on."""
+    drive: Drive
+    """Drive, not necessarily booted, from `connect` on."""
+
     def __init__(
         self,
         load: Callable[[], AxisConfig],
@@ -376,29 +323,15 @@ class BringUpContext(ExitStack):
         self.rest_begins = 0
         self._connect = connect
         self._force = force
-        self._axis: AxisConfig | None = None
-        self._od: ObjectDictionary | None = None
-        self._drive: Drive | None = None
 
     def admit(self, axis: AxisConfig, od: ObjectDictionary) -> None:
         """Stores the axis file and the EDS after they have been read."""
-        self._axis, self._od = axis, od
+        self.axis, self._od = axis, od
 
     def connect(self) -> None:
         """Opens the bus without sending. Raises `BusError`."""
         bus, clock = self.enter_context(self._connect(self.axis))
-        self._drive = self.enter_context(Drive(bus, self.axis, clock, self._od, force=self._force))
-
-    @property
-    def axis(self) -> AxisConfig:
-        assert self._axis is not None, "checks that need the files come after them"
-        return self._axis
-
-    @property
-    def drive(self) -> Drive:
-        """Drive, not necessarily booted."""
-        assert self._drive is not None, "checks that need the bus come after it"
-        return self._drive
+        self.drive = self.enter_context(Drive(bus, self.axis, clock, self._od, force=self._force))
 
     def boot(self) -> Drive:
         """Boots the drive again, resets a fault left by an earlier check, and returns the drive, disabled."""

@@ -118,11 +118,6 @@ def provenance(
     return {name: value for name, value in data.items() if value not in ([], {})}
 
 
-def with_provenance(model: TransmissionModel, data: dict[str, Any]) -> TransmissionModel:
-    """Returns the model with ``data`` added to its provenance."""
-    return replace(model, provenance={**model.provenance, **data})
-
-
 class _Piece(NamedTuple):
     record: Record
     kind: str

@@ -10,7 +10,6 @@ from typing import Any, Final
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.commissioning.calibration.journal import Journal
 from hdbridge.control.bench import Bench, axis_view, lost_channels
-from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import HdbridgeError, InputError, OutputError
 from hdbridge.files.atomic import make_folder
@@ -102,7 +101,7 @@ def start_journal(
     return Journal.create(folder, axis, plan, date, identity, notes)
 
 
-def measure(drive: Drive | Rig, journal: Journal, callbacks: Callbacks = SILENT) -> None:
+def measure(drive: Drive, journal: Journal, callbacks: Callbacks = SILENT) -> None:
     """Runs the remaining tasks of the journal's plan on a booted drive.
 
     If a task is stopped (KeyboardInterrupt, `SafetyStop`, `DriveError`, `BusError`), its samples are kept
@@ -114,7 +113,7 @@ def measure(drive: Drive | Rig, journal: Journal, callbacks: Callbacks = SILENT)
         return
     make_folder(journal.folder)  # fails on an unwritable disk before the axis moves
     pace = Pace(left.duration_s, drive.axis.drive.cycle_s, callbacks)
-    bench = bench_on(drive, interrupted=pace.interrupted)
+    bench = Bench(drive, interrupted=pace.interrupted)
     journal.begin_session()
     for task in left.tasks:
         pace.begin(task.name)

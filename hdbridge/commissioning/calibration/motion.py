@@ -32,8 +32,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import Response
 from hdbridge.commissioning.calibration.measure import SILENT, Callbacks, Pace
 from hdbridge.commissioning.calibration.path import PathError, inertia_over_stiffness, path_errors
-from hdbridge.control.bench import axis_view, compensation_for
-from hdbridge.control.rig import Rig, bench_on
+from hdbridge.control.bench import Bench, axis_view, compensation_for
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.gains import changed_gains, read_gains
 from hdbridge.errors import InputError
@@ -220,7 +219,7 @@ def motion_test_s(axis: AxisConfig) -> float:
 
 
 def motion_test(
-    drive: Drive | Rig, model: TransmissionModel, callbacks: Callbacks = SILENT, *, measure: bool = True
+    drive: Drive, model: TransmissionModel, callbacks: Callbacks = SILENT, *, measure: bool = True
 ) -> MotionTest:
     """Runs a booted drive's axis at several speeds and on paths, without and with the model's correction.
 
@@ -233,7 +232,7 @@ def motion_test(
     runner = _Runner(drive, model, callbacks)
     if not measure:
         compensation_for(drive.axis, model)  # rejects a response for a different cycle time before any motion
-    gains = read_gains(drive.sdo) if isinstance(drive, Drive) else {}
+    gains = read_gains(drive.sdo)
     found = _ripple_test(runner, model, measure)
     if found.response is not None and measure:
         found = replace(found, response=found.response.model_copy(update={"gain_objects": gains}))
@@ -346,7 +345,7 @@ class _Runner:
 
     def __init__(
         self,
-        drive: Drive | Rig,
+        drive: Drive,
         model: TransmissionModel,
         callbacks: Callbacks,
         shares: Sequence[float] = SHARES,
@@ -386,7 +385,7 @@ class _Runner:
 
     def _run(self, name: str, model: TransmissionModel, procedure: Procedure[Outcome]) -> Outcome:
         self._pace.begin(name)
-        bench = bench_on(self._drive, compensation_for(self.axis, model), interrupted=self._pace.interrupted)
+        bench = Bench(self._drive, compensation_for(self.axis, model), interrupted=self._pace.interrupted)
         return bench.run(procedure).outcome
 
     def _harmonics(self, runs: tuple[EvenRun, ...]) -> tuple[Harmonics, ...]:

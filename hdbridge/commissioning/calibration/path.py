@@ -12,14 +12,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hdbridge.axis.effects import Motion
+from hdbridge.axis.effects import FloatArray, Motion
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.motion.procedures.path_test import PathRun
 from hdbridge.units import ARCSEC_PER_DEG
-
-FloatArray = NDArray[np.float64]
 
 SETTLED_ARCSEC = 3.0
 """Maximum distance from the rest position at which the load counts as settled."""

@@ -15,14 +15,13 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.difference import diff
 from hdbridge.axis.model.store import propose
-from hdbridge.commissioning.calibration.identification import identify, provenance, standings, with_provenance
+from hdbridge.commissioning.calibration.identification import identify, provenance, standings
 from hdbridge.commissioning.calibration.journal import Journal, fault_notes_in, tasks_of
 from hdbridge.commissioning.calibration.measure import SILENT, Callbacks, measure
 from hdbridge.commissioning.calibration.motion import MotionTest, motion_test, wind_up_of
 from hdbridge.commissioning.calibration.validation import Validation, floor_of, validate
 from hdbridge.control.caps import cap_remark
 from hdbridge.control.realtime import suspended_realtime
-from hdbridge.control.rig import Rig
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError, OutputError
 from hdbridge.files.atomic import write_atomically
@@ -145,7 +144,7 @@ ACTIVE_NAME = "active.yaml"
 
 @suspended_realtime()  # fitting takes long; a bench resumes real-time priority for each motion
 def calibrate(
-    drive: Drive | Rig,
+    drive: Drive,
     journal: Journal,
     profile: Path,
     date: datetime,
@@ -202,9 +201,7 @@ def calibrate(
     return _kept(journal.folder, replace(result, offer=proposed(profile, result.model, reason, date, drive)))
 
 
-def proposed(
-    profile: Path, model: TransmissionModel, reason: str, date: datetime, drive: Drive | Rig
-) -> Offer:
+def proposed(profile: Path, model: TransmissionModel, reason: str, date: datetime, drive: Drive) -> Offer:
     """Makes the model pending; if its file cannot be written, the offer's reason still states the results."""
     try:
         return Offer(True, reason, propose(profile, model, reason, date, drive.identity))
@@ -229,9 +226,8 @@ def conclude(
     fit = identify(measured, ratio, active, independent_zeros=independent_zeros)
     fit = replace(fit, warnings=(*_lost(recordings), *fault_notes_in(recordings), *fit.warnings))
     gain = fit.held_out.gain
-    model = with_provenance(
-        fit.model, provenance(recordings, measured, gain.as_dict() if gain else fit.held_out.text)
-    )
+    held_out = gain.as_dict() if gain else fit.held_out.text
+    model = fit.model.with_provenance(**provenance(recordings, measured, held_out))
     first = measured[0]
     return Calibration(
         recordings=tuple(map(str, recordings)),
@@ -282,7 +278,7 @@ def concluded(folder: Path) -> Calibration:
 
 
 def active_model(
-    profile: Path, axis: AxisConfig, drive: Drive | Rig, notify: Callable[[str], None] = lambda _: None
+    profile: Path, axis: AxisConfig, drive: Drive, notify: Callable[[str], None] = lambda _: None
 ) -> TransmissionModel | None:
     """Returns the profile's active model if it belongs to this axis and drive, else None."""
     path = profile / "model.yaml"

@@ -22,7 +22,6 @@ from hdbridge.commissioning.evaluation.accuracy import AxisAccuracy, axis_accura
 from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_floor_arcsec
 from hdbridge.control.bench import Bench, Run, axis_view, compensation_for
 from hdbridge.control.faultcounts import fault_notes
-from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
 from hdbridge.files.outputs import writing
 from hdbridge.motion.procedures.moves import Settle
@@ -165,7 +164,7 @@ def validation_s(plan: Plan, axis: AxisConfig) -> float:
 
 
 def validate(
-    drive: Drive | Rig,
+    drive: Drive,
     plan: Plan,
     before: TransmissionModel | None,
     after: TransmissionModel,
@@ -189,7 +188,7 @@ def validate(
 
     def stepped(name: str, model: TransmissionModel) -> tuple[Bench, Run[SteppingOutcome]]:
         pace.begin(f"stepping {name}")
-        bench = bench_on(drive, compensation_for(axis, model), interrupted=pace.interrupted)
+        bench = Bench(drive, compensation_for(axis, model), interrupted=pace.interrupted)
         with record_kept(bench, folder / f"stepping-{name}.csv.gz"):
             return bench, bench.run(stepping)
 

@@ -8,9 +8,8 @@ from typing import Any, Self
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_floor_arcsec
-from hdbridge.control.bench import Run, compensation_for
+from hdbridge.control.bench import Bench, Run, compensation_for
 from hdbridge.control.faultcounts import fault_notes
-from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
 from hdbridge.enums import Scheme
 from hdbridge.motion.procedures.stepping import Stepping, SteppingOutcome
@@ -60,7 +59,7 @@ class Comparison:
 
 
 def compare_schemes(
-    drive: Drive | Rig,
+    drive: Drive,
     model: TransmissionModel,
     schemes: Sequence[Scheme],
     stepping: Stepping,
@@ -78,7 +77,7 @@ def compare_schemes(
     # All compensations first, so that an impossible one is refused before anything moves.
     compensations = {scheme: compensation_for(drive.axis, scheme.of(model)) for scheme in schemes}
     for scheme, compensation in compensations.items():
-        bench = bench_on(drive, compensation, interrupted=interrupted)
+        bench = Bench(drive, compensation, interrupted=interrupted)
         try:
             run = bench.run(stepping, partial(progress, scheme))
         except BaseException:

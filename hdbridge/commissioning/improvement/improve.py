@@ -9,7 +9,7 @@ from typing import Any
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.calibration.identification import provenance, with_provenance
+from hdbridge.commissioning.calibration.identification import provenance
 from hdbridge.commissioning.calibration.journal import Journal, check_is_of, fault_notes_in, tasks_of
 from hdbridge.commissioning.calibration.measure import SILENT, Callbacks, measure, start_journal
 from hdbridge.commissioning.calibration.pipeline import Offer, proposed, save_result
@@ -20,7 +20,6 @@ from hdbridge.commissioning.improvement.trial import Trial, run_trial
 from hdbridge.control.bench import axis_view
 from hdbridge.control.caps import cap_remark
 from hdbridge.control.realtime import suspended_realtime
-from hdbridge.control.rig import Rig
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
 from hdbridge.motion.procedures.plan import Plan
@@ -109,7 +108,7 @@ class Source:
 
 @suspended_realtime()  # fitting takes long; a bench resumes real-time priority for each motion
 def improve(
-    drive: Drive | Rig,
+    drive: Drive,
     source: Source,
     profile: Path,
     active: TransmissionModel,
@@ -176,7 +175,7 @@ def improve(
 class _Bench:
     """Drive, date and callbacks shared by all measurements of an improvement."""
 
-    drive: Drive | Rig
+    drive: Drive
     date: datetime
     callbacks: Callbacks
 
@@ -237,7 +236,7 @@ def _concluded(
         return replace(result, offer=Offer(False, f"nothing proposed: {'; '.join(extension.left)}"))
     if not extension.improves:
         return replace(result, offer=Offer(False, f"not offered: {'; '.join(extension.refused)}"))
-    model = with_provenance(extension.model, _provenance(result, recording))
+    model = extension.model.with_provenance(**_provenance(result, recording))
     if remark := cap_remark(drive.axis, model):
         notify(remark)
     notify("stepping with the active and the extended model alternately")

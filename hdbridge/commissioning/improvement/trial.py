@@ -20,9 +20,8 @@ from hdbridge.commissioning.calibration.validation import (
     worse_ways,
 )
 from hdbridge.commissioning.evaluation.stepping import Stepped
-from hdbridge.control.bench import axis_view, compensation_for
+from hdbridge.control.bench import Bench, axis_view, compensation_for
 from hdbridge.control.faultcounts import FaultCount, fault_notes
-from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
 from hdbridge.motion.procedures.moves import AxisView
 from hdbridge.motion.procedures.plan import Plan
@@ -79,7 +78,7 @@ class Trial:
 
 
 def run_trial(
-    drive: Drive | Rig,
+    drive: Drive,
     plan: Plan,
     active: TransmissionModel,
     model: TransmissionModel,
@@ -102,7 +101,7 @@ def run_trial(
         for which in (0, 1) if number % 2 == 0 else (1, 0):
             title = f"{name}-{'before' if which == 0 else 'after'}"
             pace.begin(title.replace("-", " "))
-            bench = bench_on(drive, compensations[which], interrupted=pace.interrupted)
+            bench = Bench(drive, compensations[which], interrupted=pace.interrupted)
             with record_kept(bench, folder / f"{title}.csv.gz"):
                 run = bench.run(procedure)
                 outcomes[which].append(run.outcome)

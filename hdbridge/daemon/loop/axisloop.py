@@ -261,7 +261,7 @@ class AxisLoop:
             raise TransitionError(
                 f"{self.config.name}: boot and verify the drive again before this latch is released"
             )
-        self.cycle.reset(verified=bool(command.i))
+        self.supervision.reset(verified=bool(command.i))
         if quick_stopped:
             self.cycle.begin()
 

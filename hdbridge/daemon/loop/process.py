@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from typing import Final
 
-from hdbridge.axis import AxisConfig, BusConfig
+from hdbridge.axis import BusConfig
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.control.realtime import prepare_realtime
@@ -20,7 +20,7 @@ from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Cell, Memory
 from hdbridge.daemon.start import Simulation, Start, run_child, when_terminated
 from hdbridge.drive.link import Link, open_bus
-from hdbridge.drive.masterdetection import DEFAULT_MASTER_ID, MasterDetector, listening_s
+from hdbridge.drive.masterdetection import refuse_other_masters
 from hdbridge.errors import BusError, HdbridgeError
 
 _POLLS: Final = 256
@@ -61,18 +61,6 @@ class Interface(ExitStack):
     def close(self) -> None:
         with suppress(HdbridgeError):
             super().close()
-
-
-def listen(link: Link, axes: tuple[AxisConfig, ...]) -> None:
-    """Listens for another master before the first SYNC; raises BusInUseError if one is heard."""
-    if link.private:
-        return
-    masters = {axis.drive.master_node_id for axis in axes} | {DEFAULT_MASTER_ID}
-    drives = {axis.drive.node_id for axis in axes}
-    duration_s = listening_s(max(axis.drive.heartbeat_ms for axis in axes))
-    detector = MasterDetector(drives, masters, {node for axis in axes for node in axis.nodes})
-    detector.listen(link, duration_s)
-    detector.raise_if_heard(link.name, duration_s)
 
 
 def run(start: Start) -> None:
@@ -116,8 +104,8 @@ def _bus(start: Start) -> Iterator[tuple[Link, Clock, Interface | None]]:
     clock = MonotonicClock()
     with Interface(machine.bus, clock) as interface:
         link = interface.open()
-        if not start.force:
-            listen(link, tuple(axis.config for axis in machine.axes))
+        if not (start.force or link.private):
+            refuse_other_masters(link, [axis.config for axis in machine.axes])
         yield link, clock, interface
 
 

@@ -12,8 +12,9 @@ from support.daemon import article_axes
 from hdbridge.axis import BusConfig
 from hdbridge.clock import MonotonicClock
 from hdbridge.daemon.loop import process
-from hdbridge.daemon.loop.process import Interface, listen
+from hdbridge.daemon.loop.process import Interface
 from hdbridge.drive.link import Link
+from hdbridge.drive.masterdetection import refuse_other_masters
 from hdbridge.errors import BusError, BusInUseError
 from hdbridge.sim.lockstep import LockstepBus, VirtualClock
 
@@ -31,7 +32,7 @@ def test_a_bus_with_another_master_is_left_alone(can_id: int, words: str | None)
         pytest.raises(BusInUseError, match=words) if words else nullcontext(),
     ):
         clock.nodes.append(Chatter(other, (can_id, bytes(6))))
-        listen(Link(bus, clock), tuple(article_axes(2)))
+        refuse_other_masters(Link(bus, clock), article_axes(2))
     assert clock.now() >= 0.5
 
 
