@@ -41,6 +41,7 @@ from hdbridge.client.messages import (
 )
 from hdbridge.enums import AdaptationMode, Scheme
 from hdbridge.errors import DaemonError, HdbridgeError, LeaseError, SafetyStop
+from hdbridge.strictness import complaint
 
 M = TypeVar("M", bound=BaseModel)
 PREFIX: Final = "/api/v1"
@@ -485,10 +486,10 @@ def _read(kind: type[M], content: str | bytes, what: str) -> M:
     try:
         return kind.model_validate_json(content)
     except ValidationError as problem:
-        first = problem.errors(include_input=False, include_url=False)[0]
+        first = complaint(problem.errors(include_input=False)[0], "the message")
         raise DaemonError(
             f"{what}: the answer is not what this version of hdbridge expects "
-            f"({'.'.join(map(str, first['loc']))}: {first['msg']}); use the same version at both ends"
+            f"({first}); use the same version at both ends"
         ) from None
 
 

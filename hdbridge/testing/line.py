@@ -25,6 +25,7 @@ from hdbridge.errors import BusInUseError, HdbridgeError, InputError
 from hdbridge.files.expectation import nearest
 from hdbridge.files.profile import Profile
 from hdbridge.sim.truth import Truth
+from hdbridge.strictness import complaint
 from hdbridge.testing.port import INTERFACE, Port, StallingClock
 from hdbridge.testing.watched import WatchedDrive
 
@@ -112,10 +113,8 @@ def _behaviour(keys: Mapping[str, Any]) -> Behaviour:
     try:
         return Behaviour.model_validate(keys)
     except ValidationError as error:
-        problem = error.errors()[0]
-        name = ".".join(map(str, problem["loc"]))
         known = ", ".join(Behaviour.model_fields)
-        raise InputError(f"firmware: '{name}': {problem['msg']}; expected keys are {known}") from error
+        raise InputError(f"firmware: {complaint(error.errors()[0])}; keys are {known}") from error
 
 
 LONGEST_WAIT_S: Final = 0.005
