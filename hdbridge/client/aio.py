@@ -48,6 +48,9 @@ PREFIX: Final = "/api/v1"
 FAILURES: Final = (OSError, EOFError, ConnectionClosed, InvalidHandshake)
 """Exceptions of a WebSocket."""
 POLL_S: Final = 0.1
+STOPS_SENT: Final = 5
+"""Number of times that a stop is sent if the connection is lost. A daemon that is flooded with connections
+closes the oldest ones on which no request has arrived yet."""
 JOG_S: Final = 0.5
 """Time after the client's last request at which a jog ends; s."""
 RENEWALS: Final = 3
@@ -220,12 +223,15 @@ class AsyncClient:
         async with self._held() if moving else nullcontext():
             if self._grant is not None:
                 headers["X-Lease"] = self._grant.token
-            try:
-                response = await self._http.request(
-                    method, path, content=content, headers=headers, params=query, timeout=timeout
-                )
-            except httpx.TransportError as problem:
-                raise _failure(self.address, problem) from None
+            for left in reversed(range(STOPS_SENT if path.endswith("stop") else 1)):
+                try:
+                    response = await self._http.request(
+                        method, path, content=content, headers=headers, params=query, timeout=timeout
+                    )
+                    break
+                except httpx.TransportError as problem:
+                    if not left or isinstance(problem, httpx.TimeoutException):
+                        raise _failure(self.address, problem) from None
         if response.is_error:
             kind = response.headers.get("content-type", "")
             raise _refused(response.status_code, kind, response.content)
