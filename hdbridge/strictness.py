@@ -1,4 +1,7 @@
-"""Base class of all pydantic models of files and their parts."""
+"""Base class of all pydantic models of files and their parts; pydantic's errors in words."""
+
+from collections.abc import Mapping
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
@@ -11,3 +14,16 @@ class Strict(BaseModel):
     """
 
     model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def complaint(error: Mapping[str, Any], root: str = "") -> str:
+    """Returns one of a `ValidationError`'s ``errors()`` as a line: its place, the value and the expectation.
+
+    ``root`` is the place of an error that concerns no single key. Without an ``input``, or if it is not a
+    plain value, the line does not contain it.
+    """
+    place = ".".join(map(str, error["loc"])) or root
+    value = error.get("input")
+    found = f"found {value!r}; " if isinstance(value, str | int | float) else ""
+    expected = error["msg"].replace("Input should be", "expected").removeprefix("Value error, ")
+    return f"{place}: {found}{expected}"

@@ -207,11 +207,11 @@ class Limits(Strict):
 
     position_min_deg: float = Field(description="lowest position")
     position_max_deg: float = Field(description="highest position")
-    velocity_deg_s: float = Field(gt=0, le=100_000, description="highest speed")
-    acceleration_deg_s2: float = Field(gt=0, le=1e7, description="highest acceleration")
-    jerk_deg_s3: float = Field(gt=0, le=1e9, description="highest jerk")
+    velocity_deg_s: float = Field(ge=0.001, le=100_000, description="highest speed")
+    acceleration_deg_s2: float = Field(ge=0.001, le=1e7, description="highest acceleration")
+    jerk_deg_s3: float = Field(ge=0.001, le=1e9, description="highest jerk")
     torque_percent: float = Field(
-        gt=0, le=500, description="highest motor torque (6072h), relative to the rated torque"
+        ge=0.1, le=500, description="highest motor torque (6072h), relative to the rated torque"
     )
 
     @model_validator(mode="after")

@@ -438,17 +438,19 @@ def move(
 
     The axis must be enabled. Ctrl-C stops it; it stays enabled.
     """
+    from hdbridge.client.messages import Move
+
     if not wait and len(angles_deg) > 1:
         raise InputError("--no-wait goes to one angle: give one, or use 'hdbridge ctl queue'")
+    limits = {"velocity_deg_s": velocity_deg_s, "acceleration_deg_s2": acceleration_deg_s2}
+    Move.given(target_deg=angles_deg[0], **limits)  # refused before anything is said or done
     with daemon.moving(axis) as moved:
         state = moved.state()
-        note_clamped(state.limits, velocity_deg_s=velocity_deg_s, acceleration_deg_s2=acceleration_deg_s2)
+        note_clamped(state.limits, **limits)
         before_deg = state.load_target_deg or 0.0
         for given_deg in angles_deg:
             before_deg = before_deg + given_deg if relative else given_deg
-            state = moved.move(
-                before_deg, velocity_deg_s=velocity_deg_s, acceleration_deg_s2=acceleration_deg_s2, wait=wait
-            )
+            state = moved.move(before_deg, **limits, wait=wait)
             (daemon.print_state if given_deg is angles_deg[-1] else print_state)(state)
 
 
@@ -462,6 +464,9 @@ def jog(
     ] = 1.0,
 ) -> None:
     """Turn an axis at a speed for a time, then brake to rest, even if this command is killed."""
+    from hdbridge.client.messages import Jog
+
+    Jog.given(velocity_deg_s=velocity_deg_s)  # refused before anything is said or done
     with daemon.moving(axis) as moved:
         note_clamped(moved.state().limits, velocity_deg_s=velocity_deg_s)
         moved.jog(velocity_deg_s, duration_s)

@@ -16,13 +16,11 @@ from hdbridge.cli.recordings import Part, is_flight, remarks
 from hdbridge.cli.session import Session, model_file
 from hdbridge.errors import InputError, command
 from hdbridge.files.outputs import Kind
-from hdbridge.files.profile import Profile
 from hdbridge.units import figure
 
 if TYPE_CHECKING:
     from hdbridge.analysis.findings import Diagnosis, Finding
     from hdbridge.analysis.probability import Prior
-    from hdbridge.axis.model import TransmissionModel
     from hdbridge.commissioning.improvement import Improvement
     from hdbridge.records.recording import Recording
 
@@ -298,10 +296,11 @@ def improve(
 
     The axis moves within the limits of its axis file. Ctrl-C stops it and keeps what was measured.
     """
+    from hdbridge.axis.model import TransmissionModel
     from hdbridge.commissioning.improvement import Source, improve
     from hdbridge.commissioning.improvement.trial import trial_s
 
-    axis, active = session.axis, _active(session.files)
+    axis, active = session.axis, TransmissionModel.load(session.files.model)
     if given and measured.resume is not None:
         raise InputError("--from and --resume exclude each other: leave one of them out")
     recordings = csv.load(given or ())  # refused before anything is connected
@@ -378,17 +377,6 @@ def _write_improvement_page(path: Path, result: Improvement) -> None:
         offer=result.offer,
     )
     write_result(path, render(page))
-
-
-def _active(files: Profile) -> TransmissionModel:
-    from hdbridge.axis.model import TransmissionModel
-
-    if not files.model.exists():
-        raise InputError(
-            f"{files.model}: there is no active model to improve; calibrate first: "
-            f"{command('calibrate', files.folder)}"
-        )
-    return TransmissionModel.load(files.model)
 
 
 COMMANDS: Final = {"diagnose": diagnose, "improve": improve}

@@ -1,22 +1,24 @@
 """``hdbridge model``: history of an axis's model or twin: list, compare, commit, roll back."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from rich.text import Text
 from typer import Argument, Option
 
-from hdbridge.axis.model import TransmissionModel
-from hdbridge.axis.model.difference import Difference, diff
-from hdbridge.axis.model.store import ACTIVE, MODELS, PENDING, Store, Version
 from hdbridge.cli import options as opt
 from hdbridge.cli.printing import print_table, say, write_json
 from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile
-from hdbridge.files.yamlfile import read_yaml
 from hdbridge.units import figure, with_interval
+
+if TYPE_CHECKING:
+    from hdbridge.axis.model.difference import Difference
+    from hdbridge.axis.model.store import Store, Version
 
 ReasonOption = Annotated[str, Option("--reason", help="Reason, for the log.")]
 TwinOption = Annotated[bool, Option("--twin", help="The twins of the axis instead of its models.")]
@@ -50,6 +52,8 @@ def compare(
     json_file: opt.Json = None,
 ) -> None:
     """Show the differences between two models, parameter by parameter."""
+    from hdbridge.axis.model.store import ACTIVE, PENDING
+
     folder, store = _folder(profile), _store(twin)
     log = store.log(folder)
     names = {each.name for each in log} | ({ACTIVE} if any(each.active for each in log) else set())
@@ -110,16 +114,22 @@ def discard(profile: opt.Profile, twin: TwinOption = False) -> None:
 
 
 def _store(twin: bool) -> Store[Any]:
-    if not twin:
-        return MODELS
-    from hdbridge.twin.twin import TWINS
+    if twin:
+        from hdbridge.twin.twin import TWINS
 
-    return TWINS
+        return TWINS
+    from hdbridge.axis.model.store import MODELS
+
+    return MODELS
 
 
 def _rows(before: Any, after: Any) -> list[Difference]:
     """Returns the differences between two models or two twins; ``before`` may be None."""
+    from hdbridge.axis.model import TransmissionModel
+
     if isinstance(after, TransmissionModel):
+        from hdbridge.axis.model.difference import diff
+
         return diff(before or after.only(()), after)
     from hdbridge.twin.twin import diff as diff_of_twins
 
@@ -128,6 +138,8 @@ def _rows(before: Any, after: Any) -> list[Difference]:
 
 def _folder(profile: str) -> Path:
     """Returns the folder of an axis's models; InputError without an axis file, which may be invalid."""
+    from hdbridge.files.yamlfile import read_yaml
+
     axis = Profile.find(profile).axis
     data = read_yaml(axis).data
     if not (isinstance(data, dict) and str(data.get("schema")).startswith("hdbridge.axis/")):

@@ -14,12 +14,12 @@ from typer import Option
 from hdbridge.cli import options as opt
 from hdbridge.cli.calibration import phases, print_steps
 from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_result
-from hdbridge.cli.session import Session, compensating_model, note_clamped, on_axis
+from hdbridge.cli.session import Session, note_clamped, on_axis
 from hdbridge.enums import Scheme
 from hdbridge.errors import HdbridgeError, InputError, command
 from hdbridge.files.atomic import make_folder, new_folder
 from hdbridge.files.outputs import Kind, writing
-from hdbridge.files.profile import Profile
+from hdbridge.files.profile import Profile, no_model
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
@@ -196,7 +196,9 @@ def step(
     rehearse(stepping, axis_view(axis), start_deg)  # refused before anything is connected
     chosen: Path | None = None
     if model is not None or not scheme or set(scheme) != {Scheme.NONE}:  # the scheme none needs no model
-        chosen = compensating_model(files, session.profile, model, ", or step without one: --scheme none")
+        chosen = model or files.model
+        if not chosen.exists():
+            raise no_model(chosen, "; or step without one: --scheme none")
 
     run_comparison(session, chosen, stepping, scheme, record=record, json_file=json_file, html_file=html_file)
 
@@ -350,7 +352,7 @@ def motion(
     from hdbridge.commissioning.calibration.motion import motion_test, motion_test_s
 
     files, axis = session.files, session.axis
-    chosen = compensating_model(files, session.profile, model)
+    chosen = model or files.model
     if propose and not measure:
         raise InputError("--propose needs a measured response: leave out --no-measure")
     used = TransmissionModel.load(chosen)

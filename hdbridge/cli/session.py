@@ -16,7 +16,7 @@ from hdbridge.cli.options import taking
 from hdbridge.cli.printing import note
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.errors import DaemonError, InputError, command
-from hdbridge.files.profile import Profile
+from hdbridge.files.profile import Profile, no_model
 
 if TYPE_CHECKING:
     import can
@@ -231,6 +231,8 @@ def model_file(text: str) -> Path:
     Raises `InputError` if neither exists, or if the profile has no model yet.
     """
     path = Path(text)
+    if path.name == "model.yaml" and not path.exists() and (path.parent / "axis.yaml").is_file():
+        return model_file(str(path.parent))
     if path.is_file() and path.name != "axis.yaml":
         return path
     try:
@@ -243,26 +245,9 @@ def model_file(text: str) -> Path:
             "with an axis.yaml"
         )
     if not files.model.is_file():
-        raise InputError(
-            f"{files.folder}: there is no model.yaml; make one: {command('calibrate', files.folder)}, and "
-            f"commit it: {command('model', 'commit', files.folder)}; or fit one to a record: "
-            f"{command('fit', 'RECORD', '--axis', files.folder, '--out', 'model.yaml')}, and pass "
-            "--model model.yaml"
-        )
+        fit = command("fit", "RECORD", "--axis", files.folder, "--out", "model.yaml")
+        raise no_model(files.model, f"; or fit one to a record: {fit}, and pass --model model.yaml")
     return files.model
-
-
-def compensating_model(files: Profile, profile: str, model: Path | None, otherwise: str = "") -> Path:
-    """Returns the compensating model file: the given file, else the profile's.
-
-    Raises `InputError` without a model; ``otherwise`` adds an alternative to the message.
-    """
-    if model is None and not files.model.exists():
-        raise InputError(
-            f"{files.model}: there is no model to compensate with; calibrate first: "
-            f"{command('calibrate', profile)}{otherwise}"
-        )
-    return model or files.model
 
 
 def note_clamped(limits: Any, **wanted: float | None) -> None:

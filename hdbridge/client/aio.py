@@ -41,12 +41,16 @@ from hdbridge.client.messages import (
 )
 from hdbridge.enums import AdaptationMode, Scheme
 from hdbridge.errors import DaemonError, HdbridgeError, LeaseError, SafetyStop
+from hdbridge.strictness import complaint
 
 M = TypeVar("M", bound=BaseModel)
 PREFIX: Final = "/api/v1"
 FAILURES: Final = (OSError, EOFError, ConnectionClosed, InvalidHandshake)
 """Exceptions of a WebSocket."""
 POLL_S: Final = 0.1
+STOPS_SENT: Final = 5
+"""Number of times that a stop is sent if the connection is lost. A daemon that is flooded with connections
+closes the oldest ones on which no request has arrived yet."""
 JOG_S: Final = 0.5
 """Time after the client's last request at which a jog ends; s."""
 RENEWALS: Final = 3
@@ -219,12 +223,15 @@ class AsyncClient:
         async with self._held() if moving else nullcontext():
             if self._grant is not None:
                 headers["X-Lease"] = self._grant.token
-            try:
-                response = await self._http.request(
-                    method, path, content=content, headers=headers, params=query, timeout=timeout
-                )
-            except httpx.TransportError as problem:
-                raise _failure(self.address, problem) from None
+            for left in reversed(range(STOPS_SENT if path.endswith("stop") else 1)):
+                try:
+                    response = await self._http.request(
+                        method, path, content=content, headers=headers, params=query, timeout=timeout
+                    )
+                    break
+                except httpx.TransportError as problem:
+                    if not left or isinstance(problem, httpx.TimeoutException):
+                        raise _failure(self.address, problem) from None
         if response.is_error:
             kind = response.headers.get("content-type", "")
             raise _refused(response.status_code, kind, response.content)
@@ -485,10 +492,10 @@ def _read(kind: type[M], content: str | bytes, what: str) -> M:
     try:
         return kind.model_validate_json(content)
     except ValidationError as problem:
-        first = problem.errors(include_input=False, include_url=False)[0]
+        first = complaint(problem.errors(include_input=False)[0], "the message")
         raise DaemonError(
             f"{what}: the answer is not what this version of hdbridge expects "
-            f"({'.'.join(map(str, first['loc']))}: {first['msg']}); use the same version at both ends"
+            f"({first}); use the same version at both ends"
         ) from None
 
 

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from hdbridge import errors
 from hdbridge.enums import AdaptationMode, PowerState, Scheme
 from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.strictness import complaint
 
 WORDS_MAXIMUM: Final = 400
 """Maximum length of a client's text."""
@@ -48,10 +49,7 @@ class Request(BaseModel):
         try:
             return cls.model_validate(values)
         except ValidationError as problem:
-            first = problem.errors(include_url=False)[0]
-            where = ".".join(map(str, first["loc"]))
-            expected = first["msg"].replace("Input should be", "expected")
-            raise InputError(f"{where}: found {first['input']!r}; {expected}") from None
+            raise InputError(complaint(problem.errors()[0])) from None
 
 
 class Report(BaseModel):

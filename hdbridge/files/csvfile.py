@@ -125,25 +125,17 @@ class CsvFile:
             return self.names[int(column) - 1]
         return None
 
-    def read(self, finite: Collection[str] = (), times: Collection[str] = ()) -> dict[str, Column]:
+    def read(self, numeric: Collection[str] = (), times: Collection[str] = ()) -> dict[str, Column]:
         """Returns the columns by name, in the order of the file.
 
-        Columns in ``finite`` must contain only finite numbers. Those in ``times`` may contain ISO times or
-        times of day, which are converted to seconds since the first. Other columns are returned as numbers if
-        possible (an empty cell is NaN), else as text. Of several columns with the same name, the first is
-        returned.
+        Columns in ``numeric`` must contain only numbers. Those in ``times`` may contain ISO times or times of
+        day, which are converted to seconds since the first. Other columns are returned as numbers if possible
+        (an empty cell is NaN), else as text. Of several columns with the same name, the first is returned.
         """
         content = self._text()
         self._held = None
         columns = self._fast(content)
-        if columns is None:
-            columns = self._slow(content, finite, times)
-        for name in columns:
-            if name in finite and len(wrong := np.flatnonzero(~np.isfinite(columns[name]))):
-                line = self._line_of(content, int(wrong[0]))
-                found = columns[name][int(wrong[0])]
-                raise _wrong(f"{self.path}:{line}: {name}: {found}; expected a finite number")
-        return columns
+        return self._slow(content, numeric, times) if columns is None else columns
 
     def line_of_row(self, row: int) -> int:
         """Returns the line number in the file (from 1) of a row of data (from 0)."""
@@ -195,7 +187,7 @@ class CsvFile:
             return None
         return self._named([np.ascontiguousarray(column) for column in table])
 
-    def _slow(self, content: bytes, finite: Collection[str], times: Collection[str]) -> dict[str, Column]:
+    def _slow(self, content: bytes, numeric: Collection[str], times: Collection[str]) -> dict[str, Column]:
         """Reads all columns row by row; raises `InputError` at the first invalid row."""
         rows: list[list[str]] = []
         lines: list[int] = []
@@ -208,11 +200,11 @@ class CsvFile:
         columns = []
         wrong: list[tuple[int, str, str]] = []
         for name, column in zip(self.names, cells, strict=True):
-            made = _column(column, blanks=name not in finite, comma=comma)
+            made = _column(column, blanks=name not in numeric, comma=comma)
             if made.dtype.kind != "f" and name in times and (seconds := _seconds(column)) is not None:
                 made = seconds
                 self.remarks = (*self.remarks, f"dates or times of day in '{name}'")
-            elif made.dtype.kind != "f" and name in finite:
+            elif made.dtype.kind != "f" and name in numeric:
                 row_number = next(at for at, cell in enumerate(column) if not _is_number(cell, comma))
                 wrong.append((row_number, name, column[row_number].strip()))
             columns.append(made)

@@ -1,14 +1,17 @@
 """Describes the expected value of a pydantic model's field, for error messages and reference pages."""
 
+from __future__ import annotations
+
 import difflib
 import types
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+    from pydantic.fields import FieldInfo
 
 _PLAIN: dict[Any, str] = {int: "an integer", float: "a number", str: "text", bool: "true or false"}
 
@@ -122,6 +125,8 @@ def _number(value: Any) -> str:
 
 
 def _is_model(member: Any) -> bool:
+    from pydantic import BaseModel  # noqa: PLC0415 - `hdbridge --help` needs only `nearest`
+
     return isinstance(member, type) and issubclass(member, BaseModel)
 
 
@@ -162,6 +167,8 @@ def _item(place: Field) -> Field | None:
 
 
 def _annotated(annotation: Any) -> Field:
+    from pydantic.fields import FieldInfo  # noqa: PLC0415 - as above
+
     if get_origin(annotation) is Annotated:
         inner, *metadata = get_args(annotation)
         flat: list[Any] = []

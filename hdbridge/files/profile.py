@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, Self
 
-from hdbridge.errors import InputError
+from hdbridge.errors import InputError, command
 from hdbridge.files.expectation import nearest
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -33,6 +33,23 @@ def bundled_profile(name: str) -> Path:
     raise InputError(
         f"{name}: no such file or folder, nor a bundled profile; expected a path or one of: {expected}{hint}"
     )
+
+
+def no_model(path: Path, otherwise: str = "") -> InputError:
+    """Returns the error for a missing model file, with the commands that give a profile its active model.
+
+    ``otherwise`` adds an alternative to these.
+    """
+    folder = path.parent
+    if not (folder / "axis.yaml").is_file():
+        return InputError(f"{path}: no such file")
+    name = folder.name if folder == bundled_folder("profiles") / folder.name else folder
+    commit = command("model", "commit", name)
+    if (folder / "pending.yaml").is_file():
+        advice = f"commit the pending one: {commit}"
+    else:
+        advice = f"calibrate first: {command('calibrate', name)}, and commit the result: {commit}"
+    return InputError(f"{path}: there is no active model; {advice}{otherwise}")
 
 
 TWIN_NAME: Final = "twin.yaml"

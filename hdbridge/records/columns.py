@@ -300,9 +300,9 @@ def read(file: CsvFile, said: CsvColumns) -> tuple[dict[str, Column], Origin]:
     """
     found = _located(file, said)
     units, remarks = _units(file, said, found)
-    finite = {name for name in found.values() if name != ROW}
+    numeric = {name for name in found.values() if name != ROW}
     time = found["time"]
-    columns = file.read(finite, {time} - {ROW})
+    columns = file.read(numeric, {time} - {ROW})
     rows = len(next(iter(columns.values())))
     converted: dict[str, Column] = {}
     for channel, name in found.items():
@@ -311,7 +311,8 @@ def read(file: CsvFile, said: CsvColumns) -> tuple[dict[str, Column], Origin]:
             values = _unwrapped(values, said.unwrap[channel], ordered=channel == "time")
         if name == time and abs(units[channel].factor) < 1e-3 and rows:
             values = values - values[0]  # nanoseconds since 1970 exceed the precision of a float
-        converted[CHANNELS[channel]] = units[channel].convert(values)
+        with np.errstate(over="ignore"):  # an infinite value is reported with its line
+            converted[CHANNELS[channel]] = units[channel].convert(values)
     used = set(found.values())
     kept = {name: each for name, each in columns.items() if name not in used and name not in converted}
     origin = Origin(

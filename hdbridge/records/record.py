@@ -203,7 +203,7 @@ class Record:
         if len(record) < minimum_samples:
             count = f"{len(record)} sample{'s' * (len(record) != 1)}"
             raise InputError(f"{path}: {count}; expected at least {minimum_samples}")
-        record._check_times()
+        record.check_values(np.finfo(np.float64).max)
         return record
 
     def write_csv(self, path: Path | str) -> None:
@@ -275,17 +275,20 @@ class Record:
         square = float(motor @ motor)
         return float(motor @ self.load_position_deg) / square if square else None
 
-    def check_values(self) -> None:
-        """Raises `InputError` if time decreases, or if a value is not finite or beyond `LARGEST`."""
-        for name in sorted(self.columns.keys() & {*REQUIRED, *OPTIONAL}):
-            for row in np.flatnonzero(~(np.abs(self.columns[name]) <= LARGEST))[:1].tolist():
-                raise InputError(
-                    f"{self._place(row)}: {name}: {self.columns[name][row]:g}; expected a finite number of "
-                    f"at most {LARGEST:g}: remove the sample, or state the unit of its column"
+    def check_values(self, largest: float = LARGEST) -> None:
+        """Raises `InputError` if time decreases, or if a value is not finite or beyond ``largest``."""
+        for channel, name in CHANNELS.items():
+            values = self.columns.get(name, np.empty(0))
+            for row in np.flatnonzero(~(np.abs(values) <= largest))[:1].tolist():
+                column = self.origin.columns[channel] if self.origin else name
+                cure = (
+                    f" of at most {largest:g}: remove the sample, or state the unit of its column"
+                    if math.isfinite(values[row])
+                    else ""
                 )
-        self._check_times()
-
-    def _check_times(self) -> None:
+                raise InputError(
+                    f"{self._place(row)}: {column}: {values[row]:g}; expected a finite number{cure}"
+                )
         time_s, origin = self.time_s, self.origin
         for row in np.setdiff1d(np.flatnonzero(np.diff(time_s) < 0.0) + 1, self.starts)[:1].tolist():
             cure = origin.clock_cure(time_s) if origin else "sort the samples, or split the record"

@@ -17,10 +17,29 @@ import can
 
 from hdbridge.errors import BusError, InputError
 from hdbridge.files.expectation import nearest
+from hdbridge.testing.arguments import check_number, check_type
 from hdbridge.testing.port import Condition, Port
 from hdbridge.testing.watched import End, WatchedDrive, shown
 
 Value = int | float
+_RANGES: Final[Mapping[str, tuple[float, float]]] = {
+    "count": (0, 100_000),
+    "samples": (0, 100_000),
+    "number": (1, 512),
+    "node_id": (1, 127),
+    "command": (0, 0xFF),
+    "code": (0, 0xFFFF),
+    "index": (0, 0xFFFF),
+    "subindex": (0, 0xFF),
+    "counts": (-(1 << 31), (1 << 31) - 1),
+    "value": (-(1 << 63), (1 << 64) - 1),
+    "product_code": (0, 0xFFFF_FFFF),
+    "percent": (0, 1000),
+    "counts_per_s": (-1e12, 1e12),
+    "counts_per_s2": (1e-3, 1e12),
+    "duration_s": (0, 3600),
+}
+"""Smallest and largest value of the arguments."""
 _BUS_OFF: Final = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of an error frame."""
 
@@ -137,12 +156,8 @@ class Row:
                 close = nearest(name, list(self.arguments))
                 hint = f"; did you mean '{close}'?" if close else ""
                 raise InputError(f"fault '{self.name}' has no argument '{name}'; expected: {signature}{hint}")
-            wanted = type(self.arguments[name])
-            is_number = isinstance(value, int) and not isinstance(value, bool)
-            if not (is_number or (wanted is float and isinstance(value, float))):
-                raise InputError(
-                    f"fault '{self.name}': {name} is {value!r}; expected a number as in {signature}"
-                )
+            whole = isinstance(self.arguments[name], int)
+            check_number(f"fault '{self.name}': {name}", value, *_RANGES.get(name, ()), whole=whole)
         return {**self.arguments, **given}
 
 
@@ -350,6 +365,7 @@ consequences of other faults."""
 def find(name: str) -> Row:
     """Returns the fault with this name; raises `InputError` with the most similar name."""
     __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
+    check_type("the name of the fault", name, str, "text")
     row = FAULTS.get(name)
     if row is None:
         close = nearest(name, list(FAULTS))

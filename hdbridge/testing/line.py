@@ -25,6 +25,8 @@ from hdbridge.errors import BusInUseError, HdbridgeError, InputError
 from hdbridge.files.expectation import nearest
 from hdbridge.files.profile import Profile
 from hdbridge.sim.truth import Truth
+from hdbridge.strictness import complaint
+from hdbridge.testing.arguments import check_number
 from hdbridge.testing.port import INTERFACE, Port, StallingClock
 from hdbridge.testing.watched import WatchedDrive
 
@@ -78,11 +80,11 @@ class Settings:
     @classmethod
     def load(
         cls,
-        profile: str,
+        profile: str | Path,
         bus: str,
         seed: int,
         truth: str | Path | None = None,
-        folder: Path | None = None,
+        folder: str | Path | None = None,
         firmware: Mapping[str, Any] = MappingProxyType({}),
     ) -> Self:
         """Loads and checks the settings; raises a one-line `InputError`.
@@ -91,10 +93,9 @@ class Settings:
         profile's ``twin.yaml`` is used if it exists, else its ``truth.yaml``. ``firmware`` contains keys of
         the truth file's section of that name.
         """
-        folder = folder or Path()
+        folder = Path(folder or "")
         choice = BusChoice.parse(bus)
-        if isinstance(seed, bool) or not isinstance(seed, int):
-            raise InputError(f"the seed {seed!r}; expected an integer")
+        check_number("the seed", seed, whole=True)
         files = Profile.find(str(profile), folder)
         axis = AxisConfig.load(files.axis)
         path = folder / truth if truth is not None else files.simulated
@@ -112,10 +113,8 @@ def _behaviour(keys: Mapping[str, Any]) -> Behaviour:
     try:
         return Behaviour.model_validate(keys)
     except ValidationError as error:
-        problem = error.errors()[0]
-        name = ".".join(map(str, problem["loc"]))
         known = ", ".join(Behaviour.model_fields)
-        raise InputError(f"firmware: '{name}': {problem['msg']}; expected keys are {known}") from error
+        raise InputError(f"firmware: {complaint(error.errors()[0])}; keys are {known}") from error
 
 
 LONGEST_WAIT_S: Final = 0.005

@@ -4,13 +4,14 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, NoneType
 from typing import Any, Final
 
 import can
 
 from hdbridge.clock import Clock
 from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.testing.arguments import check_number, check_type
 from hdbridge.testing.faulttable import FAULTS, Reach, find
 from hdbridge.testing.line import LOCKSTEP, Line, Settings, open_line
 from hdbridge.testing.watched import Event, Fault, Frame, Trigger, TrueState, WatchedDrive, words
@@ -138,7 +139,9 @@ class SimulatedDrive:
             return tuple(self._node.history.frames)
 
     def note(self, text: str) -> None:
-        """Adds a note of the test to the log."""
+        """Adds a note of the test to the log; raises `InputError` if it is not text."""
+        __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
+        check_type("the note", text, str, "text")
         self._node.note("note", text)
 
     def report(self) -> str:
@@ -171,11 +174,11 @@ class SimulatedDrive:
         __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
         row = find(name)
         checked = row.checked(arguments)
-        for what, value in (("after_s", after_s), ("for_s", for_s), ("beyond_deg", beyond_deg)):
-            if value is not None and not (
-                abs(value) < float("inf") and (value >= 0.0 or what == "beyond_deg")
-            ):
-                raise InputError(f"fault '{name}': {what} is {value!r}; expected a number of at least 0")
+        check_number(f"fault '{name}': after_s", after_s, 0.0)
+        if for_s is not None:
+            check_number(f"fault '{name}': for_s", for_s, 0.0)
+        if beyond_deg is not None:
+            check_number(f"fault '{name}': beyond_deg", beyond_deg)
         if after_s and beyond_deg is not None:
             raise InputError(f"fault '{name}': after_s and beyond_deg are both given; expected one of them")
         self._check()
@@ -197,13 +200,20 @@ class SimulatedDrive:
         return self._node.time_s
 
     def sleep(self, seconds: float) -> None:
-        """Runs the drive for this time."""
+        """Runs the drive for this time; raises `InputError` for a time that is not a number of at least 0."""
+        __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
+        check_number("the time to sleep, in seconds,", seconds, 0.0)
         self.time.sleep(seconds)
         self._check()
 
     def wait_until(self, condition: Callable[[], object], timeout_s: float = 5.0, what: str = "it") -> None:
-        """Runs the drive until a condition is true; raises `TimeoutError` with the log."""
+        """Runs the drive until a condition is true; raises `TimeoutError` with the log.
+
+        Raises `InputError` for a condition that cannot be called, and an invalid time-out.
+        """
         __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
+        check_type("the condition", condition, Callable, "a function without arguments")  # type: ignore[arg-type]
+        check_number("timeout_s", timeout_s, 0.0)
         end_s = self._clock.now() + timeout_s
         while not condition():
             if self._clock.now() >= end_s:
@@ -223,12 +233,12 @@ class SimulatedDrive:
 
 @contextmanager
 def simulated_drive(
-    profile: str = "demo",
+    profile: str | Path = "demo",
     *,
     bus: str = "virtual",
     seed: int = 0,
     truth: str | Path | None = None,
-    folder: Path | None = None,
+    folder: str | Path | None = None,
     beside: SimulatedDrive | None = None,
     firmware: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[SimulatedDrive]:
@@ -244,6 +254,15 @@ def simulated_drive(
 
     Raises a one-line `InputError` or `BusError`.
     """
+    for what, value, kinds, expected in (
+        ("profile", profile, (str, Path), "the name or the folder of a profile"),
+        ("bus", bus, str, "its name, as text"),
+        ("truth", truth, (str, Path, NoneType), "the path of a truth file"),
+        ("folder", folder, (str, Path, NoneType), "a path"),
+        ("beside", beside, (SimulatedDrive, NoneType), "another simulated drive"),
+        ("firmware", firmware, Mapping, "a mapping of keys to values"),
+    ):
+        check_type(what, value, kinds, expected)
     settings = Settings.load(
         profile, bus if beside is None else str(beside._line.choice), seed, truth, folder, firmware
     )

@@ -30,6 +30,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.resonance import Resonance
+from hdbridge.strictness import complaint
 from hdbridge.twin.parameters import RESOLVED, default_truth
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -778,10 +779,9 @@ def _validated(data: dict[str, Any]) -> Truth:
     try:
         return Truth.model_validate(data)
     except ValidationError as problem:
-        first = problem.errors()[0]
-        place = ".".join(map(str, first["loc"]))
+        first = complaint(problem.errors()[0])
         raise InputError(
-            f"the model needs a value that the simulated drive does not allow: {place}: {first['msg']}; "
+            f"the model needs a value that the simulated drive does not allow: {first}; "
             "look at the effect of the model that requires it"
         ) from None
 

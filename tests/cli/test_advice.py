@@ -39,8 +39,8 @@ def test_the_next_commands_of_a_measurement(at_bench, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "advice"),
     [
-        (("improve", NAME, "--simulate"), [["calibrate", NAME]]),
-        (("step", NAME, "--simulate"), [["calibrate", NAME]]),
+        (("improve", NAME, "--simulate"), [["calibrate", NAME], ["model", "commit", NAME]]),
+        (("step", NAME, "--simulate"), [["calibrate", NAME], ["model", "commit", NAME]]),
         (("diagnose", "a b.csv"), [["fit", "a b.csv", "--ratio", "N", "--out", "model.yaml"]]),
         (
             ("diagnose", "a b.csv", "--model", NAME),

@@ -72,7 +72,9 @@ def test_each_command_sends_its_request(ctl, machine, line, asked):
     ],
 )
 def test_a_refused_value_is_named_as_on_the_command_line(ctl, machine, words, complaint):
-    assert complaint in ctl(*words, status=2)
+    said = ctl(*words, status=2)
+    assert complaint in said
+    assert "is used" not in said
     assert not machine.moved
 
 

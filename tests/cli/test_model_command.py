@@ -83,6 +83,27 @@ def test_diff_compares_active_and_pending_or_any_two(hdbridge, propose, tmp_path
     assert "there is no model '7'" in done.stderr
 
 
+@pytest.mark.parametrize(
+    "asked",
+    [
+        ("step", "profile", "--simulate"),
+        ("motion", "profile", "--simulate", "--model", "profile/model.yaml"),
+        ("improve", "profile", "--simulate"),
+        ("check", "profile", "--model", "profile/model.yaml"),
+        ("diagnose", "record.csv", "--model", "profile"),
+        ("diagnose", "record.csv", "--model", "profile/model.yaml"),
+    ],
+)
+def test_every_command_without_a_model_advises_the_next_step(hdbridge, propose, asked):
+    folder = propose(41.0)
+    done = hdbridge(*asked)
+    assert done.returncode == 2
+    assert "profile/model.yaml: there is no active model; commit the pending one: " in done.stderr
+    assert done.stderr.rstrip().count("hdbridge model commit ") == 1
+    hdbridge("model", "discard", folder)
+    assert "calibrate first: hdbridge calibrate profile" in hdbridge(*asked).stderr
+
+
 def test_discard_leaves_the_active_model(hdbridge, propose):
     folder = propose(41.0)
     hdbridge("model", "commit", folder)

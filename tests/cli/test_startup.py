@@ -56,7 +56,8 @@ def test_help_loads_no_numeric_or_bus_modules_and_a_daemon_no_scipy():
     program = (
         "import sys\nfrom hdbridge.cli import PANELS, load\n"
         "for panel in PANELS.values():\n    for name in panel:\n        load(name)\n"
-        "print(sorted({'scipy', 'can', 'canopen', 'ruckig', 'jinja2'} & set(sys.modules)))\n"
+        "heavy = {'numpy', 'scipy', 'pydantic', 'can', 'canopen', 'ruckig', 'jinja2'}\n"
+        "print(sorted(heavy & set(sys.modules)))\n"
         "from hdbridge.daemon import keeper, serve\nfrom hdbridge.daemon.gateway import process\n"
         "from hdbridge.daemon.loop import process\nprint('scipy' in sys.modules)"
     )

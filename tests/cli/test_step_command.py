@@ -47,4 +47,5 @@ def test_check_explains_the_files(hdbridge):
 def test_a_profile_without_a_model_gets_advice(hdbridge):
     done = hdbridge("step", "demo", "--simulate")
     assert done.returncode == 2
-    assert "hdbridge calibrate demo, or step without one: --scheme none" in done.stderr
+    assert "calibrate first: hdbridge calibrate demo, and commit" in done.stderr
+    assert "; or step without one: --scheme none" in done.stderr

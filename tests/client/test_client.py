@@ -3,6 +3,7 @@
 import os
 import pwd
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -14,6 +15,7 @@ from support.patience import until
 
 from hdbridge import Client, DaemonError, InputError, LeaseError, RefusedError, SafetyStop
 from hdbridge.client import messages
+from hdbridge.client.aio import STOPS_SENT
 
 USER = pwd.getpwuid(os.getuid()).pw_name
 
@@ -186,6 +188,29 @@ def test_samples_are_received_live(client):
         if len(cycles) > 10:
             break
     assert all(each % 5 == 0 for each in cycles)
+
+
+@pytest.mark.parametrize(("stops", "connections"), [(True, STOPS_SENT), (False, 1)])
+def test_a_stop_is_sent_again_if_the_connection_is_lost_and_nothing_else_is(stops, connections):
+    seen = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def drop() -> None:
+            while True:
+                try:
+                    connection, _ = server.accept()
+                except OSError:
+                    return
+                seen.append(connection.recv(4))
+                connection.close()
+
+        threading.Thread(target=drop, daemon=True).start()
+        address = f"http://127.0.0.1:{server.getsockname()[1]}"
+        lost = pytest.raises(DaemonError, match="the outcome is unknown")
+        with Client(address, token="-") as client, lost:
+            client.stop() if stops else client.mark("here")
+        server.shutdown(socket.SHUT_RDWR)
+    assert seen == [b"POST"] * connections
 
 
 def test_without_a_daemon_the_error_explains_how_to_start_one(tmp_path, monkeypatch):

@@ -183,7 +183,7 @@ class Disorder(RuleBasedStateMachine):
         self._enable(axis)
 
     @event(axis=st.integers(-1, 2), kind=st.sampled_from(
-        [K.DISABLE, K.QUICK_STOP, K.STOP, K.LEND, K.RELEASE, K.STREAM_END, K.DRIVE_FAULT_RESET]))  # fmt: skip
+        [K.DISABLE, K.QUICK_STOP, K.STOP, K.HOME, K.RELEASE, K.STREAM_END, K.DRIVE_FAULT_RESET]))  # fmt: skip
     def order(self, axis: int, kind: CommandKind) -> None:
         self.post(kind, axis)
 
@@ -238,7 +238,7 @@ class Disorder(RuleBasedStateMachine):
         k=st.one_of(counts, st.sampled_from([0x0250, 0x1237, 0x0008, 0x0007])),
     )  # fmt: skip
     def nonsense(self, kind, axis, a, b, c, i, j, k) -> None:
-        if kind in (K.VERIFIED, K.UNLEND, K.ENABLE):
+        if kind in (K.VERIFIED, K.HOMED, K.ENABLE):
             # Only the service can know how often the position has wrapped around 2**32 counts.
             i = max(min(i, (1 << 31) - 1), -(1 << 31))
         self.post(kind, axis, a=a, b=b, c=c, i=i, j=j, k=k)

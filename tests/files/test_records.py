@@ -68,6 +68,14 @@ def test_bad_input_gets_one_line_with_file_and_row(tmp_path, text, expected):
     assert str(caught.value) == f"{path}{expected}"
 
 
+@pytest.mark.parametrize("cell", ["nan", "1e308"])
+def test_a_value_without_a_meaning_is_named_by_the_column_of_the_file(tmp_path, cell):
+    path = tmp_path / "record.csv"
+    path.write_text(f"t,theta,{HEAD.rpartition(',')[2]}\n0,1,2\n1,{cell},2\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"record\.csv:3: theta: (nan|inf); expected a finite number$"):
+        Record.read_csv(path, columns="time=t,motor=theta", units="motor=turns")
+
+
 def test_files_that_cannot_be_read_at_all(tmp_path):
     (tmp_path / "plain.csv.gz").write_text(HEAD)
     with pytest.raises(InputError, match=r"absent\.csv: no such file$"):

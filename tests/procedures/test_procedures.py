@@ -1,6 +1,7 @@
 """Procedures on an ideal axis, without bus or clock."""
 
 import math
+from dataclasses import fields, replace
 from itertools import pairwise
 
 import pytest
@@ -8,7 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.errors import InputError
-from hdbridge.motion.procedures.moves import AxisView, MotionLimits, MoveTo, Sample, Settle, Sine
+from hdbridge.motion.procedures.chain import Chain
+from hdbridge.motion.procedures.even_speed import EvenSpeed
+from hdbridge.motion.procedures.moves import AxisView, Dwell, MotionLimits, MoveTo, Sample, Settle, Sine
+from hdbridge.motion.procedures.positioning import Positioning
 from hdbridge.motion.procedures.rehearsal import rehearse
 from hdbridge.motion.procedures.reversals import Reversals
 from hdbridge.motion.procedures.sine import Sines
@@ -16,6 +20,7 @@ from hdbridge.motion.procedures.small_steps import SmallSteps
 from hdbridge.motion.procedures.standstill import Precondition, Standstill
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.motion.procedures.sweep import Sweep
+from hdbridge.motion.procedures.waypoints import Hold, WayPoints
 
 LIMITS = MotionLimits(-400.0, 400.0, 20.0, 200.0, 4000.0)
 AXIS = AxisView(50.0, LIMITS)
@@ -141,9 +146,66 @@ def test_the_rehearsal_predicts_the_bench_run(procedure):
 
 @pytest.mark.parametrize(
     "procedure",
-    [Stepping(count=500), Sweep(-10, 500, 5.0), Standstill(float("nan")), Standstill(-401.0)],
-    ids=["stepping", "sweep", "nan", "standstill"],
+    [Stepping(count=500), Sweep(-10, 500, 5.0), Standstill(-401.0)],
+    ids=["stepping", "sweep", "standstill"],
 )
 def test_leaving_the_limits_is_refused_before_anything_moves(procedure):
     with pytest.raises(InputError, match=r"the axis file allows -400 to 400|no trajectory"):
         rehearse(procedure, AXIS)
+
+
+GOOD = [
+    *PROCEDURES,
+    Positioning((0.0, 9.0)),
+    EvenSpeed((5.0,)),
+    WayPoints((1.0,), velocity_deg_s=5.0),
+    MoveTo(1.0),
+]
+GOOD += [Chain((Sines(),), 5.0), Dwell(1.0), Settle(), Sine(0.0, 1.0, 1.0, 1.0)]
+NUMBERS = [
+    (each, field.name)
+    for each in GOOD
+    for field in fields(each)
+    if isinstance(getattr(each, field.name), (int, float)) and field.type is not bool
+]
+SERIES = [
+    (each, field.name)
+    for each in GOOD
+    for field in fields(each)
+    if str(field.type).startswith(("tuple[float", "tuple[typing.Annotated"))
+]
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, "1", True, [1.0]], ids=repr)
+@pytest.mark.parametrize(("good", "name"), NUMBERS)
+def test_a_parameter_that_is_not_a_finite_number_is_refused_at_construction(good, name, wrong):
+    with pytest.raises(InputError, match=rf"^\w+: {name}: found .*; expected a"):
+        replace(good, **{name: wrong})
+
+
+@pytest.mark.parametrize("wrong", [(), (math.nan,), ("1",), 1.0, "1"], ids=repr)
+@pytest.mark.parametrize(("good", "name"), SERIES)
+def test_a_parameter_without_finite_numbers_is_refused_at_construction(good, name, wrong):
+    with pytest.raises(InputError, match=rf"^\w+: {name}: found .*; expected at least one"):
+        replace(good, **{name: wrong})
+
+
+@pytest.mark.parametrize("wrong", [0, -1])
+@pytest.mark.parametrize(
+    ("good", "name"),
+    [
+        (each, name)
+        for each, name in NUMBERS
+        if name in {"velocity_deg_s", "acceleration_deg_s2", "frequency_hz", "periods"}
+        or name in {"laps", "count", "cycles", "window_s", "timeout_s"}
+    ],
+)
+def test_a_parameter_that_allows_no_motion_is_refused_at_construction(good, name, wrong):
+    with pytest.raises(InputError, match=rf"^\w+: {name}: found {wrong}; expected an? \w+ above 0"):
+        replace(good, **{name: wrong})
+
+
+def test_a_hold_without_an_end_is_not_a_number():
+    for wrong in (math.nan, -1.0, "1"):
+        with pytest.raises(InputError, match="duration_s"):
+            Hold(wrong)

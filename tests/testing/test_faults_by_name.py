@@ -1,5 +1,6 @@
 """Every fault of `drive.fault`, by its effect on the bus."""
 
+import math
 import struct
 from pathlib import Path
 
@@ -318,17 +319,29 @@ def test_the_drive_lists_its_faults(drive):
         ("zzz", {}, "expected one of: lost_tpdo, late_tpdo"),
         ("encoder_jump", {"cuonts": 3}, "'cuonts'; expected: counts=100000; did you mean 'counts'"),
         ("cable_pulled", {"count": 3}, "expected: none"),
-        ("lost_tpdo", {"count": "two"}, "count is 'two'; expected a number"),
-        ("lost_tpdo", {"count": 1.5}, "count is 1.5; expected a number"),
+        ("lost_tpdo", {"count": "two"}, "count is 'two'; expected an integer"),
+        ("lost_tpdo", {"count": 1.5}, "count is 1.5; expected an integer from 0 to 100000"),
         ("tpdo_stopped", {"number": 7}, "has no object 1806h"),
         ("missing_object", {"index": 0x7000}, "has no object 7000h:01"),
         ("lost_tpdo", {"after_s": -1.0}, "after_s is -1.0; expected a number of at least 0"),
+        ("lost_tpdo", {"after_s": "a"}, "after_s is 'a'; expected a number of at least 0"),
+        ("lost_tpdo", {"for_s": math.nan}, "for_s is nan; expected a number of at least 0"),
+        ("lost_tpdo", {"beyond_deg": "a"}, "beyond_deg is 'a'; expected a number$"),
+        (5, {}, "the name of the fault is 5; expected text"),
         ("lost_tpdo", {"after_s": 1.0, "beyond_deg": 3.0}, "both given"),
     ],
 )  # fmt: skip
 def test_unknown_faults_are_refused_with_the_known_ones(drive, name, arguments, complaint):
     with pytest.raises(InputError, match=complaint):
         drive.fault(name, **arguments)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1e30, 1e30, 10**30, -(10**30), None, [], "1", True])
+def test_an_argument_that_no_drive_can_have_is_refused(drive, value):
+    for name, row in FAULTS.items():
+        for argument in row.arguments:
+            with pytest.raises(InputError, match=rf"^fault '{name}': {argument} is .*; expected an? "):
+                drive.fault(name, **{argument: value})
 
 
 @pytest.mark.parametrize("name", ["program_stalls"])

@@ -1,5 +1,6 @@
 """`hdbridge.testing.simulated_drive`: the drive on its buses, its time and its history."""
 
+import math
 import threading
 import time
 
@@ -34,14 +35,33 @@ def test_the_same_seed_gives_the_same_frames():
         ({"bus": "socketcan"}, "did you mean 'socketcan:vcan0'"),
         ({"bus": "sockecan:vcan9"}, "python-can has no interface 'sockecan'"),
         ({"bus": "socketcan:vcan9"}, "socketcan:vcan9: cannot open it"),
-        ({"seed": "one"}, "the seed 'one'; expected an integer"),
+        ({"seed": "one"}, "the seed is 'one'; expected an integer"),
         ({"truth": "none.yaml"}, "none.yaml"),
+        ({"profile": None}, "profile is None; expected"),
+        ({"bus": None}, "bus is None; expected"),
+        ({"truth": 5}, "truth is 5; expected"),
+        ({"folder": 5}, "folder is 5; expected"),
+        ({"beside": "demo"}, "beside is 'demo'; expected another simulated drive"),
+        ({"firmware": "level"}, "firmware is 'level'; expected a mapping"),
+        ({"firmware": {"controlword": 5}}, "firmware: controlword: found 5; expected"),
     ],
 )
 def test_impossible_options_are_refused_in_one_line(choice, complaint):
     with pytest.raises(HdbridgeError, match=complaint) as refused, simulated_drive(**choice):
         pass
     assert "\n" not in str(refused.value)
+
+
+def test_times_and_conditions_that_are_none_are_refused(drive):
+    for wrong in ("1", None, -1.0, math.nan, math.inf):
+        with pytest.raises(InputError, match="expected a number of at least 0"):
+            drive.sleep(wrong)
+        with pytest.raises(InputError, match="expected a number of at least 0"):
+            drive.wait_until(lambda: False, wrong)
+    with pytest.raises(InputError, match="expected a function"):
+        drive.wait_until(True)
+    with pytest.raises(InputError, match="expected text"):
+        drive.note(5)
 
 
 def test_true_angles_and_their_trace(drive, program):

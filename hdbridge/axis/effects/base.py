@@ -40,7 +40,7 @@ from hdbridge.axis.effects.described import (
     Tracker,
 )
 from hdbridge.axis.effects.motion import MEASURED, Channel, FloatArray, Moment, Motion, Start
-from hdbridge.strictness import Strict
+from hdbridge.strictness import Strict, complaint
 
 GRID: Final[Mapping[int, int]] = {1: 6, 2: 4, 3: 3}
 """Grid points per shape parameter in the default proposals, by number of shape parameters."""
@@ -310,7 +310,7 @@ class Effect(Law):
             return [
                 f"{'.'.join(map(str, each['loc']))} = {each['input']:.3g}"
                 if isinstance(each["input"], float)
-                else f"{'.'.join(map(str, each['loc'])) or self.name}: {each['msg']}"
+                else complaint(each, self.name)
                 for each in error.errors()
             ]
         return []

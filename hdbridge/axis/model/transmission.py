@@ -16,6 +16,7 @@ from hdbridge.axis.model.binding import binding, check_binding
 from hdbridge.axis.model.file import ModelFile, effects_of, text_of
 from hdbridge.axis.model.response import Response
 from hdbridge.errors import InputError
+from hdbridge.files.profile import no_model
 from hdbridge.files.yamlfile import Document, document_from_text, read_yaml, write_atomically
 
 
@@ -62,6 +63,8 @@ class TransmissionModel:
     @classmethod
     def load(cls, path: Path | str) -> Self:
         """Reads a model file; raises `InputError` with file:line:column and the nearest valid name."""
+        if not Path(path).exists():
+            raise no_model(Path(path))
         return cls._from_document(read_yaml(path))
 
     @classmethod

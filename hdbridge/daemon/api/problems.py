@@ -11,6 +11,7 @@ from starlette.exceptions import HTTPException
 
 from hdbridge.client.messages import CONTENT_TYPE, TYPE_PREFIX, Problem
 from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.strictness import complaint
 
 COMPLAINTS_MAXIMUM = 20
 _log = logging.getLogger(__name__)
@@ -44,8 +45,8 @@ async def _on_validation_error(request: Request, error: RequestValidationError) 
     """Answers a request that violates the schema, with one complaint per key, without its value."""
     complaints = []
     for each in error.errors()[:COMPLAINTS_MAXIMUM]:
-        where = ".".join(str(part) for part in each["loc"] if part != "body")
-        complaints.append(_printable(f"{where or 'the body'}: {each['msg']}"))
+        place = [part for part in each["loc"] if part != "body"]
+        complaints.append(_printable(complaint({"loc": place, "msg": each["msg"]}, "the body")))
     malformed = any(each["type"] == "json_invalid" for each in error.errors())
     status = HTTPStatus.BAD_REQUEST if malformed else HTTPStatus.UNPROCESSABLE_ENTITY
     problem = refusal(status, "the request is not valid: nothing was done", "InputError")

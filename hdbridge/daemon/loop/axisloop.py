@@ -97,8 +97,8 @@ class AxisLoop:
         self._handlers: dict[CommandKind, Callable[[Command], None]] = {
             CommandKind.VERIFIED: self._verified,
             CommandKind.RELEASE: self._silence,
-            CommandKind.LEND: self._silence,
-            CommandKind.UNLEND: self._verified,
+            CommandKind.HOME: self._silence,
+            CommandKind.HOMED: self._verified,
             CommandKind.ENABLE: self._enable,
             CommandKind.DISABLE: self._disable,
             CommandKind.QUICK_STOP: self._quick_stop,

@@ -76,12 +76,12 @@ TRANSITIONS: Final[tuple[Transition, ...]] = (
     Transition(_S.UNVERIFIED, _C.RESET, _S.UNVERIFIED),
     Transition(_S.DISABLED, _C.VERIFIED, _S.DISABLED),
     Transition(_S.DISABLED, _C.RELEASE, _S.UNVERIFIED),
-    Transition(_S.DISABLED, _C.LEND, _S.LENT),
+    Transition(_S.DISABLED, _C.HOME, _S.LENT),
     Transition(_S.DISABLED, _C.ENABLE, _S.ENABLING),
     Transition(_S.DISABLED, _C.DISABLE, _S.DISABLED),
     Transition(_S.DISABLED, _C.RESET, _S.DISABLED),
     Transition(_S.DISABLED, _C.DRIVE_FAULT_RESET, _S.DISABLED),
-    Transition(_S.LENT, _C.UNLEND, _S.DISABLED),
+    Transition(_S.LENT, _C.HOMED, _S.DISABLED),
     Transition(_S.LENT, _C.RELEASE, _S.UNVERIFIED),
     Transition(_S.LENT, _C.QUICK_STOP, _S.QUICK_STOPPED),
     Transition(_S.ENABLING, _T.POWERED, _S.ENABLED),
@@ -139,8 +139,7 @@ def target_of(state: AxisState, cause: Cause) -> AxisState | None:
 
 def refusal(state: AxisState, kind: CommandKind) -> str:
     """Returns the message for a command that is refused in a state."""
-    what = "homing" if kind is _C.LEND else label(kind)
-    return f"{what} is not possible while the axis is {label(state)}: {_WAY_OUT[state]}"
+    return f"{label(kind)} is not possible while the axis is {label(state)}: {_WAY_OUT[state]}"
 
 
 def label(name: AxisState | CommandKind) -> str:

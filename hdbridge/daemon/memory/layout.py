@@ -74,10 +74,10 @@ class CommandKind(IntEnum):
     """i motor counts, j load counts, k statusword. The drive is verified; its RPDO may be sent."""
     RELEASE = 2
     """Returns the axis to the unverified state; the loop sends it no RPDO."""
-    LEND = 3
-    """Stops the RPDO until UNLEND, while the service controls the drive by SDO."""
-    UNLEND = 4
-    """Ends LEND; i, j, k as VERIFIED."""
+    HOME = 3
+    """Stops the RPDO until HOMED, while the service homes the drive by SDO."""
+    HOMED = 4
+    """Ends homing; i, j, k as VERIFIED."""
     ENABLE = 5
     """Switches power on; i, j, k as VERIFIED."""
     DISABLE = 6

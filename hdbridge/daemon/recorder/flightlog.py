@@ -131,8 +131,9 @@ class FlightLog:
         size = cycles * (1 + len(self._about.axes)) * MESSAGE_BYTES
         self._note_spans(waiting)
         try:
-            if self._free(self.folder) < size + self._settings.free_mb * _MB:
-                raise OSError(f"less than {self._settings.free_mb:g} MB are free")
+            free_mb, needed_mb = self._free(self.folder) / _MB, size / _MB + self._settings.free_mb
+            if free_mb < needed_mb:
+                raise OSError(f"{free_mb:.3g} MB are free; expected at least {needed_mb:.3g} MB (free_mb)")
             if self._file is not None and self._file.behind:
                 self._file.flush()
             begins = self._file is None
@@ -223,7 +224,9 @@ class FlightLog:
             return
         old_s = (self._newest_ns - self._begun_ns) / _NS
         over = any(end_ns <= self._newest_ns for _, end_ns in self._spans)
-        if over or old_s >= settings.file_s or file.size >= settings.file_mb * _MB:
+        # At least two files fit into the ring, because only whole files are removed.
+        largest_mb = min(settings.file_mb, 0.5 * settings.size_mb, 0.5 * settings.kept_mb)
+        if over or old_s >= settings.file_s or file.size >= largest_mb * _MB:
             self._end()
         else:
             self._remove_old(file.size)

@@ -220,7 +220,7 @@ class ServiceAxis:
         self.check_may(holder)
         async with self._exclusive_use("the axis is being homed"):
             self.is_prepared = False
-            await self.link.do(CommandKind.LEND)
+            await self.link.do(CommandKind.HOME)
             try:
                 seeds = await self._work(self.commissioning.home, run)
             except BaseException:
@@ -228,7 +228,7 @@ class ServiceAxis:
                 with suppress(HdbridgeError):
                     await self.link.do(CommandKind.RELEASE)
                 raise
-            await self.link.do(CommandKind.UNLEND, **seeds)
+            await self.link.do(CommandKind.HOMED, **seeds)
 
     async def _verify(self, *, clear_fault: bool = False) -> None:
         """Boots and verifies the drive, then lets the control process communicate with it."""

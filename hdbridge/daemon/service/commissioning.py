@@ -189,7 +189,7 @@ class Commissioning:
         self._bus.shutdown()
 
     def _seeds(self, positions: Positions) -> Arguments:
-        """Returns counts and statusword, the arguments of VERIFIED, UNLEND and ENABLE."""
+        """Returns counts and statusword, the arguments of VERIFIED, HOMED and ENABLE."""
         self.drive.state()
         statusword = self.drive.image.statusword or 0
         return Arguments(i=positions.motor_counts, j=positions.load_counts, k=statusword)

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from hdbridge.motion.procedures.moves import AxisView, Move, MoveTo, Procedure, Sample, Steps
+from hdbridge.motion.procedures.parameters import Checked, Positive
 
 
 @dataclass(frozen=True, slots=True)
-class Chain:
+class Chain(Checked):
     """Runs procedures in sequence; the outcome is that of the last one.
 
     ``acceleration_deg_s2`` (at the load) limits every move, because acceleration winds up the gear's spring.
@@ -15,7 +16,7 @@ class Chain:
     """
 
     parts: tuple[Procedure[object], ...]
-    acceleration_deg_s2: float | None = None
+    acceleration_deg_s2: Positive | None = None
 
     def moves(self, axis: AxisView) -> Steps[object]:
         outcome: object = None

@@ -6,6 +6,7 @@ from typing import Self
 
 from hdbridge.errors import InputError
 from hdbridge.motion.procedures.moves import AxisView, MoveTo, Sample, Steps
+from hdbridge.motion.procedures.parameters import Checked, Positive
 from hdbridge.units import DEG_PER_TURN
 
 SHARES = (0.95, 0.8, 0.64, 0.5, 0.38, 0.28, 0.18, 0.08)
@@ -29,11 +30,11 @@ class EvenRun:
 
 
 @dataclass(frozen=True, slots=True)
-class EvenSpeed:
+class EvenSpeed(Checked):
     """Runs an axis at several constant speeds about the middle of the travel, in both directions."""
 
-    speeds_deg_s: tuple[float, ...]
-    window_s: float = WINDOW_S
+    speeds_deg_s: tuple[Positive, ...]
+    window_s: Positive = WINDOW_S
 
     @classmethod
     def spread(cls, axis: AxisView, shares: Sequence[float] = SHARES) -> Self:

@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol, TypeVar
 from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
 from hdbridge.errors import InputError
+from hdbridge.motion.procedures.parameters import Checked, Positive
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +123,10 @@ def solutions(
             yield trajectory
 
 
-class _Timed:
+class _Timed(Checked):
     """Base class of legs that end with their path."""
+
+    __slots__ = ()
 
     def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
         return True
@@ -134,9 +137,9 @@ class MoveTo(_Timed):
     """Jerk-limited move to a load angle, at the axis's limits or at lower ones."""
 
     load_deg: float
-    velocity_deg_s: float | None = None
+    velocity_deg_s: Positive | None = None
     kind: str = "move"
-    acceleration_deg_s2: float | None = None
+    acceleration_deg_s2: Positive | None = None
     """Maximum acceleration, if less than the axis's limit; a lower one reduces wind-up of the gear."""
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
@@ -176,7 +179,7 @@ class Dwell(_Timed):
 
 
 @dataclass(frozen=True, slots=True)
-class Settle:
+class Settle(Checked):
     """Standstill until motor and load have settled, or until the time-out.
 
     The axis has settled if, over the last ``window_s``, the mean load angles of the two halves agree within
@@ -185,10 +188,10 @@ class Settle:
     of extremes, so that encoder noise does not prevent settling.
     """
 
-    window_s: float = 0.06
-    drift_arcsec: float = 0.3
+    window_s: Positive = 0.06
+    drift_arcsec: Positive = 0.3
     minimum_s: float = 0.1
-    timeout_s: float = 3.0
+    timeout_s: Positive = 3.0
     kind: str = "settle"
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
@@ -228,8 +231,8 @@ class Sine(_Timed):
 
     centre_deg: float
     amplitude_deg: float
-    frequency_hz: float
-    periods: float
+    frequency_hz: Positive
+    periods: Positive
     kind: str = "sine"
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:

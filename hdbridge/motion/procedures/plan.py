@@ -110,6 +110,12 @@ class ReversalsEntry(Strict):
         False, description="all depths in one curve, each beyond the last turning point; shows memory"
     )
 
+    @model_validator(mode="after")
+    def _within_reach(self) -> Self:
+        if min(self.depths_deg) > self.reach_deg:
+            raise wrong("every depth is larger than reach_deg; expected smaller ones", "depths_deg")
+        return self
+
     def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
         """Yields the reversals, slowed to the permitted speed, with the reach shortened to the travel."""
         reach = room.half(name, "the reach of the reversals", self.reach_deg / room.ratio) * room.ratio

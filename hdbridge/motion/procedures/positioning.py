@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from hdbridge.motion.procedures.moves import AxisView, MoveTo, Settle, Steps
+from hdbridge.motion.procedures.parameters import Checked, Count
 from hdbridge.motion.procedures.stepping import step
 
 
@@ -17,12 +18,12 @@ class Approach:
 
 
 @dataclass(frozen=True, slots=True)
-class Positioning:
+class Positioning(Checked):
     """Standard test cycle: up to each target, past the last, down to each target, past the first."""
 
     targets_deg: tuple[float, ...]
     """Load angles, ascending."""
-    cycles: int = 5
+    cycles: Count = 5
     overrun_deg: float = 2.0
     """Travel beyond the first and last target, load degrees; more than the width of any hysteresis."""
     settle: Settle = Settle()

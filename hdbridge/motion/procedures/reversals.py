@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 from hdbridge.motion.procedures.moves import AxisView, MoveTo, Steps
+from hdbridge.motion.procedures.parameters import Checked, Positive
 
 
 @dataclass(frozen=True, slots=True)
-class Reversals:
+class Reversals(Checked):
     """Reversal curves: for each depth, back by the depth, forward by half of it, back again, then forward.
 
     The gear forgets each curve on the approach to the next. ``depths_deg`` and ``reach_deg`` are motor
@@ -15,9 +16,9 @@ class Reversals:
     """
 
     centre_deg: float = 0.0
-    depths_deg: tuple[float, ...] = (2.0, 4.0, 8.0, 12.0, 16.0, 24.0)
-    reach_deg: float = 60.0
-    velocity_deg_s: float = 0.2
+    depths_deg: tuple[Positive, ...] = (2.0, 4.0, 8.0, 12.0, 16.0, 24.0)
+    reach_deg: Positive = 60.0
+    velocity_deg_s: Positive = 0.2
     """Speed at the load."""
     beyond: bool = False
 

@@ -3,16 +3,17 @@
 from dataclasses import dataclass
 
 from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Sine, Steps
+from hdbridge.motion.procedures.parameters import Checked, Positive
 
 
 @dataclass(frozen=True, slots=True)
-class Sines:
+class Sines(Checked):
     """Runs sines of ``amplitudes_deg`` (motor degrees) about ``centre_deg`` (load degrees), in sequence."""
 
     centre_deg: float = 0.0
-    amplitudes_deg: tuple[float, ...] = (180.0, 45.0, 5.0)
-    frequency_hz: float = 0.05
-    periods: float = 2.0
+    amplitudes_deg: tuple[Positive, ...] = (180.0, 45.0, 5.0)
+    frequency_hz: Positive = 0.05
+    periods: Positive = 2.0
 
     def moves(self, axis: AxisView) -> Steps[None]:
         """Yields the sines, each starting at its upper extreme."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from hdbridge.motion.procedures.moves import AxisView, Settle, Steps
+from hdbridge.motion.procedures.parameters import Checked, Count, Positive
 from hdbridge.motion.procedures.standstill import Precondition
 from hdbridge.motion.procedures.stepping import Standing, SteppingOutcome, step
 
@@ -10,7 +11,7 @@ _GOLDEN = 0.618_033_988_75
 
 
 @dataclass(frozen=True, slots=True)
-class SmallSteps:
+class SmallSteps(Checked):
     """Steps to ``count`` targets in mixed order, within ``reach_deg`` (motor degrees) of a centre.
 
     If steps are longer than the width of the hysteresis, the loop is saturated after each. Such a test cannot
@@ -20,8 +21,8 @@ class SmallSteps:
 
     centre_deg: float = 0.0
     """Centre of the targets, load degrees."""
-    reach_deg: float = 20.0
-    count: int = 40
+    reach_deg: Positive = 20.0
+    count: Count = 40
     precondition_deg: float = 2.0
     """Travel of the pre-conditioning move, load degrees; more than the width of any hysteresis."""
     settle: Settle = Settle()

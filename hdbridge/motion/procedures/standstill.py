@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Steps
+from hdbridge.motion.procedures.parameters import Checked, Positive
 
 
 @dataclass(frozen=True, slots=True)
-class Precondition:
+class Precondition(Checked):
     """Moves back and forth by more than the width of any hysteresis, ending forward at ``load_deg``.
 
     The gear's elastic state is then known, because it is saturated in the forward direction. Every task of a
@@ -22,11 +23,11 @@ class Precondition:
 
 
 @dataclass(frozen=True, slots=True)
-class Standstill:
+class Standstill(Checked):
     """Standstill at ``load_deg`` for a given time."""
 
     load_deg: float = 0.0
-    duration_s: float = 10.0
+    duration_s: Positive = 10.0
     kind: str = "standstill"
     """Purpose: ``reference`` at a recurring pose, always approached from the same side, which shows drift."""
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from hdbridge.errors import InputError
 from hdbridge.motion.procedures.moves import AxisView, MoveTo, Sample, Settle, Steps
+from hdbridge.motion.procedures.parameters import Checked, Count
 from hdbridge.motion.procedures.standstill import Precondition
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -37,14 +38,14 @@ class SteppingOutcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Stepping:
+class Stepping(Checked):
     """Runs ``count`` steps of ``step_deg`` (motor degrees) in one direction, then back.
 
     The test starts with a pre-conditioning move (back by ``precondition_deg`` and forward again), so that the
     gear's elastic state is that after forward motion.
     """
 
-    count: int = 240
+    count: Count = 240
     step_deg: float = 43.56
     start_deg: float = 0.0
     """Load angle at the start."""
@@ -53,7 +54,8 @@ class Stepping:
     settle: Settle = Settle()
 
     def __post_init__(self) -> None:
-        """Raises `InputError` for steps of size zero."""
+        """Raises `InputError` for an invalid parameter, such as steps of size zero."""
+        Checked.__post_init__(self)
         if self.step_deg == 0.0:
             raise InputError("step_deg: found 0; expected the size of a step, negative for steps down first")
 

@@ -4,7 +4,9 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from hdbridge.errors import InputError
 from hdbridge.motion.procedures.moves import AxisView, MotionLimits, Path, Sample, Settle, Steps
+from hdbridge.motion.procedures.parameters import Checked, Positive
 from hdbridge.motion.procedures.stepping import Standing, step
 
 
@@ -14,7 +16,12 @@ class Hold:
     kind = "hold"
 
     def __init__(self, duration_s: float = math.inf, released: Callable[[], bool] = lambda: False) -> None:
-        """``released`` is called in each cycle, and ends the hold when it returns True."""
+        """``released`` is called in each cycle, and ends the hold when it returns True.
+
+        Raises `InputError` for a duration that is not a number of at least 0; infinity is allowed.
+        """
+        if not (isinstance(duration_s, int | float) and duration_s >= 0.0):
+            raise InputError(f"Hold: duration_s: found {duration_s!r}; expected at least 0")
         self.begun = False
         """True once the axis stands at its final position."""
         self._duration_s, self._released = duration_s, released
@@ -31,13 +38,13 @@ class Hold:
 
 
 @dataclass(frozen=True, slots=True)
-class WayPoints:
+class WayPoints(Checked):
     """Jerk-limited moves, each followed by settling, and a hold at the last target."""
 
     targets_deg: tuple[float, ...]
     """Load angles."""
     hold: Hold = field(default_factory=lambda: Hold(0.0))
-    velocity_deg_s: float | None = None
+    velocity_deg_s: Positive | None = None
     """Maximum speed at the load; None for the axis's limit."""
     settle: Settle = Settle()
 

@@ -42,7 +42,7 @@ def test_nothing_is_sent_to_a_drive_that_is_not_verified(daemon: SteppedDaemon) 
     daemon.run(0.5)
     assert sent == []
     assert daemon.states == [S.UNVERIFIED]
-    for kind in (K.ENABLE, K.LEND, K.MOVE, K.DISABLE):
+    for kind in (K.ENABLE, K.HOME, K.MOVE, K.DISABLE):
         answer = daemon.order(kind)
         assert answer.kind is E.REFUSED
         assert "has to be booted and verified first" in answer.text
@@ -142,7 +142,7 @@ def test_a_drive_that_does_not_enable_is_given_up(daemon: SteppedDaemon) -> None
 
 def test_a_lent_axis_is_quick_stopped_by_the_loop(daemon: SteppedDaemon) -> None:
     daemon.verify()
-    daemon.done(K.LEND)
+    daemon.done(K.HOME)
     drive = daemon.drive(0)
     from hdbridge.drive.objects import Mode
 
@@ -167,7 +167,7 @@ def test_quick_stop_is_latched_until_reset(enabled: SteppedDaemon) -> None:
     assert {word for word, _ in sent} == {0x02}
     (stopped,) = enabled.reported(E.STOPPED)
     assert "quick stop by command" in stopped.text
-    for kind in (K.ENABLE, K.MOVE, K.VERIFIED, K.LEND):
+    for kind in (K.ENABLE, K.MOVE, K.VERIFIED, K.HOME):
         assert enabled.order(kind).kind is E.REFUSED
     enabled.done(K.RESET)
     enabled.until(lambda: enabled.states == [S.DISABLED])

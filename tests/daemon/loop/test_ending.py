@@ -67,7 +67,7 @@ def test_from_every_state(daemon: SteppedDaemon, state: str) -> None:
     elif state == "lent":
         from hdbridge.drive.objects import Mode
 
-        daemon.done(K.LEND)
+        daemon.done(K.HOME)
         daemon.drive(0).enable(Mode.PP)
     elif state in ("quick stopped", "latched"):
         daemon.enable()

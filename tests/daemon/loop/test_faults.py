@@ -30,7 +30,7 @@ def test_a_bus_that_goes_down_while_nothing_moves(daemon: SteppedDaemon, lent: b
     daemon.turn()
     if lent:
         daemon.verify()
-        daemon.done(K.LEND)
+        daemon.done(K.HOME)
     daemon.bus.down = errno.ENETDOWN
     daemon.run(0.1)
     assert daemon.states == [S.LATCHED if lent else S.UNVERIFIED]

@@ -192,7 +192,7 @@ def test_a_mailbox_full_of_nonsense_is_refused(moving: DaemonBench) -> None:
     posted = 0
     with suppress(MailboxFullError):
         while posted < 10_000:
-            kind = (K.MOVE, K.VERIFIED, K.CHANGE, K.UNLEND, K.STREAM_BEGIN)[posted % 5]
+            kind = (K.MOVE, K.VERIFIED, K.CHANGE, K.HOMED, K.STREAM_BEGIN)[posted % 5]
             daemon.memory.commands.post(kind, (7, -1, 0, 99, 1)[posted % 5], i=1 << 40, j=-1, a=math.nan)
             posted += 1
     assert 100 < posted < 10_000

@@ -56,11 +56,8 @@ def test_refusals_state_the_remedy() -> None:
         "enable is not possible while the axis is quick stopped: remove the cause, then reset it: "
         "hdbridge ctl reset AXIS"
     )
-
-
-def test_a_refused_homing_is_called_homing() -> None:
-    assert refusal(S.ENABLED, CommandKind.LEND) == (
-        "homing is not possible while the axis is enabled: disable it first"
+    assert refusal(S.ENABLED, CommandKind.HOME) == (
+        "home is not possible while the axis is enabled: disable it first"
     )
 
 

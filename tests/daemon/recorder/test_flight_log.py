@@ -92,7 +92,7 @@ def test_files_are_split_by_size(tmp_path):
     assert max(sizes) < 0.4e6
 
 
-@pytest.mark.parametrize("file_mb", [0.1, 0.6])
+@pytest.mark.parametrize("file_mb", [0.1, 0.6, 64.0])
 def test_the_ring_stays_within_its_size_and_drops_the_oldest(tmp_path, file_mb):
     log, clock = flight_log(tmp_path, file_mb=file_mb, size_mb=1.0)
     for second in range(40):

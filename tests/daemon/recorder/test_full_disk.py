@@ -1,5 +1,6 @@
 """Full disks: recording pauses, the gap is counted and reported once, and recording resumes."""
 
+import re
 import subprocess
 import sys
 
@@ -48,12 +49,20 @@ def test_free_space_is_checked_and_dropped_cycles_are_counted(tmp_path):
     assert log.refused == 2 * SECOND
     assert len(reports) == 2
     assert "nothing is recorded" in reports[0]
-    assert "less than 100 MB" in reports[0]
+    assert "99 MB are free; expected at least 100 MB (free_mb)" in reports[0]
     assert f"{2 * SECOND} cycles were not" in reports[1]
     (path,) = tmp_path.glob("*.mcap")
     flight = read(path)
     assert len(flight.machine["cycle"]) == 4 * SECOND
     assert [each.kind for each in flight.events] == ["REFUSED_BY_DISK"]
+
+
+def test_a_disk_without_any_space_is_named_even_if_no_space_is_reserved(tmp_path):
+    reports = []
+    log, _ = flight_log(tmp_path, reports, free=lambda _: 0, free_mb=0.0)
+    log.put(Batch(samples(SECOND, 1)))
+    log.flush()
+    assert re.search(r"0 MB are free; expected at least 0\.\d+ MB \(free_mb\)", reports[0])
 
 
 def test_a_failed_write_leaves_a_whole_file_and_is_repeated(tmp_path):

@@ -65,7 +65,7 @@ async def test_without_a_control_process_nothing_is_sent(service: Service) -> No
 
 async def test_a_lent_axis_is_taken_back(service: Service) -> None:
     async with service.ready() as bridge:
-        await bridge.axes["axis1"].link.do(CommandKind.LEND)
+        await bridge.axes["axis1"].link.do(CommandKind.HOME)
     async with service.bridge() as bridge:
         axis = bridge.axes["axis1"]
         await until(bridge, lambda: axis.state().state == "disabled")

@@ -28,6 +28,7 @@ from hdbridge.daemon.api.routes.parts import Bridge, port
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.eventlog import STATES
 from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.strictness import complaint
 from hdbridge.units import ARCSEC_PER_DEG
 
 M = TypeVar("M", bound=BaseModel)
@@ -141,9 +142,8 @@ async def _receive(websocket: WebSocket, kind: type[M]) -> M:
     try:
         return kind.model_validate_json(text)
     except ValidationError as problem:
-        first = problem.errors(include_input=False, include_url=False)[0]
-        where = ".".join(map(str, first["loc"])) or "the message"
-        raise InputError(f"{kind.__name__}: {where}: {first['msg']}") from None
+        first = complaint(problem.errors(include_input=False)[0], "the message")
+        raise InputError(f"{kind.__name__}: {first}") from None
 
 
 async def _send(websocket: WebSocket, message: BaseModel) -> None:
