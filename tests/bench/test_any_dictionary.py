@@ -300,17 +300,6 @@ def test_identity_from_the_device_info_section(tmp_path: Path) -> None:
     assert report.identity["vendor_id"] == 119
 
 
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "windows-1252"])
-def test_an_eds_as_vendors_ship_it(tmp_path: Path, encoding: str) -> None:
-    text = OWN.replace("Position actual value", "Lageistwert f\u00fcr 25 \u00b0C").replace(
-        "[DeviceInfo]", "[deviceinfo]"
-    )
-    text = text.replace("VendorNumber=0x00004844", "VendorNumber=").replace("PDOMapping=1", "PDOMapping=True")
-    stepped(
-        profile_with(tmp_path, text.replace("\n", "\r\n").encode(encoding) + b"\x1a" * (encoding != "utf-16"))
-    )
-
-
 def test_an_axis_without_a_heartbeat_still_stops_when_its_drive_falls_silent(tmp_path: Path) -> None:
     axis = profile_with(tmp_path, without(OWN, 0x1017))
     with simulated(axis) as drive:

@@ -222,22 +222,3 @@ def test_a_model_with_missing_channels_is_refused_for_compensation():
     with pytest.raises(InputError, match=r"'amplitude_drift' needs temperature_c, .*add 'temperature' to"):
         compensation_for(without, model_with(drift))
     compensation_for(without, model_with(compliance(torque="motor_torque_nm")))
-
-
-def test_the_motor_torque_has_the_sign_of_the_axis():
-    """If the motor encoder counts down, the drive's torque is negative when the axis accelerates forward."""
-    reversed_text = (PROFILE / "axis.yaml").read_text().replace(
-        "counts_per_turn: 8000         # one count is 3.24 arcsec at the load\n  direction: 1",
-        "counts_per_turn: 8000\n  direction: -1",
-    )  # fmt: skip
-    reversed_axis = AxisConfig.from_text(reversed_text, PROFILE / "axis.yaml")
-    truth = (PROFILE / "truth.yaml").read_text().replace(
-        "{counts_per_turn: 8000, direction: 1,", "{counts_per_turn: 8000, direction: -1,"
-    )  # fmt: skip
-    found = {}
-    for axis, text in ((axis_with(""), (PROFILE / "truth.yaml").read_text()), (reversed_axis, truth)):
-        with booted(axis, Truth.from_text(text), 1) as (drive, _):
-            record = Bench(drive).run(Moves(MoveTo(5.0))).record
-            found[axis.motor_encoder.direction] = record.columns["motor_torque_nm"]
-    assert found[1].max() > 0.05
-    assert np.allclose(found[1], found[-1], atol=0.02)

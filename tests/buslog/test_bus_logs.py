@@ -10,6 +10,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
+from support.rawmaster import FrameMaster
 from typer.testing import CliRunner
 
 from hdbridge.axis import AxisConfig
@@ -51,11 +52,12 @@ class Logged:
         return path
 
 
-class Master:
-    """A third-party master: its own PDO order and identifiers, SDO and CSP in raw frames."""
+class Master(FrameMaster):
+    """A third-party master: its own PDO order and identifiers, SDO and CSP in raw frames, all logged."""
 
     def __init__(self, bus: LockstepBus, clock: VirtualClock) -> None:
-        self.bus, self.clock, self.log = bus, clock, Logged()
+        super().__init__(bus, clock)
+        self.log = Logged()
 
     def keep(self, message: can.Message, *, is_rx: bool) -> None:
         copy = frame(EPOCH_S + message.timestamp, message.arbitration_id, message.data, is_rx=is_rx)
@@ -66,33 +68,11 @@ class Master:
         self.keep(message, is_rx=False)
         self.bus.send(message)
 
-    def take(self) -> dict[int, bytes]:
-        frames = {}
-        while (message := self.bus.recv(0)) is not None:
-            self.keep(message, is_rx=True)
-            frames[message.arbitration_id] = bytes(message.data)
-        return frames
-
-    def put(self, index: int, sub: int, value: int, size: int) -> None:
-        raw = (value & (1 << 8 * size) - 1).to_bytes(size, "little").ljust(4, b"\0")
-        self.send(0x601, struct.pack("<BHB", 0x23 | (4 - size) << 2, index, sub) + raw)
-        assert self.take()[0x581][0] == 0x60, f"{index:04X}h:{sub:02X} := {value:X}"
-
-    def read(self, index: int, sub: int) -> None:
-        self.send(0x601, struct.pack("<BHBI", 0x40, index, sub, 0))
-        assert self.take()[0x581][0] & 0xE3 == 0x43
-
-    def map(self, kind: int, number: int, can_id: int, *words: int, sync: int = 1) -> None:
-        """Maps and enables a PDO by SDO; ``kind`` is 1800h for a TPDO and 1400h for an RPDO."""
-        communication, mapping = kind + number - 1, kind + 0x200 + number - 1
-        self.put(communication, 1, can_id | 0x8000_0000, 4)
-        self.put(mapping, 0, 0, 1)
-        for place, word in enumerate(words, 1):
-            self.put(mapping, place, word, 4)
-        self.put(mapping, 0, len(words), 1)
-        self.put(communication, 2, sync, 1)
-        if words:
-            self.put(communication, 1, can_id, 4)
+    def messages(self) -> list[can.Message]:
+        found = super().messages()
+        for each in found:
+            self.keep(each, is_rx=True)
+        return found
 
     def boot(self, *, with_demand: bool = True) -> None:
         """Configures and starts the node. TPDO1 carries load encoder and statusword, TPDO2 torque and
@@ -114,7 +94,7 @@ class Master:
     def cycle(self, word: int, target: int | None = None) -> tuple[int, int]:
         now_s = self.clock.now()
         self.send(0x080)
-        frames = self.take()
+        frames = dict(self.take())
         load, _ = struct.unpack("<iH", frames[0x1A1])
         torque, motor = struct.unpack("<hi", frames[0x2C1])
         demand = struct.unpack("<i", frames[0x381])[0] if 0x381 in frames else 0

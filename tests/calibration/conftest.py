@@ -41,9 +41,7 @@ class Cell:
         path.write_text(text.replace(old, new))
 
     def run(self, *arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
-        done = run_here(self.folder, *arguments)
-        assert done.returncode == status, done.stderr
-        return done
+        return run_here(self.folder, *arguments, status=status)
 
     def calibrate(self, *arguments: object, status: int = 0):
         return self.run("calibrate", "axis", "--simulate", *arguments, status=status)

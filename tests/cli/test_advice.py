@@ -53,8 +53,7 @@ def test_the_next_commands_of_a_measurement(at_bench, tmp_path, monkeypatch):
     ],
 )
 def test_the_advice_of_an_error(at_bench, arguments, advice):
-    refused = at_bench(*arguments)
-    assert refused.returncode == 2
+    refused = at_bench(*arguments, status=2)
     assert commands_in(refused.stderr) == advice
 
 

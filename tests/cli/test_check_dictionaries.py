@@ -31,7 +31,6 @@ SOURCE = "source: {index: 0x60E4, subindex: 1, type: int32, via: tpdo}"
 def test_values_left_to_the_drive_are_listed(hdbridge, tmp_path, eds, lines):
     profile_with(tmp_path / "axis", eds)
     done = hdbridge("check", "axis", "--json", "found.json")
-    assert done.returncode == 0, done.stderr
     for line in lines:
         assert re.search(line, done.stdout, flags=re.MULTILINE), done.stdout
     found = json.loads((tmp_path / "found.json").read_text())
@@ -42,7 +41,6 @@ def test_values_left_to_the_drive_are_listed(hdbridge, tmp_path, eds, lines):
     ]
     assert len(listed) == len(lines)
     done = hdbridge("step", "axis", "--simulate", "--scheme", "none", "--count", 2)
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(
@@ -62,7 +60,6 @@ def test_values_left_to_the_drive_are_listed(hdbridge, tmp_path, eds, lines):
 def test_impossible_settings_are_refused_by_check(hdbridge, tmp_path, eds, edit, complaint):
     profile_with(tmp_path / "axis", eds, *([edit] if edit else []))
     for command in (("check", "axis"), ("step", "axis", "--simulate", "--scheme", "none", "--count", 2)):
-        done = hdbridge(*command)
-        assert done.returncode == 2, done.stdout
+        done = hdbridge(*command, status=2)
         assert len(done.stderr.strip().splitlines()) == 1
         assert re.search(complaint, done.stderr), done.stderr

@@ -74,8 +74,7 @@ def test_a_full_disk_during_motion_loses_no_figures(tmp_path):
     step = ("step", "article", "--simulate", "--count", 2, "--scheme", "none")
     outputs = ("--json", "out.json", "--html", "out.html", "--record", "kept")
     full = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))  # noqa: E731
-    done = run_apart(tmp_path, *step, *outputs, preexec_fn=full)
-    assert done.returncode == 6, done.stderr
+    done = run_apart(tmp_path, *step, *outputs, preexec_fn=full, status=6)
     assert "quantisation floor" in done.stdout
     assert done.stderr.count("cannot be written: File too large") == 3
     assert done.stderr.count("hdbridge: ") == 1
@@ -85,8 +84,7 @@ def test_a_full_disk_during_motion_loses_no_figures(tmp_path):
 def test_one_measurement_of_an_axis_at_a_time(hdbridge, profile, tmp_path):
     with (profile.folder / "axis.yaml").open() as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        done = hdbridge("calibrate", profile.folder, "--simulate", "--out", "rec")
-    assert done.returncode == 2
+        done = hdbridge("calibrate", profile.folder, "--simulate", "--out", "rec", status=2)
     assert "another hdbridge process is measuring this axis" in done.stderr
     assert "booted" not in done.stderr
     assert not (tmp_path / "rec").exists()

@@ -27,23 +27,19 @@ def faulty():
 def test_the_suggested_command_resets_the_fault(hdbridge, faulty, tmp_path):
     drive, bus = faulty
     before_deg = drive.truth.load_deg
-    refused = hdbridge("move", "article", 1, "--hold", 0, *bus)
-    assert refused.returncode == 4
+    refused = hdbridge("move", "article", 1, "--hold", 0, *bus, status=4)
     assert "3210h" in refused.stderr
     assert RESET in refused.stderr
     done = hdbridge("reset", "article", *bus, "--json", "reset.json")
-    assert done.returncode == 0, done.stderr
     assert "the fault is reset (error code 3210h, DC link over-voltage" in done.stdout
     assert json.loads((tmp_path / "reset.json").read_text())["state"] == "switch on disabled"
     assert drive.truth.load_deg == pytest.approx(before_deg, abs=1e-3)
     again = hdbridge("reset", "article", *bus)
-    assert again.returncode == 0, again.stderr
     assert again.stdout == "there is no fault to reset: the drive is in 'switch on disabled'\n"
 
 
 def test_without_a_fault_nothing_is_done(hdbridge):
     done = hdbridge("reset", "article", "--simulate")
-    assert done.returncode == 0, done.stderr
     assert "there is no fault to reset" in done.stdout
 
 

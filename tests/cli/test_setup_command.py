@@ -48,7 +48,6 @@ def steps(text: str) -> list[str]:
 
 def test_sets_up_a_compensated_axis_from_scratch(finished):
     folder, done = finished
-    assert done.returncode == 0, done.stderr
     assert steps(done.stdout) == list(STEPS)
     TransmissionModel.load(folder / "arm" / "model.yaml").check_bound_to(AxisConfig.load(folder / "arm"))
     assert (folder / "arm" / "setup-calibration" / "report.html").exists()
@@ -60,14 +59,12 @@ def test_prints_ordinary_commands(finished, tmp_path):
     _, done = finished
     for line in re.findall(r"^\$ hdbridge (.*)", done.stdout, re.M)[:3]:
         again = run_here(tmp_path, *line.split())
-        assert again.returncode == 0, again.stderr
     assert "all right" in again.stdout
 
 
 def test_finished_steps_are_not_repeated(finished):
     folder, _ = finished
     again = run_here(folder, "setup", "arm")
-    assert again.returncode == 0, again.stderr
     assert steps(again.stdout) == ["check"]
 
 
@@ -76,8 +73,7 @@ def test_a_changed_axis_file_is_checked_again(finished, tmp_path):
     shutil.copytree(folder / "arm", tmp_path / "arm")
     path = tmp_path / "arm" / "axis.yaml"
     path.write_text(with_value(path.read_text(), "load_encoder.direction", "-1"))
-    again = run_here(tmp_path, "setup", "arm", "--yes")
-    assert again.returncode == 4
+    again = run_here(tmp_path, "setup", "arm", "--yes", status=4)
     assert steps(again.stdout) == ["check", "doctor"]
     assert "resume: hdbridge setup arm" in again.stderr
 
@@ -94,7 +90,6 @@ def test_an_interrupted_calibration_is_resumed(tmp_path):
     assert process.returncode == 130, err
     assert "resume: hdbridge setup arm" in err
     again = run_here(tmp_path, *command)
-    assert again.returncode == 0, again.stderr
     assert "$ hdbridge calibrate arm --resume arm/setup-calibration" in again.stdout
     assert steps(again.stdout) == ["check", "calibrate", "model diff", "model commit", "move"]
 
@@ -127,8 +122,7 @@ def test_values_to_fill_in_are_marked():
     ],
 )
 def test_missing_requirements_are_reported(arguments, status, said, tmp_path):
-    done = run_here(tmp_path, "setup", *arguments)
-    assert done.returncode == status
+    done = run_here(tmp_path, "setup", *arguments, status=status)
     assert said in done.stderr
 
 

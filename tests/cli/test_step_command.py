@@ -9,7 +9,6 @@ import pytest
 
 def test_step_prints_a_table_and_writes_the_contract(hdbridge, tmp_path):
     done = hdbridge("step", "article", "--simulate", "--count", 12, "--json", "out.json", "--record", "kept")
-    assert done.returncode == 0, done.stderr
     for word in ("none", "synchronous", "hysteresis", "both", "quantisation floor"):
         assert word in done.stdout
     result = json.loads((tmp_path / "out.json").read_text())
@@ -29,8 +28,7 @@ def test_step_prints_a_table_and_writes_the_contract(hdbridge, tmp_path):
 
 
 def test_demo_writes_every_file_it_names(hdbridge, tmp_path):
-    done = hdbridge("demo", "--count", 4)
-    assert done.returncode == 0, done.stderr
+    hdbridge("demo", "--count", 4)
     page = (tmp_path / "demo-output" / "stepping.html").read_text()
     assert "<html" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
@@ -39,13 +37,11 @@ def test_demo_writes_every_file_it_names(hdbridge, tmp_path):
 
 def test_check_explains_the_files(hdbridge):
     done = hdbridge("check", "article")
-    assert done.returncode == 0, done.stderr
     for fact in ("ratio", "50", "3.24 arcsec", "synchronous, hysteresis", "all right"):
         assert fact in done.stdout
 
 
 def test_a_profile_without_a_model_gets_advice(hdbridge):
-    done = hdbridge("step", "demo", "--simulate")
-    assert done.returncode == 2
+    done = hdbridge("step", "demo", "--simulate", status=2)
     assert "calibrate first: hdbridge calibrate demo, and commit" in done.stderr
     assert "; or step without one: --scheme none" in done.stderr

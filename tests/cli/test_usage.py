@@ -26,8 +26,7 @@ import pytest
     ],
 )
 def test_errors_state_the_given_and_the_expected_value(hdbridge, arguments, line):
-    done = hdbridge(*arguments)
-    assert done.returncode == 2
+    done = hdbridge(*arguments, status=2)
     assert done.stdout == ""
     (said,) = done.stderr.splitlines()
     assert said.startswith("hdbridge: ")
@@ -36,7 +35,6 @@ def test_errors_state_the_given_and_the_expected_value(hdbridge, arguments, line
 
 @pytest.mark.parametrize("arguments", [(), ("model",)])
 def test_without_a_command_the_overview_is_shown(hdbridge, arguments):
-    done = hdbridge(*arguments)
-    assert done.returncode == 2
+    done = hdbridge(*arguments, status=2)
     assert "Usage" in done.stdout
     assert done.stderr == ""

@@ -4,9 +4,9 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-import can
 import pytest
 from support.ideal_motor import IdealMotor
+from support.rawmaster import FrameMaster
 
 from hdbridge.device.node import DriveNode
 from hdbridge.sim.lockstep import LockstepBus, VirtualClock, lockstep_bench
@@ -15,74 +15,17 @@ EDS = Path(__file__).parents[2] / "eds" / "hdbridge-402.eds"
 PERIOD_S = 0.004
 
 
-class RawMaster:
-    """Writes and reads frames as bytes, independently of the package's master."""
+class RawMaster(FrameMaster):
+    """Master of the simulated drive with a motor without physics."""
 
     def __init__(self, bus: LockstepBus, clock: VirtualClock, node: DriveNode, motor: IdealMotor) -> None:
-        self.bus, self.clock, self.node, self.motor = bus, clock, node, motor
-        self.seen: list[tuple[int, bytes]] = []
-
-    # frames
-
-    def send(self, can_id: int, data: bytes = b"") -> None:
-        self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
-
-    def take(self) -> list[tuple[int, bytes]]:
-        """Returns all received frames without waiting."""
-        frames = []
-        while (message := self.bus.recv(0)) is not None:
-            frames.append((message.arbitration_id, bytes(message.data)))
-        self.seen += frames
-        return frames
-
-    def wait(self, seconds: float) -> list[tuple[int, bytes]]:
-        self.clock.sleep_until(self.clock.now() + seconds)
-        return self.take()
+        super().__init__(bus, clock)
+        self.node, self.motor = node, motor
 
     def emergencies(self) -> list[int]:
         """Returns the codes of all EMCY frames so far."""
         self.take()
         return [data[0] | data[1] << 8 for can_id, data in self.seen if can_id == 0x081]
-
-    def nmt(self, command: int, node_id: int = 1) -> None:
-        self.send(0x000, bytes([command, node_id]))
-
-    # SDO
-
-    def request(self, data: bytes) -> bytes:
-        """Sends an SDO request of eight bytes and returns its answer."""
-        (answer,) = self.requests(data)
-        return answer
-
-    def requests(self, data: bytes) -> list[bytes]:
-        """Sends an SDO request of eight bytes and returns all its answers."""
-        self.take()
-        self.send(0x601, data)
-        return [data for can_id, data in self.take() if can_id == 0x581]
-
-    def write(self, index: int, sub: int, value: int, size: int) -> int:
-        """Expedited download; returns the abort code, 0 for success."""
-        raw = (value & (1 << 8 * size) - 1).to_bytes(size, "little").ljust(4, b"\0")
-        answer = self.request(struct.pack("<BHB", 0x23 | (4 - size) << 2, index, sub) + raw)
-        assert answer[1:4] == struct.pack("<HB", index, sub)
-        if answer[0] == 0x80:
-            return struct.unpack_from("<I", answer, 4)[0]
-        assert answer[0] == 0x60
-        return 0
-
-    def put(self, index: int, sub: int, value: int, size: int) -> None:
-        abort = self.write(index, sub, value, size)
-        assert abort == 0, f"{index:04X}h:{sub:02X} := {value} aborted with {abort:08X}h"
-
-    def read(self, index: int, sub: int = 0) -> int:
-        """Expedited upload of a signed number of the object's width; see ``unsigned``."""
-        answer = self.request(struct.pack("<BHBI", 0x40, index, sub, 0))
-        assert answer[0] & 0xE3 == 0x43, answer.hex()
-        return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little", signed=True)
-
-    def abort_of_read(self, index: int, sub: int = 0) -> int:
-        answer = self.request(struct.pack("<BHBI", 0x40, index, sub, 0))
-        return struct.unpack_from("<I", answer, 4)[0] if answer[0] == 0x80 else 0
 
     @property
     def statusword(self) -> int:

@@ -24,11 +24,8 @@ def set_point(master, target: int, bits: int = 0) -> None:
 @pytest.fixture
 def ip(master):
     """Provides ``ip(word, target)``: one cycle in interpolated position mode (RPDO1: 6040h, 60C1h:01)."""
-    for index, sub, value, size in (
-        (0x1400, 1, 0x80000201, 4), (0x1600, 0, 0, 1), (0x1600, 2, 0x60C10120, 4), (0x1600, 0, 2, 1),
-        (0x1400, 1, 0x201, 4), (0x6060, 0, 7, 1),
-    ):  # fmt: skip
-        master.put(index, sub, value, size)
+    master.map(0x1400, 1, 0x201, 0x60400010, 0x60C10120)
+    master.put(0x6060, 0, 7, 1)
     master.nmt(1)
     for word in (0x06, 0x06, 0x07, 0x07, 0x0F, 0x0F):
         master.cycle(word)

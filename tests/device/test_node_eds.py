@@ -172,14 +172,7 @@ def test_there_are_as_many_pdos_as_the_eds_describes(bench):
     with bench((r"\[(1[8A])03(sub\d)?\]", r"[\g<1>04\g<2>]"), (r"\[1[46]0[23](sub\d)?\][^[]*", "")) as master:
         assert master.abort_of_read(0x1803, 1) == NO_OBJECT
         assert master.abort_of_read(0x1402, 1) == NO_OBJECT
-        for step in (
-            (0x1804, 1, 0x80000481, 4),
-            (0x1A04, 1, 0x60410010, 4),
-            (0x1A04, 0, 1, 1),
-            (0x1804, 2, 1, 1),
-        ):
-            master.put(*step)
-        master.put(0x1804, 1, 0x481, 4)
+        master.map(0x1800, 5, 0x481, 0x60410010)
         master.nmt(1)
         master.take()
         master.send(0x080)

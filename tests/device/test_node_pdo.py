@@ -7,27 +7,8 @@ import pytest
 RANGE = 0x06090030
 
 
-def remap(master, number: int, words: list[int], *, receive: bool = False, kind: int = 1) -> int:
-    """Remaps by the sequence of CiA 301; returns the first abort code or 0."""
-    communication = (0x1400 if receive else 0x1800) + number - 1
-    mapping = (0x1600 if receive else 0x1A00) + number - 1
-    can_id = (0x101 if receive else 0x081) + 0x100 * number
-    steps = [
-        (communication, 1, can_id | 1 << 31, 4),
-        (mapping, 0, 0, 1),
-        *[(mapping, sub, word, 4) for sub, word in enumerate(words, 1)],
-        (mapping, 0, len(words), 1),
-        (communication, 2, kind, 1),
-        (communication, 1, can_id, 4),
-    ]
-    for step in steps:
-        if abort := master.write(*step):
-            return abort
-    return 0
-
-
 def test_only_the_refused_values_of_a_pdo_are_dropped(master):
-    assert remap(master, 2, [0x60600008, 0x60810020], receive=True) == 0
+    master.map(0x1400, 2, 0x301, 0x60600008, 0x60810020)
     master.nmt(1)
     master.send(0x301, struct.pack("<bI", 3, 777))
     master.send(0x080)

@@ -108,14 +108,8 @@ class Slave(RawMaster):
 
     def configure(self) -> None:
         """Controlword and statusword, each in an event-driven PDO."""
-        for communication, word in ((0x1400, 0x60400010), (0x1800, 0x60410010)):
-            base = 0x200 if communication == 0x1400 else 0x180
-            self.put(communication, 1, 0x80000001 | base, 4)
-            self.put(communication + 0x200, 0, 0, 1)
-            self.put(communication + 0x200, 1, word, 4)
-            self.put(communication + 0x200, 0, 1, 1)
-            self.put(communication, 2, 255, 1)
-            self.put(communication, 1, 1 | base, 4)
+        self.map(0x1400, 1, 0x201, 0x60400010, kind=255)
+        self.map(0x1800, 1, 0x181, 0x60410010, kind=255)
         self.put(0x605A, 0, 6, 2)
         self.put(0x6060, 0, 1, 1)
         self.nmt(1)

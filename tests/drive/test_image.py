@@ -16,6 +16,8 @@ from hdbridge.drive import PdoLengthError, ProcessImage, State, load_eds
 from hdbridge.drive.image import Frames
 from hdbridge.errors import InputError, TransitionError
 
+from .conftest import make_axis
+
 
 def tpdo1(statusword: int, position: int, torque: int = 0) -> bytes:
     return struct.pack("<Hih", statusword, position, torque)
@@ -47,15 +49,6 @@ def test_heartbeats_are_awaited_for_two_periods_and_sent_twice_in_the_drives_tim
     assert image.heartbeat_period_s == pytest.approx(0.04)
 
 
-def test_targets_at_the_limits_are_packed_and_no_further_ones(axis: AxisConfig) -> None:
-    image = ProcessImage(axis)
-    least, greatest = image.limits_counts
-    for target, beyond in ((least, least - 1), (greatest, greatest + 1)):
-        assert sent(image.pack_rpdo(target))[1] == target
-        with pytest.raises(InputError, match="the target was not sent"):
-            image.pack_rpdo(beyond)
-
-
 def test_a_quick_stop_is_sent_with_the_actual_position(axis: AxisConfig) -> None:
     image = ProcessImage(axis)
     image.accept(0x181, tpdo1(0x0027, 500))
@@ -63,6 +56,8 @@ def test_a_quick_stop_is_sent_with_the_actual_position(axis: AxisConfig) -> None
     assert sent(image.pack_rpdo_stop()) == (0x02, 500)
 
 
+ENDS = [end + by for end in ProcessImage(make_axis()).limits_counts for by in (-1, 0, 1)]
+"""Position limits of the axis, and the counts next to them."""
 END = 2**31
 """First count beyond the range of 32 bits."""
 
@@ -136,7 +131,7 @@ def test_limits_are_ordered_and_leave_room_for_the_compensation(
     assert image.limits_counts == (math.ceil(expected[0]), math.floor(expected[1]))
 
 
-@given(counts=st.integers(-(2**33), 2**33) | st.floats() | st.none())
+@given(counts=st.integers(-(2**33), 2**33) | st.sampled_from(ENDS) | st.floats() | st.none())
 def test_only_targets_within_the_limits_are_packed(
     counts: object, build_axis: Callable[..., AxisConfig]
 ) -> None:
@@ -174,11 +169,6 @@ def test_halt_sets_its_bit(axis: AxisConfig) -> None:
     assert sent(image.pack_rpdo(0)) == (0x010F, 0)
 
 
-def ip_frames(frames: Frames) -> tuple[int, int]:
-    ((_, data),) = frames
-    return struct.unpack("<Hi", data)
-
-
 def test_in_ip_the_target_is_enabled_in_operation_enabled_only(build_axis: Callable[..., AxisConfig]) -> None:
     image = ProcessImage(build_axis(drive__mode="ip"))
     assert [entry.mapping for entry in image.rpdos[0].codec.entries] == [0x60400010, 0x60C10120]
@@ -186,14 +176,14 @@ def test_in_ip_the_target_is_enabled_in_operation_enabled_only(build_axis: Calla
     image.power.go(State.OPERATION_ENABLED)
     for status, word in ((0x0040, 0x06), (0x0021, 0x07), (0x0023, 0x0F), (0x0027, 0x1F)):
         image.accept(0x181, tpdo1(status, 100))
-        assert ip_frames(image.pack_rpdo_idle()) == (word, 100)
-    assert ip_frames(image.pack_rpdo(150)) == (0x1F, 150)
-    assert ip_frames(image.pack_rpdo_held()) == (0x1F, 150)
-    assert ip_frames(image.pack_rpdo_stop()) == (0x02, 100)
+        assert sent(image.pack_rpdo_idle()) == (word, 100)
+    assert sent(image.pack_rpdo(150)) == (0x1F, 150)
+    assert sent(image.pack_rpdo_held()) == (0x1F, 150)
+    assert sent(image.pack_rpdo_stop()) == (0x02, 100)
     image.power.quick_stop()
-    assert ip_frames(image.pack_rpdo_held()) == (0x02, 150)
+    assert sent(image.pack_rpdo_held()) == (0x02, 150)
     image.accept(0x181, tpdo1(0x0007, 100))
-    assert ip_frames(image.pack_rpdo_held()) == (0x02, 150)
+    assert sent(image.pack_rpdo_held()) == (0x02, 150)
 
 
 STATES = st.sampled_from([0x00, 0x40, 0x21, 0x23, 0x27, 0x07, 0x0F, 0x08, 0xFF])
@@ -217,7 +207,7 @@ def test_in_ip_no_other_word_than_enable_operation_has_the_bit(
                 image.power.go(State.SWITCH_ON_DISABLED)
             elif wish == "stop":
                 image.power.quick_stop()
-        word, _ = ip_frames(image.pack_rpdo(7))
+        word, _ = sent(image.pack_rpdo(7))
         assert not word & 0x10 or (word & 0x0F == 0x0F and image.power.state is State.OPERATION_ENABLED)
 
 

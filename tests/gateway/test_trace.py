@@ -193,11 +193,11 @@ def test_the_command_reads_a_bus_log(outer, tmp_path):
         "schema: hdbridge.machine/1\nname: between\naxes:\n  - profile: article\n"
         "gateway:\n  bus: {interface: socketcan, channel: can1}\n  nodes: {article: 5}\n"
     )
-    done = run_here(tmp_path, "gateway", "doctor", "machine.yaml", "--log", "bus.log", "--json", "trace.json")
-    assert done.returncode == 4, done.stderr
+    done = run_here(
+        tmp_path, "gateway", "doctor", "machine.yaml", "--log", "bus.log", "--json", "trace.json", status=4
+    )
     assert "refused with" in done.stdout
     assert "the modes are 1, 6, 7, 8 (6502h)" in done.stdout
     assert "mistakes of the other master: 1; the first: the modes" in done.stderr
-    done = run_here(tmp_path, "gateway", "doctor", "machine.yaml", "--log", "none.log")
-    assert done.returncode == 2
+    done = run_here(tmp_path, "gateway", "doctor", "machine.yaml", "--log", "none.log", status=2)
     assert "none.log: no such file" in done.stderr

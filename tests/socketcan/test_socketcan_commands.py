@@ -21,7 +21,7 @@ def test_step_masters_the_simulated_drive_in_another_process(interface, profile,
         with subprocess.Popen(simulate, stderr=subprocess.PIPE, text=True) as drive:
             try:
                 assert "simulated drive: node 1" in drive.stderr.readline()
-                done = run_here(tmp_path, *step)
+                done = run_here(tmp_path, *step, status=None)
             finally:
                 drive.terminate()
         if done.returncode != SafetyStop.exit_status:

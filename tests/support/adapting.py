@@ -1,4 +1,4 @@
-"""Simulated axis that runs with adaptation, over real CAN frames, while its gear changes."""
+"""Axis in a stepped control loop that runs with adaptation while its gear changes, and synthetic samples."""
 
 import math
 import random
@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from hdbridge.axis import AxisConfig
-from hdbridge.axis.effects import Moment, Motion, Start
+from hdbridge.axis.effects import Motion, Start
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scatter, quantisation_floor_arcsec
-from hdbridge.control.bench import Bench
 from hdbridge.daemon.following.adaptation import Adaptation, Entry, Learned
 from hdbridge.daemon.following.follower import Follower
 from hdbridge.daemon.following.health import EncoderFault, EncoderStatus
@@ -24,14 +23,10 @@ from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SampleArray, SampleFlag, sample_dtype
-from hdbridge.device.node import DriveNode
-from hdbridge.drive import Drive
-from hdbridge.motion.procedures.stepping import Stepping
-from hdbridge.records.record import Record
 from hdbridge.sim.truth import Truth
 from hdbridge.units import ARCSEC_PER_DEG
 from support.bare_axis import truth
-from support.exercised import booted
+from support.daemon import SteppedDaemon, stepped_daemon
 
 ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
 AXIS = AxisConfig.load(ARTICLE / "axis.yaml")
@@ -42,6 +37,7 @@ LOAD_COUNT_ARCSEC = AXIS.load_encoder.resolution_arcsec
 PERIOD_S = AXIS.drive.cycle_s
 GOLDEN = 0.6180339887
 SPAN_DEG = 60.0
+REST_S = 0.2
 
 
 def truth_of(duration_s: float = 3600.0, growth: float = 0.2, second_order_arcsec: float = 3.0) -> Truth:
@@ -180,53 +176,10 @@ class WorkingAxis:
         self.time_s = float(times[-1]) + PERIOD_S
 
 
-class Sampler:
-    """Converts records to consecutive samples, as the control process would write them."""
-
-    def __init__(self, axis: AxisConfig, model: TransmissionModel) -> None:
-        self.axis = axis
-        self._cycle = 0
-        self._demand = np.zeros(0)
-        self.use(model)
-
-    def use(self, model: TransmissionModel) -> None:
-        """Predicts with a different model from now on; its hysteresis state follows from the last path."""
-        self._tracker = model.tracker(Start.VIRGIN)
-        for angle in self._demand.tolist():
-            self._tracker.advance(angle, Moment())
-
-    @property
-    def time_s(self) -> float:
-        """Time of the next sample, seconds."""
-        return self._cycle * self.axis.drive.cycle_s
-
-    def samples(self, record: Record) -> SampleArray:
-        """Returns all samples of a record, shape (n,); their time continues that of the previous record."""
-        columns, ratio = record.columns, self.axis.gear.ratio
-        demand = columns["motor_target_deg"]
-        count, period_s = len(demand), self.axis.drive.cycle_s
-        found = np.zeros(count, sample_dtype(1))
-        found["cycle"] = found["sequence"] = self._cycle + np.arange(count)
-        found["time_ns"] = np.round(1e9 * period_s * found["cycle"])
-        axis = found["axes"][:, 0]
-        axis["state"], axis["fault"] = AxisState.ENABLED, NO_FAULT
-        axis["flags"] = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN | SampleFlag.COMPENSATING
-        axis["motor_target_deg"] = axis["issued_deg"] = demand
-        axis["motor_position_deg"] = columns["motor_position_deg"]
-        axis["load_position_deg"] = columns["load_position_deg"]
-        axis["load_target_deg"] = demand / ratio
-        axis["velocity_deg_s"] = np.gradient(demand) / period_s / ratio
-        axis["reading0"] = axis["reading1"] = np.nan
-        axis["predicted_arcsec"] = [self._tracker.advance(each, Moment()) for each in demand.tolist()]
-        self._cycle += count
-        self._demand = demand
-        return found
-
-
 class Work:
-    """Axis that runs stepping tests; the adaptation receives the samples and may change the model."""
+    """Axis at work in the control loop; an adaptation follows its samples and may change its model."""
 
-    def __init__(self, drive: Drive, node: DriveNode, settings: AdaptationSettings | None) -> None:
+    def __init__(self, daemon: SteppedDaemon, settings: AdaptationSettings | None) -> None:
         self._files = History()
         self.follower = Follower(AXIS, MODEL, settings=settings)
         if settings is not None:
@@ -235,12 +188,8 @@ class Work:
         """Detected faults of the load encoder, without repetition."""
         self.errors_arcsec: list[list[float]] = []
         """True load position minus its target at each step; one list per stepping test."""
-        self.faults = node.faults
-        self._drive = drive
-        self._machine = node.firmware.motion.machine
-        self._loads_deg: list[float] = []
-        self._sampler = Sampler(AXIS, MODEL)
-        self._use(MODEL)
+        self.faults = daemon.nodes[0].faults
+        self._daemon, self._model = daemon, MODEL
 
     @property
     def adaptation(self) -> Adaptation | None:
@@ -254,30 +203,15 @@ class Work:
 
     @property
     def time_s(self) -> float:
-        """Time since the axis was switched on."""
-        return self._drive.link.clock.now()
+        """Time since the axis was switched on, as in the samples and the history."""
+        return self._daemon.clock.now()
 
-    @property
-    def axis_time_s(self) -> float:
-        """Duration of the samples so far, the time in the history; less than `time_s` by the pauses."""
-        return self._sampler.time_s
-
-    def step(self, count: int = 16, step_deg: float = 43.56) -> None:
+    def step(self, count: int = 16, step_deg: float = 0.8712) -> None:
         """Runs a stepping test at new angles, because repeated angles do not separate the orders."""
         start_deg = SPAN_DEG * math.fmod(GOLDEN * len(self.errors_arcsec), 1.0)
-        self._loads_deg.clear()
-        run = self._bench.run(Stepping(count=count, step_deg=step_deg, start_deg=start_deg))
-        ends = [each.end_s for each in run.segments if each.kind == "settle"]
-        loads_deg = self._loads_deg[-len(run.record) :]  # without the cycles of the power-on
-        rows = np.searchsorted(run.record.columns["time_s"], np.array(ends) - 1e-9)
-        targets = [each.target_deg for each in (*run.outcome.cw, *run.outcome.ccw)]
-        self.errors_arcsec.append(
-            [
-                (loads_deg[row] - target) * ARCSEC_PER_DEG
-                for row, target in zip(rows.tolist(), targets, strict=True)
-            ]
-        )
-        self._adapt(self._sampler.samples(run.record))
+        there = [start_deg + step_deg * number for number in range(count + 1)]
+        self._go(start_deg)
+        self.errors_arcsec.append([self._go(each) for each in (*there[1:], *there[-2::-1])])
 
     def until(self, time_s: float) -> None:
         """Runs stepping tests until that time, s."""
@@ -292,23 +226,28 @@ class Work:
             for at in range(len(errors) - tests + 1)
         ]
 
-    def _use(self, model: TransmissionModel) -> None:
-        def look() -> bool:
-            self._loads_deg.append(self._machine.true_load_deg)
-            return False
+    def _go(self, target_deg: float) -> float:
+        """Moves to a load angle and rests there; returns the true error, arcsec."""
+        daemon = self._daemon
+        daemon.events.clear()
+        moved = daemon.move(target_deg)
+        daemon.until(lambda: daemon.ended(moved))
+        daemon.run(REST_S)
+        self._follow()
+        return (daemon.nodes[0].firmware.motion.machine.true_load_deg - target_deg) * ARCSEC_PER_DEG
 
-        self._model, self._bench = model, Bench(self._drive, model, interrupted=look)
-        self._sampler.use(model)
-
-    def _adapt(self, samples: SampleArray) -> None:
-        for part in np.array_split(samples, max(len(samples) // 125, 1)):  # half a second
-            self.follower.take(part)
-            reason = self.follower.health.status.reason
-            if reason and reason not in self.encoder_faults:
-                self.encoder_faults.append(reason)
-            if self.adaptation is not None and self.adaptation.model is not self._model:
-                self._use(self.adaptation.model)
-                self.follower.health.restart()
+    def _follow(self) -> None:
+        """Passes the new samples to the adaptation, and its model to the loop, as the service does."""
+        samples, lost = self._daemon.samples.read()
+        assert lost == 0
+        self.follower.take(samples)
+        reason = self.follower.health.status.reason
+        if reason and reason not in self.encoder_faults:
+            self.encoder_faults.append(reason)
+        if self.adaptation is not None and self.adaptation.model is not self._model:
+            self._model = self.adaptation.model
+            self._daemon.use(self._daemon.setting(model=self._model))
+            self.follower.use_model(self._model)
 
 
 Misreading = Callable[[int], int]
@@ -350,6 +289,8 @@ FAULTS: dict[str, Callable[[Work], Misreading]] = {
 
 @contextmanager
 def at_work(truth: Truth, settings: AdaptationSettings | None) -> Iterator[Work]:
-    """Provides a booted axis with the article's model; without settings, nothing is adapted."""
-    with booted(AXIS, truth, 1) as (drive, node):
-        yield Work(drive, node, settings)
+    """Provides an enabled axis with the article's model; without settings, nothing is adapted."""
+    with stepped_daemon([AXIS], truth=truth) as daemon:
+        daemon.verify()
+        daemon.enable()
+        yield Work(daemon, settings)

@@ -13,9 +13,9 @@ import pytest
 from hdbridge.cli import main
 
 
-def run_here(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+def run_here(folder: Path, *arguments: object, status: int | None = 0) -> subprocess.CompletedProcess[str]:
     """Runs the command in ``folder`` and this process, which saves half a second of start-up, without a
-    terminal and with an empty standard input.
+    terminal and with an empty standard input. AssertionError for another exit status; None permits any.
     """
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
@@ -24,7 +24,7 @@ def run_here(folder: Path, *arguments: object) -> subprocess.CompletedProcess[st
         patch.setattr(sys, "stdin", io.StringIO(""))
         with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as end:
             main()
-    return subprocess.CompletedProcess(arguments, end.value.code or 0, out.getvalue(), err.getvalue())
+    return _checked(arguments, end.value.code or 0, out.getvalue(), err.getvalue(), status)
 
 
 def started(
@@ -40,8 +40,17 @@ def started(
     return subprocess.Popen(command, cwd=folder, env={**os.environ, **(env or {})}, text=True, **options)
 
 
-def run_apart(folder: Path, *arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    """Runs the command to its end in a process of its own; see `started`."""
+def run_apart(
+    folder: Path, *arguments: object, status: int | None = 0, **options: Any
+) -> subprocess.CompletedProcess[str]:
+    """Runs the command to its end in a process of its own; see `started` and `run_here`."""
     with started(folder, *arguments, **options) as process:
         out, err = process.communicate()
-    return subprocess.CompletedProcess(arguments, process.returncode, out, err)
+    return _checked(arguments, process.returncode, out, err, status)
+
+
+def _checked(
+    arguments: tuple[object, ...], found: Any, out: str, err: str, expected: int | None
+) -> subprocess.CompletedProcess[str]:
+    assert expected in (None, found), f"{arguments}: status {found}, expected {expected}; {err or out}"
+    return subprocess.CompletedProcess(arguments, found, out, err)

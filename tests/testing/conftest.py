@@ -7,6 +7,7 @@ from pathlib import Path
 
 import can
 import pytest
+from support.rawmaster import FrameMaster
 
 from hdbridge.files.profile import bundled_profile
 from hdbridge.testing import SimulatedDrive, simulated_drive
@@ -16,42 +17,12 @@ STEP_COUNTS = 40
 """Motion of the motor per cycle: 9 deg/s at the load of the profile 'article'."""
 
 
-class Program:
+class Program(FrameMaster):
     """Raw frames of CiA 301 and CiA 402 on a bus of python-can."""
 
     def __init__(self, drive: SimulatedDrive) -> None:
-        self.drive = drive
-        self.bus = drive.open_bus()
-        self.target = 0
-        self.others: list[can.Message] = []
-        """Frames other than the answers to SYNC."""
-
-    def send(self, can_id: int, data: bytes = b"") -> None:
-        self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
-
-    def take(self) -> list[can.Message]:
-        found = []
-        while (message := self.bus.recv(0)) is not None:
-            found.append(message)
-        return found
-
-    def request(self, data: bytes) -> bytes | None:
-        """Sends an SDO request and returns the answer."""
-        self.others += self.take()
-        self.send(0x601, data)
-        answers = [bytes(each.data) for each in self.take() if each.arbitration_id == 0x581]
-        return answers[0] if answers else None
-
-    def read(self, index: int, subindex: int = 0) -> int | None:
-        """Reads an object; returns None if no answer arrives, or after an abort."""
-        answer = self.request(struct.pack("<BHBI", 0x40, index, subindex, 0))
-        return int.from_bytes(answer[4:], "little") if answer and answer[0] != 0x80 else None
-
-    def write(self, index: int, subindex: int, value: int, size: int) -> None:
-        data = value.to_bytes(size, "little").ljust(4, b"\0")
-        answer = self.request(struct.pack("<BHB", 0x23 | (4 - size) << 2, index, subindex) + data)
-        assert answer is not None
-        assert answer[0] == 0x60
+        super().__init__(drive.open_bus(), drive)
+        self.drive, self.target = drive, 0
 
     def start(self) -> None:
         """Enables the drive in cyclic synchronous position, with its own watchdogs set."""
@@ -59,7 +30,7 @@ class Program:
             (0x6060, 0, 8, 1), (0x1017, 0, 50, 2), (0x1400, 5, 20, 2),
             (0x6065, 0, 2000, 4), (0x6066, 0, 20, 2),
         ):  # fmt: skip
-            self.write(index, subindex, value, size)
+            self.put(index, subindex, value, size)
         self.send(0x000, b"\x01\x01")
         for word in (0x00, 0x06, 0x06, 0x07, 0x07, 0x0F, 0x0F):
             self.cycle(word, step=0)
@@ -67,9 +38,9 @@ class Program:
 
     def cycle(self, word: int = 0x0F, step: int = STEP_COUNTS) -> list[can.Message]:
         """Runs one period: SYNC, its TPDOs, which are returned, and an RPDO."""
-        self.others += self.take()
+        self.take()
         self.send(0x080)
-        answers = self.take()
+        answers = self.messages()
         self.target += step
         self.send(0x201, struct.pack("<Hi", word, self.target))
         self.drive.sleep(PERIOD_S)
@@ -103,5 +74,5 @@ def program(drive: SimulatedDrive) -> Program:
     made = Program(drive)
     made.start()
     made.move(30)
-    made.others.clear()
+    made.seen.clear()
     return made

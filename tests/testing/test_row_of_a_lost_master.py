@@ -12,7 +12,7 @@ HEARTBEAT_MS = 60
 
 def silenced(program: Program) -> Witness:
     """Ends the program's frames in motion, and watches the drive."""
-    program.write(0x1016, 1, 0x7F << 16 | HEARTBEAT_MS, 4)
+    program.put(0x1016, 1, 0x7F << 16 | HEARTBEAT_MS, 4)
     program.send(0x77F, b"\x05")
     program.move(3)
     witness = Witness(program.drive.open_bus(), PERIOD_S, program.drive.time.monotonic)
@@ -42,7 +42,7 @@ def test_a_drive_that_only_reports_the_lost_master_fails_the_row(
     program: Program, drive: SimulatedDrive, ignored: str
 ) -> None:
     if ignored == "by option 6007h":
-        program.write(0x6007, 0, 0, 2)
+        program.put(0x6007, 0, 0, 2)
     else:
         drive._node.faults.ignore_missing_set_points = True
         drive._node.faults.only_report_lost_heartbeat = True

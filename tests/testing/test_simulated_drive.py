@@ -6,6 +6,7 @@ import time
 
 import can
 import pytest
+from support.patience import until
 
 from hdbridge.errors import BusError, HdbridgeError, InputError
 from hdbridge.testing import simulated_drive
@@ -207,7 +208,7 @@ def test_a_failed_bus_of_a_drive_is_reported(monkeypatch):
                 raise can.CanOperationError("Network is down")
 
             drive._node.bus.recv = recv
-            time.sleep(0.5)
+            until(lambda: "simulated drive 1" not in {each.name for each in threading.enumerate()})
 
     with pytest.raises(BusError, match="cannot be read"):
         use()

@@ -42,7 +42,7 @@ def measure_fault(name: str, until_s: float) -> None:
     """Measures a run in which the load encoder fails halfway."""
     with at_work(truth_of(3600.0), ON) as work:
         work.until(0.5 * until_s)
-        failed_s = work.axis_time_s
+        failed_s = work.time_s
         work.faults.load_reading = FAULTS[name](work)
         work.until(until_s)
         frozen = next((each for each in work.history if each["event"] == "frozen"), None)

@@ -57,22 +57,19 @@ def renames(folder: Path, names: list[str]) -> Callable[[str, Path], None]:
 def test_a_recording_renamed_meanwhile_is_listed_and_exported(folder: Path, which: int) -> None:
     files = flight_files([folder])
     with before_each(renames(folder, [files[which].name])):
-        listed = run_here(folder.parent, "record", "list", folder, "--json", "listed.json")
-    assert listed.returncode == 0, listed.stderr
+        run_here(folder.parent, "record", "list", folder, "--json", "listed.json")
     found = json.loads((folder.parent / "listed.json").read_text())["flights"]
     assert [each["cycles"] for each in found] == [250, 250, 250]
     files = flight_files([folder])
     with before_each(renames(folder, [files[which].name])):
         done = run_here(folder.parent, "record", "export", folder, "--all-states", "--out", "out")
-    assert done.returncode == 0, done.stderr
     assert "750 samples" in done.stdout
 
 
 def test_a_renamed_recording_is_found_by_its_old_name(folder: Path) -> None:
     (part,) = folder.glob("*.part")
     part.rename(part.with_name(part.name.removesuffix(".part")))
-    done = run_here(folder.parent, "record", "info", part)
-    assert done.returncode == 0, done.stderr
+    run_here(folder.parent, "record", "info", part)
     assert len(read(part).machine["cycle"]) == 250
 
 
@@ -88,12 +85,15 @@ def test_a_recording_removed_meanwhile_is_omitted(folder: Path, command: tuple[s
     doing, *options = command
     with before_each(hook):
         done = run_here(folder.parent, "record", doing, folder, *options)
-    assert done.returncode == 0, done.stderr
     assert gone.name not in done.stdout
     named = run_here(
-        folder.parent, "record", doing, gone, *("other" if each == "out" else each for each in options)
+        folder.parent,
+        "record",
+        doing,
+        gone,
+        *("other" if each == "out" else each for each in options),
+        status=2,
     )
-    assert named.returncode == 2
     assert "no such file" in named.stderr
     with pytest.raises(GoneError):
         read(gone)
