@@ -64,5 +64,10 @@ def calibrated(
     content = axis.model_dump(mode="json", by_alias=True, exclude_none=True)
     (folder / "axis.yaml").write_text(yaml.safe_dump(content))
     with simulated(axis, truth, seed) as (drive, clock):
-        journal = start_journal(folder / "recording", axis, Plan.load(plan), DATE, drive.identity)
-        return calibrate(drive, journal, folder, DATE), clock.now()
+        return calibration(drive, Plan.load(plan), folder), clock.now()
+
+
+def calibration(drive: Drive, plan: Plan, folder: Path) -> Calibration:
+    """Calibrates a booted axis without a model, stepping test included; ``folder`` receives the recording."""
+    journal = start_journal(folder / "recording", drive.axis, plan, DATE, drive.identity)
+    return calibrate(drive, journal, folder, DATE)

@@ -37,14 +37,12 @@ from pathlib import Path
 import can
 import canopen
 from can.interfaces.virtual import VirtualBus
-from harness import PROFILE, Busy, block_us, in_turn, keep, medians, parser, undisturbed
+from harness import PROFILE, block_us, in_turn, keep, medians, parser, undisturbed
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.clock import Clock
-from hdbridge.control.axiscycle import AxisCycle
-from hdbridge.control.buscycle import BusCycle
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive.image import ProcessImage
@@ -118,8 +116,11 @@ class AnsweringBus(VirtualBus):
 
 
 @contextmanager
-def answering_kernel(channel: str, *node_ids: int) -> Iterator[None]:
-    """Makes the kernel's CAN gateway answer SYNC with TPDOs, and the master's heartbeat with the drives'."""
+def answering_kernel(channel: str, *node_ids: int) -> Iterator[can.BusABC]:
+    """Opens a bus on which the kernel's CAN gateway answers.
+
+    It answers SYNC with TPDOs, and the master's heartbeat with those of the drives.
+    """
     rules = [("080", f"{reply.arbitration_id:X}.8.{reply.data.hex()}") for reply in answers(*node_ids)]
     rules += [("77F", f"{0x700 + node_id:X}.1.0500000000000000") for node_id in node_ids]
     commands = [
@@ -131,7 +132,8 @@ def answering_kernel(channel: str, *node_ids: int) -> Iterator[None]:
         for command in commands:
             subprocess.run(["cangw", "-A", *command], check=True)
             done.append(command)
-        yield
+        with can.Bus(interface="socketcan", channel=channel, ignore_config=True) as bus:
+            yield bus
     finally:
         for command in done:
             subprocess.run(["cangw", "-D", *command], check=False)
@@ -151,56 +153,6 @@ def response_of_usual_length(cycle_ms: float) -> Response:
             lead_cycles=8, per_cycle=2, full_speed_deg_s=1.0, weights=(0.01,) * 55, feedback=(-0.5, 0.05)
         ),
     )
-
-
-class Axes:
-    """Enabled axes on one bus, each of which follows its own slow sine."""
-
-    def __init__(
-        self, bus: can.BusABC, count: int, model: TransmissionModel, clock: Clock | None = None
-    ) -> None:
-        self.bus = bus
-        self.clock = clock if clock is not None else NeverSleeping()
-        axis = AxisConfig.load(PROFILE)
-        self.period_s = axis.drive.cycle_s
-        self.cycle = BusCycle(Link(bus, self.clock), self.clock, self.period_s, bitrate_bps=1_000_000)
-        self.answers: list[Callable[[Feedback], int]] = []
-        for node_id in range(1, count + 1):
-            drive = axis.drive.model_copy(update={"node_id": node_id})
-            image = ProcessImage(axis.model_copy(update={"drive": drive}))
-            each = AxisCycle(image, Supervision())
-            self.cycle.join(each)
-            each.begin()
-            self.answers.append(self._answer(image, model, float(node_id)))
-
-    def _answer(
-        self, image: ProcessImage, model: TransmissionModel, phase: float
-    ) -> Callable[[Feedback], int]:
-        compensation = Compensation(model, CompensationLimits(), self.period_s)
-        compensation.engage()
-        sin, command, counts_for = math.sin, compensation.command, image.target_counts_for
-        return lambda feedback: counts_for(command(2.0 * sin(feedback.time_s + phase)))
-
-    def start(self) -> None:
-        """Prepares a block: resets latched stops and enables the axes."""
-        while self.bus.recv(0.0) is not None:
-            pass
-        for axis, answer in zip(self.cycle.axes, self.answers, strict=True):
-            axis.reset(verified=True)
-            axis.begin()
-            axis.command = answer
-        self.cycle.restart()
-        for _ in range(20):
-            self.cycle.exchange()
-            if all(axis.feedback.fresh for axis in self.cycle.axes):
-                break
-        for axis in self.cycle.axes:
-            axis.image.power.go(State.OPERATION_ENABLED)
-
-    def check(self) -> None:
-        """Raises `Busy` if an axis was stopped within the block."""
-        if any(axis.supervision.stop is not None for axis in self.cycle.axes):
-            raise Busy
 
 
 class Variants:
@@ -408,13 +360,9 @@ def measure(
             result = run(Variants(bus, axis, model), blocks, cycles, bus.answer, time.thread_time)
             bus.queue.queue.clear()
         return "the virtual bus", result
-    channel = options.channel
-    with (
-        answering_kernel(channel, node_id),
-        can.Bus(interface="socketcan", channel=channel, ignore_config=True) as bus,
-    ):
+    with answering_kernel(options.channel, node_id) as bus:
         result = run(Variants(bus, axis, model), blocks, cycles, None, time.perf_counter)
-    return f"SocketCAN ({channel})", result
+    return f"SocketCAN ({options.channel})", result
 
 
 def main() -> int:

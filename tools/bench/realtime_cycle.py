@@ -8,8 +8,6 @@ runs, so that commits can be compared. The exchanges are those of `cycle.py` and
 kernel's CAN gateway answers in place of the drive. Each exchange has SCHED_FIFO, locked memory and absolute
 deadlines.
 
-Then six axes on one bus, compensated, at 250 Hz.
-
   late    from the deadline to the first instruction of the cycle
   busy    from there to the last instruction of the cycle, system calls included
   missed  cycles that began more than half a period late or were busy beyond the next deadline
@@ -18,15 +16,13 @@ Then six axes on one bus, compensated, at 250 Hz.
 from __future__ import annotations
 
 import subprocess
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import can
 import numpy as np
-from cycle import Axes, Variants, answering_kernel
+from cycle import Variants, answering_kernel
 from harness import PROFILE, Waking, keep, parser
 
 from hdbridge.axis import AxisConfig
@@ -34,8 +30,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.realtime import prepare_realtime
 
 WARM_UP = 50
-AXES = 6
-KINDS = ("bare", "cycle", "compensated", "filtered", "canopen", "axes")
+KINDS = ("bare", "cycle", "compensated", "filtered", "canopen")
 
 
 @dataclass(frozen=True)
@@ -64,14 +59,10 @@ class Figures:
 
 def timed(name: str, cycle: Callable[[], object], clock: Waking, cycles: int, period_s: float) -> Figures:
     """Measures ``cycles`` cycles, each started at its deadline."""
-    late_s, busy_s = np.zeros(cycles), np.zeros(cycles)
     for _ in range(WARM_UP):
         cycle()
-    for place in range(cycles):
-        cycle()
-        busy_s[place] = time.monotonic() - clock.woke_s
-        late_s[place] = clock.late_s
-    return Figures.of(name, 1e6 * late_s, 1e6 * busy_s, 1e6 * period_s)
+    clock.record(cycles, cycle)
+    return Figures.of(name, 1e6 * np.array(clock.late_s), 1e6 * np.array(clock.busy_s), 1e6 * period_s)
 
 
 def in_c(master: Path, channel: str, cycles: int, period_s: float) -> Figures:
@@ -80,22 +71,6 @@ def in_c(master: Path, channel: str, cycles: int, period_s: float) -> Figures:
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     late_ns, busy_ns = np.array([line.split() for line in done.stdout.splitlines()], dtype=float).T
     return Figures.of("a master in C", 1e-3 * late_ns, 1e-3 * busy_ns, 1e6 * period_s)
-
-
-def of_axes(channel: str, model: TransmissionModel, clock: Waking, cycles: int) -> tuple[Figures, float]:
-    """Measures several axes at the cycle time of the profile; returns the figures and that time, s."""
-    with (
-        answering_kernel(channel, *range(1, AXES + 1)),
-        can.Bus(interface="socketcan", channel=channel, ignore_config=True) as bus,
-        prepare_realtime(),
-    ):
-        axes = Axes(bus, AXES, model, clock)
-        axes.start()
-        figures = timed(f"{AXES} axes, compensated", axes.cycle.exchange, clock, cycles, axes.period_s)
-        axes.check()
-        if axes.cycle.skipped:
-            raise SystemExit(f"{axes.cycle.skipped} periods were skipped")
-    return figures, axes.period_s
 
 
 def table(figures: list[Figures], period_s: float) -> str:
@@ -125,14 +100,11 @@ def main() -> int:
     axis = AxisConfig.load(PROFILE)
     axis = axis.model_copy(update={"drive": axis.drive.model_copy(update={"cycle_ms": 1.0})})
     model = TransmissionModel.load(PROFILE / "model.yaml")
-    period_s, node_id = axis.drive.cycle_s, axis.drive.node_id
+    period_s = axis.drive.cycle_s
     clock = Waking()
     figures: list[Figures] = []
     wanted = options.only or KINDS
-    with (
-        answering_kernel(options.channel, node_id),
-        can.Bus(interface="socketcan", channel=options.channel, ignore_config=True) as bus,
-    ):
+    with answering_kernel(options.channel, axis.drive.node_id) as bus:
         variants = Variants(bus, axis, model, clock)
         loops: dict[str, tuple[str, Callable[[], object]]] = {
             "bare": ("bare python-can exchange", variants.bare),
@@ -150,12 +122,7 @@ def main() -> int:
             print(f"measured: {name}", flush=True)
         if options.master is not None:
             figures.append(in_c(options.master, options.channel, options.cycles, period_s))
-    if figures:
-        print(table(figures, period_s), flush=True)
-    if "axes" in wanted:
-        several, several_s = of_axes(options.channel, model, clock, options.cycles)
-        print(table([several], several_s))
-        figures.append(several)
+    print(table(figures, period_s), flush=True)
     keep([asdict(each) for each in figures], options.json)
     return 0
 

@@ -33,12 +33,10 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from typing import Any
 
-import can
-import numpy as np
 from cycle import answering_kernel
 from daemon_loop import bench_cycle, configs_of
 from harness import PROFILE, Waking, keep, parser
-from realtime_cycle import WARM_UP, Figures, table
+from realtime_cycle import WARM_UP, Figures, table, timed
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.buscycle import BusCycle
@@ -58,30 +56,6 @@ JOG_EVERY_S = 0.05
 SDO_UPLOAD = bytes.fromhex("4041600000000000")
 SPEED = 5.0
 """Velocity of the moves, deg/s at the load."""
-
-
-class TurnClock(Waking):
-    """Clock that records the busy time of the loop between two sleeps, and the lateness of its wake-ups."""
-
-    def __init__(self, turns: int) -> None:
-        super().__init__()
-        self.busy_s, self.lateness_s = np.zeros(turns), np.zeros(turns)
-        self.turns = 0
-        """Number of cycles recorded."""
-        self.keeping = False
-
-    def sleep_until(self, deadline_s: float) -> None:
-        """Sleeps until the absolute deadline."""
-        if self.keeping and self.turns < len(self.busy_s):
-            self.busy_s[self.turns] = time.monotonic() - self.woke_s
-            self.lateness_s[self.turns] = self.late_s
-            self.turns += 1
-        super().sleep_until(deadline_s)
-
-    @property
-    def full(self) -> bool:
-        """True if the buffer of recorded cycles is full."""
-        return self.turns == len(self.busy_s)
 
 
 # -------------------------------------------------------------------- the service's process
@@ -221,10 +195,9 @@ def measured(axes: int, cycle_ms: float, turns: int, channel: str) -> tuple[Figu
     """Measures the loop with this number of axes; returns figures and the service's observations."""
     configs = configs_of(axes, cycle_ms)
     model = TransmissionModel.load(PROFILE / "model.yaml")
-    clock = TurnClock(turns)
+    clock = Waking()
     with ExitStack() as stack:
-        stack.enter_context(answering_kernel(channel, *range(1, axes + 1)))
-        bus = stack.enter_context(can.Bus(interface="socketcan", channel=channel, ignore_config=True))
+        bus = stack.enter_context(answering_kernel(channel, *range(1, axes + 1)))
         memory = stack.enter_context(Memory.create(axes, configs[0].drive.cycle_s))
         cycle = BusCycle(Link(bus, clock), clock, memory.period_s, bitrate_bps=1_000_000)
         controller = Controller(cycle, [(each, None) for each in configs], memory)
@@ -237,11 +210,8 @@ def measured(axes: int, cycle_ms: float, turns: int, channel: str) -> tuple[Figu
         stack.enter_context(prepare_realtime())
         cycle.restart()
         enabled(controller, memory)
-        for _ in range(WARM_UP):
-            controller.turn()
-        clock.keeping = True
-        while not clock.full:
-            controller.turn()
+        name = "daemon's loop, one axis" if axes == 1 else f"daemon's loop, {axes} axes"
+        figures = timed(name, controller.turn, clock, turns, memory.period_s)
         check(controller)
         assert process.stdin is not None
         process.stdin.close()
@@ -250,28 +220,16 @@ def measured(axes: int, cycle_ms: float, turns: int, channel: str) -> tuple[Figu
         seen = json.loads(process.stdout.readline())
     if seen["lost"] or not seen["samples"]:
         raise SystemExit(f"the service saw {seen['samples']} samples and lost {seen['lost']}")
-    name = "daemon's loop, one axis" if axes == 1 else f"daemon's loop, {axes} axes"
-    return Figures.of(name, 1e6 * clock.lateness_s, 1e6 * clock.busy_s, 1e3 * cycle_ms), seen
+    return figures, seen
 
 
 def of_bench(cycle_ms: float, turns: int, channel: str) -> Figures:
     """Measures the bench's cycle on the path of a move, alone on the processor."""
     (axis,) = configs_of(1, cycle_ms)
-    clock = TurnClock(turns)
-    with (
-        answering_kernel(channel, 1),
-        can.Bus(interface="socketcan", channel=channel, ignore_config=True) as bus,
-        prepare_realtime(),
-    ):
+    clock = Waking()
+    with answering_kernel(channel, 1) as bus, prepare_realtime():
         turn, _ = bench_cycle(bus, TransmissionModel.load(PROFILE / "model.yaml"), axis, clock)
-        for _ in range(WARM_UP):
-            turn()
-        clock.keeping = True
-        while not clock.full:
-            turn()
-    return Figures.of(
-        "bench's cycle, compensated", 1e6 * clock.lateness_s, 1e6 * clock.busy_s, 1e3 * cycle_ms
-    )
+        return timed("bench's cycle, compensated", turn, clock, turns, axis.drive.cycle_s)
 
 
 def report(seen: dict[str, Any]) -> None:
