@@ -61,13 +61,13 @@ def calibrated(
     axis: AxisConfig, truth: Truth, plan: str, seed: int, folder: Path
 ) -> tuple[Calibration, float]:
     """Calibrates an axis without a model, stepping test included; returns the result and the axis time, s."""
-    content = axis.model_dump(mode="json", by_alias=True, exclude_none=True)
-    (folder / "axis.yaml").write_text(yaml.safe_dump(content))
     with simulated(axis, truth, seed) as (drive, clock):
         return calibration(drive, Plan.load(plan), folder), clock.now()
 
 
 def calibration(drive: Drive, plan: Plan, folder: Path) -> Calibration:
-    """Calibrates a booted axis without a model, stepping test included; ``folder`` receives the recording."""
+    """Calibrates a booted axis without a model, stepping test included; ``folder`` becomes its profile."""
+    content = drive.axis.model_dump(mode="json", by_alias=True, exclude_none=True)
+    (folder / "axis.yaml").write_text(yaml.safe_dump(content))
     journal = start_journal(folder / "recording", drive.axis, plan, DATE, drive.identity)
     return calibrate(drive, journal, folder, DATE)

@@ -160,11 +160,11 @@ def mermaid() -> str:
             words = row.cause.value if isinstance(row.cause, Trigger) else row.cause.name
             causes.setdefault((row.source, row.target), []).append(str(words))
     sources: dict[tuple[AxisState, str], list[str]] = {}
-    for (source, target), words in causes.items():
-        sources.setdefault((target, ", ".join(words)), []).append(source.name)
-    for (target, text), names in sources.items():
+    for (source, target), each in causes.items():
+        sources.setdefault((target, ", ".join(each)), []).append(source.name)
+    for (target, cause), names in sources.items():
         if len(names) > len(AxisState) / 2:
-            lines.append(f"    note right of {target.name}: {text} (from {', '.join(names)})")
+            lines.append(f"    note right of {target.name}: {cause} (from {', '.join(names)})")
         else:
-            lines += [f"    {name} --> {target.name}: {text}" for name in names]
+            lines += [f"    {name} --> {target.name}: {cause}" for name in names]
     return "\n".join(lines)
