@@ -94,6 +94,12 @@ def in_turn(variants: Mapping[str, Callable[[], float]], blocks: int) -> dict[st
     return times
 
 
+def verdict(what: str, ratio: float, goal: float, reference: str) -> str:
+    """Returns a line that states if a ratio reaches its goal."""
+    reached = "reached" if ratio <= goal else "missed"
+    return f"  goal: {what} at most {goal} x {reference}: {reached} ({ratio:.2f} x)"
+
+
 def medians(times: Mapping[str, list[float]]) -> dict[str, float]:
     """Returns the median of each variant."""
     return {name: statistics.median(values) for name, values in times.items()}
