@@ -25,7 +25,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads slow down operatio
 import numpy as np
 import yaml
 from proportions import proportion
-from random_axes import DEMO, calibrated, parser, seeds
+from random_axes import DEMO, calibrated, drawn_orders, parser, seeds
 
 from hdbridge.axis import AxisConfig
 from hdbridge.sim.truth import Truth
@@ -65,14 +65,7 @@ def draw(seed: int, presliding_arcsec: float = 0.0) -> tuple[dict[str, Any], dic
         ratio=ratio,
         stiffness_nm_per_rad=truth["gear"]["stiffness_nm_per_rad"] * scale**2,
         damping_nm_s_per_rad=truth["gear"]["damping_nm_s_per_rad"] * scale**2,
-        motor_orders=[
-            {
-                "order": int(order),
-                "amplitude_arcsec": float(np.exp(rng.uniform(np.log(0.8), np.log(14.0)))),
-                "phase_deg": float(rng.uniform(-180.0, 180.0)),
-            }
-            for order in sorted(rng.choice(np.arange(1, 11), int(rng.integers(3, 7)), replace=False))
-        ],
+        motor_orders=drawn_orders(rng, int(rng.integers(3, 7))),
         hysteresis={
             "law": "rolling_friction",
             "offset_arcsec": offset,

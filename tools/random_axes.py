@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from hdbridge.axis import AxisConfig
@@ -37,6 +39,18 @@ def parser(text: str, axes: int, first: int = 1, workers: int | None = None) -> 
 def seeds(options: argparse.Namespace) -> range:
     """Returns the seeds of the axes."""
     return range(options.first, options.first + options.axes)
+
+
+def drawn_orders(rng: np.random.Generator, count: int) -> list[dict[str, Any]]:
+    """Draws motor orders of 1 to 10 with amplitudes of 0.8 to 14 arcsec, as in a truth file."""
+    return [
+        {
+            "order": int(order),
+            "amplitude_arcsec": float(np.exp(rng.uniform(math.log(0.8), math.log(14.0)))),
+            "phase_deg": float(rng.uniform(-180.0, 180.0)),
+        }
+        for order in sorted(rng.choice(np.arange(1, 11), count, replace=False))
+    ]
 
 
 @contextmanager
