@@ -1,11 +1,11 @@
 """Computes all figures of docs/method.md: why the article's Tables 1 and 2 cannot give its Table 3.
 
-    python tools/article_table3.py [--simulate] [--as-data]
+    python tools/article_table3.py [--as-data]
 
 The axis is ideal except for the article's own error model and the resolution of its two encoders: no
 dynamics, no noise. The hysteresis law is that of the project's effects; the inverse and the statistics are
-computed here independently, so that they also check the compensation. ``--simulate`` runs the same test on
-the simulated drive (half a minute) and compares the errors step by step.
+computed here independently, so that they also check the compensation. `hdbridge demo` runs the same test on
+the simulated drive.
 """
 
 from __future__ import annotations
@@ -18,17 +18,13 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
+from table3_budget import budget
 
-from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Hysteresis, HysteresisMemory, Moment, Motion, Start, Tracker
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.evaluation.comparison import Comparison, compare_schemes
 from hdbridge.commissioning.evaluation.stepping import quantisation_floor_arcsec
-from hdbridge.drive.drive import Drive
 from hdbridge.enums import Scheme
 from hdbridge.files.profile import bundled_profile
-from hdbridge.motion.procedures.stepping import Stepping
-from hdbridge.sim.lockstep import simulated_bench
 
 RATIO, MOTOR_COUNTS, LOAD_COUNTS = 50.0, 8000, 2_880_000
 STEP_COUNTS, COUNT = 968, 240
@@ -152,41 +148,10 @@ def memory_gap(law: Hysteresis) -> float:
 
 def as_data(result: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the error budget of Table 3, which is treated as a measurement."""
-    from table3_budget import budget  # noqa: PLC0415 - found only where this file is run as a script
-
     computed = result["computed"]
     return budget(
         TABLE_3, computed["none"]["cw"][0], computed["synchronous"]["cw"][1], result["floor_arcsec"]
     )
-
-
-def simulated() -> dict[str, Any]:
-    """Runs the test on the simulated drive; returns its figures and deviations from the computed steps."""
-    profile = bundled_profile("article")
-    axis = AxisConfig.load(profile / "axis.yaml")
-    model = TransmissionModel.load(profile / "model.yaml")
-    stepping = Stepping(count=COUNT, step_deg=STEP_DEG)
-    with (
-        simulated_bench(profile / "truth.yaml", axis.eds_path, axis.drive.node_id) as (bus, clock, _),
-        Drive(bus, axis, clock) as drive,
-    ):
-        drive.boot()
-        comparison = Comparison.of(axis, dict(compare_schemes(drive, model, SCHEMES, stepping)))
-    result = {}
-    for scheme, measured in comparison.results.items():
-        there, back = step_errors(model, scheme.of(model))
-        apart = np.concatenate(measured.errors_arcsec) - np.array([*there, *back])
-        result[scheme.value] = {
-            **{
-                name: (part.three_sigma_arcsec, part.mean_arcsec)
-                for name, part in (("cw", measured.cw), ("ccw", measured.ccw), ("pooled", measured.pooled))
-            },
-            "off the computed steps, arcsec": {
-                "rms": float(np.sqrt(np.mean(np.square(apart)))),
-                "largest": float(np.max(np.abs(apart))),
-            },
-        }
-    return result
 
 
 def _print(result: Mapping[str, Any]) -> None:
@@ -195,17 +160,12 @@ def _print(result: Mapping[str, Any]) -> None:
     print(f"{'scheme':>12} {'CW':>15} {'CCW':>15} {'pooled':>15} {'Table 3':>15}")
     for name, parts in rows.items():
         print(_row(name, parts, TABLE_3.get(name)))
-    if "simulated" in result:
-        print("\nthe same on the simulated drive\n")
-        for name, parts in result["simulated"].items():
-            off = "off the computed steps, arcsec"
-            print(_row(name, parts, None), f" {off}: {_words(parts[off])}")
     for name, lines in result.get("as_data", {}).items():
         print(f"\nTable 3 as data: {name}; arcsec\n")
         print("\n".join(f"{line:>75}  {_words(value)}" for line, value in lines.items()))
     print()
     for name, value in result.items():
-        if name in {"computed", "both_by_the_formula_as_printed", "table_3", "simulated", "as_data"}:
+        if name in {"computed", "both_by_the_formula_as_printed", "table_3", "as_data"}:
             continue
         print(f"{name.replace('_', ' ')}: {_words(value)}")
 
@@ -226,14 +186,11 @@ def _words(value: object) -> str:
 def main() -> None:
     """Prints the figures."""
     parser = argparse.ArgumentParser(description="Why Tables 1 and 2 cannot give Table 3.")
-    parser.add_argument("--simulate", action="store_true", help="run the test on the simulated drive too")
     parser.add_argument("--as-data", action="store_true", help="take Table 3 as a measurement: what it lacks")
     options = parser.parse_args()
     result = figures()
     if options.as_data:
         result["as_data"] = as_data(result)
-    if options.simulate:
-        result["simulated"] = simulated()
     _print(result)
 
 

@@ -15,45 +15,23 @@ import os
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from multiprocessing import Pool
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads slow down operations on such small matrices
 
 import numpy as np
 import yaml
-from random_axes import DEMO, calibrated, parser, seeds
+from proportions import proportion
+from random_axes import DEMO, calibrated, drawn_orders, parser, seeds
 
 from hdbridge.axis import AxisConfig
-from hdbridge.commissioning.calibration import Calibration
 from hdbridge.sim.truth import Truth
 
 ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
-
-
-class Outcome(NamedTuple):
-    seed: int
-    ratio: float
-    counts: int
-    noise: float
-    offset: tuple[float, float, bool]
-    """True value, error of the fit, and True if the interval contains the true value."""
-    width: tuple[float, float, bool]
-    exponent: tuple[float, float, bool]
-    amplitude: float
-    """Largest ratio of an amplitude's error to its tolerance, 0.15 arcsec or 2 %."""
-    missed: int
-    invented: int
-    held: int
-    intervals: int
-    floor: float
-    three_sigma: float
-    before: float
-    offered: bool
-    axis_s: float
-    wall_s: float
-    cpu_s: float
+LOOP = ("offset_arcsec", "width_deg", "exponent")
 
 
 def draw(seed: int, presliding_arcsec: float = 0.0) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -87,14 +65,7 @@ def draw(seed: int, presliding_arcsec: float = 0.0) -> tuple[dict[str, Any], dic
         ratio=ratio,
         stiffness_nm_per_rad=truth["gear"]["stiffness_nm_per_rad"] * scale**2,
         damping_nm_s_per_rad=truth["gear"]["damping_nm_s_per_rad"] * scale**2,
-        motor_orders=[
-            {
-                "order": int(order),
-                "amplitude_arcsec": float(np.exp(rng.uniform(np.log(0.8), np.log(14.0)))),
-                "phase_deg": float(rng.uniform(-180.0, 180.0)),
-            }
-            for order in sorted(rng.choice(np.arange(1, 11), int(rng.integers(3, 7)), replace=False))
-        ],
+        motor_orders=drawn_orders(rng, int(rng.integers(3, 7))),
         hysteresis={
             "law": "rolling_friction",
             "offset_arcsec": offset,
@@ -115,83 +86,89 @@ def draw(seed: int, presliding_arcsec: float = 0.0) -> tuple[dict[str, Any], dic
     return axis, truth
 
 
-def one(job: tuple[int, str, float]) -> Outcome:
+def one(job: tuple[int, str, float]) -> dict[str, Any]:
+    """Calibrates one axis; returns its figures.
+
+    The figures of a parameter are its true value, the error of the fit, and True if the interval contains the
+    true value. ``worst`` is the largest ratio of an amplitude's error to its tolerance, 0.15 arcsec or 2 %.
+    """
     seed, plan, presliding_arcsec = job
     axis_data, truth = draw(seed, presliding_arcsec)
+    axis = AxisConfig.from_text(yaml.safe_dump(axis_data), DEMO / "axis.yaml")
     with tempfile.TemporaryDirectory() as name:
-        axis = AxisConfig.from_text(yaml.safe_dump(axis_data), DEMO / "axis.yaml")
         wall, cpu = time.perf_counter(), time.process_time()
         result, axis_s = calibrated(axis, Truth.model_validate(truth), plan, seed, Path(name))
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    return judge(seed, axis, truth, result, axis_s, wall, cpu)
-
-
-def judge(
-    seed: int,
-    axis: AxisConfig,
-    truth: dict[str, Any],
-    result: Calibration,
-    axis_s: float,
-    wall_s: float,
-    cpu_s: float,
-) -> Outcome:
     gear = truth["gear"]
     known = {
         f"orders[{each['order']}].{name}": float(each[name])
         for each in gear["motor_orders"]
         for name in ("amplitude_arcsec", "phase_deg")
-    } | {name: float(gear["hysteresis"][name]) for name in ("offset_arcsec", "width_deg", "exponent")}
+    } | {name: float(gear["hysteresis"][name]) for name in LOOP}
     found = {each.parameter: each for each in result.fit.intervals}
     off = {name: found[name].value - value for name, value in known.items() if name in found}
     off = {name: (value + 180.0) % 360.0 - 180.0 if "phase" in name else value for name, value in off.items()}
     held = {name: abs(value) <= found[name].half_width for name, value in off.items()}
     amplitudes = {name: value for name, value in known.items() if "amplitude" in name}
-    worst = max(abs(off.get(name, value)) / max(0.15, 0.02 * value) for name, value in amplitudes.items())
-    checked = result.validation
-    nothing = float("nan")
-    return Outcome(
-        seed,
-        axis.gear.ratio,
-        axis.motor_encoder.counts_per_turn,
-        float(truth["load"]["encoder"]["noise_arcsec"]),
-        *(  # type: ignore[arg-type]
-            (known[name], off.get(name, nothing), held.get(name, False))
-            for name in ("offset_arcsec", "width_deg", "exponent")
+    checked, nothing = result.validation, float("nan")
+    return {
+        **{name: (known[name], off.get(name, nothing), held.get(name, False)) for name in LOOP},
+        "seed": seed,
+        "ratio": axis.gear.ratio,
+        "counts": axis.motor_encoder.counts_per_turn,
+        "noise": float(truth["load"]["encoder"]["noise_arcsec"]),
+        "worst": max(
+            abs(off.get(name, value)) / max(0.15, 0.02 * value) for name, value in amplitudes.items()
         ),
-        worst,
-        sum(name not in found for name in amplitudes),
-        sum("amplitude" in name and name not in known for name in found),
-        sum(held.values()),
-        len(held),
-        checked.floor.three_sigma_arcsec if checked else nothing,
-        checked.after.pooled.three_sigma_arcsec if checked else nothing,
-        checked.before.pooled.three_sigma_arcsec if checked else nothing,
-        bool(result.offer and result.offer.made),
-        axis_s,
-        wall_s,
-        cpu_s,
-    )
+        "missed": sum(name not in found for name in amplitudes),
+        "invented": sum("amplitude" in name and name not in known for name in found),
+        "held": sum(held.values()),
+        "intervals": len(held),
+        "floor": checked.floor.three_sigma_arcsec if checked else nothing,
+        "after": checked.after.pooled.three_sigma_arcsec if checked else nothing,
+        "before": checked.before.pooled.three_sigma_arcsec if checked else nothing,
+        "offered": "" if result.offer and result.offer.made else "  not offered",
+        "axis_s": axis_s,
+        "by_wall": axis_s / wall,
+        "by_cpu": axis_s / cpu,
+    }
 
 
-def row(each: Outcome) -> str:
-    def part(value: tuple[float, float, bool], percent: bool) -> str:
-        error = 100.0 * value[1] / value[0] if percent else value[1]
-        return f"{value[0]:6.2f} {error:+6.{1 if percent else 3}f}{' ' if value[2] else '!'}"
-
+def row(each: dict[str, Any]) -> str:
+    """Returns the output line of one axis."""
+    loop = []
+    for name, shown in (("offset_arcsec", "+6.1f"), ("width_deg", "+6.1f"), ("exponent", "+6.3f")):
+        true, off, inside = each[name]
+        error = off if name == "exponent" else 100.0 * off / true
+        loop.append(f"{true:6.2f} {error:{shown}}{' ' if inside else '!'}")
     return (
-        f"{each.seed:4d} {each.ratio:6.1f} {each.counts:6d} {each.noise:5.2f} | {part(each.offset, True)} | "
-        f"{part(each.width, True)} | {part(each.exponent, False)} | {each.amplitude:5.2f} {each.missed:2d} "
-        f"{each.invented:2d} | {each.held:2d}/{each.intervals:<2d} | {each.before:7.2f} "
-        f"{each.three_sigma:6.2f} {each.floor:6.2f} {each.three_sigma / each.floor:5.2f} | "
-        f"{each.axis_s:6.0f} {each.axis_s / each.wall_s:5.1f} {each.axis_s / each.cpu_s:5.1f}"
-        f"{'' if each.offered else '  not offered'}"
-    )
+        "{seed:4d} {ratio:6.1f} {counts:6d} {noise:5.2f} | {} | {} | {} | {worst:5.2f} {missed:2d} "
+        "{invented:2d} | {held:2d}/{intervals:<2d} | {before:7.2f} {after:6.2f} {floor:6.2f} {:5.2f} | "
+        "{axis_s:6.0f} {by_wall:5.1f} {by_cpu:5.1f}{offered}"
+    ).format(*loop, each["after"] / each["floor"], **each)
 
 
 HEAD = (
     "seed  ratio counts noise |  offset, off % |   width, off % |  exponent, off | worst mis inv | held  | "
     " before  after  floor ratio | axis s  x wall  x cpu"
 )
+
+
+def near(each: dict[str, Any], name: str, tolerance: float) -> bool:
+    """Returns True if the true value is within the tolerance or the interval of the fit."""
+    _, off, inside = each[name]
+    return bool(inside or abs(off) <= tolerance)
+
+
+GOALS: dict[str, Callable[[dict[str, Any]], bool]] = {
+    "offset within 1 % or its interval": lambda o: near(o, "offset_arcsec", 0.01 * o["offset_arcsec"][0]),
+    "width within 4 % or its interval": lambda o: near(o, "width_deg", 0.04 * o["width_deg"][0]),
+    "exponent within 0.04 or its interval": lambda o: near(o, "exponent", 0.04),
+    "every amplitude within 0.15 arcsec or 2 %": lambda o: o["worst"] <= 1.0,
+    "no order missed or invented": lambda o: not o["missed"] and not o["invented"],
+    "stepping at most 1.15 x the floor": lambda o: o["after"] <= 1.15 * o["floor"],
+    "at least 20 x faster than the axis": lambda o: o["by_wall"] >= 20.0,
+}
 
 
 def main() -> None:
@@ -214,23 +191,10 @@ def main() -> None:
         for each in pool.imap(one, jobs):
             found.append(each)
             print(row(each), flush=True)
-    near = {
-        "offset within 1 % or its interval": [
-            o.offset[2] or abs(o.offset[1]) <= 0.01 * o.offset[0] for o in found
-        ],
-        "width within 4 % or its interval": [
-            o.width[2] or abs(o.width[1]) <= 0.04 * o.width[0] for o in found
-        ],
-        "exponent within 0.04 or its interval": [o.exponent[2] or abs(o.exponent[1]) <= 0.04 for o in found],
-        "every amplitude within 0.15 arcsec or 2 %": [o.amplitude <= 1.0 for o in found],
-        "no order missed or invented": [not o.missed and not o.invented for o in found],
-        "stepping at most 1.15 x the floor": [o.three_sigma <= 1.15 * o.floor for o in found],
-        "at least 20 x faster than the axis": [o.axis_s >= 20.0 * o.wall_s for o in found],
-    }
-    for name, values in near.items():
-        print(f"{sum(values):3d} of {len(values)}  {name}")
-    held, intervals = sum(o.held for o in found), sum(o.intervals for o in found)
-    print(f"coverage of the 95 % intervals: {held} of {intervals}, {100 * held / intervals:.1f} %")
+    for name, reached in GOALS.items():
+        print(f"{sum(map(reached, found)):3d} of {len(found)}  {name}")
+    held, intervals = sum(o["held"] for o in found), sum(o["intervals"] for o in found)
+    print(f"coverage of the 95 % intervals: {proportion(held, intervals)}")
 
 
 if __name__ == "__main__":

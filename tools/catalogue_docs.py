@@ -95,8 +95,9 @@ def _once(kind: type[Effect]) -> Iterator[str]:
     first = {each: other.name for other in reversed(earlier) for each in _parameters(other, other)}
     same: dict[str, list[str]] = {}
     for each in _parameters(kind, kind):
-        if ":" in each and each in first:
-            same.setdefault(first[each], []).append(re.split(r" \(|:", each)[0])
+        described = re.sub(r"^`\w+\.", "`", each)
+        if ":" in each and described in first:
+            same.setdefault(first[described], []).append(re.split(r" \(|:", each)[0])
         else:
             yield each
     for name, names in same.items():

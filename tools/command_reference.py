@@ -54,6 +54,8 @@ third one ends the program at once.
 
 ## Arguments and options of several commands
 
+The commands below list these without a description.
+
 """
 
 _COMMON = 2
@@ -166,7 +168,7 @@ def _section(command: Command, common: Container[Parameter], general: Container[
     ending = " options" if also else ""
     also = [*(f"`{each}`" for each in shared if each not in in_sets), *also]
     if also:
-        own.append(f"- {'also ' if own else ''}{', '.join(also)}{ending}")
+        own.append(f"- {', '.join(also)}{ending}")
     return "\n".join([*lines, *own]) + ("\n" if own else "")
 
 

@@ -33,6 +33,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -199,18 +200,13 @@ class Shell:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for kind in (signal.SIGTERM, signal.SIGKILL):
-            try:
-                os.killpg(self.process.pid, kind)
-            except ProcessLookupError:
-                break
-            for _attempt in range(50 if kind == signal.SIGTERM else 1):
+        with suppress(ProcessLookupError):  # raised when the last process of the session has ended
+            os.killpg(self.process.pid, signal.SIGTERM)
+            for _attempt in range(50):
                 self.process.poll()
-                try:
-                    os.killpg(self.process.pid, 0)
-                except ProcessLookupError:
-                    break
+                os.killpg(self.process.pid, 0)
                 time.sleep(0.1)
+            os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
         assert self.process.stdin is not None
         self.process.stdin.close()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from hdbridge.axis import AxisConfig
@@ -39,6 +41,18 @@ def seeds(options: argparse.Namespace) -> range:
     return range(options.first, options.first + options.axes)
 
 
+def drawn_orders(rng: np.random.Generator, count: int) -> list[dict[str, Any]]:
+    """Draws motor orders of 1 to 10 with amplitudes of 0.8 to 14 arcsec, as in a truth file."""
+    return [
+        {
+            "order": int(order),
+            "amplitude_arcsec": float(np.exp(rng.uniform(math.log(0.8), math.log(14.0)))),
+            "phase_deg": float(rng.uniform(-180.0, 180.0)),
+        }
+        for order in sorted(rng.choice(np.arange(1, 11), count, replace=False))
+    ]
+
+
 @contextmanager
 def simulated(axis: AxisConfig, truth: Truth, seed: int) -> Iterator[tuple[Drive, Any]]:
     """Boots a simulated axis over frames; yields its drive and its clock."""
@@ -61,8 +75,13 @@ def calibrated(
     axis: AxisConfig, truth: Truth, plan: str, seed: int, folder: Path
 ) -> tuple[Calibration, float]:
     """Calibrates an axis without a model, stepping test included; returns the result and the axis time, s."""
-    content = axis.model_dump(mode="json", by_alias=True, exclude_none=True)
-    (folder / "axis.yaml").write_text(yaml.safe_dump(content))
     with simulated(axis, truth, seed) as (drive, clock):
-        journal = start_journal(folder / "recording", axis, Plan.load(plan), DATE, drive.identity)
-        return calibrate(drive, journal, folder, DATE), clock.now()
+        return calibration(drive, Plan.load(plan), folder), clock.now()
+
+
+def calibration(drive: Drive, plan: Plan, folder: Path) -> Calibration:
+    """Calibrates a booted axis without a model, stepping test included; ``folder`` becomes its profile."""
+    content = drive.axis.model_dump(mode="json", by_alias=True, exclude_none=True)
+    (folder / "axis.yaml").write_text(yaml.safe_dump(content))
+    journal = start_journal(folder / "recording", drive.axis, plan, DATE, drive.identity)
+    return calibrate(drive, journal, folder, DATE)

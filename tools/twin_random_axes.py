@@ -28,10 +28,9 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads slow down operations on such small matrices
 
 import numpy as np
-import random_axes
 import yaml
 from proportions import proportion
-from random_axes import DEMO, parser, seeds, simulated
+from random_axes import DEMO, drawn_orders, parser, recorded, seeds, simulated
 
 from hdbridge.axis import AxisConfig
 from hdbridge.errors import SafetyStop
@@ -124,14 +123,7 @@ def draw(seed: int) -> tuple[AxisConfig, Truth]:
     gear["damping_nm_s_per_rad"] = 2.0 * float(rng.uniform(0.03, 0.2)) * load["inertia_kg_m2"] * turn
     load["encoder"]["noise_arcsec"] = float(rng.uniform(0.3, 2.0))
     gear["hysteresis"] = _law(LAWS[seed % len(LAWS)], rng)
-    gear["motor_orders"] = [
-        {
-            "order": int(order),
-            "amplitude_arcsec": float(np.exp(rng.uniform(math.log(0.8), math.log(14.0)))),
-            "phase_deg": float(rng.uniform(-180.0, 180.0)),
-        }
-        for order in sorted(rng.choice(np.arange(1, 11), 5, replace=False))
-    ]
+    gear["motor_orders"] = drawn_orders(rng, 5)
     # An explicit reference, because by default the friction would depend on the ambient temperature.
     truth.setdefault("temperature", {}).update(friction_growth_per_k=-0.015, reference_c=22.0)
     while _gain_margin(truth) < GAIN_MARGIN:
@@ -201,7 +193,7 @@ def without_noise(truth: Truth) -> Truth:
 def bench(axis: AxisConfig, truth: Truth, plan: Plan, seed: int) -> Recording:
     """Runs a plan on the simulated drive."""
     with simulated(axis, truth, seed) as (drive, _):
-        return random_axes.recorded(drive, plan)
+        return recorded(drive, plan)
 
 
 def both_motions(seed: int, axis: AxisConfig, truth: Truth) -> tuple[Recording, Recording] | None:

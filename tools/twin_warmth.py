@@ -84,8 +84,11 @@ def fitted(rng: np.random.Generator) -> Fitted:
     parameters, spread = tuple(BY_NAME[name] for name in FRICTION), np.array(list(FRICTION.values()))
     place = np.array(coordinates(TRUTH, parameters)) + spread * rng.standard_normal(len(spread))
     truth = at_coordinates(TRUTH, parameters, place.tolist())
-    rows, none = np.zeros(0, dtype=np.bool_), np.zeros(0)
-    return Fitted(truth, parameters, place, np.diag(spread**2), Scales({}), {}, rows, none, none)
+    none = np.zeros(0)
+    return Fitted(
+        truth, parameters, prior=place, place=place, covariance=np.diag(spread**2), scales=Scales({}),
+        residuals={}, rows=none.astype(np.bool_), vector=none, jacobian=np.zeros((0, len(spread))),
+    )  # fmt: skip
 
 
 def main() -> None:

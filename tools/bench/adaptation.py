@@ -54,8 +54,15 @@ def measure_fault(name: str, until_s: float) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--minutes", type=float, default=60.0, help="axis time without faults; 0: none")
-    parser.add_argument("--faulty-minutes", type=float, default=10.0, help="axis time of each fault's run")
+    parser.add_argument(
+        "--minutes", type=float, default=60.0, help="axis time without faults, 8 or more; 0: none"
+    )
+    parser.add_argument(
+        "--faulty-minutes",
+        type=float,
+        default=10.0,
+        help="axis time of each run with a fault, 8 or more; 0: none",
+    )
     given = parser.parse_args()
     print(f"Floor {FLOOR_ARCSEC:.2f} arcsec, 1.3 x floor {1.3 * FLOOR_ARCSEC:.2f} arcsec.\n")
     print("| adaptation | minutes | first | largest | last | told |\n|---|---|---|---|---|---|")

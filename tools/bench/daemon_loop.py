@@ -20,7 +20,7 @@ from functools import partial
 
 import can
 from cycle import AnsweringBus, NeverSleeping
-from harness import PROFILE, Busy, block_us, in_turn, keep, medians, parser, undisturbed
+from harness import PROFILE, Busy, block_us, in_turn, keep, medians, parser, undisturbed, verdict
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment
@@ -177,9 +177,7 @@ def report(result: dict[str, float]) -> str:
             f"  {name:<8} {value:>8.1f} us  {value / bench:>6.2f} x bench  {value / axes:>8.1f} us/axis"
         )
     ratio = result.get("loop 1", 0.0) / bench
-    verdict = "reached" if ratio <= GOAL else "missed"
-    lines += ["", f"  goal: one axis at most {GOAL} x the bench's own cycle: {verdict} ({ratio:.2f} x)"]
-    return "\n".join(lines)
+    return "\n".join([*lines, "", verdict("one axis", ratio, GOAL, "the bench's own cycle")])
 
 
 def main() -> int:

@@ -16,7 +16,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 import statistics
 import subprocess
 import sys
@@ -24,19 +23,19 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
 from harness import PROFILE, keep, parser
+from support.running import Daemon, running
 
 from hdbridge.client import Client
 from hdbridge.daemon.memory import Cell, Memory
-from hdbridge.errors import DaemonError
 
-PATIENCE_S = 180.0
-CONTROL, SERVICE, KEEPER = "control", "service", "keeper"
+CONTROL = "control"
 MACHINE = """schema: hdbridge.machine/1
 name: endurance
 axes: [{profile: article}]
@@ -125,65 +124,18 @@ class Accounts:
         return {**counts, "balanced": self.missing == self.skipped + self.lost}
 
 
-class RunningDaemon:
-    """Daemon of the article's axis in its own processes, which logs to the file ``log``."""
+@contextmanager
+def memory_of(daemon: Daemon) -> Iterator[Memory]:
+    """Opens the keeper's shared memory for reading, as the service does."""
+    fds = Path(f"/proc/{daemon.process.pid}/fd")
+    found = next(each for each in fds.iterdir() if str(each.readlink()).startswith("/memfd:hdbridge "))
+    with Memory.attach(os.open(found, os.O_RDWR)) as memory:  # `Memory` closes it
+        yield memory
 
-    def __init__(self, folder: Path) -> None:
-        own = folder / "endurance"
-        shutil.copytree(PROFILE, own / "article")
-        (own / "machine.yaml").write_text(MACHINE, encoding="utf-8")
-        self.log = folder / "daemon.log"
-        self.socket = folder / "hdbridge" / "endurance.sock"
-        environment = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder)}
-        with self.log.open("wb") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "hdbridge", "run", str(own / "machine.yaml"), "--simulate"],
-                env=environment, cwd=folder, stderr=log, stdout=subprocess.DEVNULL,
-            )  # fmt: skip
 
-    def until_disabled(self) -> None:
-        """Waits until every axis is disabled, and thus its drive is verified."""
-        end_s = time.monotonic() + PATIENCE_S
-        while True:
-            with suppress(DaemonError), Client(str(self.socket)) as client:
-                if all(axis.state == "disabled" for axis in client.state().axes):
-                    return
-            if self.process.poll() is not None or time.monotonic() > end_s:
-                raise SystemExit("\n".join(["the drives are not verified", *self.last_words()]))
-            time.sleep(0.05)
-
-    def events(self) -> Iterator[dict[str, Any]]:
-        """Yields the events in the log."""
-        for line in self.log.read_text(encoding="utf-8").splitlines():
-            with suppress(ValueError):
-                yield json.loads(line)
-
-    def last_words(self) -> list[str]:
-        """Returns the last 30 lines of the log, without requests."""
-        lines = self.log.read_text(encoding="utf-8").splitlines()
-        return [line for line in lines if '"request"' not in line][-30:]
-
-    def pids(self) -> dict[str, int]:
-        """Returns the process ids of the daemon's processes, by name."""
-        started = {f"{name} process started": name for name in (CONTROL, SERVICE)}
-        found = {started[each["event"]]: each["pid"] for each in self.events() if each["event"] in started}
-        return {KEEPER: self.process.pid, **found}
-
-    @contextmanager
-    def memory(self) -> Iterator[Memory]:
-        """Opens the keeper's shared memory for reading, as the service does."""
-        fds = Path(f"/proc/{self.process.pid}/fd")
-        found = next(each for each in fds.iterdir() if str(each.readlink()).startswith("/memfd:hdbridge "))
-        with Memory.attach(os.open(found, os.O_RDWR)) as memory:  # `Memory` closes it
-            yield memory
-
-    def close(self) -> None:
-        """Ends the daemon in an orderly way."""
-        self.process.send_signal(signal.SIGTERM)
-        with suppress(subprocess.TimeoutExpired):
-            self.process.wait(60.0)
-        self.process.kill()
-        self.process.wait()
+def pids_of(daemon: Daemon) -> dict[str, int]:
+    """Returns the process id of each of the daemon's processes, by name."""
+    return {"keeper": daemon.process.pid, **{name: daemon.pids(name)[-1] for name in (CONTROL, "service")}}
 
 
 @contextmanager
@@ -222,11 +174,12 @@ def run(minutes: float, every_s: float, idle_s: float) -> tuple[list[Growth], di
     accounts = Accounts()
     with tempfile.TemporaryDirectory(prefix="endurance-") as text, ExitStack() as stack:
         folder = Path(text)
-        daemon = RunningDaemon(folder)
-        stack.callback(daemon.close)
-        daemon.until_disabled()
-        memory = stack.enter_context(daemon.memory())
-        pids, reader = daemon.pids(), memory.reader()
+        shutil.copytree(PROFILE, folder / "article")
+        (folder / "machine.yaml").write_text(MACHINE, encoding="utf-8")
+        daemon = stack.enter_context(running(folder, "machine.yaml", "--simulate", name="endurance"))
+        daemon.until_axis("disabled")
+        memory = stack.enter_context(memory_of(daemon))
+        pids, reader = pids_of(daemon), memory.reader()
 
         def watch() -> None:
             begin_s = due_s = time.monotonic()
@@ -237,8 +190,8 @@ def run(minutes: float, every_s: float, idle_s: float) -> tuple[list[Growth], di
                     rows.append({name: Cost.of(pid) for name, pid in pids.items()})
                     memories = (f"{name} {cost.rss_kb} kB" for name, cost in rows[-1].items())
                     print(f"{(now_s - begin_s) / 60.0:6.1f} min ", *memories, flush=True)
-                if daemon.pids() != pids:
-                    raise SystemExit("\n".join(["a process was started again", *daemon.last_words()]))
+                if pids_of(daemon) != pids:
+                    raise SystemExit(f"a process was started again: {daemon.events[-20:]}")
                 time.sleep(1.0)
 
         idle_us = turn_us(memory, pids[CONTROL], lambda: time.sleep(idle_s))
@@ -261,7 +214,7 @@ def run(minutes: float, every_s: float, idle_s: float) -> tuple[list[Growth], di
             "clients": seen(),
             "problems in the log": Counter(
                 f"{event['event']}: {event.get('text', event.get('why', ''))}"
-                for event in daemon.events()
+                for event in daemon.events
                 if event.get("level") in ("warning", "error", "critical")
             ),
         }

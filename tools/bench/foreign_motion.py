@@ -22,18 +22,21 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
 from foreign.bench import foreign_bench
 from foreign.servos import STRUCTURES
+from random_axes import calibration, simulated
 from support.raised import ARTICLE, raised_axis
 
 from hdbridge import Bench, Drive
@@ -48,14 +51,13 @@ from hdbridge.analysis.response import (
 )
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.calibration import Calibration, calibrate, start_journal
 from hdbridge.commissioning.calibration.motion import MotionTest, motion_test
 from hdbridge.control.bench import compensation_for
 from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.errors import HdbridgeError
 from hdbridge.motion.procedures.even_speed import EvenRun, EvenSpeed
 from hdbridge.motion.procedures.plan import Plan
-from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.sim.truth import Truth
 
 SHARES = (0.04, 0.1, 0.2, 0.32, 0.45, 0.58, 0.71, 0.84, 1.0)
 """Speeds as fractions of the limit, in addition to `SLOWEST_DEG_S`; others than in the motion test."""
@@ -78,12 +80,10 @@ procedures:
 validation: {count: 20, step_deg: 43.56, motion: true}
 """
 """Plan of the calibration: `quick` without its long sweep; it takes minutes."""
-DATE = datetime(2026, 1, 1, tzinfo=UTC)
 
 
-@contextmanager
-def simulated(seed: int, folder: Path) -> Iterator[Drive]:
-    """Provides the article's gear with random servo, load and stiffness, and with raised limits."""
+def drawn(seed: int) -> tuple[AxisConfig, dict[str, Any]]:
+    """Returns the article's axis with random servo, load and stiffness, and with raised limits; its truth."""
     rng = np.random.default_rng([32, seed])
     axis = yaml.safe_load(raised_axis())
     truth = yaml.safe_load((ARTICLE / "truth.yaml").read_text(encoding="utf-8"))
@@ -104,30 +104,15 @@ def simulated(seed: int, folder: Path) -> Iterator[Drive]:
     else:
         del servo["load_feedforward"]
         servo["inertia_feedforward_kg_m2"] = 0.0
-    (folder / "axis.yaml").write_text(yaml.safe_dump(axis), encoding="utf-8")
-    (folder / "truth.yaml").write_text(yaml.safe_dump(truth), encoding="utf-8")
-    config = AxisConfig.load(folder)
-    with booted(config, folder, seed) as drive:
-        yield drive
+    return AxisConfig.from_text(yaml.safe_dump(axis), ARTICLE / "axis.yaml"), truth
 
 
-@contextmanager
-def booted(axis: AxisConfig, folder: Path, seed: int) -> Iterator[Drive]:
-    """Provides a booted drive that simulates the truth file in a folder."""
-    with (
-        simulated_bench(folder / "truth.yaml", axis.eds_path, seed=seed) as (bus, clock, _),
-        Drive(bus, axis, clock) as drive,
-    ):
-        drive.boot()
-        yield drive
-
-
-def retuned(seed: int, folder: Path) -> Iterator[dict[str, Any]]:
+def retuned(seed: int) -> Iterator[dict[str, Any]]:
     """Yields the figures of an axis for each change of its position gain."""
     static = TransmissionModel.load(ARTICLE / "model.yaml")
-    with simulated(seed, folder) as drive:
-        axis, model = drive.axis, replace(static, response=motion_test(drive, static).response)
-    truth = yaml.safe_load((folder / "truth.yaml").read_text(encoding="utf-8"))
+    axis, truth = drawn(seed)
+    with simulated(axis, Truth.model_validate(truth), seed) as (drive, _):
+        model = replace(static, response=motion_test(drive, static).response)
     gain = truth["servo"]["position_gain_per_s"]
     orders, limits, limit = motor_orders(model), Limits.of(axis, model), axis.limits.velocity_deg_s
     third_hz = 1.0 / (3.0 * axis.drive.cycle_s)
@@ -145,8 +130,7 @@ def retuned(seed: int, folder: Path) -> Iterator[dict[str, Any]]:
 
     for factor in GAINS:
         truth["servo"]["position_gain_per_s"] = factor * gain
-        (folder / "truth.yaml").write_text(yaml.safe_dump(truth), encoding="utf-8")
-        with booted(axis, folder, seed) as drive:
+        with simulated(axis, Truth.model_validate(truth), seed) as (drive, _):
             used, answers, differences = model, None, []
             while len(differences) < STEPS:
                 answers = Answers(used.response, orders, model.ratio, answers)
@@ -165,32 +149,23 @@ def retuned(seed: int, folder: Path) -> Iterator[dict[str, Any]]:
 
 
 @contextmanager
-def foreign(seed: int, structure: str, folder: Path) -> Iterator[Drive]:
-    """Provides a foreign axis, random by seed."""
-    with (
-        foreign_bench(seed, structure, folder) as bench,
-        Drive(bench.bus, bench.axis, bench.clock) as drive,
-    ):
+def booted(kind: str, seed: int, folder: Path) -> Iterator[Drive]:
+    """Provides a simulated axis, or one with a foreign servo structure, random by seed."""
+    if kind == "simulated":
+        axis, truth = drawn(seed)
+        with simulated(axis, Truth.model_validate(truth), seed) as (drive, _):
+            yield drive
+        return
+    with foreign_bench(seed, kind, folder) as bench, Drive(bench.bus, bench.axis, bench.clock) as drive:
         drive.boot()
         yield drive
 
 
-def calibrated(drive: Drive, folder: Path) -> Calibration:
-    """Calibrates an axis, response in motion included."""
-    path = folder / "plan.yaml"
-    path.write_text(PLAN, encoding="utf-8")
-    journal = start_journal(folder / "recording", drive.axis, Plan.load(str(path)), DATE, drive.identity)
-    return calibrate(drive, journal, folder, DATE)
-
-
 def figures(drive: Drive, model: TransmissionModel) -> dict[str, Any]:
-    (
-        """Returns the rms of the ripple and of the slow orders, arcsec, for each speed.
+    """Returns the rms of the ripple and of the slow orders, arcsec, for each speed.
 
     Each has three values: without correction, with static correction, and with filtered correction.
     """
-        ""
-    )
     axis = drive.axis
     limit = axis.limits.velocity_deg_s
     speeds = (SLOWEST_DEG_S, *(round(share * limit, 3) for share in SHARES))
@@ -235,8 +210,8 @@ def measure(kind: str, seed: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:
-            with simulated(seed, folder) if kind == "simulated" else foreign(seed, kind, folder) as drive:
-                result = calibrated(drive, folder)
+            with booted(kind, seed, folder) as drive:
+                result = calibration(drive, Plan.model_validate(yaml.safe_load(PLAN)), folder)
                 assert result.motion is not None
                 assert result.validation is not None
                 rest = {"of_floor": result.validation.as_dict()["of_floor"]}
@@ -308,8 +283,8 @@ if __name__ == "__main__":
     first, last = map(int, given.seeds.split("-"))
     if given.retuned:
         for number in range(first, last + 1):
-            with tempfile.TemporaryDirectory() as name, given.file.open("a") as out:
-                for found in retuned(number, Path(name)):
+            with given.file.open("a") as out:
+                for found in retuned(number):
                     print(json.dumps(found), file=out, flush=True)
         raise SystemExit
     main(given.file, given.kinds, range(first, last + 1))

@@ -22,21 +22,34 @@ class Busy(Exception):  # noqa: N818 - what happened
 
 
 class Waking:
-    """Clock of this computer, which records the time and lateness of its last wake-up."""
+    """Clock of this computer, which records the lateness of each wake-up and the busy time after it."""
 
     now = staticmethod(time.monotonic)
 
     def __init__(self) -> None:
-        self.woke_s = 0.0
-        self.late_s = 0.0
+        self._woke_s = self._late_s = 0.0
+        self._left = 0
+        self.late_s = self.busy_s = [0.0]
+
+    def record(self, cycles: int, cycle: Callable[[], object]) -> None:
+        """Calls ``cycle``, which sleeps once, until that many cycles are recorded."""
+        self._left = cycles + 1  # the first one, which is stored last, began before
+        self.late_s, self.busy_s = [0.0] * self._left, [0.0] * self._left
+        while self._left:
+            cycle()
+        del self.late_s[-1], self.busy_s[-1]
 
     def sleep_until(self, deadline_s: float) -> None:
         """Sleeps until the absolute deadline."""
-        delay_s = deadline_s - time.monotonic()
-        if delay_s > 0.0:
-            time.sleep(delay_s)
-        self.woke_s = time.monotonic()
-        self.late_s = self.woke_s - deadline_s
+        now_s = time.monotonic()
+        if self._left:
+            self._left -= 1
+            self.busy_s[self._left] = now_s - self._woke_s
+            self.late_s[self._left] = self._late_s
+        if deadline_s > now_s:
+            time.sleep(deadline_s - now_s)
+        self._woke_s = time.monotonic()
+        self._late_s = self._woke_s - deadline_s
 
 
 def parser(text: str | None, *, blocks: int = 0, cycles: int = 0) -> argparse.ArgumentParser:
@@ -79,6 +92,12 @@ def in_turn(variants: Mapping[str, Callable[[], float]], blocks: int) -> dict[st
         for name, block in variants.items():
             times[name].append(block())
     return times
+
+
+def verdict(what: str, ratio: float, goal: float, reference: str) -> str:
+    """Returns a line that states if a ratio reaches its goal."""
+    reached = "reached" if ratio <= goal else "missed"
+    return f"  goal: {what} at most {goal} x {reference}: {reached} ({ratio:.2f} x)"
 
 
 def medians(times: Mapping[str, list[float]]) -> dict[str, float]:

@@ -10,8 +10,10 @@ with exit status 1.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import tempfile
+from collections import Counter
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -21,22 +23,16 @@ from support.disorder import draw, play_story
 from support.slave_events import play_events
 
 PER_STORY = {"slave": 200, "gateway": 100}
+COUNTED = ("periods", "moved", "enabled")
 
 
-def story(stack: str, seed: int) -> None:
+def story(stack: str, seed: int) -> Any:
     """Plays one sequence of events; raises AssertionError if an invariant is violated."""
     count, rng = PER_STORY[stack], Random(seed)
-    seen: Any
+    if stack == "slave":
+        return play_events(seed, count)
     with tempfile.TemporaryDirectory(prefix="events-") as folder:
-        if stack == "slave":
-            seen = play_events(seed, count)
-        else:
-            seen = play_story(Path(folder), [draw(rng) for _ in range(count)])
-    for name in TOTAL:
-        TOTAL[name] += getattr(seen, name)
-
-
-TOTAL = {"periods": 0, "moved": 0, "enabled": 0}
+        return play_story(Path(folder), [draw(rng) for _ in range(count)])
 
 
 def main() -> int:
@@ -45,18 +41,21 @@ def main() -> int:
     parser.add_argument("--events", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    events, broken, seed = 0, 0, options.seed
-    while events < options.events:
+    per_story, broken = PER_STORY[options.stack], 0
+    total: Counter[str] = Counter()
+    stories = math.ceil(options.events / per_story)
+    for number in range(1, stories + 1):
+        seed = options.seed + number - 1
         try:
-            story(options.stack, seed)
+            seen = story(options.stack, seed)
+            total.update({name: getattr(seen, name) for name in COUNTED})
         except AssertionError as error:
             broken += 1
             print(f"seed {seed}: {error}", flush=True)
-        events += PER_STORY[options.stack]
-        seed += 1
-        if seed % (50 if options.stack == "slave" else 5) == 0:
-            print(f"{events} events, {broken} stories that broke a law, {TOTAL}", flush=True)
-    print(f"{events} events, {broken} stories that broke a law, {TOTAL}")
+        if number % 25 == 0 or number == stories:
+            print(
+                f"{number * per_story} events, {broken} stories that broke a law, {dict(total)}", flush=True
+            )
     return 1 if broken else 0
 
 

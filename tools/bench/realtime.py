@@ -1,21 +1,27 @@
-"""Number of instructions of a cycle of the daemon's control loop on a PREEMPT_RT kernel, and missed cycles.
+"""Number of instructions of a control cycle on a PREEMPT_RT kernel, and number of missed cycles.
 
     make bench-realtime
-    tools/realtime/run.sh .venv/bin/python tools/bench/realtime_daemon.py
+    tools/realtime/run.sh .venv/bin/python tools/bench/realtime.py --master build/realtime/master
 
-Runs on the kernel of `tools/realtime/run.sh`, as `realtime_cycle.py`: one axis at 1 kHz, then six at 250 Hz,
-compensated, and before them the bench's cycle (`Cycle.tick`) with the same compensation and set-point. The
-loop (`Controller.turn`) is in this process, with SCHED_FIFO and locked memory. A second process is the
-service, on the same processor: it empties the rings of samples and events, and posts requests of clients
-in a loop:
+Runs on the kernel of `tools/realtime/run.sh`, on which an instruction takes one nanosecond and nothing else
+runs, so that commits can be compared. The kernel's CAN gateway answers in place of the drives. Each variant
+has SCHED_FIFO, locked memory and absolute deadlines:
+
+  bare ... canopen  the exchanges of `cycle.py`, at 1 kHz; with ``--master`` also that in C (`master.c`)
+  bench             the bench's cycle (`Cycle.tick`), compensated, on the path of a move, at 1 kHz
+  one, six          the daemon's loop (`Controller.turn`) with one axis at 1 kHz, and with six at 250 Hz
+
+Next to the daemon's loop a second process is the service, on the same processor: it empties the rings of
+samples and events, and posts requests of clients in a loop:
 
     moves, re-targeted in motion - jogs - stops - streams of knots - compensation off and on - a different
     model in motion - SDO requests
 
-  busy    from the wake-up to the next time that the loop sleeps: a whole cycle, sample and commands included
-  missed  cycles that began more than half a period late or were busy beyond the next deadline
+It fails if the loop skipped a period, an axis stopped without a request, or a sample was lost.
 
-It fails if a period was skipped, an axis stopped without a request, or a sample was lost.
+  late    from the deadline to the first instruction of the cycle
+  busy    from there until the loop sleeps again: a whole cycle, sample, commands and system calls included
+  missed  cycles that began more than half a period late or were busy beyond the next deadline
 """
 
 from __future__ import annotations
@@ -28,17 +34,17 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
-import can
 import numpy as np
-from cycle import answering_kernel
+from cycle import Variants, answering_kernel
 from daemon_loop import bench_cycle, configs_of
 from harness import PROFILE, Waking, keep, parser
-from realtime_cycle import WARM_UP, Figures, table
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.buscycle import BusCycle
@@ -50,8 +56,17 @@ from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.link import Link
 from hdbridge.enums import Scheme
 
-VARIANTS = {"bench": (1, 1.0), "one": (1, 1.0), "six": (6, 4.0)}
-"""Number of axes and cycle time, ms, of each variant."""
+EXCHANGES = {
+    "bare": ("bare python-can exchange", Variants.bare),
+    "cycle": ("hdbridge cycle", Variants.plain),
+    "compensated": ("hdbridge cycle, compensated", Variants.compensated),
+    "filtered": ("hdbridge cycle, filtered", Variants.filtered),
+    "canopen": ("canopen's PDO objects", Variants.with_canopen),
+}
+LOOPS = {"one": (1, 1.0), "six": (6, 4.0)}
+"""Number of axes and cycle time, ms, of the daemon's loop."""
+FAST_MS = 1.0
+WARM_UP = 50
 STATUS_OFF = 0x0250
 POLL_S = 0.02
 JOG_EVERY_S = 0.05
@@ -60,28 +75,60 @@ SPEED = 5.0
 """Velocity of the moves, deg/s at the load."""
 
 
-class TurnClock(Waking):
-    """Clock that records the busy time of the loop between two sleeps, and the lateness of its wake-ups."""
+@dataclass(frozen=True)
+class Figures:
+    """Figures of one kind of cycle; times in microseconds."""
 
-    def __init__(self, turns: int) -> None:
-        super().__init__()
-        self.busy_s, self.lateness_s = np.zeros(turns), np.zeros(turns)
-        self.turns = 0
-        """Number of cycles recorded."""
-        self.keeping = False
+    name: str
+    busy_median_us: float
+    busy_999_us: float
+    busy_most_us: float
+    late_999_us: float
+    missed: int
+    cycles: int
 
-    def sleep_until(self, deadline_s: float) -> None:
-        """Sleeps until the absolute deadline."""
-        if self.keeping and self.turns < len(self.busy_s):
-            self.busy_s[self.turns] = time.monotonic() - self.woke_s
-            self.lateness_s[self.turns] = self.late_s
-            self.turns += 1
-        super().sleep_until(deadline_s)
+    @classmethod
+    def of(cls, name: str, late_us: np.ndarray, busy_us: np.ndarray, period_us: float) -> Figures:
+        missed = (late_us > 0.5 * period_us) | (late_us + busy_us > period_us)
+        return cls(
+            name,
+            *(float(each) for each in np.percentile(busy_us, [50.0, 99.9, 100.0])),
+            float(np.percentile(late_us, 99.9)),
+            int(missed.sum()),
+            len(busy_us),
+        )
 
-    @property
-    def full(self) -> bool:
-        """True if the buffer of recorded cycles is full."""
-        return self.turns == len(self.busy_s)
+
+def timed(name: str, cycle: Callable[[], object], clock: Waking, cycles: int, period_s: float) -> Figures:
+    """Measures ``cycles`` cycles, each started at its deadline."""
+    for _ in range(WARM_UP):
+        cycle()
+    clock.record(cycles, cycle)
+    return Figures.of(name, 1e6 * np.array(clock.late_s), 1e6 * np.array(clock.busy_s), 1e6 * period_s)
+
+
+def in_c(master: Path, channel: str, cycles: int, period_s: float) -> Figures:
+    """Measures the same exchange in C."""
+    command = [str(master), channel, f"{1e6 * period_s:.0f}", str(cycles)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    late_ns, busy_ns = np.array([line.split() for line in done.stdout.splitlines()], dtype=float).T
+    return Figures.of("a master in C", 1e-3 * late_ns, 1e-3 * busy_ns, 1e6 * period_s)
+
+
+def table(figures: list[Figures], period_s: float) -> str:
+    """Returns a table with one line per kind of cycle, and ratios to the bare exchange if it was measured."""
+    bare = next((each for each in figures if each.name.startswith("bare")), None)
+    head = (
+        f"{'':<28} {'busy us':>8} {'99.9 %':>8} {'most':>8} {'late 99.9 %':>12} {'missed':>14} {'x bare':>7}"
+    )
+    lines = [f"Cycles of {1e3 * period_s:g} ms on PREEMPT_RT, 1 us = 1000 instructions:", "", head]
+    lines += [
+        f"{each.name:<28} {each.busy_median_us:>8.1f} {each.busy_999_us:>8.1f} {each.busy_most_us:>8.1f} "
+        f"{each.late_999_us:>12.1f} {f'{each.missed} of {each.cycles}':>14} "
+        + (f"{each.busy_median_us / bare.busy_median_us:>7.2f}" if bare is not None else "")
+        for each in figures
+    ]
+    return "\n".join(lines)
 
 
 # -------------------------------------------------------------------- the service's process
@@ -221,10 +268,9 @@ def measured(axes: int, cycle_ms: float, turns: int, channel: str) -> tuple[Figu
     """Measures the loop with this number of axes; returns figures and the service's observations."""
     configs = configs_of(axes, cycle_ms)
     model = TransmissionModel.load(PROFILE / "model.yaml")
-    clock = TurnClock(turns)
+    clock = Waking()
     with ExitStack() as stack:
-        stack.enter_context(answering_kernel(channel, *range(1, axes + 1)))
-        bus = stack.enter_context(can.Bus(interface="socketcan", channel=channel, ignore_config=True))
+        bus = stack.enter_context(answering_kernel(channel, *range(1, axes + 1)))
         memory = stack.enter_context(Memory.create(axes, configs[0].drive.cycle_s))
         cycle = BusCycle(Link(bus, clock), clock, memory.period_s, bitrate_bps=1_000_000)
         controller = Controller(cycle, [(each, None) for each in configs], memory)
@@ -237,11 +283,8 @@ def measured(axes: int, cycle_ms: float, turns: int, channel: str) -> tuple[Figu
         stack.enter_context(prepare_realtime())
         cycle.restart()
         enabled(controller, memory)
-        for _ in range(WARM_UP):
-            controller.turn()
-        clock.keeping = True
-        while not clock.full:
-            controller.turn()
+        name = "daemon's loop, one axis" if axes == 1 else f"daemon's loop, {axes} axes"
+        figures = timed(name, controller.turn, clock, turns, memory.period_s)
         check(controller)
         assert process.stdin is not None
         process.stdin.close()
@@ -250,60 +293,62 @@ def measured(axes: int, cycle_ms: float, turns: int, channel: str) -> tuple[Figu
         seen = json.loads(process.stdout.readline())
     if seen["lost"] or not seen["samples"]:
         raise SystemExit(f"the service saw {seen['samples']} samples and lost {seen['lost']}")
-    name = "daemon's loop, one axis" if axes == 1 else f"daemon's loop, {axes} axes"
-    return Figures.of(name, 1e6 * clock.lateness_s, 1e6 * clock.busy_s, 1e3 * cycle_ms), seen
+    return figures, seen
 
 
 def of_bench(cycle_ms: float, turns: int, channel: str) -> Figures:
     """Measures the bench's cycle on the path of a move, alone on the processor."""
     (axis,) = configs_of(1, cycle_ms)
-    clock = TurnClock(turns)
-    with (
-        answering_kernel(channel, 1),
-        can.Bus(interface="socketcan", channel=channel, ignore_config=True) as bus,
-        prepare_realtime(),
-    ):
+    clock = Waking()
+    with answering_kernel(channel, 1) as bus, prepare_realtime():
         turn, _ = bench_cycle(bus, TransmissionModel.load(PROFILE / "model.yaml"), axis, clock)
-        for _ in range(WARM_UP):
-            turn()
-        clock.keeping = True
-        while not clock.full:
-            turn()
-    return Figures.of(
-        "bench's cycle, compensated", 1e6 * clock.lateness_s, 1e6 * clock.busy_s, 1e3 * cycle_ms
-    )
+        return timed("bench's cycle, compensated", turn, clock, turns, axis.drive.cycle_s)
 
 
-def report(seen: dict[str, Any]) -> None:
-    """Prints the observations of the service, if there was one."""
-    if seen:
-        told = ", ".join(f"{count} {name}" for name, count in sorted(seen["told"].items()))
-        print(f"the service saw {seen['samples']} samples and lost none; events: {told}", flush=True)
-        for text in seen["refused"]:
-            print(f"  {text}")
+def of_exchanges(kinds: list[str], master: Path | None, cycles: int, channel: str) -> list[Figures]:
+    """Measures the exchanges of `cycle.py`, and the one in C."""
+    (axis,) = configs_of(1, FAST_MS)
+    model, clock, figures = TransmissionModel.load(PROFILE / "model.yaml"), Waking(), []
+    with answering_kernel(channel, axis.drive.node_id) as bus:
+        variants = Variants(bus, axis, model, clock)
+        for kind in kinds:
+            name, loop = EXCHANGES[kind]
+            with prepare_realtime():
+                variants.start()
+                figures.append(timed(name, partial(loop, variants), clock, cycles, variants.period_s))
+            print(f"measured: {name}", flush=True)
+        if master is not None:
+            figures.append(in_c(master, channel, cycles, variants.period_s))
+    return figures
 
 
 def main() -> int:
-    given = parser(__doc__)
+    given = parser(__doc__, cycles=20_000)
     given.add_argument("--channel", default="vcan0")
-    given.add_argument("--turns", type=int, default=20_000)
-    given.add_argument("--only", choices=tuple(VARIANTS), action="append", help="measure these only")
+    given.add_argument("--master", type=Path, help="the compiled master.c")
+    given.add_argument(
+        "--only", choices=(*EXCHANGES, "bench", *LOOPS), action="append", help="measure these only"
+    )
     given.add_argument("--serve", type=int, metavar="FD", help=argparse.SUPPRESS)
     given.add_argument("--axes", type=int, default=1, help=argparse.SUPPRESS)
     options = given.parse_args()
     warnings.simplefilter("ignore")
     if options.serve is not None:
         return serve(options.serve, options.axes)
-    results = []
-    for kind in options.only or VARIANTS:
-        axes, cycle_ms = VARIANTS[kind]
-        if kind == "bench":
-            figures, seen = of_bench(cycle_ms, options.turns, options.channel), {}
-        else:
-            figures, seen = measured(axes, cycle_ms, options.turns, options.channel)
-        print(table([figures], 1e-3 * cycle_ms), flush=True)
-        report(seen)
-        results.append({**asdict(figures), "cycle_ms": cycle_ms, **seen})
+    wanted, cycles, channel = options.only or (*EXCHANGES, "bench", *LOOPS), options.cycles, options.channel
+    fast = of_exchanges([each for each in EXCHANGES if each in wanted], options.master, cycles, channel)
+    if "bench" in wanted:
+        fast.append(of_bench(FAST_MS, cycles, channel))
+    print(table(fast, 1e-3 * FAST_MS), flush=True)
+    results = [{**asdict(each), "cycle_ms": FAST_MS} for each in fast]
+    for kind, (axes, cycle_ms) in LOOPS.items():
+        if kind in wanted:
+            figures, seen = measured(axes, cycle_ms, cycles, channel)
+            print(table([figures], 1e-3 * cycle_ms), flush=True)
+            told = ", ".join(f"{count} {name}" for name, count in sorted(seen["told"].items()))
+            print(f"the service saw {seen['samples']} samples and lost none; events: {told}", flush=True)
+            print(*seen["refused"], sep="\n")
+            results.append({**asdict(figures), "cycle_ms": cycle_ms, **seen})
     keep(results, options.json)
     return 0
 
