@@ -291,10 +291,10 @@ class Record:
                 )
         time_s, origin = self.time_s, self.origin
         for row in np.setdiff1d(np.flatnonzero(np.diff(time_s) < 0.0) + 1, self.starts)[:1].tolist():
-            cure = origin.clock_cure(time_s) if origin else "sort the samples, or split the record"
+            cure = (origin.clock_cure(time_s) if origin else "") or "sort the samples, or split the record"
             raise InputError(
                 f"{self._place(row)}: time_s: {time_s[row]:g} after {time_s[row - 1]:g}; "
-                f"expected times that do not decrease{f': {cure}' if cure else ''}"
+                f"expected times that do not decrease: {cure}"
             )
 
     def _place(self, row: int) -> str:

@@ -48,7 +48,7 @@ def record(samples: int = 101, ratio: float = 50.0, travel_deg: float = 400.0, *
         (f"{HEAD},temperature_c\n0,1,2,20\n1,1,2,nan\n".encode(), ":3: temperature_c: nan; expected a finite number"),
         (f"{HEAD},temperature_c\n0,1,2,20\n1,1,2,\n".encode(), ":3: temperature_c: no value; expected a number"),
         (f"\n{HEAD}\r\n0,1,2\r\n1,1,x\r\n".encode(), ":4: load_position_deg: 'x' is not a number; expected a number"),
-        (f"{HEAD}\n0,1,2\n2,1,2\n\n1.5,1,2\n".encode(), ":5: time_s: 1.5 after 2; expected times that do not decrease"),
+        (f"{HEAD}\n0,1,2\n2,1,2\n\n1.5,1,2\n".encode(), ":5: time_s: 1.5 after 2; expected times that do not decrease: sort the samples, or split the record"),
         (f"{HEAD}\n0,1,2\n1,1\n".encode(), ":3: 2 values; expected 3, one for each column"),
         (f"{HEAD}\n0,1,2\n1,1,2,3\n".encode(), ":3: 4 values; expected 3, one for each column"),
         (f"{HEAD}\n0,1,2,3\n1,1,2,3\n".encode(), ":2: 4 values; expected 3, one for each column"),
