@@ -243,8 +243,9 @@ class Bench:
         self, procedure: Procedure[Outcome], rehearsal: Rehearsal, progress: Callable[[float], None]
     ) -> Outcome:
         """Runs the procedure, from power on to power off."""
-        self._enable()
+        self._drive.enable()
         try:
+            self._engage()
             outcome = run_moves(procedure, self.view, rehearsal, progress, lambda: self._place, self._leg)
         except SafetyStop:
             raise  # the drive is at rest, or stops on its own; the latch remains
@@ -286,9 +287,8 @@ class Bench:
         """Faults of the current procedure so far, including the one that stopped it, and skipped periods."""
         return self._fault_counter.fault_counts(self.cycle.skipped)
 
-    def _enable(self) -> None:
+    def _engage(self) -> None:
         """Enables the drive by PDO at standstill, with the compensation starting from its position."""
-        self._drive.enable()
         self.cycle.restart()
         feedback = until_enabled(self.cycle.tick, self._image.power, self.cycle.period_s)
         feedback = self._await_channels(feedback)
@@ -308,8 +308,6 @@ class Bench:
             if waiting[0].lost:
                 break
             feedback = self.cycle.tick()
-        image.power.go(State.SWITCH_ON_DISABLED)
-        self._rest()
         raise DriveError(
             f"{image.axis.where(waiting[0].key)}: no plausible reading arrived ({waiting[0].why}); "
             "check the sensor, or leave the key out"
