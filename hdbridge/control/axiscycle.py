@@ -116,12 +116,15 @@ class AxisCycle:
     def begin(self) -> None:
         """Sends RPDOs from the next cycle on; earlier frames and encoder motion are not supervised.
 
-        After a `Reaction.LATCH`, the axis stays silent unless the latch has been released.
+        If power is requested, the positions in ``image`` are those of the preparation, and the first ones of
+        the cycle must agree with them. After a `Reaction.LATCH`, the axis stays silent unless the latch has
+        been released.
         """
         self.flushing = True
         self.pending.clear()
         self.silent = self.supervision.reaction is Reaction.LATCH
-        self._last = None
+        prepared = self.image.power.aim is _ENABLED
+        self._last = self._feedback(self.feedback.cycle, self.feedback.time_s, True) if prepared else None
         self._commanded = False
         self.image.forget_channels()
         self.changed()

@@ -56,6 +56,8 @@ class AxisLaws:
         self.velocity = self.acceleration = 0.0
         self.asked = False
         """True from a command for motion until the set-point rests again without another one."""
+        self.rest_deg = 0.0
+        """Set-point that may not change without a command, degrees at the load."""
         self.waiting = 0
         """Number of commands for motion that are not answered yet."""
         self.streamed = False
@@ -87,21 +89,21 @@ class AxisLaws:
         self.word, self.target = word, target
 
     def _follow(self, target: int, *, driven: bool) -> None:
-        """Checks that speed, acceleration and jerk of the set-point are within the limits of the axis."""
+        """Checks that the set-point moves only on command, and within the limits of the axis."""
         limits, period_s = self.axis.config.limits, self.axis.config.drive.cycle_s
         rounding = self.deg_per_count / period_s
         correction_deg = self.axis.follower.correction.correction_arcsec / ARCSEC_PER_DEG
         mode, place_deg = self.axis.set_point.mode, target * self.deg_per_count + correction_deg
         before_deg, self.place_deg = self.place_deg, place_deg if driven else None
-        asked, self.asked = self.asked, self.waiting > 0 or mode is not MotionMode.HOLD
+        if self.asked or before_deg is None:
+            self.rest_deg = place_deg
+        elif driven:
+            moved_deg = abs(place_deg - self.rest_deg)
+            assert moved_deg <= 2 * self.deg_per_count, f"the target moved {moved_deg} deg without a command"
+        self.asked = self.asked and (self.waiting > 0 or mode is not MotionMode.HOLD)
         if before_deg is None or not driven:
             self.velocity = self.acceleration = 0.0
             return
-        if not asked:
-            moved_deg = abs(place_deg - before_deg)
-            assert moved_deg <= 2 * self.deg_per_count, (
-                f"the target moves by {moved_deg} deg without a command"
-            )
         velocity = (place_deg - before_deg) / period_s
         acceleration = (velocity - self.velocity) / period_s
         assert abs(velocity) <= limits.velocity_deg_s + 2 * rounding

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ from can.interfaces.virtual import VirtualBus
 from canopen.objectdictionary import ODVariable, import_od
 
 from hdbridge.axis import AxisConfig
+from hdbridge.drive.layout import Layout
 from hdbridge.sim.lockstep import VirtualClock
 
 NOT_READY, OFF, READY, ON, ENABLED, STOPPED, FAULT = 0x00, 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
@@ -171,6 +173,17 @@ class RudeDrive:
         self._heard_s, self._beat_s, self.nmt = None, float("inf"), 0
         self._values[0x1016, 1] = self._values[0x1017, 0] = 0
         self._events = [(self._clock.now() + self.ways.boot_delay_s, "boot", 0)]
+
+    def configure(self, tpdos: Iterable[Layout]) -> None:
+        """Makes it OPERATIONAL in CSP with these PDOs, as if a master had booted it."""
+        self.nmt = 5
+        self._values[0x6061, 0] = 8
+        for layout in tpdos:
+            place, entries = layout.number - 1, layout.codec.entries
+            self._values[0x1800 + place, 1] = layout.can_id
+            self._values[0x1A00 + place, 0] = len(entries)
+            for sub, entry in enumerate(entries, 1):
+                self._values[0x1A00 + place, sub] = entry.mapping
 
     def _booted(self, now_s: float) -> None:
         self.nmt = 5 if self.ways.starts_itself else 127
