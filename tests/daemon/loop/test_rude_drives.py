@@ -24,7 +24,7 @@ from hdbridge.drive.supervision import Fault
 AFTER_TURNS = st.integers(0, 8)
 """Cycles from the command to enable until a drive is enabled, and some more."""
 PLAUSIBLE_COUNTS = 400
-"""Largest error of a position that the supervision must accept: vibration, and the highest speed in a cycle."""
+"""Largest error of a position that the supervision accepts: vibration, and the highest speed in a cycle."""
 
 
 @contextmanager
