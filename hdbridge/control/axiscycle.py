@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
+from hdbridge.cia301 import NmtState
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import Frames, ProcessImage
 from hdbridge.drive.link import Frame, new_tuple
@@ -31,10 +32,15 @@ Target = int | None
 """Motor counts for 607Ah; None repeats the last target."""
 Command = Target | Callable[[Feedback], Target]
 
+OBEY_S: Final = 0.25
+"""Maximum time from the command of a quick stop until the drive leaves 'operation enabled'.
+
+A drive that takes longer loses its voltage."""
 STILL_CYCLES: Final = 3
 """Number of cycles without motion after which a quick stop counts as completed."""
 _ENABLED: Final = State.OPERATION_ENABLED
 _POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
+_NOT_STOPPED: Final = (State.OPERATION_ENABLED, State.UNKNOWN)
 _STILL_DRIVEN: Final = (State.OPERATION_ENABLED, State.FAULT_REACTION_ACTIVE, State.UNKNOWN)
 
 
@@ -100,17 +106,25 @@ class AxisCycle:
         self._commanded = False
         self._handled_stop: Event | None = None
         self._left = self._still = 0
-        self._stop_cycles = max(int(stop_timeout_s / axis.drive.cycle_s), STILL_CYCLES + 1)
+        self._disobeyed = False
+        """True if the drive was still in 'operation enabled' `OBEY_S` after the command."""
+        braking_s = axis.limits.velocity_deg_s / axis.limits.acceleration_deg_s2
+        timeout_s = max(stop_timeout_s, 2.0 * braking_s)
+        self._stop_cycles = max(int(timeout_s / axis.drive.cycle_s), STILL_CYCLES + 1)
+        self._obey_cycles = int(OBEY_S / axis.drive.cycle_s)
 
     def begin(self) -> None:
         """Sends RPDOs from the next cycle on; earlier frames and encoder motion are not supervised.
 
-        After a `Reaction.LATCH`, the axis stays silent unless the latch has been released.
+        If power is requested, the positions in ``image`` are those of the preparation, and the first ones of
+        the cycle must agree with them. After a `Reaction.LATCH`, the axis stays silent unless the latch has
+        been released.
         """
         self.flushing = True
         self.pending.clear()
         self.silent = self.supervision.reaction is Reaction.LATCH
-        self._last = None
+        prepared = self.image.power.aim is _ENABLED
+        self._last = self._feedback(self.feedback.cycle, self.feedback.time_s, True) if prepared else None
         self._commanded = False
         self.image.forget_channels()
         self.changed()
@@ -143,8 +157,11 @@ class AxisCycle:
         if supervision.stop is None:
             return None
         stop = supervision.error()
-        if supervision.reaction is not Reaction.QUICK_STOP or self.stopping or self.confirmed:
+        if supervision.reaction is not Reaction.QUICK_STOP or self.stopping:
             return stop
+        if self.confirmed:
+            disobeyed = "; the drive did not obey it, so its voltage was disabled" * self._disobeyed
+            return SafetyStop(f"{stop.text}{disobeyed}", stop.hint)
         return SafetyStop(
             f"{stop.text}; the drive did not confirm it: its own watchdogs have to stop it", stop.hint
         )
@@ -180,10 +197,10 @@ class AxisCycle:
         """Returns RPDOs with a quick stop if a fault noticed before SYNC stops the axis, else None.
 
         A drive holds the last RPDO until SYNC. If it has stopped on its own in the meantime, the set-point
-        in that RPDO would set it in motion again. After a fault that latches the axis, no RPDO is sent at
-        all.
+        in that RPDO would set it in motion again. A drive that has restarted gets no RPDO at all.
         """
-        if max(ROWS[fault].first for fault, _ in self.pending) is not Reaction.QUICK_STOP:
+        reaction = max(ROWS[fault].first for fault, _ in self.pending)
+        if reaction < Reaction.QUICK_STOP or (reaction is Reaction.LATCH and not self._drive_runs):
             return None
         self.image.power.quick_stop()
         return self.image.pack_rpdo_stop()
@@ -195,7 +212,6 @@ class AxisCycle:
             self.image.power.observe(word)
             if self.image.power.dropped is not None:
                 self._fell_out()
-                self._commanded = False
 
     def hear(self, frame: Frame) -> None:
         """Interprets a frame of the axis that the cycle does not wait for, and records its faults."""
@@ -208,7 +224,9 @@ class AxisCycle:
                 self.image.accept(can_id, data)
             except PdoLengthError:
                 faults.append((Fault.DISCARDED_FRAME, f"{can_id:03X}h with {len(data)} bytes"))
-        if not (self.silent or self.flushing):
+        if self.flushing:
+            faults = [each for each in faults if each[0] is Fault.BOOT_UP]  # a restart is never out of date
+        if not self.silent:
             self.pending += faults
 
     def run_period(self, now: float, count: int, time_s: float, complete: bool) -> Frames | None:
@@ -225,15 +243,15 @@ class AxisCycle:
             self._step_channels()
         power = image.power
         enabled = power.state is _ENABLED
-        if complete and enabled and self._last is not None:
-            complete = self._believable(self._last, count)
+        if complete and self._last is not None and (enabled or power.aim is _ENABLED):
+            complete = self._believable(self._last, count, enabled=enabled)
         before = self.feedback
         if complete:
             self.feedback = feedback = self._last = self._feedback(count, time_s, True)
             self._good_cycle = count
         else:
             feedback = self.stale(count, time_s)
-        if self._commanded and (not enabled or power.dropped is not None):
+        if power.dropped is not None and stop is None:
             self._fell_out()
         if now - self._traffic.heard_s > image.heartbeat_timeout_s and (stop is None or not self._over()):
             silent_ms = 1e3 * (now - self._traffic.heard_s)
@@ -300,12 +318,13 @@ class AxisCycle:
         power, stop = self.image.power, self.supervision.stop
         reaction = self._judge(count)
         if reaction is Reaction.QUICK_STOP:
-            power.quick_stop()
             data = None
         if stop is not None:
             self._count_stop_cycle(before)
+        if reaction is Reaction.QUICK_STOP:
+            self._stop_drive()
         if reaction is Reaction.LATCH:
-            return None
+            return self.image.pack_rpdo_stop() if self._drive_runs else None
         self._commanded = power.state is State.OPERATION_ENABLED and power.aim is State.OPERATION_ENABLED
         return data if data is not None else self._idle()
 
@@ -315,6 +334,12 @@ class AxisCycle:
         if reaction is Reaction.LATCH:
             self._latch()
         return reaction
+
+    @property
+    def _drive_runs(self) -> bool:
+        """True unless the drive itself, and not only another node of the axis, must be verified again."""
+        drive = self.monitor.watch(self.image.node_id)
+        return not drive.restarted and drive.nmt_state in (None, NmtState.OPERATIONAL)
 
     def _latch(self) -> None:
         """Stops the set-points of the axis, and withdraws the request to enable it."""
@@ -331,8 +356,11 @@ class AxisCycle:
             if image.awaited_channels() != self._awaited_channels:
                 self.changed()
 
-    def _believable(self, last: Feedback, count: int) -> bool:
-        """Returns False if the positions contradict the last ones; records an excessive following error."""
+    def _believable(self, last: Feedback, count: int, *, enabled: bool) -> bool:
+        """Returns False if the positions contradict the last ones; records an excessive following error.
+
+        The drive has a demand to follow only once it is ``enabled``.
+        """
         image, plausibility = self.image, self._plausibility
         motor = image.motor_counts
         cycles = count - self._good_cycle
@@ -340,7 +368,7 @@ class AxisCycle:
         if jump is not None:
             self.pending.append((Fault.ENCODER_JUMP, jump))
             return False
-        lag = plausibility.lag(image.demand_counts - motor)
+        lag = plausibility.lag(image.demand_counts - motor) if enabled else None
         if lag is not None:
             self.pending.append((Fault.FOLLOWING_ERROR, lag))
         return True
@@ -353,9 +381,9 @@ class AxisCycle:
         self.pending.append((Fault.DRIVE_FAULT if fault else Fault.DROPPED_OUT, detail))
 
     def _idle(self) -> Frames:
-        """Returns the RPDOs with the actual position as target."""
+        """Returns the RPDOs with the last plausible position as target."""
         try:
-            return self.image.pack_rpdo_idle()
+            return self.image.pack_rpdo_idle(self.feedback.motor_counts)
         except InputError:
             # The position does not fit the target object. The drive ignores the target in any case, because
             # it is not enabled or is being stopped.
@@ -370,7 +398,7 @@ class AxisCycle:
     def _note(self, stop: Event | None) -> None:
         """Handles a stop that was latched or released since the last cycle; a latched stop starts braking."""
         self._handled_stop = stop
-        self._still, self._left = 0, self._stop_cycles
+        self._still, self._left, self._disobeyed = 0, self._stop_cycles, False
         if stop is not None:
             self.image.power.quick_stop()
         self.changed()
@@ -384,8 +412,19 @@ class AxisCycle:
         halted = feedback.fresh and self.image.power.state not in _STILL_DRIVEN
         kept = halted and abs(feedback.motor_counts - before.motor_counts) <= 1
         self._still = self._still + 1 if kept else 0
+        waited = self._stop_cycles - self._left
+        if feedback.fresh and waited >= self._obey_cycles and self.image.power.state in _NOT_STOPPED:
+            self._disobeyed = True
         if self._over():
             self.changed()
+
+    def _stop_drive(self) -> None:
+        """Commands the quick stop, or power off if the drive has not obeyed it."""
+        power = self.image.power
+        if self._disobeyed:
+            power.power_off()
+        else:
+            power.quick_stop()
 
 
 def _nobody() -> None:

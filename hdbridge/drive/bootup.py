@@ -177,11 +177,11 @@ class BootUp:
 
     def _start(self, node_id: int) -> None:
         status = self._monitor.watch(node_id)
+        self._monitor.started(node_id)
         self._nmt(NmtCommand.START, node_id)
         if node_id == self._axis.drive.node_id and not drive_heartbeat_ms(self._axis, self._sdo.od):
             return  # Without a heartbeat, only the TPDOs that follow show that it has started.
         deadline_s = self._link.now() + STATE_TIMEOUT_S + 2e-3 * self._axis.drive.heartbeat_ms
-        status.nmt_state = None
         while status.nmt_state != NmtState.OPERATIONAL and self._receive_until(deadline_s):
             pass
         if status.nmt_state != NmtState.OPERATIONAL:

@@ -17,7 +17,7 @@ from hdbridge.drive.link import Link
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.sdo import SdoClient
-from hdbridge.drive.states import State, controlword_for, decode, states_on_the_way
+from hdbridge.drive.states import Command, State, controlword_for, decode, states_on_the_way
 from hdbridge.errors import RESET, DriveError, TransitionError
 
 STEP_TIMEOUT_S: Final = 1.0
@@ -27,6 +27,7 @@ POLL_S: Final = 0.005
 _STILL_COUNTS: Final = 2
 _STILL_POLL_S: Final = 0.02
 _FAILED_STATES: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
+_MAY_BE_ENABLED: Final = (State.SWITCHED_ON, State.OPERATION_ENABLED)
 
 
 class Commander:
@@ -56,8 +57,21 @@ class Commander:
         return self.image.power.observe(statusword)
 
     def control(self, controlword: int) -> None:
+        """Writes the controlword.
+
+        *Enable operation* would set a drive in motion again that has stopped by itself. It is therefore only
+        sent to a drive that is switched on or enabled, and is not repeated without an answer. Raises
+        `DriveError` otherwise.
+        """
+        enables = controlword & Command.ENABLE_OPERATION.mask == Command.ENABLE_OPERATION.word
+        if enables and (state := decode(self.statusword())) not in _MAY_BE_ENABLED:
+            if state in _FAILED_STATES:
+                raise self.fault("before 'enable operation'")
+            raise DriveError(
+                f"{self.name}: is in '{state.value}' before 'enable operation'; look at its error display"
+            )
         self._beat()
-        self.sdo.store(objects.CONTROLWORD, controlword)
+        self.sdo.store(objects.CONTROLWORD, controlword, attempts=1 if enables else None)
 
     def pause(self, duration_s: float) -> None:
         """Waits, receiving frames and sending the master's heartbeat when due."""

@@ -185,6 +185,10 @@ class Drive:
         self._expect_master(True)
         self._commander.set_mode(mode)
         self._mode = mode
+        if (node_id := self.monitor.restarted) is not None:
+            raise TransitionError(
+                f"node {node_id} on {self.link.name}: has restarted since it was verified; call boot() again"
+            )
         return positions
 
     def disable(self) -> None:

@@ -284,9 +284,9 @@ class ProcessImage:
         self.check_target(target_counts)
         return self._pack(target_counts)
 
-    def pack_rpdo_idle(self) -> Frames:
+    def pack_rpdo_idle(self, motor_counts: int) -> Frames:
         """Returns the RPDOs with the actual position as target, for every cycle before power is enabled."""
-        return self._pack(wrap_int32(self.motor_counts))
+        return self._pack(wrap_int32(motor_counts))
 
     def pack_rpdo_held(self) -> Frames:
         """Returns the RPDOs with the last target repeated."""

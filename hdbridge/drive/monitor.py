@@ -42,6 +42,8 @@ class NodeStatus:
     """Time of the last heartbeat or boot-up message, on the link's clock; s."""
     boot_ups: int = 0
     heartbeats: int = 0
+    restarted: bool = False
+    """True if the node has sent a boot-up message since `NetworkMonitor.started`."""
     boot_up_s: float | None = None
     """Time of the last boot-up message, on the link's clock; s."""
     emergency_count: int = 0
@@ -91,6 +93,16 @@ class NetworkMonitor:
             self._emergency[COB_EMCY + node_id] = status
         return status
 
+    def started(self, node_id: int) -> None:
+        """Records that a configured node is being started (NMT); a later boot-up message undoes that."""
+        status = self.watch(node_id)
+        status.restarted, status.nmt_state = False, None
+
+    @property
+    def restarted(self) -> int | None:
+        """Id of a watched node that has restarted since it was started; None without one."""
+        return next((each.node_id for each in self.nodes.values() if each.restarted), None)
+
     def dispatch(self, frame: Frame) -> bool:
         """Takes a frame; returns True for a heartbeat, boot-up message or emergency of a watched node."""
         can_id, data, time_s = frame
@@ -104,6 +116,7 @@ class NetworkMonitor:
             status.heartbeat_s = time_s
             if nmt_state == NmtState.BOOT_UP:
                 status.boot_ups += 1
+                status.restarted = True
                 status.boot_up_s = time_s
             else:
                 status.heartbeats += 1

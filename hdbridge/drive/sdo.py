@@ -211,15 +211,25 @@ class SdoClient:
             )
         return kind.decode(data[:size])
 
-    def write(self, index: int, sub: int, value: int, type: IntegerType | None = None) -> None:  # noqa: A002
-        """Writes an integer object; raises `InputError` for a value out of range, `SdoError` on refusal."""
+    def write(
+        self,
+        index: int,
+        sub: int,
+        value: int,
+        type: IntegerType | None = None,  # noqa: A002
+        attempts: int | None = None,
+    ) -> None:
+        """Writes an integer object; raises `InputError` for a value out of range, `SdoError` on refusal.
+
+        ``attempts`` replaces those of the client.
+        """
         kind = type or self.type_of(index, sub)
         if not isinstance(value, int) or not kind.minimum <= value <= kind.maximum:
             raise InputError(
                 f"{self.describe(index, sub)}: {value!r} is not an integer in "
                 f"[{kind.minimum}, {kind.maximum}] ({kind.value}); nothing was written"
             )
-        self.write_bytes(index, sub, kind.encode(value))
+        self._transfer("write", index, sub, kind.encode(value), attempts)
 
     def fetch(self, address: Address) -> int:
         return self.read(address.index, address.sub)
@@ -228,8 +238,8 @@ class SdoClient:
         """Reads the objects that the EDS lists."""
         return {each: self.fetch(each) for each in addresses if self.has(each.index, each.sub)}
 
-    def store(self, address: Address, value: int) -> None:
-        self.write(address.index, address.sub, value)
+    def store(self, address: Address, value: int, attempts: int | None = None) -> None:
+        self.write(address.index, address.sub, value, attempts=attempts)
 
     def read_text(self, index: int) -> str:
         """Reads a string object; characters outside ASCII become question marks."""
@@ -245,9 +255,11 @@ class SdoClient:
         """Writes raw bytes: up to four expedited, more segmented."""
         self._transfer("write", index, sub, data)
 
-    def _transfer(self, doing: str, index: int, sub: int, data: bytes | None) -> bytes:
-        problem = "no attempt was made"
-        for _ in range(self.attempts):
+    def _transfer(
+        self, doing: str, index: int, sub: int, data: bytes | None, attempts: int | None = None
+    ) -> bytes:
+        problem, attempts = "no attempt was made", attempts or self.attempts
+        for _ in range(attempts):
             self._channel.transfer_ends_s = (
                 self._channel.link.now() + _TIMEOUTS_PER_TRANSFER * self._channel.timeout_s
             )
@@ -275,7 +287,7 @@ class SdoClient:
                 self._log(f"sdo {doing} failed", index, sub, problem=str(error))
             else:
                 return b""
-        times = f"{self.attempts} attempts" if self.attempts != 1 else "one attempt"
+        times = f"{attempts} attempts" if attempts != 1 else "one attempt"
         raise SdoError(f"{self.describe(index, sub)}: {doing} failed after {times}: {problem}")
 
     def _log(self, event: str, index: int, sub: int, **facts: object) -> None:

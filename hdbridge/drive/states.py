@@ -23,6 +23,7 @@ State = PowerState
 _ENABLED: Final = State.OPERATION_ENABLED
 _QUICK_STOP: Final = State.QUICK_STOP_ACTIVE
 _FAULT: Final = State.FAULT
+_FAULTS: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 
 _DECODING: Final[tuple[tuple[State, int, int], ...]] = (
     # state, mask, value: bits 0-3, 5, 6 of the statusword
@@ -193,8 +194,9 @@ _WORDS: Final = {state: {aim: _word(state, aim) for aim in State} for state in S
 class PowerWalk:
     """Walks a drive through its states, taking one statusword and returning one controlword at a time.
 
-    It only walks towards its target state. A drive that leaves 'operation enabled' on its own is not enabled
-    again, and a fault is reset only on request. A call that raises changes nothing.
+    It only walks towards its target state. A drive that leaves 'operation enabled' on its own, or reports a
+    fault on the way there, is not enabled until the next `go`, and a fault is reset only on request. A call
+    that raises changes nothing.
     """
 
     def __init__(self) -> None:
@@ -205,9 +207,9 @@ class PowerWalk:
         self._reset = _NO_RESET
         self._was_enabled = False
         self.dropped: State | None = None
-        """First state after the drive left 'operation enabled' without a command.
+        """First state after the drive left the way to 'operation enabled', or that state, without a command.
 
-        Kept until the next `go`, whatever the drive reports meanwhile."""
+        Kept until the next `go` or `power_off`, whatever the drive reports meanwhile."""
 
     def observe(self, statusword: int | None) -> State:
         """Takes a statusword and returns its state."""
@@ -215,7 +217,7 @@ class PowerWalk:
         self.state = state
         if state is _ENABLED:
             self._was_enabled = True
-        elif self._was_enabled:
+        elif self._was_enabled or state in _FAULTS:
             self._was_enabled = False
             if self.aim is State.OPERATION_ENABLED:
                 # The drive dropped out on its own. It stays there until the next `go`.
@@ -240,6 +242,12 @@ class PowerWalk:
             if self.state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.UNKNOWN)
             else State.SWITCH_ON_DISABLED
         )
+        self._reset = _NO_RESET
+
+    def power_off(self) -> None:
+        """Removes power now, by disable voltage, and ends the request for power. Always allowed."""
+        self.aim = State.SWITCH_ON_DISABLED
+        self.dropped = None
         self._reset = _NO_RESET
 
     def reset_fault(self) -> None:

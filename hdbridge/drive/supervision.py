@@ -25,7 +25,9 @@ class Reaction(IntEnum):
     QUICK_STOP = 2
     """Command a quick stop until the drive reports it; latched."""
     LATCH = 3
-    """Send no more RPDOs; latched until the drive has been verified again, from identity to limits."""
+    """Send no more RPDOs, except for a last quick stop to a drive that has not restarted itself.
+
+    Latched until the drive has been verified again, from identity to limits."""
 
 
 class Fault(Enum):

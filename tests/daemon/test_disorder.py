@@ -19,10 +19,11 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
-from support.characters import AWKWARD, FRIENDLY, INTERPOLATED, Character
+from support.characters import AWKWARD, FRIENDLY, INTERPOLATED, RUDE, Character
 from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
 from support.daemonlaws import Laws
 from support.keys import changed
+from support.rude import RudeDrive, Ways
 
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Knot, MailboxFullError, RelayedFrame
@@ -36,6 +37,8 @@ COUNTS_PER_TURN = 1 << 20
 """Resolution of the motor encoder. It is high, because coarse counts would hide small jumps."""
 TRAVEL_DEG = 3.0
 """Short, so that the limits are reached often."""
+WORDS = ((0,), (0x27, 0), (0xFFFF,), (0x08,), (0x0F, 0x08, 0x27), (0x07, 0x27), (0x27, 0x27), (0x40, 0x21))
+"""Statuswords that a drive may show for some cycles."""
 KINDS = list(K)
 axes = st.integers(0, 1)
 angles = st.one_of(
@@ -83,7 +86,7 @@ class Disorder(RuleBasedStateMachine):
         super().__init__()
         self.stack = ExitStack()
 
-    @initialize(character=st.sampled_from([FRIENDLY, AWKWARD, INTERPOLATED]))
+    @initialize(character=st.sampled_from([FRIENDLY, AWKWARD, INTERPOLATED, RUDE, RUDE]))
     def boot(self, character: Character) -> None:
         truth = changed(Truth.load(PROFILE), motor__encoder__counts_per_turn=COUNTS_PER_TURN)
         self.daemon: SteppedDaemon = self.stack.enter_context(
@@ -312,6 +315,23 @@ class Disorder(RuleBasedStateMachine):
     @event(node=st.integers(1, 2), length=st.integers(0, 7))
     def lying_tpdo(self, node: int, length: int) -> None:
         self.daemon.interfere(0x180 + node, struct.pack("<Hih", 0x1237, 999_999, 0)[:length])
+
+    @event(axis=axes, way=st.sampled_from(sorted(vars(Ways()))), on=st.booleans(), which=st.integers(0, 200))
+    def misbehave(self, axis: int, way: str, on: bool, which: int) -> None:
+        node = self.daemon.nodes[axis]
+        if not isinstance(node, RudeDrive):
+            return
+        usual = getattr(Ways(), way)
+        if isinstance(usual, bool):
+            setattr(node.ways, way, on)
+        elif isinstance(usual, float):
+            setattr(node.ways, way, 0.1 * on)
+        elif way == "words":
+            node.ways.words.extend(WORDS[which % len(WORDS)])
+        elif way == "jumps":
+            node.ways.jumps.extend([500 * (which - 100)] * (1 + which % 3))
+        elif isinstance(usual, int):
+            setattr(node.ways, way, which % 6 if on else 0)
 
     @event(can_id=st.sampled_from([0x080, 0x201, 0x202, 0x77F, 0x601]))
     def no_room(self, can_id: int) -> None:

@@ -44,7 +44,7 @@ def test_in_csp_power_is_left_to_the_cycle(drive: Drive, slave: Any) -> None:
     image = drive.image
     assert (image.motor_counts, image.load_counts) == (1000, 7200)
     assert image.power.state is State.SWITCH_ON_DISABLED
-    ((can_id, data),) = image.pack_rpdo_idle()
+    ((can_id, data),) = image.pack_rpdo_idle(image.motor_counts)
     assert (can_id, struct.unpack("<Hi", data)) == (0x201, (0x06, 1000))
 
 

@@ -158,7 +158,7 @@ def test_before_power_the_target_is_the_actual_position(axis: AxisConfig) -> Non
     image.accept(0x181, tpdo1(0x0040, -(2**31) + 10))
     assert image.motor_counts == 2**31 + 10
     image.power.go(State.OPERATION_ENABLED)
-    assert sent(image.pack_rpdo_idle()) == (0x06, -(2**31) + 10)
+    assert sent(image.pack_rpdo_idle(image.motor_counts)) == (0x06, -(2**31) + 10)
 
 
 def test_halt_sets_its_bit(axis: AxisConfig) -> None:
@@ -176,7 +176,7 @@ def test_in_ip_the_target_is_enabled_in_operation_enabled_only(build_axis: Calla
     image.power.go(State.OPERATION_ENABLED)
     for status, word in ((0x0040, 0x06), (0x0021, 0x07), (0x0023, 0x0F), (0x0027, 0x1F)):
         image.accept(0x181, tpdo1(status, 100))
-        assert sent(image.pack_rpdo_idle()) == (word, 100)
+        assert sent(image.pack_rpdo_idle(image.motor_counts)) == (word, 100)
     assert sent(image.pack_rpdo(150)) == (0x1F, 150)
     assert sent(image.pack_rpdo_held()) == (0x1F, 150)
     assert sent(image.pack_rpdo_stop()) == (0x02, 100)

@@ -50,7 +50,9 @@ def cycle(drive: Drive, clock: Any, target_counts: int | None) -> None:
         else:
             drive.monitor.dispatch(frame)
     assert not waited
-    for frame in image.pack_rpdo_idle() if target_counts is None else image.pack_rpdo(target_counts):
+    for frame in (
+        image.pack_rpdo_idle(image.motor_counts) if target_counts is None else image.pack_rpdo(target_counts)
+    ):
         link.send(*frame)
 
 

@@ -19,6 +19,8 @@ class Character:
     behaviour: Behaviour = Behaviour()
     quick_stop_option: int = 2
     mode: Literal["csp", "ip"] = "csp"
+    rude: bool = False
+    """True for the drive of `support.rude`."""
 
     def of_axis(self, axis: AxisConfig) -> AxisConfig:
         update = {"quick_stop_option": self.quick_stop_option, "mode": self.mode}
@@ -47,6 +49,7 @@ SLUGGISH: Final = Character("sluggish", Behaviour(**_SLUGGISH), 6)
 AWKWARD: Final = Character("awkward", Behaviour(**_RESTLESS, **_SLUGGISH), 2)
 INTERPOLATED: Final = Character("interpolated", Behaviour(**_RESTLESS), 6, "ip")
 """Drive that resumes whenever it can, in interpolated position mode."""
+RUDE: Final = Character("rude", quick_stop_option=6, rude=True)
 CHARACTERS: Final = (FRIENDLY, RESTLESS, SLUGGISH, AWKWARD, INTERPOLATED)
 
 

@@ -37,6 +37,7 @@ from hdbridge.enums import Scheme
 from hdbridge.sim.lockstep import SimulatedAxis, VirtualClock, simulated_benches
 from hdbridge.sim.truth import Truth
 from support.characters import FRIENDLY, Character
+from support.rude import RudeDrive
 from support.spoilt import SpoiltBus
 
 Params = ParamSpec("Params")
@@ -276,8 +277,15 @@ def stepped_daemon(
         SimulatedAxis(plant, each.eds_path, each.drive.node_id, seed) for seed, each in enumerate(configs)
     ]
     with ExitStack() as stack:
-        bus, clock, nodes = stack.enter_context(simulated_benches(simulated, channel))
-        bus.shutdown()
+        if character.rude:
+            clock = VirtualClock()
+            nodes = [RudeDrive(channel, each, clock) for each in configs]
+            for node in nodes:
+                stack.callback(node.close)
+            clock.nodes += nodes
+        else:
+            bus, clock, nodes = stack.enter_context(simulated_benches(simulated, channel))
+            bus.shutdown()
         intruder = stack.enter_context(VirtualBus(channel))
         spoilt = stack.enter_context(SpoiltBus(channel, clock))
         memory = stack.enter_context(Memory.create(len(configs), configs[0].drive.cycle_s))

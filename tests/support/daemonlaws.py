@@ -22,6 +22,8 @@ ENABLE_OPERATION = 0x0F
 PRE_OPERATIONAL = (0x000, 0x80)
 """NMT command that the loop itself sends to each node when the bus has been opened again."""
 SILENT = frozenset({AxisState.UNVERIFIED, AxisState.LENT, AxisState.LATCHED})
+MOTION = frozenset({CommandKind.MOVE, CommandKind.JOG, CommandKind.STREAM_BEGIN, CommandKind.FOLLOW})
+"""Commands that lead to motion."""
 DRIVEN = frozenset({AxisState.ENABLED, AxisState.STOPPING})
 LATCHES = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
 STANDING_DEG = 0.01
@@ -52,6 +54,12 @@ class AxisLaws:
         self.place_deg: float | None = None
         """Set-point at the last RPDO (target without correction), degrees at the load; None if not driven."""
         self.velocity = self.acceleration = 0.0
+        self.asked = False
+        """True from a command for motion until the set-point rests again without another one."""
+        self.rest_deg = 0.0
+        """Set-point that may not change without a command, degrees at the load."""
+        self.waiting = 0
+        """Number of commands for motion that are not answered yet."""
         self.streamed = False
         """True from the begin of a stream until rest; near a position limit, its stop has no jerk limit."""
 
@@ -81,12 +89,18 @@ class AxisLaws:
         self.word, self.target = word, target
 
     def _follow(self, target: int, *, driven: bool) -> None:
-        """Checks that speed, acceleration and jerk of the set-point are within the limits of the axis."""
+        """Checks that the set-point moves only on command, and within the limits of the axis."""
         limits, period_s = self.axis.config.limits, self.axis.config.drive.cycle_s
         rounding = self.deg_per_count / period_s
         correction_deg = self.axis.follower.correction.correction_arcsec / ARCSEC_PER_DEG
         mode, place_deg = self.axis.set_point.mode, target * self.deg_per_count + correction_deg
         before_deg, self.place_deg = self.place_deg, place_deg if driven else None
+        if self.asked or before_deg is None:
+            self.rest_deg = place_deg
+        elif driven:
+            moved_deg = abs(place_deg - self.rest_deg)
+            assert moved_deg <= 2 * self.deg_per_count, f"the target moved {moved_deg} deg without a command"
+        self.asked = self.asked and (self.waiting > 0 or mode is not MotionMode.HOLD)
         if before_deg is None or not driven:
             self.velocity = self.acceleration = 0.0
             return
@@ -124,6 +138,9 @@ class Laws:
     def post(self, kind: CommandKind | int, axis: int, id_: int) -> None:
         """Records a command that was put into the mailbox."""
         self.asked[id_] = kind
+        if kind in MOTION:
+            for laws in self.axes.values():  # a stream is of several axes
+                laws.asked, laws.waiting = True, laws.waiting + 1
         if kind == CommandKind.ENABLE and 0 <= axis < len(self.daemon.axes):
             self.axes[self.daemon.axes[axis].config.drive.node_id].allowed = True
 
@@ -147,6 +164,7 @@ class Laws:
         for axis in self.daemon.axes:
             laws = self.axes[axis.config.drive.node_id]
             laws.axis, laws.latched, laws.allowed = axis, False, False
+            laws.asked, laws.waiting = False, 0
 
     def turn(self) -> None:
         """Runs one cycle and checks that it relays at most one frame."""
@@ -160,6 +178,9 @@ class Laws:
             if event.kind in (EventKind.DONE, EventKind.REFUSED) and event.id:
                 assert event.id in self.asked, f"answered twice, or not asked: {event}"
                 kind = self.asked.pop(event.id)
+                if kind in MOTION:
+                    for laws in self.axes.values():
+                        laws.waiting -= 1
                 if kind == CommandKind.RESET and event.kind is EventKind.DONE:
                     self._laws_of(event.axis).latched = False
             elif event.kind is EventKind.STATE and event.code in LATCHES:

@@ -210,10 +210,15 @@ class AxisLoop:
 
     def _verified(self, command: Command) -> None:
         self._seed(command)
-        self._request_power_off()
+        self.image.power.power_off()
         self.cycle.begin()
 
     def _seed(self, command: Command) -> None:
+        if (node_id := self.cycle.monitor.restarted) is not None:
+            raise TransitionError(
+                f"{self.config.name}: node {node_id} has restarted since it was verified; verify it again: "
+                f"{RESET}"
+            )
         if not 0 <= command.k <= 0xFFFF:
             raise InputError(f"{self.config.name}: invalid statusword {command.k}; expected 16 bits")
         self.image.seed(command.i, command.j, command.k)
@@ -296,6 +301,8 @@ class AxisLoop:
     def _stop(self, _: Command) -> None:
         if self.state is AxisState.ENABLED:
             self.set_point.stop()
+        elif self.state is AxisState.ENABLING:
+            self._why = "it was stopped before it was enabled"
 
     def _change(self, command: Command) -> None:
         setting = CompensationSetting.from_json(self._slot.get(command.i))
@@ -307,17 +314,10 @@ class AxisLoop:
 
     # ---------------------------------------------------------------- power
 
-    def _request_power_off(self) -> None:
-        power = self.image.power
-        try:
-            power.go(State.SWITCH_ON_DISABLED)
-        except TransitionError:
-            power.quick_stop()  # only a fault reset leaves this state; at least, no power is requested
-
     def _power_off(self) -> None:
         self.cycle.command = None
         self._turns_left = self._turns(STOP_TIMEOUT_S)
-        self._request_power_off()
+        self.image.power.power_off()
 
     def _enabling(self, feedback: Feedback) -> int | None:
         """Holds position until every channel has a value, then follows from the actual position."""
@@ -443,7 +443,7 @@ class AxisLoop:
             return self._still_turns >= STILL_CYCLES
         if driven:
             self._why += "; the drive did not obey it, so its voltage is disabled"
-            self._request_power_off()
+            self.image.power.power_off()
         return True
 
     # ---------------------------------------------------------------- the sample of a cycle

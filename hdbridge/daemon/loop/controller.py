@@ -14,6 +14,7 @@ from functools import partial
 from typing import Final
 
 from hdbridge.axis import AxisConfig
+from hdbridge.cia301 import NmtCommand
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.daemon.loop.axisloop import AxisLoop
 from hdbridge.daemon.loop.relay import incoming_ids, refusal_reason
@@ -21,6 +22,7 @@ from hdbridge.daemon.loop.states import AxisState, label
 from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import Cell, Command, CommandKind, Event, EventKind, Memory, RelayedFrame
 from hdbridge.drive.link import Frame, Link
+from hdbridge.drive.objects import COB_NMT
 from hdbridge.drive.states import State
 from hdbridge.errors import BusError, HdbridgeError, InputError
 
@@ -194,6 +196,8 @@ class Controller:
         states = {node: axis.state for node, axis in self._axis_of_node.items()}
         refusal = refusal_reason(can_id, data, states)
         if refusal is None:
+            if can_id == COB_NMT and data[0] == NmtCommand.START:
+                self._axis_of_node[data[1]].cycle.monitor.started(data[1])
             return can_id, data
         second = round(1.0 / self.cycle.period_s)
         if self.cycle.count - self._last_refusal_cycle > second // REFUSALS_PER_SECOND:

@@ -101,8 +101,8 @@ TRANSITIONS: Final[tuple[Transition, ...]] = (
     Transition(_S.STOPPING, _T.OVERDUE, _S.QUICK_STOPPED),
     Transition(_S.QUICK_STOPPED, _C.RESET, _S.STOPPING),
     Transition(_S.LATCHED, _C.RESET, _S.UNVERIFIED),
-    # A stop is never refused, even if nothing moves.
-    *(Transition(state, _C.STOP, state) for state in _S),
+    # A stop is never refused, even if nothing moves. An axis that is being enabled is not enabled after it.
+    *(Transition(state, _C.STOP, state if state is not _S.ENABLING else _S.STOPPING) for state in _S),
     *(
         Transition(state, _C.QUICK_STOP, state)
         for state in (_S.UNVERIFIED, _S.DISABLED, _S.QUICK_STOPPED, _S.LATCHED)

@@ -115,9 +115,13 @@ class ServiceAxis:
 
     # ---------------------------------------------------------------- power
 
-    async def enable(self, holder: str) -> None:
-        """Switches power on, at rest; first boots and verifies the drive if this was not done."""
+    async def enable(self, holder: str, is_withdrawn: Callable[[], bool] = lambda: False) -> None:
+        """Switches power on, at rest; first boots and verifies the drive if this was not done.
+
+        Power stays off if the axis is stopped, the lease ends or ``is_withdrawn()`` becomes True meanwhile.
+        """
         self.check_may(holder)
+        request = self.link.request(holder)
         async with self._exclusive_use("the axis is being enabled"):
             self.motion.replace(None, "the axis was enabled again")
             await self.settle()
@@ -135,6 +139,9 @@ class ServiceAxis:
             else:
                 seeds = await self._work(self.commissioning.prepare)
             try:
+                request.check()
+                if is_withdrawn():
+                    raise RefusedError(f"{self.name}: the request for power was withdrawn")
                 await link.do(CommandKind.ENABLE, POWER_S, **seeds)
             except HdbridgeError:
                 await self._rest()
@@ -158,7 +165,8 @@ class ServiceAxis:
             await self._rest()
 
     def cancel_activity(self, why: str) -> None:
-        """Ends the current activity and interrupts SDO requests to the drive; a homing axis stops."""
+        """Withdraws all requests for power and motion; interrupts SDO requests, so a homing axis stops."""
+        self.link.withdraw_requests(why)
         self.motion.replace(None, why)
         self.commissioning.interrupt(f"{self.name}: {why}")
 
@@ -202,8 +210,10 @@ class ServiceAxis:
         async with self._drive:
             await self.core.until(lambda: self.core.newest is not None, ANSWER_S)
             if link.state is AxisState.LENT:
-                await self._work(self.commissioning.abandon_homing)
-                await link.do(CommandKind.RELEASE)
+                try:
+                    await self._work(self.commissioning.abandon_homing)
+                finally:
+                    await link.do(CommandKind.RELEASE)  # the drive is then booted again, without power
             if link.state not in UNKNOWN:
                 await self._work(self.commissioning.take_over)
 
@@ -218,17 +228,19 @@ class ServiceAxis:
     async def home(self, holder: str, run: messages.Home) -> None:
         """Homes by a method of 6098h. The axis is disabled before and after."""
         self.check_may(holder)
+        request = self.link.request(holder)
         async with self._exclusive_use("the axis is being homed"):
             self.is_prepared = False
+            request.check()
             await self.link.do(CommandKind.HOME)
             try:
-                seeds = await self._work(self.commissioning.home, run)
+                seeds = await self._work(self.commissioning.home, run, request.check_not_stopped)
+                await self.link.do(CommandKind.HOMED, **seeds)
             except BaseException:
                 # The position may be lost, so the drive must be verified again.
                 with suppress(HdbridgeError):
                     await self.link.do(CommandKind.RELEASE)
                 raise
-            await self.link.do(CommandKind.HOMED, **seeds)
 
     async def _verify(self, *, clear_fault: bool = False) -> None:
         """Boots and verifies the drive, then lets the control process communicate with it."""

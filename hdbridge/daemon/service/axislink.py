@@ -76,6 +76,30 @@ class Activity:
             self.end("it was braked before its end" if event.code == MotionMode.STOP else COMPLETE)
 
 
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A client's request for power or motion, in force until a stop of the axis or the end of the lease."""
+
+    link: "AxisLink"
+    holder: str
+    """Token of the lease under which the request was made."""
+    stops: int
+    """Value of `AxisLink.stops` at the time of the request."""
+
+    def check(self) -> None:
+        """Raises LeaseError or RefusedError if the request is no longer in force.
+
+        Must be called just before a command that leads to power or motion, without a wait between the two.
+        """
+        self.link.core.lease.check(self.holder, renew=False)
+        self.check_not_stopped()
+
+    def check_not_stopped(self) -> None:
+        """Raises RefusedError if the axis was stopped since the request. Thread-safe."""
+        if self.link.stops != self.stops:
+            raise RefusedError(f"{self.link.name}: {self.link.stopped_by}")
+
+
 class AxisLink:
     """Connection to one axis; ``index`` is its index in the shared memory."""
 
@@ -84,6 +108,10 @@ class AxisLink:
         self.index = index
         self.config = config
         self.name = config.name
+        self.stops = 0
+        """Number of stops requested so far."""
+        self.stopped_by = ""
+        """Reason for the last of them."""
         self._activities: WeakSet[Activity] = WeakSet()
 
     # ---------------------------------------------------------------- the newest cycle
@@ -114,6 +142,15 @@ class AxisLink:
         return Arguments(i=motor, j=load, k=int(self.value("statusword")))
 
     # ---------------------------------------------------------------- commands
+
+    def request(self, holder: str) -> Request:
+        """Returns a request made now by the holder of the lease."""
+        return Request(self, holder, self.stops)
+
+    def withdraw_requests(self, why: str) -> None:
+        """Withdraws all requests made so far, because of a stop."""
+        self.stopped_by = why
+        self.stops += 1
 
     async def do(
         self, kind: CommandKind, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]

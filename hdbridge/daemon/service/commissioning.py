@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
@@ -149,12 +149,14 @@ class Commissioning:
         with self._request("it is being switched off"):
             self.drive.disable()
 
-    def home(self, run: messages.Home) -> Arguments:
+    def home(self, run: messages.Home, check: Callable[[], None]) -> Arguments:
         """Homes a drive that the control process has lent; power is off afterwards.
 
-        Raises like `Drive.home`; even then, the axis stops and its power is off if the drive answers.
+        ``check`` raises if the axis was stopped since homing was requested. Raises like `Drive.home`; even
+        then, the axis stops and its power is off if the drive answers.
         """
         with self._request("it is being homed"):
+            check()  # an `interrupt` before this request is lost; a later one ends it
             try:
                 positions = self.drive.home(**run.model_dump())
             finally:

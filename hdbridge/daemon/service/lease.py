@@ -79,14 +79,17 @@ class Lease:
         self.check(token)
         self._holder = None
 
-    def check(self, token: str) -> None:
-        """Raises LeaseError unless ``token`` is the current holder's; extends the lease by its time-out."""
+    def check(self, token: str, *, renew: bool = True) -> None:
+        """Raises LeaseError unless ``token`` is the current holder's.
+
+        Extends the lease by its time-out unless ``renew`` is False.
+        """
         holder = self.holder
         if holder is None:
             raise LeaseError("the lease is free or has expired: take it first")
         if not compare_digest(token.encode(), holder.token.encode()):
             raise LeaseError(f"'{holder.client}' holds the lease{self._doing()}; take it first")
-        if math.isfinite(holder.expires_s):
+        if renew and math.isfinite(holder.expires_s):
             self._holder = replace(holder, expires_s=self._now() + self.timeout_s)
 
     def holds(self, token: str) -> bool:

@@ -74,8 +74,9 @@ class AxisMotion:
         """
         self._check(holder)
         self._check_target(target_deg)
-        activity = Activity(Kind.MOVE, holder)
+        activity, request = Activity(Kind.MOVE, holder), self._link.request(holder)
         async with self.commanding:
+            request.check()
             await self._goto(activity, target_deg, velocity_deg_s, acceleration_deg_s2)
             self.replace(activity, "it was replaced by another move")
         if wait:
@@ -84,8 +85,9 @@ class AxisMotion:
     async def jog(self, holder: str, velocity_deg_s: float, timeout_s: float = 0.5) -> None:
         """Turns at a speed; brakes to rest unless called again within ``timeout_s``."""
         self._check(holder)
-        activity = Activity(Kind.JOG, holder)
+        activity, request = Activity(Kind.JOG, holder), self._link.request(holder)
         async with self.commanding:
+            request.check()
             await self._link.begin(activity, CommandKind.JOG, a=float(velocity_deg_s), b=float(timeout_s))
             self.replace(activity, "it was replaced by a jog")
 
@@ -95,8 +97,9 @@ class AxisMotion:
         If none arrive for ``timeout_s`` and all are used up, the axis brakes to rest.
         """
         self._check(holder)
-        activity = Activity(Kind.STREAM, holder)
+        activity, request = Activity(Kind.STREAM, holder), self._link.request(holder)
         async with self.commanding:
+            request.check()
             link = self._link
             if link.state is not AxisState.ENABLED:
                 await link.do(CommandKind.STREAM_BEGIN, a=timeout_s)  # raises RefusedError with the reason
@@ -207,7 +210,7 @@ async def run_together(
     """
     for axis in axes:
         axis.check_may(holder)
-    core = axes[0].core
+    core, requests = axes[0].core, [axis.link.request(holder) for axis in axes]
     async with AsyncExitStack() as stack:
         for axis in sorted(axes, key=lambda each: each.link.index):
             await stack.enter_async_context(axis.motion.commanding)
@@ -222,6 +225,8 @@ async def run_together(
         )
         stream = core.next_stream()
         waiting = {axis: [Knot(stream, *row) for row in plan.knots[axis.name].tolist()] for axis in axes}
+        for request in requests:
+            request.check()  # planning took a while
         _hand_over(waiting)
         begin, mask = CommandKind.STREAM_BEGIN, sum(1 << axis.link.index for axis in axes)
         id_ = core.post(begin, axes[0].link.index, a=STREAM_TIMEOUT_S, i=mask, j=stream)

@@ -151,17 +151,22 @@ class OuterMaster:
                 ),
                 SETTLES_S,
             )
-            await axis.enable(token)
+            await axis.enable(token, is_withdrawn)
             if not is_withdrawn():
                 await link.do(CommandKind.FOLLOW, a=self._timeout_s, j=series)
-            if is_withdrawn():
-                cells[OuterCell.REFUSED] = series
-                await axis.disable(self._token)
-                return
         except HdbridgeError:
-            cells[OuterCell.REFUSED] = series
+            await self._refuse(axis, cells, series)
             raise
-        cells[OuterCell.GRANTED] = series
+        if is_withdrawn():
+            await self._refuse(axis, cells, series)
+        else:
+            cells[OuterCell.GRANTED] = series
+
+    async def _refuse(self, axis: ServiceAxis, cells: OuterCells, series: int) -> None:
+        """Refuses a request, or ends one that was withdrawn; no power is left."""
+        cells[OuterCell.REFUSED] = series
+        if axis.link.state in _POWERED:
+            await axis.disable(self._token)
 
     async def _reset(self, axis: ServiceAxis, cells: OuterCells, holds: bool) -> None:
         asked = cells[OuterCell.RESETS]

@@ -1,0 +1,181 @@
+"""Faults and bad manners of a drive at any moment: they neither power nor move the axis, and a stop lasts.
+
+`tests/daemon/test_disorder.py` draws sequences of them.
+"""
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import can
+import pytest
+from can.interfaces.virtual import VirtualBus
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+from support.characters import RUDE
+from support.daemon import SteppedDaemon, article_axis, stepped_daemon
+from support.rude import ENABLED, OFF, RudeDrive
+
+from hdbridge.axis import Source
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import CommandKind, EventKind
+from hdbridge.drive.supervision import Fault
+
+AFTER_TURNS = st.integers(0, 8)
+"""Cycles from the command to enable until a drive is enabled, and some more."""
+PLAUSIBLE_COUNTS = 400
+"""Largest error of a position that the supervision accepts: vibration, and the highest speed in a cycle."""
+
+
+@contextmanager
+def verified() -> Iterator[tuple[SteppedDaemon, RudeDrive]]:
+    with stepped_daemon(1, character=RUDE) as daemon:
+        daemon.verify()
+        (node,) = daemon.nodes
+        assert isinstance(node, RudeDrive)
+        yield daemon, node
+
+
+@contextmanager
+def moving() -> Iterator[tuple[SteppedDaemon, RudeDrive]]:
+    with verified() as (daemon, node):
+        daemon.enable()
+        daemon.move(300.0)
+        daemon.run(0.5)
+        yield daemon, node
+
+
+@pytest.mark.parametrize("coasts", [False, True])
+@pytest.mark.parametrize("by_command", [False, True])
+def test_a_drive_that_ignores_a_quick_stop_loses_its_voltage(coasts: bool, by_command: bool) -> None:
+    with moving() as (daemon, node):
+        node.ways.ignores_quick_stop, node.ways.coasts = True, coasts
+        if by_command:
+            daemon.post(CommandKind.QUICK_STOP)
+        else:
+            daemon.interfere(0x080)
+        daemon.run(0.4 if coasts or not by_command else 2.1)
+        assert node.state == OFF
+        daemon.until(lambda: bool(daemon.reported(EventKind.STOPPED)))
+        (stopped,) = daemon.reported(EventKind.STOPPED)
+        assert "did not obey it" in stopped.text
+        assert daemon.states == [AxisState.QUICK_STOPPED]
+
+
+@settings(max_examples=12, phases=[Phase.generate])
+@given(AFTER_TURNS, st.integers(1, 3), st.integers(-3000, 3000))
+def test_a_wrong_position_while_enabling_moves_nothing(turns: int, times: int, error: int) -> None:
+    with verified() as (daemon, node):
+        daemon.post(CommandKind.ENABLE, **daemon.prepare())
+        daemon.turn(turns)
+        node.ways.jumps.extend([error] * times)
+        for _ in range(40):
+            daemon.turn()
+            assert abs(node.motor_counts) <= PLAUSIBLE_COUNTS
+
+
+@settings(max_examples=12, phases=[Phase.generate])
+@given(AFTER_TURNS, st.booleans())
+def test_a_fault_while_enabling_is_left_only_by_a_reset(turns: int, heals: bool) -> None:
+    with verified() as (daemon, node):
+        node.ways.heals = heals
+        daemon.post(CommandKind.ENABLE, **daemon.prepare())
+        daemon.turn(turns)
+        node.raise_error(0x3210)
+        powered = node.powered
+        daemon.run(0.5)
+        assert node.powered == powered
+        assert daemon.states == [AxisState.QUICK_STOPPED]
+        stop = daemon.axes[0].supervision.stop
+        assert stop is not None
+        assert stop.fault is Fault.DRIVE_FAULT
+
+
+@settings(max_examples=12, phases=[Phase.generate])
+@given(AFTER_TURNS, st.sampled_from([CommandKind.STOP, CommandKind.QUICK_STOP, CommandKind.DISABLE]))
+def test_no_axis_is_enabled_after_a_stop(turns: int, kind: CommandKind) -> None:
+    with verified() as (daemon, node):
+        daemon.post(CommandKind.ENABLE, **daemon.prepare())
+        daemon.turn(turns)
+        was_enabled = daemon.states == [AxisState.ENABLED]
+        powered = node.powered
+        daemon.post(kind)
+        daemon.run(0.3)
+        assert node.powered <= powered + was_enabled or node.state == OFF
+        if not (was_enabled and kind is CommandKind.STOP):
+            assert node.state != ENABLED
+
+
+@pytest.mark.parametrize("kind", [CommandKind.VERIFIED, CommandKind.ENABLE, CommandKind.HOMED])
+@settings(max_examples=8, phases=[Phase.generate])
+@given(
+    waits_s=st.sampled_from([0.0, 0.001, 0.003, 0.004, 0.05]), taken_s=st.sampled_from([0.0, 0.001, 0.004])
+)
+def test_a_drive_that_restarted_after_its_verification_gets_no_power(
+    kind: CommandKind, waits_s: float, taken_s: float
+) -> None:
+    with stepped_daemon(1, character=RUDE) as daemon:
+        (node,) = daemon.nodes
+        assert isinstance(node, RudeDrive)
+        node.ways.starts_itself = True
+        commissioning = daemon.commissioning(0)
+        arguments = commissioning.verify()
+        if kind is not CommandKind.VERIFIED:
+            daemon.done(CommandKind.VERIFIED, **arguments)
+        if kind is CommandKind.HOMED:
+            daemon.done(CommandKind.HOME)
+        elif kind is CommandKind.ENABLE:
+            arguments = daemon.prepare()
+        node.restart()
+        daemon.clock.sleep_until(daemon.clock.now() + waits_s)
+        daemon.post(kind, **arguments)
+        daemon.clock.sleep_until(daemon.clock.now() + taken_s)
+        daemon.run(0.05)
+        daemon.post(CommandKind.ENABLE, i=node.motor_counts, j=0, k=0x0250)
+        daemon.run(0.5)
+        assert node.powered == 0
+        assert daemon.states[0] in {AxisState.UNVERIFIED, AxisState.LATCHED, AxisState.LENT}
+
+
+class Encoder:
+    """Node 5, an encoder at rest that answers each SYNC."""
+
+    def __init__(self, bus: VirtualBus) -> None:
+        self._bus = bus
+
+    def next_event_s(self) -> float:
+        return float("inf")
+
+    def poll(self, now_s: float) -> None:
+        while (message := self._bus.recv(0)) is not None:
+            if message.arbitration_id == 0x080:
+                self._bus.send(can.Message(arbitration_id=0x185, data=bytes(4), is_extended_id=False))
+
+
+def test_a_restarted_encoder_node_leaves_no_power_on_the_drive() -> None:
+    axis = article_axis(1)
+    source = Source(index=0x6004, subindex=0, type="uint32", via="tpdo", node=5)
+    encoder = axis.load_encoder.model_copy(update={"source": source})
+    with (
+        stepped_daemon([axis.model_copy(update={"load_encoder": encoder})], character=RUDE) as daemon,
+        VirtualBus(daemon.bus._inner.channel_id) as bus,
+    ):
+        daemon.clock.nodes.append(Encoder(bus))
+        (node,) = daemon.nodes
+        assert isinstance(node, RudeDrive)
+        daemon.turn(2)
+        node.configure(daemon.axes[0].image.tpdos[:2])
+        daemon.axes[0].cycle.monitor.started(1)
+        daemon.turn(2)
+        daemon.done(CommandKind.VERIFIED, i=0, j=0, k=0x0250)
+        daemon.done(CommandKind.ENABLE, i=0, j=0, k=0x0250)
+        daemon.move(300.0)
+        daemon.turn(5)
+        assert node.state == ENABLED
+        sent = daemon.sent()
+        daemon.interfere(0x705, b"\0")
+        daemon.turn(20)
+        assert daemon.states == [AxisState.LATCHED]
+        assert node.state != ENABLED
+        words = [struct.unpack_from("<H", data)[0] for _, can_id, data in sent if can_id == 0x201]
+        assert set(words) == {0x0002}

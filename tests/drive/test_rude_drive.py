@@ -1,0 +1,77 @@
+"""A drive that restarts, stops by itself or gets no power leaves no motion behind, by SDO or on a bench."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from uuid import uuid4
+
+import pytest
+from support.daemon import article_axis
+from support.rude import ENABLED, OFF, RudeDrive, Ways
+from support.spoilt import SpoiltBus
+
+from hdbridge.control.bench import Bench
+from hdbridge.drive import Drive, Mode
+from hdbridge.errors import DriveError, SdoError, TransitionError
+from hdbridge.motion.procedures.stepping import Stepping
+from hdbridge.sim.lockstep import VirtualClock
+
+
+@contextmanager
+def booted(**ways: bool | float) -> Iterator[tuple[Drive, RudeDrive]]:
+    axis, channel, clock = article_axis(1), str(uuid4()), VirtualClock()
+    node = RudeDrive(channel, axis, clock)
+    node.ways = Ways(**ways)  # type: ignore[arg-type]
+    clock.nodes.append(node)
+    with SpoiltBus(channel, clock) as bus:
+        bus.private = True
+        with Drive(bus, axis, clock) as drive:
+            drive.boot()
+            yield drive, node
+    node.close()
+
+
+@pytest.mark.parametrize("mode", [Mode.PP, Mode.HM, None])
+def test_a_drive_that_restarted_is_not_enabled_before_it_is_booted_again(mode: Mode | None) -> None:
+    with booted(starts_itself=True) as (drive, node):
+        node.restart(lasts=False)
+        drive.wait(0.05)
+        with pytest.raises(TransitionError, match="has restarted"):
+            drive.enable(mode)
+        assert node.powered == 0
+        drive.boot()
+        drive.enable(Mode.PP)
+        assert node.state == ENABLED
+
+
+def test_a_drive_that_stopped_while_its_answer_was_lost_is_not_enabled_again() -> None:
+    with booted(mode_delay_s=0.1) as (drive, node):
+        node._values[0x605A, 0] = 6  # it stays in quick stop active
+        drive.enable(Mode.HM)
+        drive.wait(0.05)
+        node.ways.mute_sdo.extend((False, True))  # the statusword is answered, the controlword is not
+        with pytest.raises(SdoError, match="one attempt"):
+            drive._commander.control(0x000F)
+        assert node.state != ENABLED
+        assert node.powered == 1
+
+
+def test_enable_operation_is_not_sent_to_a_drive_that_stopped_by_itself() -> None:
+    with booted() as (drive, node):
+        node._values[0x605A, 0] = 6
+        drive.enable(Mode.HM)
+        node.miss_master()
+        with pytest.raises(DriveError, match="quick stop active"):
+            drive._commander.control(0x001F)
+        assert node.powered == 1
+
+
+def test_a_drive_that_is_not_enabled_in_time_has_no_power_on_the_bench() -> None:
+    with booted(ignores_enable=True) as (drive, node):
+        bench = Bench(drive)
+        with pytest.raises(TransitionError, match="did not reach"):
+            bench.run(Stepping())
+        assert node.state == OFF
+        node.ways.ignores_enable = False
+        for _ in range(20):
+            bench.cycle.exchange()
+        assert node.powered == 0
