@@ -94,12 +94,11 @@ def test_diff_compares_active_and_pending_or_any_two(hdbridge, propose, tmp_path
 )
 def test_every_command_without_a_model_advises_the_next_step(hdbridge, propose, asked):
     folder = propose(41.0)
-    done = hdbridge(*asked)
-    assert done.returncode == 2
+    done = hdbridge(*asked, status=2)
     assert "profile/model.yaml: there is no active model; commit the pending one: " in done.stderr
     assert done.stderr.rstrip().count("hdbridge model commit ") == 1
     hdbridge("model", "discard", folder)
-    assert "calibrate first: hdbridge calibrate profile" in hdbridge(*asked).stderr
+    assert "calibrate first: hdbridge calibrate profile" in hdbridge(*asked, status=2).stderr
 
 
 def test_discard_leaves_the_active_model(hdbridge, propose):
