@@ -655,12 +655,16 @@ SHORT_MS: Final = 0.1
 """Time constant of a negligible command filter: a fifth of a substep."""
 VELOCITY_FEEDFORWARD: Final = 0.9
 """Start value of the speed feed-forward, between none (rare) and the full speed."""
-FEW_STEPS = 3
-"""Maximum number of steps for each start between two halvings."""
-MAX_COST_RATIO: Final = 2.0
+FEW_STEPS = 2
+"""Maximum number of steps for each start between two halvings. On a servo of a different structure, the eight
+best of 27 starts after three steps were among the better ten after two, but not after one."""
+MAX_COST_RATIO: Final = 3.0
 """Ratio of a start's cost to the lowest cost, after the same number of steps, above which a start is dropped
 even if it is in the better half. On three servos of a different structure, the winning starts had ratios of
 at most 1.8."""
+HOPELESS_RATIO: Final = 30.0
+"""Ratio of the mean square of the residuals after a halving to the largest near the noise, above which no
+spring and no lag is fitted any further, because the servo has a different structure."""
 MAX_MISFIT_RATIO: Final = 0.97
 """Maximum ratio of the misfits with and without a block for keeping the block; a superfluous block gains
 less."""
@@ -718,6 +722,7 @@ def by_halving(
     known: Scales,
     keep: Callable[[Fitted], None] = lambda _: None,
     suffices: Callable[[Fitted], bool] = lambda _: False,
+    hopeless: Callable[[Fitted], bool] = lambda _: False,
 ) -> Fitted:
     """Fits from each start for a few steps, continues with the better half, and repeats until one is left,
     which is fitted to the neighbourhood of its minimum.
@@ -725,7 +730,8 @@ def by_halving(
     Successive halving (Jamieson and Talwalkar, AISTATS 2016) does not drop a start that is far from a better
     minimum in favour of one that is already near its own minimum. All legs count, because a few held-out legs
     do not decide between servos with equally many parameters. Of starts that have come together, only the
-    best is continued. No other start is tried after one that ``suffices``.
+    best is continued. No other start is tried after one that ``suffices``, and none is continued if the best
+    is ``hopeless``.
     """
 
     def led(start: Start, steps: int = FEW_STEPS) -> Fitted:
@@ -745,6 +751,8 @@ def by_halving(
             if apart and each.cost <= MAX_COST_RATIO * best.cost:
                 tried.append(each)
         keep(best)
+        if hopeless(best):
+            return best
         if len(tried) == 1:
             return led((best.truth, best.parameters), MORE_STEPS)
         tried = [led((each.truth, each.parameters)) for each in tried]
@@ -1083,11 +1091,17 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
     progress(0.05)
     rows = fitted_rows(few.data)
 
+    def squares(fitted: Fitted) -> float:
+        return float(np.mean(np.square(softened(fitted.residuals, noise, rows)))) / HUBER_THRESHOLD**2
+
     def near(fitted: Fitted) -> bool:
-        return bool(np.mean(np.square(softened(fitted.residuals, noise, rows))) < HUBER_THRESHOLD**2)
+        return squares(fitted) < 1.0
+
+    def hopeless(fitted: Fitted) -> bool:
+        return squares(fitted) > HOPELESS_RATIO
 
     usual = [(each, parameters) for each in (begun, *springs(begun), *lags(begun))]
-    best = by_halving(few, usual, noise, keep, near)  # near the noise, `_polished` compares minima
+    best = by_halving(few, usual, noise, keep, near, hopeless)  # near the noise, `_polished` compares minima
     best = replace(best, prior=np.array(coordinates(begun, parameters)))
     progress(0.2)
     if not near(best):
@@ -1096,7 +1110,14 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
     progress(0.5)
     polished, in_motion = None, noise_in_motion(data)
     while near(best):
-        polished, before = _polished(replays, best, begun, keep), polished
+        # The expected scales are used, because the residuals of a wrong simulation do not estimate the noise
+        # and would reduce the weight of the very channel that shows the error.
+        whole = continued(replays, best, STEPS, known=expected(data), near=best, linear=False)
+        whole = _ended(replays, whole)
+        if polished is not None and misfit(data, polished.residuals) <= misfit(data, whole.residuals):
+            break
+        keep(whole)
+        polished, before = _polished(replays, whole, begun, keep), polished
         if values_in(polished, channel_residuals(data, polished.residuals, in_motion)) is Values.AXIS:
             return polished
         if before is not None and misfit(data, before.residuals) <= misfit(data, polished.residuals):
@@ -1121,28 +1142,22 @@ def values_in(fitted: Fitted, left: Sequence[ChannelResidual]) -> Values:
     return Values.REPLAY if fitted.interrupted or fitted.rough else values_of(left, fitted.scatter)
 
 
-def _polished(replays: Replays, near: Fitted, begun: Truth, keep: Callable[[Fitted], None]) -> Fitted:
-    """Continues a fit near the noise on all legs, and adds the parts that the recording shows."""
-    data = replays.data
-    # The expected scales are used, because the residuals of a wrong simulation do not estimate the noise and
-    # would reduce the weight of the very channel that shows the error.
-    best = continued(replays, near, STEPS, known=expected(data), near=near, linear=False)
-    best = _ended(replays, best)
-    keep(best)
+def _polished(replays: Replays, best: Fitted, begun: Truth, keep: Callable[[Fitted], None]) -> Fitted:
+    """Moves a fit of all legs to its best minimum, and adds the parts that the recording shows."""
     laws = len(LAWS)  # maximum number of changes of the law
+    best = _in_best_minimum(replays, best, begun)
     while True:
-        best = _in_best_minimum(replays, best, begun)
         wider = with_optional_groups(replays, best)
         if wider is not best:
-            best = _ended(replays, wider)
+            best = _in_nearby_minimum(replays, _ended(replays, wider))
             continue
         keep(best)
         # The loop comes last, because a wrong spring also leaves residuals of the load angle.
         other = with_loop(replays, best) if laws else None
         if other is None:
             break
-        laws, best = laws - 1, other
-    limited = with_limit(replays, best, data.base)
+        laws, best = laws - 1, _in_nearby_minimum(replays, other)
+    limited = with_limit(replays, best, replays.data.base)
     best = best if limited is best else _ended(replays, limited)
     keep(best)
     # Wide differences are used for the covariance only, because the servo loops may be unstable near a
@@ -1156,35 +1171,48 @@ def _linearised(replays: Replays, found: Fitted) -> Fitted:
 
 
 def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
-    """Moves the fit to significantly better minima until none is found.
+    """Moves the fit to significantly better minima until none is found, nearby or `elsewhere`.
 
     The fit must be near a minimum, because the alternatives are equally good until the other parameters are
     known.
     """
     few, noise = replays.rough, expected(replays.rough.data)
     least = least_deviation(replays.data) | {LOAD: noise.deviation[LOAD]}
-
-    def moved(places: Iterable[Truth]) -> Fitted:
-        found = best
-        for place in places:
-            other = continued(replays, found, MORE_STEPS, place, rival=found.loss)
-            if other.loss + MIN_LOG_LIKELIHOOD_RATIO < found.loss:
-                found = _ended(replays, other)
-        return found
-
     while True:
-        last = best
-        # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
-        # the next substep increases the residuals too little for any channel to show it.
-        best = moved([exchanged(best.truth), *neighbours(best.truth)])
-        excess = any(best.scales.deviation[name] > EXCESS_RATIO * least[name] for name in CHANNELS)
-        if best is last and excess:
-            tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
-            here, other = (by_halving(few, each, noise) for each in ([(best.truth, best.parameters)], tried))
-            if other.cost + MIN_COST_DECREASE < here.cost:
-                best = moved([other.truth])
+        best = _in_nearby_minimum(replays, best)
+        if all(best.scales.deviation[name] <= EXCESS_RATIO * least[name] for name in CHANNELS):
+            return best
+        tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
+        here, other = (by_halving(few, each, noise) for each in ([(best.truth, best.parameters)], tried))
+        if other.cost + MIN_COST_DECREASE >= here.cost:
+            return best
+        moved = _moved(replays, best, other.truth)
+        if moved is best:
+            return best
+        best = moved
+
+
+def _in_nearby_minimum(replays: Replays, best: Fitted) -> Fitted:
+    """Moves the fit to the minima with exchanged gains, or with the dead time in the next substep.
+
+    They are always tried: exchanged gains differ only at rest, and a dead time in the next substep increases
+    the residuals too little for any channel to show it. A few legs show which of them cannot win.
+    """
+    while True:
+        last, few = best, replays.rough
+        here = continued(few, best, MORE_STEPS, linear=False)
+        for place in (exchanged(best.truth), *neighbours(best.truth)):
+            other = continued(few, here, MORE_STEPS, place, rival=here.loss, linear=False)
+            if other.loss < here.loss + MIN_LOG_LIKELIHOOD_RATIO:
+                best = _moved(replays, best, place)
         if best is last:
             return best
+
+
+def _moved(replays: Replays, best: Fitted, place: Truth) -> Fitted:
+    """Returns the fit from ``place`` if it is significantly better, else ``best``."""
+    other = continued(replays, best, MORE_STEPS, place, rival=best.loss)
+    return _ended(replays, other) if other.loss + MIN_LOG_LIKELIHOOD_RATIO < best.loss else best
 
 
 def _ended(replays: Replays, near: Fitted) -> Fitted:
