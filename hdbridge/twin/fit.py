@@ -20,7 +20,9 @@ from pydantic import TypeAdapter
 from scipy.optimize import brentq, least_squares
 
 from hdbridge.analysis.intervals import NORMAL_95
+from hdbridge.analysis.linear import Linearised, steps_without
 from hdbridge.analysis.linear import counted as numbered
+from hdbridge.analysis.noise import White
 from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.hysteresis_laws import law_of
 from hdbridge.sim.truth import Truth
@@ -209,8 +211,6 @@ def _with_loop(truth: Truth, loop: Hysteresis) -> Truth:
 
 DETERMINED = 10.0
 """Minimum information about a principal direction, relative to the prior's, for it to count as determined."""
-JACKKNIFE_RIDGE = 1e-9
-"""Regularisation of the jackknife: fraction of the information that no single leg may contribute alone."""
 
 
 def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
@@ -254,17 +254,13 @@ class Jackknife:
         scatter between legs.
         """
         along = principal(slopes, spread)
-        rows = slopes @ along
+        known = np.sum(np.square(along / spread[:, None]), axis=0)
         left = left - slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
-        numbers = numbered(legs)
-        order = np.argsort(numbers, kind="stable")
-        drawn = []
-        for leg in np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1):
-            others = (1.0 + JACKKNIFE_RIDGE) * np.eye(len(spread)) - rows[leg].T @ rows[leg]
-            drawn.append(np.linalg.solve(others, rows[leg].T @ left[leg]))
+        linear = Linearised(slopes @ along, left, np.stack([known, np.zeros_like(known)], axis=1))
+        drawn = steps_without(linear, numbered(legs), lambda rows: White(np.ones(np.count_nonzero(rows))))
         between = np.sum(np.square(drawn), axis=0) * (1.0 - 1.0 / len(drawn))
         independent = max(1.0, float(left @ left) / max(len(left) - len(spread), 1))
-        return cls(along, between, independent, 1.0 / np.sum(np.square(along / spread[:, None]), axis=0))
+        return cls(along, between, independent, 1.0 / known)
 
     @property
     def covariance(self) -> FloatArray:
