@@ -654,6 +654,8 @@ VELOCITY_FEEDFORWARD: Final = 0.9
 FEW_STEPS = 2
 """Maximum number of steps for each start between two halvings. On a servo of a different structure, the eight
 best of 27 starts after three steps were among the better ten after two, but not after one."""
+USUAL_STEPS = 3
+"""The same for the usual servo, which must come near the noise on few starts."""
 MAX_COST_RATIO: Final = 3.0
 """Ratio of a start's cost to the lowest cost, after the same number of steps, above which a start is dropped
 even if it is in the better half. On three servos of a different structure, the winning starts had ratios of
@@ -662,8 +664,8 @@ HOPELESS_RATIO: Final = 30.0
 """Ratio of the mean square of the residuals after a halving to the largest near the noise, above which no
 spring and no lag is fitted any further, because the servo has a different structure."""
 MAX_MISFIT_RATIO: Final = 0.97
-"""Maximum ratio of the misfits with and without a block for keeping the block; a superfluous block gains
-less."""
+"""Maximum ratio of the misfits with and without a block or a measured response for keeping it; a superfluous
+one gains less."""
 MECHANICS: Final = (
     "motor inertia", "Coulomb friction", "viscous friction", "friction's rise at rest", "Stribeck speed",
     "load inertia", "gear stiffness", "gear damping",
@@ -719,9 +721,10 @@ def by_halving(
     keep: Callable[[Fitted], None] = lambda _: None,
     suffices: Callable[[Fitted], bool] = lambda _: False,
     hopeless: Callable[[Fitted], bool] = lambda _: False,
+    few_steps: int = FEW_STEPS,
 ) -> Fitted:
-    """Fits from each start for a few steps, continues with the better half, and repeats until one is left,
-    which is fitted to the neighbourhood of its minimum.
+    """Fits from each start for ``few_steps`` steps, continues with the better half, and repeats until one is
+    left, which is fitted to the neighbourhood of its minimum.
 
     Successive halving (Jamieson and Talwalkar, AISTATS 2016) does not drop a start that is far from a better
     minimum in favour of one that is already near its own minimum. All legs count, because a few held-out legs
@@ -730,7 +733,7 @@ def by_halving(
     is ``hopeless``.
     """
 
-    def led(start: Start, steps: int = FEW_STEPS) -> Fitted:
+    def led(start: Start, steps: int = few_steps) -> Fitted:
         return solve(few, *start, steps, known=known, linear=False, share=MIN_RELATIVE_DECREASE)
 
     tried: list[Fitted] = []
@@ -1097,7 +1100,8 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
         return squares(fitted) > HOPELESS_RATIO
 
     usual = [(each, parameters) for each in (begun, *springs(begun), *lags(begun))]
-    best = by_halving(few, usual, noise, keep, near, hopeless)  # near the noise, `_polished` compares minima
+    # Near the noise, `_polished` compares minima.
+    best = by_halving(few, usual, noise, keep, near, hopeless, USUAL_STEPS)
     best = replace(best, prior=np.array(coordinates(begun, parameters)))
     progress(0.2)
     if not near(best):
