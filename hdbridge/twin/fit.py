@@ -843,9 +843,10 @@ INERTIA_FACTORS = (0.25, 0.5, 2.0, 4.0)
 """Factors for start values of the motor's inertia, which is visible only just after each new demand."""
 
 
-def elsewhere(truth: Truth, usual: Truth) -> list[Truth]:
-    """Returns alternative start values for a truth; ``usual`` is the start of the fit."""
-    return [*springs(truth), *delays(truth), *feedforwards(truth, usual), *inertias(truth)]
+def elsewhere(best: Fitted, usual: Truth) -> list[Truth]:
+    """Returns alternative start values for a fit; ``usual`` is its start."""
+    truth = best.truth
+    return [*springs(truth), *delays(truth, _most_ms(best)), *feedforwards(truth, usual), *inertias(truth)]
 
 
 def springs(truth: Truth) -> list[Truth]:
@@ -865,23 +866,28 @@ def lags(truth: Truth) -> list[Truth]:
     return [_with_dead_time(truth, (1.0 - share) * _lag_ms(truth)) for share in FILTER_SHARES]
 
 
-def delays(truth: Truth) -> list[Truth]:
-    """Returns variants of the truth with the same lag and the dead time in each of the other possible
-    substeps.
+def delays(truth: Truth, most_ms: float = DEAD_TIME.most) -> list[Truth]:
+    """Returns variants of the truth with the same lag and the dead time in each of the other substeps up to
+    ``most_ms``.
 
     The demand changes slope at the start of a cycle, and a torque lasts for a substep. A change within a
     substep is spread over two substeps, as by a filter, so the misfit over the dead time has a minimum in
     every substep.
     """
     step_ms, now = truth.substep_ms, _substep(truth)
-    most_ms = min(_lag_ms(truth) - 2.0 * FILTER.least, DEAD_TIME.most)
+    most_ms = min(_lag_ms(truth) - 2.0 * FILTER.least, most_ms)
     places = range(int(most_ms / step_ms + 0.5))
     return [_with_dead_time(truth, (each + 0.5) * step_ms) for each in places if each != now]
 
 
-def neighbours(truth: Truth) -> list[Truth]:
+def neighbours(truth: Truth, most_ms: float = DEAD_TIME.most) -> list[Truth]:
     """Returns those variants of `delays` whose dead time is one substep shorter or longer."""
-    return [each for each in delays(truth) if abs(_substep(each) - _substep(truth)) == 1]
+    return [each for each in delays(truth, most_ms) if abs(_substep(each) - _substep(truth)) == 1]
+
+
+def _most_ms(best: Fitted) -> float:
+    """Returns the upper bound of the dead time in a fit; beyond it, all starts would be the same."""
+    return next((each.most for each in best.parameters if each.name == DEAD_TIME.name), DEAD_TIME.most)
 
 
 def inertias(truth: Truth) -> list[Truth]:
@@ -1182,7 +1188,7 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
         best = _in_nearby_minimum(replays, best)
         if all(best.scales.deviation[name] <= EXCESS_RATIO * least[name] for name in CHANNELS):
             return best
-        tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
+        tried = [(each, best.parameters) for each in elsewhere(best, begun)]
         here, other = (by_halving(few, each, noise) for each in ([(best.truth, best.parameters)], tried))
         if other.cost + MIN_COST_DECREASE >= here.cost:
             return best
@@ -1201,7 +1207,7 @@ def _in_nearby_minimum(replays: Replays, best: Fitted) -> Fitted:
     while True:
         last, few = best, replays.rough
         here = continued(few, best, MORE_STEPS, linear=False)
-        for place in (exchanged(best.truth), *neighbours(best.truth)):
+        for place in (exchanged(best.truth), *neighbours(best.truth, _most_ms(best))):
             other = continued(few, here, MORE_STEPS, place, rival=here.loss, linear=False)
             if other.loss < here.loss + MIN_LOG_LIKELIHOOD_RATIO:
                 best = _moved(replays, best, place)

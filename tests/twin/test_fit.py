@@ -272,6 +272,7 @@ def test_a_dead_time_is_tried_in_each_other_substep_that_the_lag_has_room_for(
     assert found == {each for each in middles.values() if each <= lag_ms(late) - 0.1 + 1e-9}
     near = {each.servo.dead_time_ms for each in neighbours(late)}
     assert near == found & {middles.get(own - 1), middles.get(own + 1)}
+    assert {each.servo.dead_time_ms for each in delays(late, 1.0)} == {each for each in found if each <= 1.0}
 
 
 def test_position_gain_and_integral_rate_exchanged_are_the_same_loop_while_the_axis_moves() -> None:
