@@ -20,7 +20,9 @@ from pydantic import TypeAdapter
 from scipy.optimize import brentq, least_squares
 
 from hdbridge.analysis.intervals import NORMAL_95
+from hdbridge.analysis.linear import Linearised, on_one_thread, steps_without
 from hdbridge.analysis.linear import counted as numbered
+from hdbridge.analysis.noise import White
 from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.hysteresis_laws import law_of
 from hdbridge.sim.truth import Truth
@@ -209,8 +211,6 @@ def _with_loop(truth: Truth, loop: Hysteresis) -> Truth:
 
 DETERMINED = 10.0
 """Minimum information about a principal direction, relative to the prior's, for it to count as determined."""
-JACKKNIFE_RIDGE = 1e-9
-"""Regularisation of the jackknife: fraction of the information that no single leg may contribute alone."""
 
 
 def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
@@ -254,17 +254,13 @@ class Jackknife:
         scatter between legs.
         """
         along = principal(slopes, spread)
-        rows = slopes @ along
+        known = np.sum(np.square(along / spread[:, None]), axis=0)
         left = left - slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
-        numbers = numbered(legs)
-        order = np.argsort(numbers, kind="stable")
-        drawn = []
-        for leg in np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1):
-            others = (1.0 + JACKKNIFE_RIDGE) * np.eye(len(spread)) - rows[leg].T @ rows[leg]
-            drawn.append(np.linalg.solve(others, rows[leg].T @ left[leg]))
+        linear = Linearised(slopes @ along, left, np.stack([known, np.zeros_like(known)], axis=1))
+        drawn = steps_without(linear, numbered(legs), lambda rows: White(np.ones(np.count_nonzero(rows))))
         between = np.sum(np.square(drawn), axis=0) * (1.0 - 1.0 / len(drawn))
         independent = max(1.0, float(left @ left) / max(len(left) - len(spread), 1))
-        return cls(along, between, independent, 1.0 / np.sum(np.square(along / spread[:, None]), axis=0))
+        return cls(along, between, independent, 1.0 / known)
 
     @property
     def covariance(self) -> FloatArray:
@@ -655,15 +651,21 @@ SHORT_MS: Final = 0.1
 """Time constant of a negligible command filter: a fifth of a substep."""
 VELOCITY_FEEDFORWARD: Final = 0.9
 """Start value of the speed feed-forward, between none (rare) and the full speed."""
-FEW_STEPS = 3
-"""Maximum number of steps for each start between two halvings."""
-MAX_COST_RATIO: Final = 2.0
+FEW_STEPS = 2
+"""Maximum number of steps for each start between two halvings. On a servo of a different structure, the eight
+best of 27 starts after three steps were among the better ten after two, but not after one."""
+USUAL_STEPS = 3
+"""The same for the usual servo, which must come near the noise on few starts."""
+MAX_COST_RATIO: Final = 3.0
 """Ratio of a start's cost to the lowest cost, after the same number of steps, above which a start is dropped
 even if it is in the better half. On three servos of a different structure, the winning starts had ratios of
 at most 1.8."""
+HOPELESS_RATIO: Final = 30.0
+"""Ratio of the mean square of the residuals after a halving to the largest near the noise, above which no
+spring and no lag is fitted any further, because the servo has a different structure."""
 MAX_MISFIT_RATIO: Final = 0.97
-"""Maximum ratio of the misfits with and without a block for keeping the block; a superfluous block gains
-less."""
+"""Maximum ratio of the misfits with and without a block or a measured response for keeping it; a superfluous
+one gains less."""
 MECHANICS: Final = (
     "motor inertia", "Coulomb friction", "viscous friction", "friction's rise at rest", "Stribeck speed",
     "load inertia", "gear stiffness", "gear damping",
@@ -718,17 +720,20 @@ def by_halving(
     known: Scales,
     keep: Callable[[Fitted], None] = lambda _: None,
     suffices: Callable[[Fitted], bool] = lambda _: False,
+    hopeless: Callable[[Fitted], bool] = lambda _: False,
+    few_steps: int = FEW_STEPS,
 ) -> Fitted:
-    """Fits from each start for a few steps, continues with the better half, and repeats until one is left,
-    which is fitted to the neighbourhood of its minimum.
+    """Fits from each start for ``few_steps`` steps, continues with the better half, and repeats until one is
+    left, which is fitted to the neighbourhood of its minimum.
 
     Successive halving (Jamieson and Talwalkar, AISTATS 2016) does not drop a start that is far from a better
     minimum in favour of one that is already near its own minimum. All legs count, because a few held-out legs
     do not decide between servos with equally many parameters. Of starts that have come together, only the
-    best is continued. No other start is tried after one that ``suffices``.
+    best is continued. No other start is tried after one that ``suffices``, and none is continued if the best
+    is ``hopeless``.
     """
 
-    def led(start: Start, steps: int = FEW_STEPS) -> Fitted:
+    def led(start: Start, steps: int = few_steps) -> Fitted:
         return solve(few, *start, steps, known=known, linear=False, share=MIN_RELATIVE_DECREASE)
 
     tried: list[Fitted] = []
@@ -745,6 +750,8 @@ def by_halving(
             if apart and each.cost <= MAX_COST_RATIO * best.cost:
                 tried.append(each)
         keep(best)
+        if hopeless(best):
+            return best
         if len(tried) == 1:
             return led((best.truth, best.parameters), MORE_STEPS)
         tried = [led((each.truth, each.parameters)) for each in tried]
@@ -836,9 +843,10 @@ INERTIA_FACTORS = (0.25, 0.5, 2.0, 4.0)
 """Factors for start values of the motor's inertia, which is visible only just after each new demand."""
 
 
-def elsewhere(truth: Truth, usual: Truth) -> list[Truth]:
-    """Returns alternative start values for a truth; ``usual`` is the start of the fit."""
-    return [*springs(truth), *delays(truth), *feedforwards(truth, usual), *inertias(truth)]
+def elsewhere(best: Fitted, usual: Truth) -> list[Truth]:
+    """Returns alternative start values for a fit; ``usual`` is its start."""
+    truth = best.truth
+    return [*springs(truth), *delays(truth, _most_ms(best)), *feedforwards(truth, usual), *inertias(truth)]
 
 
 def springs(truth: Truth) -> list[Truth]:
@@ -858,23 +866,28 @@ def lags(truth: Truth) -> list[Truth]:
     return [_with_dead_time(truth, (1.0 - share) * _lag_ms(truth)) for share in FILTER_SHARES]
 
 
-def delays(truth: Truth) -> list[Truth]:
-    """Returns variants of the truth with the same lag and the dead time in each of the other possible
-    substeps.
+def delays(truth: Truth, most_ms: float = DEAD_TIME.most) -> list[Truth]:
+    """Returns variants of the truth with the same lag and the dead time in each of the other substeps up to
+    ``most_ms``.
 
     The demand changes slope at the start of a cycle, and a torque lasts for a substep. A change within a
     substep is spread over two substeps, as by a filter, so the misfit over the dead time has a minimum in
     every substep.
     """
     step_ms, now = truth.substep_ms, _substep(truth)
-    most_ms = min(_lag_ms(truth) - 2.0 * FILTER.least, DEAD_TIME.most)
+    most_ms = min(_lag_ms(truth) - 2.0 * FILTER.least, most_ms)
     places = range(int(most_ms / step_ms + 0.5))
     return [_with_dead_time(truth, (each + 0.5) * step_ms) for each in places if each != now]
 
 
-def neighbours(truth: Truth) -> list[Truth]:
+def neighbours(truth: Truth, most_ms: float = DEAD_TIME.most) -> list[Truth]:
     """Returns those variants of `delays` whose dead time is one substep shorter or longer."""
-    return [each for each in delays(truth) if abs(_substep(each) - _substep(truth)) == 1]
+    return [each for each in delays(truth, most_ms) if abs(_substep(each) - _substep(truth)) == 1]
+
+
+def _most_ms(best: Fitted) -> float:
+    """Returns the upper bound of the dead time in a fit; beyond it, all starts would be the same."""
+    return next((each.most for each in best.parameters if each.name == DEAD_TIME.name), DEAD_TIME.most)
 
 
 def inertias(truth: Truth) -> list[Truth]:
@@ -1058,6 +1071,7 @@ def free_parameters(truth: Truth, more: Sequence[str] = ()) -> tuple[Parameter, 
     return tuple(free)
 
 
+@on_one_thread
 def fit(replays: Replays, progress: Progress = lambda _: None) -> Fitted:
     """Fits the parameters, starting from the truth with which the recordings were prepared.
 
@@ -1083,11 +1097,18 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
     progress(0.05)
     rows = fitted_rows(few.data)
 
+    def squares(fitted: Fitted) -> float:
+        return float(np.mean(np.square(softened(fitted.residuals, noise, rows)))) / HUBER_THRESHOLD**2
+
     def near(fitted: Fitted) -> bool:
-        return bool(np.mean(np.square(softened(fitted.residuals, noise, rows))) < HUBER_THRESHOLD**2)
+        return squares(fitted) < 1.0
+
+    def hopeless(fitted: Fitted) -> bool:
+        return squares(fitted) > HOPELESS_RATIO
 
     usual = [(each, parameters) for each in (begun, *springs(begun), *lags(begun))]
-    best = by_halving(few, usual, noise, keep, near)  # near the noise, `_polished` compares minima
+    # Near the noise, `_polished` compares minima.
+    best = by_halving(few, usual, noise, keep, near, hopeless, USUAL_STEPS)
     best = replace(best, prior=np.array(coordinates(begun, parameters)))
     progress(0.2)
     if not near(best):
@@ -1096,7 +1117,14 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
     progress(0.5)
     polished, in_motion = None, noise_in_motion(data)
     while near(best):
-        polished, before = _polished(replays, best, begun, keep), polished
+        # The expected scales are used, because the residuals of a wrong simulation do not estimate the noise
+        # and would reduce the weight of the very channel that shows the error.
+        whole = continued(replays, best, STEPS, known=expected(data), near=best, linear=False)
+        whole = _ended(replays, whole)
+        if polished is not None and misfit(data, polished.residuals) <= misfit(data, whole.residuals):
+            break
+        keep(whole)
+        polished, before = _polished(replays, whole, begun, keep), polished
         if values_in(polished, channel_residuals(data, polished.residuals, in_motion)) is Values.AXIS:
             return polished
         if before is not None and misfit(data, before.residuals) <= misfit(data, polished.residuals):
@@ -1121,28 +1149,22 @@ def values_in(fitted: Fitted, left: Sequence[ChannelResidual]) -> Values:
     return Values.REPLAY if fitted.interrupted or fitted.rough else values_of(left, fitted.scatter)
 
 
-def _polished(replays: Replays, near: Fitted, begun: Truth, keep: Callable[[Fitted], None]) -> Fitted:
-    """Continues a fit near the noise on all legs, and adds the parts that the recording shows."""
-    data = replays.data
-    # The expected scales are used, because the residuals of a wrong simulation do not estimate the noise and
-    # would reduce the weight of the very channel that shows the error.
-    best = continued(replays, near, STEPS, known=expected(data), near=near, linear=False)
-    best = _ended(replays, best)
-    keep(best)
+def _polished(replays: Replays, best: Fitted, begun: Truth, keep: Callable[[Fitted], None]) -> Fitted:
+    """Moves a fit of all legs to its best minimum, and adds the parts that the recording shows."""
     laws = len(LAWS)  # maximum number of changes of the law
+    best = _in_best_minimum(replays, best, begun)
     while True:
-        best = _in_best_minimum(replays, best, begun)
         wider = with_optional_groups(replays, best)
         if wider is not best:
-            best = _ended(replays, wider)
+            best = _in_nearby_minimum(replays, _ended(replays, wider))
             continue
         keep(best)
         # The loop comes last, because a wrong spring also leaves residuals of the load angle.
         other = with_loop(replays, best) if laws else None
         if other is None:
             break
-        laws, best = laws - 1, other
-    limited = with_limit(replays, best, data.base)
+        laws, best = laws - 1, _in_nearby_minimum(replays, other)
+    limited = with_limit(replays, best, replays.data.base)
     best = best if limited is best else _ended(replays, limited)
     keep(best)
     # Wide differences are used for the covariance only, because the servo loops may be unstable near a
@@ -1156,35 +1178,48 @@ def _linearised(replays: Replays, found: Fitted) -> Fitted:
 
 
 def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
-    """Moves the fit to significantly better minima until none is found.
+    """Moves the fit to significantly better minima until none is found, nearby or `elsewhere`.
 
     The fit must be near a minimum, because the alternatives are equally good until the other parameters are
     known.
     """
     few, noise = replays.rough, expected(replays.rough.data)
     least = least_deviation(replays.data) | {LOAD: noise.deviation[LOAD]}
-
-    def moved(places: Iterable[Truth]) -> Fitted:
-        found = best
-        for place in places:
-            other = continued(replays, found, MORE_STEPS, place, rival=found.loss)
-            if other.loss + MIN_LOG_LIKELIHOOD_RATIO < found.loss:
-                found = _ended(replays, other)
-        return found
-
     while True:
-        last = best
-        # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
-        # the next substep increases the residuals too little for any channel to show it.
-        best = moved([exchanged(best.truth), *neighbours(best.truth)])
-        excess = any(best.scales.deviation[name] > EXCESS_RATIO * least[name] for name in CHANNELS)
-        if best is last and excess:
-            tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
-            here, other = (by_halving(few, each, noise) for each in ([(best.truth, best.parameters)], tried))
-            if other.cost + MIN_COST_DECREASE < here.cost:
-                best = moved([other.truth])
+        best = _in_nearby_minimum(replays, best)
+        if all(best.scales.deviation[name] <= EXCESS_RATIO * least[name] for name in CHANNELS):
+            return best
+        tried = [(each, best.parameters) for each in elsewhere(best, begun)]
+        here, other = (by_halving(few, each, noise) for each in ([(best.truth, best.parameters)], tried))
+        if other.cost + MIN_COST_DECREASE >= here.cost:
+            return best
+        moved = _moved(replays, best, other.truth)
+        if moved is best:
+            return best
+        best = moved
+
+
+def _in_nearby_minimum(replays: Replays, best: Fitted) -> Fitted:
+    """Moves the fit to the minima with exchanged gains, or with the dead time in the next substep.
+
+    They are always tried: exchanged gains differ only at rest, and a dead time in the next substep increases
+    the residuals too little for any channel to show it. A few legs show which of them cannot win.
+    """
+    while True:
+        last, few = best, replays.rough
+        here = continued(few, best, MORE_STEPS, linear=False)
+        for place in (exchanged(best.truth), *neighbours(best.truth, _most_ms(best))):
+            other = continued(few, here, MORE_STEPS, place, rival=here.loss, linear=False)
+            if other.loss < here.loss + MIN_LOG_LIKELIHOOD_RATIO:
+                best = _moved(replays, best, place)
         if best is last:
             return best
+
+
+def _moved(replays: Replays, best: Fitted, place: Truth) -> Fitted:
+    """Returns the fit from ``place`` if it is significantly better, else ``best``."""
+    other = continued(replays, best, MORE_STEPS, place, rival=best.loss)
+    return _ended(replays, other) if other.loss + MIN_LOG_LIKELIHOOD_RATIO < best.loss else best
 
 
 def _ended(replays: Replays, near: Fitted) -> Fitted:

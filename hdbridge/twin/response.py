@@ -20,7 +20,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.motor import TrueResponse
-from hdbridge.twin.fit import Fitted
+from hdbridge.twin.fit import MAX_MISFIT_RATIO, Fitted
 from hdbridge.twin.misfit import Data, Piece, Replays, misfit
 from hdbridge.twin.parameters import FOLLOWING, TORQUE
 from hdbridge.twin.replay import demand_deg
@@ -35,8 +35,6 @@ RIDGES: Final = (1e-1, 1e-2, 1e-3, 1e-4)
 between them."""
 ROUNDS: Final = 2
 """Number of fits of the demand's response; the second corrects for friction."""
-MAX_MISFIT_RATIO: Final = 0.97
-"""A response is kept if it reduces the misfit to less than this fraction."""
 
 
 def with_response(replays: Replays, fitted: Fitted) -> Fitted:

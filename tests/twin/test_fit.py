@@ -193,6 +193,19 @@ def test_no_start_is_tried_after_one_that_suffices() -> None:
     assert found.truth != seen[0].truth
 
 
+def test_no_start_is_continued_if_the_best_is_hopeless() -> None:
+    parameters = (BY_NAME["load feed-forward"],)
+    begun = [(with_values(SPRUNG, {"load feed-forward": each}), parameters) for each in (1e-6, 2e-6, 4e-6)]
+    needed, costs = [], []
+    for hopeless in (True, False):
+        with Counted(data(), 1) as replays:
+            found = by_halving(replays, begun, expected(data()), hopeless=lambda _, each=hopeless: each)
+        needed.append(replays.count)
+        costs.append(found.cost)
+    assert needed[0] < needed[1]
+    assert costs[0] >= costs[1]
+
+
 def test_a_fit_that_does_not_approach_its_rival_is_given_up() -> None:
     """At a wrong frequency, both feed-forward inertias approach a minimum far from the true one."""
     parameters = (BY_NAME["inertia feed-forward"], BY_NAME["load feed-forward"])
@@ -259,6 +272,7 @@ def test_a_dead_time_is_tried_in_each_other_substep_that_the_lag_has_room_for(
     assert found == {each for each in middles.values() if each <= lag_ms(late) - 0.1 + 1e-9}
     near = {each.servo.dead_time_ms for each in neighbours(late)}
     assert near == found & {middles.get(own - 1), middles.get(own + 1)}
+    assert {each.servo.dead_time_ms for each in delays(late, 1.0)} == {each for each in found if each <= 1.0}
 
 
 def test_position_gain_and_integral_rate_exchanged_are_the_same_loop_while_the_axis_moves() -> None:
