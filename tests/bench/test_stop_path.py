@@ -145,7 +145,7 @@ def test_a_fault_of_the_drive(runner: str, when: Any) -> None:
 
 def test_a_fault_of_the_drive_during_the_power_on(runner: str) -> None:
     with stop(lambda run: run.cycles == 2, lambda node: node.faults.raise_error(0x3210)) as run:
-        with pytest.raises(TransitionError, match="it is in 'fault'"):
+        with pytest.raises(SafetyStop, match="the drive reports a fault"):
             run.run(runner)
         assert ENABLE_OPERATION not in run.words[1:]
         run.check()
