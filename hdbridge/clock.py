@@ -22,16 +22,19 @@ class Clock(Protocol):
 class MonotonicClock:
     """Monotonic clock of the computer, with absolute deadlines.
 
+    Time in which the computer is suspended counts, unlike that of ``time.monotonic``: a drive may have stopped
+    by itself meanwhile, and a target that was sent before must not move it.
+
     Sleeping to an absolute deadline does not accumulate errors, because a late wake-up is followed by a
     shorter sleep.
     """
 
     def now(self) -> float:
-        """Returns the seconds of ``time.monotonic``."""
-        return time.monotonic()
+        """Returns the seconds since the computer was started (``CLOCK_BOOTTIME``)."""
+        return time.clock_gettime(time.CLOCK_BOOTTIME)
 
     def sleep_until(self, deadline_s: float) -> None:
         """Sleeps until the absolute deadline."""
-        delay = deadline_s - time.monotonic()
+        delay = deadline_s - self.now()
         if delay > 0.0:
             time.sleep(delay)
