@@ -15,10 +15,10 @@ def test_the_time_in_which_the_computer_is_suspended_counts() -> None:
     """A namespace in which CLOCK_BOOTTIME is a day later shows what a suspended day shows."""
     suspended = ("unshare", "--map-root-user", "--fork", "--time", "--boottime", str(LATER_S))
     try:
-        subprocess.run([*suspended, "true"], check=True, capture_output=True, timeout=60)
+        subprocess.run([*suspended, "true"], check=True, capture_output=True)
     except (OSError, subprocess.CalledProcessError) as error:
         pytest.skip(f"no time namespace: {error}")
     run = subprocess.run(
-        [*suspended, sys.executable, "-c", AHEAD], check=True, capture_output=True, text=True, timeout=60
+        [*suspended, sys.executable, "-c", AHEAD], check=True, capture_output=True, text=True
     )
     assert float(run.stdout) > 0.9 * LATER_S
