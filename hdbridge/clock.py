@@ -22,8 +22,8 @@ class Clock(Protocol):
 class MonotonicClock:
     """Monotonic clock of the computer, with absolute deadlines.
 
-    Time in which the computer is suspended counts, unlike that of ``time.monotonic``: a drive may have stopped
-    by itself meanwhile, and a target that was sent before must not move it.
+    Unlike ``time.monotonic``, it counts the time in which the computer is suspended. A drive may have stopped
+    meanwhile, and a target that was sent before must not move it.
 
     Sleeping to an absolute deadline does not accumulate errors, because a late wake-up is followed by a
     shorter sleep.
