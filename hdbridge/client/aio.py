@@ -125,11 +125,11 @@ class AsyncClient:
 
     async def stop(self) -> MachineState:
         """Brakes all axes to rest. Requires no lease."""
-        return await self.ask("POST", "/stop", MachineState)
+        return await self.ask("POST", "/stop", MachineState, attempts=STOPS_SENT)
 
     async def quick_stop(self) -> MachineState:
         """Quick-stops all axes and latches the stops until a reset. Requires no lease."""
-        return await self.ask("POST", "/quick-stop", MachineState)
+        return await self.ask("POST", "/quick-stop", MachineState, attempts=STOPS_SENT)
 
     async def lend_bus(self) -> MachineState:
         """Stops all axes and makes the daemon release its bus to another program of its computer.
@@ -211,8 +211,11 @@ class AsyncClient:
         moving: bool = False,
         waits: bool = False,
         query: Mapping[str, int] | None = None,
+        attempts: int = 1,
     ) -> M:
         """Sends a request and returns its answer. Takes the lease if the request moves an axis.
+
+        A request is sent up to ``attempts`` times if the connection is lost.
 
         A request that ``waits`` is answered at the end of a motion, so it has no time-out; it is limited by
         the daemon's supervision.
@@ -223,7 +226,7 @@ class AsyncClient:
         async with self._held() if moving else nullcontext():
             if self._grant is not None:
                 headers["X-Lease"] = self._grant.token
-            for left in reversed(range(STOPS_SENT if path.endswith("stop") else 1)):
+            for left in reversed(range(attempts)):
                 try:
                     response = await self._http.request(
                         method, path, content=content, headers=headers, params=query, timeout=timeout
@@ -276,10 +279,12 @@ class AsyncAxis:
         self._path = f"/axes/{quote(name, safe='')}"
 
     async def _post(
-        self, what: str, body: BaseModel | None = None, *, waits: bool = False, moving: bool = True
+        self, what: str, body: BaseModel | None = None, *, waits: bool = False, stops: bool = False
     ) -> AxisState:
-        path = f"{self._path}/{what}"
-        return await self.client.ask("POST", path, AxisState, body, moving=moving, waits=waits)
+        path, attempts = f"{self._path}/{what}", STOPS_SENT if stops else 1
+        return await self.client.ask(
+            "POST", path, AxisState, body, moving=not stops, waits=waits, attempts=attempts
+        )
 
     async def _delete(self, what: str) -> AxisState:
         return await self.client.ask("DELETE", f"{self._path}/{what}", AxisState, moving=True)
@@ -302,11 +307,11 @@ class AsyncAxis:
 
     async def stop(self) -> AxisState:
         """Brakes to rest and stays enabled. Requires no lease."""
-        return await self._post("stop", moving=False)
+        return await self._post("stop", stops=True)
 
     async def quick_stop(self) -> AxisState:
         """Quick-stops the axis and latches the stop until a reset. Requires no lease."""
-        return await self._post("quick-stop", moving=False)
+        return await self._post("quick-stop", stops=True)
 
     async def home(self, /, method: int, **values: float | None) -> AxisState:
         """Homes by a method of the drive; ``values`` are the other fields of `messages.Home`."""

@@ -22,7 +22,7 @@ from hdbridge.drive.link import Frame, new_tuple
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.pdo import PdoLengthError
 from hdbridge.drive.plausibility import Plausibility
-from hdbridge.drive.states import State
+from hdbridge.drive.states import FAULTS, State
 from hdbridge.drive.supervision import ROWS, Event, Fault, Reaction, Supervision
 from hdbridge.drive.traffic import Traffic
 from hdbridge.drive.writes import drive_master_timeout_s
@@ -376,7 +376,7 @@ class AxisCycle:
     def _fell_out(self) -> None:
         power = self.image.power
         state = power.dropped or power.state
-        fault = state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
+        fault = state in FAULTS
         detail = f"it went to '{state.value}'"
         self.pending.append((Fault.DRIVE_FAULT if fault else Fault.DROPPED_OUT, detail))
 

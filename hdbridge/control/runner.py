@@ -75,7 +75,7 @@ class AxisRunner:
         return feedback
 
     def brake(self) -> None:
-        """Quick-stops the axis, unless it has been told to stop already."""
+        """Quick-stops the axis unless it is already being stopped."""
         if self._running:
             self.stop()
 

@@ -17,7 +17,7 @@ from hdbridge.drive.link import Link
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.sdo import SdoClient
-from hdbridge.drive.states import Command, State, controlword_for, decode, states_on_the_way
+from hdbridge.drive.states import FAULTS, Command, State, controlword_for, decode, states_on_the_way
 from hdbridge.errors import RESET, DriveError, TransitionError
 
 STEP_TIMEOUT_S: Final = 1.0
@@ -26,7 +26,6 @@ BRAKE_TIMEOUT_S: Final = 3.0
 POLL_S: Final = 0.005
 _STILL_COUNTS: Final = 2
 _STILL_POLL_S: Final = 0.02
-_FAILED_STATES: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 _MAY_BE_ENABLED: Final = (State.SWITCHED_ON, State.OPERATION_ENABLED)
 
 
@@ -59,13 +58,13 @@ class Commander:
     def control(self, controlword: int) -> None:
         """Writes the controlword.
 
-        *Enable operation* would set a drive in motion again that has stopped by itself. It is therefore only
-        sent to a drive that is switched on or enabled, and is not repeated without an answer. Raises
+        *Enable operation* could restart the motion of a drive that has stopped on its own. It is therefore
+        sent only to a drive that is switched on or enabled, and is not repeated without an answer. Raises
         `DriveError` otherwise.
         """
         enables = controlword & Command.ENABLE_OPERATION.mask == Command.ENABLE_OPERATION.word
         if enables and (state := decode(self.statusword())) not in _MAY_BE_ENABLED:
-            if state in _FAILED_STATES:
+            if state in FAULTS:
                 raise self.fault("before 'enable operation'")
             raise DriveError(
                 f"{self.name}: is in '{state.value}' before 'enable operation'; look at its error display"
@@ -102,7 +101,7 @@ class Commander:
             statusword = self.statusword()
             if done(statusword):
                 return statusword
-            if not allow_fault and decode(statusword) in _FAILED_STATES:
+            if not allow_fault and decode(statusword) in FAULTS:
                 raise self.fault(f"while waiting for {what}")
             if self.link.now() >= deadline_s:
                 raise TransitionError(
@@ -188,7 +187,7 @@ class Commander:
         """Commands a quick stop and waits until the drive reacts; returns the resulting state."""
         self.image.power.quick_stop()
         self.control(0x0002)
-        stopped = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, *_FAILED_STATES)
+        stopped = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, *FAULTS)
         word = self.wait_for(
             "a quick stop", lambda word: decode(word) in stopped, STEP_TIMEOUT_S, allow_fault=True
         )

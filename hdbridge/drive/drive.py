@@ -30,7 +30,7 @@ from hdbridge.drive.masterdetection import refuse_other_masters
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import Address, IntegerType, Mode
 from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoAbortError, SdoClient
-from hdbridge.drive.states import OFF, Command, State, decode, row_for
+from hdbridge.drive.states import FAULTS, OFF, Command, State, decode, row_for
 from hdbridge.drive.writes import master_heartbeat
 from hdbridge.errors import DriveError, HdbridgeError, InputError, TransitionError
 
@@ -171,7 +171,7 @@ class Drive:
                 + ", ".join(each.name for each in modes_of_drive)
             )
         state = self._commander.state()
-        if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+        if state in FAULTS:
             raise self._commander.fault("before it was enabled")
         if state is not State.SWITCH_ON_DISABLED:
             raise TransitionError(
@@ -217,7 +217,7 @@ class Drive:
         try:
             commander.wait_for(
                 "the end of the fault",
-                lambda word: decode(word) not in (State.FAULT, State.FAULT_REACTION_ACTIVE),
+                lambda word: decode(word) not in FAULTS,
                 STEP_TIMEOUT_S,
                 allow_fault=True,
             )

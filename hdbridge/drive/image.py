@@ -285,7 +285,7 @@ class ProcessImage:
         return self._pack(target_counts)
 
     def pack_rpdo_idle(self, motor_counts: int) -> Frames:
-        """Returns the RPDOs with the actual position as target, for every cycle before power is enabled."""
+        """Returns the RPDOs with this position as target, for every cycle before power is enabled."""
         return self._pack(wrap_int32(motor_counts))
 
     def pack_rpdo_held(self) -> Frames:

@@ -23,7 +23,7 @@ State = PowerState
 _ENABLED: Final = State.OPERATION_ENABLED
 _QUICK_STOP: Final = State.QUICK_STOP_ACTIVE
 _FAULT: Final = State.FAULT
-_FAULTS: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
+FAULTS: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 
 _DECODING: Final[tuple[tuple[State, int, int], ...]] = (
     # state, mask, value: bits 0-3, 5, 6 of the statusword
@@ -217,7 +217,7 @@ class PowerWalk:
         self.state = state
         if state is _ENABLED:
             self._was_enabled = True
-        elif self._was_enabled or state in _FAULTS:
+        elif self._was_enabled or state in FAULTS:
             self._was_enabled = False
             if self.aim is State.OPERATION_ENABLED:
                 # The drive dropped out on its own. It stays there until the next `go`.

@@ -1,10 +1,11 @@
 """Checks of the arguments that a test passes."""
 
 import math
-from numbers import Integral, Real
+from numbers import Integral
 from typing import Any
 
 from hdbridge.errors import InputError
+from hdbridge.motion.procedures.parameters import is_finite
 
 
 def check_number(
@@ -12,8 +13,8 @@ def check_number(
 ) -> None:
     """Raises `InputError` for a value that is not a finite number (``whole``: an integer) in a range."""
     __tracebackhide__ = True  # hides this frame, so that pytest shows the test's line
-    is_number = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
-    if is_number and math.isfinite(value) and least <= value <= most:
+    is_right = is_finite(value) and (not whole or isinstance(value, Integral))
+    if is_right and least <= value <= most:
         return
     expected = "an integer" if whole else "a number"
     if math.isfinite(most):

@@ -35,7 +35,7 @@ class Stop:
         self.words: list[int] = []
         """Controlwords sent after the action."""
         self.on_word: dict[int, Callable[[], None]] = {}
-        """What happens after a number of these controlwords."""
+        """Actions, by the number of these controlwords after which they run."""
 
     def interrupted(self) -> bool:
         self.cycles += 1

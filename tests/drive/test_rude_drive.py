@@ -1,4 +1,4 @@
-"""A drive that restarts, stops by itself or gets no power leaves no motion behind, by SDO or on a bench."""
+"""A drive that restarts, stops on its own or gets no power does not move afterwards, by SDO or on a bench."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -196,13 +196,13 @@ class RudeDrive:
         self.nmt = 127
 
     def lose_master(self, code: int = 0x8130) -> None:
-        """Stops by itself, for want of its master, and says so."""
+        """Stops because its master is silent, and sends an emergency."""
         if self.state == ENABLED:
             self.miss_master(code)
             self._send(0x80 + self.node_id, struct.pack("<HB5x", code, 0x11))
 
     def miss_master(self, code: int = 0) -> None:
-        """Stops by itself without a word."""
+        """Stops without an emergency."""
         if self.state == ENABLED:
             self.state = STOPPED if self[0x605A, 0] > 4 else OFF
             self._speed = 0

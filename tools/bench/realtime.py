@@ -345,8 +345,8 @@ def main() -> int:
         if kind in wanted:
             figures, seen = measured(axes, cycle_ms, cycles, channel)
             print(table([figures], 1e-3 * cycle_ms), flush=True)
-            told = ", ".join(f"{count} {name}" for name, count in sorted(seen["told"].items()))
-            print(f"the service saw {seen['samples']} samples and lost none; events: {told}", flush=True)
+            events = ", ".join(f"{count} {name}" for name, count in sorted(seen["told"].items()))
+            print(f"the service saw {seen['samples']} samples and lost none; events: {events}", flush=True)
             print(*seen["refused"], sep="\n")
             results.append({**asdict(figures), "cycle_ms": cycle_ms, **seen})
     keep(results, options.json)

@@ -28,7 +28,7 @@ from hdbridge.drive.feedback import STOP_TIMEOUT_S, Feedback
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.monitor import Emergency
 from hdbridge.drive.objects import COB_EMCY
-from hdbridge.drive.states import State, decode
+from hdbridge.drive.states import FAULTS, State, decode
 from hdbridge.drive.supervision import Event
 from hdbridge.errors import SafetyStop
 from hdbridge.motion.procedures.moves import MoveTo, Path
@@ -336,7 +336,7 @@ class BringUpContext(ExitStack):
     def boot(self) -> Drive:
         """Boots the drive again, resets a fault left by an earlier check, and returns the drive, disabled."""
         report = self.drive.boot()
-        if report.state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+        if report.state in FAULTS:
             self.drive.fault_reset()
         return self.drive
 

@@ -12,12 +12,13 @@ Positive = Annotated[float, "above 0"]
 Count = Annotated[int, "above 0"]
 
 
-def _is_finite(value: Any) -> bool:
+def is_finite(value: Any) -> bool:
+    """Returns True for a finite number; True and False are not numbers."""
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _is_positive(value: Any) -> bool:
-    return _is_finite(value) and value > 0
+    return is_finite(value) and value > 0
 
 
 def _is_count(value: Any) -> bool:
@@ -29,11 +30,11 @@ def _all(check: Callable[[Any], bool]) -> Callable[[Any], bool]:
 
 
 _RULES: Final[dict[Any, tuple[Callable[[Any], bool], str]]] = {
-    float: (_is_finite, "a finite number"),
+    float: (is_finite, "a finite number"),
     Positive: (_is_positive, "a number above 0"),
     Positive | None: (lambda value: value is None or _is_positive(value), "a number above 0, or None"),
     Count: (_is_count, "an integer above 0"),
-    tuple[float, ...]: (_all(_is_finite), "at least one finite number"),
+    tuple[float, ...]: (_all(is_finite), "at least one finite number"),
     tuple[Positive, ...]: (_all(_is_positive), "at least one number above 0"),
 }
 """Check and expectation for each type of parameter; other types are not checked."""
