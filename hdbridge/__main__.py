@@ -3,8 +3,8 @@
 import os
 import sys
 
-# Threads in linear algebra cost more than they gain, because the matrices are small; on a busy computer they
-# cost several times the work. Users who want threads can set these variables.
+# Threads in linear algebra cost more than they gain, because the matrices are small. Fits and diagnoses use
+# one thread in any program (`on_one_thread`); these variables extend that to the rest of the command.
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")
 

@@ -11,7 +11,6 @@ best possible with the axis's counts and noise, and the speed relative to real t
 
 from __future__ import annotations
 
-import os
 import sys
 import tempfile
 import time
@@ -19,8 +18,6 @@ from collections.abc import Callable
 from multiprocessing import Pool
 from pathlib import Path
 from typing import Any
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads slow down operations on such small matrices
 
 import numpy as np
 import yaml

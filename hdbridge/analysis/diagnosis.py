@@ -222,6 +222,7 @@ class _Judge:
         cleared = copy(estimator)  # the record without the errors found in it
         cleared.observed = estimator.observed - before + after
 
+        @on_one_thread
         def visible() -> tuple[Mapping[str, Identifiability], Capability]:
             causes = identifiability(cleared, cleared.fit(refitted.hypothesis), given, judged.unexplained)
             return causes, capability(estimator.data, given, causes, estimator.scales)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from hdbridge.analysis import diagnosis
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
 from hdbridge.axis.model import TransmissionModel
@@ -142,7 +143,7 @@ def test_rounded_digits_yield_no_cause(
 
 
 def test_a_diagnosis_uses_one_thread_and_restores_the_caller_s(
-    columns: Callable[..., dict[str, Any]], model: TransmissionModel
+    columns: Callable[..., dict[str, Any]], model: TransmissionModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A program that uses the library may have loaded numpy with any number of threads."""
 
@@ -152,7 +153,9 @@ def test_a_diagnosis_uses_one_thread_and_restores_the_caller_s(
     during: list[int] = []
     with threadpool_limits(2, "blas"):
         before = threads()
-        diagnose(Record(columns()), model, progress=lambda _: during.extend(threads()))
+        result = diagnose(Record(columns()), model, progress=lambda _: during.extend(threads()))
+        monkeypatch.setattr(diagnosis, "capability", lambda *_: during.extend(threads()))
+        assert result.identifiability  # computed on request
         assert threads() == before
     assert set(before) == {2}
     assert set(during) == {1}
