@@ -28,6 +28,7 @@ from hdbridge.sim.hysteresis_laws import law_of
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.hysteresis import Hysteresis, MaxwellSlip
 from hdbridge.sim.truth.motor import TrueObserver
+from hdbridge.twin.mechanics import measured_mechanics
 from hdbridge.twin.misfit import (
     CHANNELS,
     FINE,
@@ -81,11 +82,12 @@ LATEST_S = 0.1
 
 
 def start_of(truth: Truth, data: Data) -> Truth:
-    """Returns the truth with command filter and dead time estimated from the lag behind the demand.
+    """Returns the truth with inertias and friction from the equation of motion, and with command filter and
+    dead time from the lag behind the demand.
 
     If the recording holds its highest torque for some rows, this torque becomes the drive's torque limit.
     """
-    servo, values = truth.servo, dict[str, float]()
+    servo, values = truth.servo, measured_mechanics(data)
     held_percent = 100.0 * _held_nm(data) / truth.motor.rated_torque_nm
     if held_percent < min(servo.torque_limit_percent, data.axis.limits.torque_percent):
         values[LIMIT.name] = held_percent
