@@ -216,7 +216,7 @@ def _seen(
     def passes(view: _View) -> bool:
         columns = np.column_stack([tangent, weight * view.predicted_arcsec])
         fit = Linearised(columns, residual, known)
-        own = [fitted.count()]
+        own = [len(fitted.parameters)]
         return block_robust(estimator, fit, own, np.zeros(1), rows, discrepancies) > scales.robust
 
     sizes = [estimator.half_span(each.predicted_arcsec) for each in views]
