@@ -382,7 +382,7 @@ class Estimator:
         costs += offset
         terms = Terms(
             self.observed - self.level,
-            lambda effect: self.columns(effect, start),
+            lambda effect: self._regressors.of_unit(effect, (start,)),
             White(self.weight),
             self.unknown if own is None else self.unknown.and_also(own),
             prior,

@@ -279,7 +279,7 @@ class Terms:
     observed: FloatArray
     """Observations, arcsec, shape (m,)."""
     columns: Columns
-    """Function that returns an effect's columns (m, p), which do not depend on its coefficients."""
+    """Function that returns the columns (m, p) of an effect with unit coefficients (`separable.unit`)."""
     weighting: Weighting
     nuisances: Nuisances
     prior: Mapping[tuple[int, str], Prior] = field(default_factory=dict)

@@ -34,10 +34,15 @@ class Regressors:
         """Returns the columns of an effect, arcsec, shape (rows, p); read-only."""
         # Columns do not depend on an effect's own coefficients. They do depend on the loop and orders that
         # an effect contains as fields.
-        key = (unit(effect), starts)
-        if key in self._recent:
+        return self.of_unit(unit(effect), starts)
+
+    def of_unit(self, effect: Effect, starts: Starts) -> FloatArray:
+        """Returns the columns of an effect with unit coefficients (`unit`)."""
+        key = (effect, starts)
+        known = self._recent.get(key)
+        if known is not None:
             self._recent.move_to_end(key)
-            return self._recent[key]
+            return known
         if effect.shape or effect.carries or effect.curved or counts(effect):
             columns = self._made(effect, starts)
         else:  # these columns are the same in every fit

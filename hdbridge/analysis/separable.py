@@ -40,7 +40,7 @@ def tangent(
     """
     coefficients = effect.coefficients()
     here = shape_value(effect, shape.name)
-    predicted = _predicted(columns(effect), coefficients)
+    predicted = _predicted(columns(unit(effect)), coefficients)
     size = float(predicted @ predicted)
 
     def change(sign: float) -> tuple[FloatArray, float]:
@@ -53,7 +53,8 @@ def tangent(
         moved_by = np.log(there / here) if shape.logarithmic else there - here
         if not moved_by:
             return np.zeros(len(predicted)), 0.0
-        there_predicted = _predicted(columns(effect.fitted(coefficients, {shape.name: there})), coefficients)
+        moved_effect = effect.fitted(coefficients, {shape.name: there})
+        there_predicted = _predicted(columns(unit(moved_effect)), coefficients)
         there_predicted -= predicted
         return there_predicted, moved_by
 
@@ -136,8 +137,8 @@ EXCHANGES = 3
 class _Point:
     """Fit of the coefficients for given shapes."""
 
-    given: tuple[Effect, ...]
-    """Effects from which the columns were computed."""
+    units: tuple[Effect, ...]
+    """Effects with unit coefficients (`unit`), which determine the columns."""
     effects: tuple[Effect, ...]
     """Same effects with fitted coefficients."""
     parts: tuple[FloatArray, ...]
@@ -231,8 +232,8 @@ class Separable:
             system = self._system(here, where, tangents)
             step, promised = self._step(here, where, system, damping)
             small = promised < enough
-            if small and self._stands(here, refreshed(here.effects)):
-                break
+            if small and tuple(map(unit, refreshed(here.effects))) == here.units:
+                break  # the copies of model parts that the effects contain agree with the fit
             for _ in range(TRIES):
                 there = self._at(refreshed(moved(here.effects, where, step)))
                 better = there.chi_square < here.chi_square
@@ -275,8 +276,9 @@ class Separable:
     def _at(self, effects: Sequence[Effect]) -> _Point:
         """Fits the coefficients, with the shapes fixed."""
         terms = self.terms
-        keys = (terms.nuisances.key, *map(unit, effects))
-        parts = (terms.nuisances.columns, *map(terms.columns, effects))
+        units = tuple(map(unit, effects))
+        keys = (terms.nuisances.key, *units)
+        parts = (terms.nuisances.columns, *map(terms.columns, units))
         gram = terms.products.gram(keys, parts, terms.weighting)
         for key, part in zip(keys, parts, strict=True):
             if key not in self._moments:
@@ -302,7 +304,7 @@ class Separable:
         chi_square += self._of_shapes(effects)
         own = _split(coefficients, parts)[1:]
         fitted = tuple(each.fitted(values) for each, values in zip(effects, own, strict=True))
-        return _Point(tuple(effects), fitted, parts, gram, coefficients, inside, chi_square)
+        return _Point(units, fitted, parts, gram, coefficients, inside, chi_square)
 
     def _linear(self, effects: Sequence[Effect]) -> list[Column]:
         """Lists the parameters of the linear columns, nuisances first."""
@@ -364,10 +366,6 @@ class Separable:
             free &= ~blocked
         step[~free] = 0.0
         return step, float(slope @ step)
-
-    def _stands(self, here: _Point, effects: Sequence[Effect]) -> bool:
-        """Returns True if the copies of model parts that the effects contain agree with the fit."""
-        return all(unit(one) == unit(other) for one, other in zip(here.given, effects, strict=True))
 
     def _solution(self, here: _Point) -> Solution:
         columns, edge = self._linear(here.effects), []

@@ -231,10 +231,7 @@ def _seen(
 
 def _standing(estimator: Estimator, residual: FloatArray) -> float:
     """Returns the typical step between neighbouring block means at rest, arcsec, which is slow noise."""
-    speed = estimator.motion.motor_speed_deg_s
-    if speed is None:
-        return 0.0
-    still = (speed == 0.0)[estimator.index]
+    still = (estimator.data.points.speed_deg_s == 0.0)[estimator.index]
     if np.count_nonzero(still) < FEW:
         return 0.0
     number = np.floor((estimator.time_s[still] - estimator.time_s[0]) / BLOCK_S).astype(np.intp)
