@@ -201,7 +201,7 @@ def _joined(axis: AxisConfig, recordings: dict[Path, Recording]) -> Recording:
                 f"{path}: no column motor_target_deg; expected the commanded motor angle in each row, "
                 f"because the simulated drive receives the same commands as the real one{name}"
             )
-    check_records({path: each.record for path, each in recordings.items()}, axis.gear.ratio)
+    check_records({path: each.record for path, each in recordings.items()}, axis.gear.ratio, str(axis.path))
     return Recording.joined(list(recordings.values()))
 
 

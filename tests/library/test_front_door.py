@@ -77,7 +77,7 @@ def test_an_axis_is_simulated_by_name_path_or_content(axis, tmp_path, monkeypatc
 @pytest.mark.parametrize("axis", ["artikle", "no/such/folder", Path("axis.yml")])
 def test_an_axis_that_does_not_exist_is_refused(axis):
     with (
-        pytest.raises(hdbridge.InputError, match="expected a path or one of: .*article"),
+        pytest.raises(hdbridge.InputError, match=r"expected a path or one of: .*article"),
         hdbridge.simulated(axis),
     ):
         pytest.fail("it was simulated")
