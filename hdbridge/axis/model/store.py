@@ -155,7 +155,7 @@ class Store(Generic[K]):
         names = ", ".join(dict.fromkeys(each for version in versions for each in _names(version)))
         raise InputError(
             f"{profile}: there is no {self.noun} '{name}'; "
-            f"expected one of: {names or f'none yet, {self.first}'}"
+            + (f"expected one of: {names}" if names else f"none is stored yet: {self.first}")
         )
 
     def propose(
@@ -208,8 +208,11 @@ class Store(Generic[K]):
         """Makes a version of the history active, and returns its number; the previous one stays stored."""
         path = self._history(profile).get(version)
         if path is None:
-            numbers = ", ".join(map(str, sorted(self._history(profile)))) or f"none yet, {self.first}"
-            raise InputError(f"{profile}: there is no version {version}; expected one of: {numbers}")
+            numbers = ", ".join(map(str, sorted(self._history(profile))))
+            raise InputError(
+                f"{profile}: there is no version {version}; "
+                + (f"expected one of: {numbers}" if numbers else f"none is stored yet: {self.first}")
+            )
         with _locked(profile):
             self._check(profile, path, identity)
             return self._activate(profile, path.read_bytes(), "activate", reason, date)
