@@ -30,6 +30,7 @@ from pydantic import Field
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
+from hdbridge.files.atomic import check_writable
 from hdbridge.files.yamlfile import dump_yaml, read_yaml, write_atomically
 from hdbridge.strictness import Strict
 
@@ -157,6 +158,10 @@ class Store(Generic[K]):
             f"{profile}: there is no {self.noun} '{name}'; "
             + (f"expected one of: {names}" if names else f"none is stored yet: {self.first}")
         )
+
+    def check_pending(self, profile: Path) -> None:
+        """Raises `InputError` if a pending version cannot be written; to be called before a measurement."""
+        check_writable(profile / self.pending)
 
     def propose(
         self,
