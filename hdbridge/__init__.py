@@ -5,12 +5,15 @@ in the changelog. Each is loaded on first use, so importing hdbridge costs nothi
 without notice.
 """
 
-import sys
-from importlib import import_module
-from types import MappingProxyType, ModuleType
-from typing import TYPE_CHECKING, Any, Final
+from __future__ import annotations
 
+import sys
+
+# Nothing else is imported here: Ctrl-C during an import that precedes `main` would print a traceback.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any, Final
+
     from hdbridge.analysis.diagnosis import diagnose
     from hdbridge.axis import AxisConfig
     from hdbridge.axis.model import TransmissionModel
@@ -74,32 +77,32 @@ __all__ = [
     "simulated",
 ]
 
-_MODULES: Final = MappingProxyType(
-    {
-        "AsyncClient": "client",
-        "AxisConfig": "axis",
-        "Bench": "control.bench",
-        "Client": "client",
-        "Compensation": "control.compensation",
-        "Drive": "drive",
-        "Inverse": "control.compensation",
-        "Record": "records.record",
-        "Recording": "records.recording",
-        "Stepping": "motion.procedures.stepping",
-        "Trajectory": "motion.procedures.trajectory",
-        "TransmissionModel": "axis.model",
-        "diagnose": "analysis.diagnosis",
-        "fit": "commissioning.calibration",
-        "open_bus": "drive",
-        "simulated": "simulated",
-    }
-)
+_MODULES: Final = {
+    "AsyncClient": "client",
+    "AxisConfig": "axis",
+    "Bench": "control.bench",
+    "Client": "client",
+    "Compensation": "control.compensation",
+    "Drive": "drive",
+    "Inverse": "control.compensation",
+    "Record": "records.record",
+    "Recording": "records.recording",
+    "Stepping": "motion.procedures.stepping",
+    "Trajectory": "motion.procedures.trajectory",
+    "TransmissionModel": "axis.model",
+    "diagnose": "analysis.diagnosis",
+    "fit": "commissioning.calibration",
+    "open_bus": "drive",
+    "simulated": "simulated",
+}
 """Module of each public name, except the errors."""
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'hdbridge' has no attribute '{name}'")
+    from importlib import import_module  # noqa: PLC0415
+
     found = getattr(import_module(f"hdbridge.{_MODULES.get(name, 'errors')}"), name)
     globals()[name] = found
     return found
@@ -109,13 +112,13 @@ def __dir__() -> list[str]:
     return sorted({*(each for each in globals() if each.startswith("__")), *__all__})
 
 
-class _FrontDoor(ModuleType):
+class _FrontDoor(type(sys)):  # type: ignore[misc]
     """Makes `hdbridge.simulated` always the function, although importing the module of the same name would
     replace it.
     """
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if not (isinstance(value, ModuleType) and name in __all__):
+        if not (isinstance(value, type(sys)) and name in __all__):
             super().__setattr__(name, value)
 
 

@@ -18,21 +18,28 @@ if TYPE_CHECKING:
 
 @contextmanager
 def simulated(
-    axis: AxisConfig, truth: Path | str | None = None, seed: int = 0, **changed: Mapping[str, Any]
+    axis: AxisConfig | Path | str,
+    truth: Path | str | None = None,
+    seed: int = 0,
+    **changed: Mapping[str, Any],
 ) -> Iterator[Drive]:
     """Yields the drive of an axis, simulated in this process and faster than real time; not booted yet.
 
-    ``truth`` describes the axis (docs/ci.md); the default is the ``twin.yaml`` next to the axis file, or else
-    the ``truth.yaml``. ``changed`` overrides keys in sections of the truth, such as
+    ``axis`` is an axis file's content, its folder or path, or the name of a bundled profile, such as
+    "article". ``truth`` describes the axis (docs/ci.md); the default is the ``twin.yaml`` next to the axis
+    file, or else the ``truth.yaml``. ``changed`` overrides keys in sections of the truth, such as
     ``gear={"backlash_arcsec": 10}``. The same truth and seed give the same frames, bit for bit. Raises
-    `InputError` for a missing or invalid truth.
+    `InputError` for a missing or invalid axis or truth.
     """
     # Loaded here, because a master of a real drive needs no simulation.
+    from hdbridge.axis import AxisConfig  # noqa: PLC0415
     from hdbridge.drive import Drive  # noqa: PLC0415
     from hdbridge.files.profile import Profile  # noqa: PLC0415
     from hdbridge.sim.lockstep import simulated_bench  # noqa: PLC0415
     from hdbridge.sim.truth import Truth  # noqa: PLC0415
 
+    if not isinstance(axis, AxisConfig):
+        axis = AxisConfig.load(Profile.find(str(axis)).axis)
     known = Path(truth) if truth is not None else Profile.find(str(axis.path)).simulated
     source = axis.load_encoder.source.address
     with (

@@ -56,16 +56,16 @@ limits: {position_min_deg: -400, position_max_deg: 400, velocity_deg_s: 60,
 """Axis file for the robot's joints; the encoder resolutions come from the records, the rest is assumed."""
 
 
-FOLDER = Path(
-    os.environ.get("HDBRIDGE_REAL_RECORDS", Path(__file__).resolve().parents[2] / "shared" / "data")
-)
-"""Folder of the measured records: beside the repository, if not given."""
+FOLDER = Path(os.environ.get("HDBRIDGE_REAL_RECORDS") or os.devnull)
+"""Folder of the measured records; no folder if the variable is not set."""
 
 
 def main() -> None:
     """Prints the figures."""
+    if sys.argv[1:] not in ([], ["twins"]):
+        sys.exit(f"found {' '.join(sys.argv[1:])!r}; expected nothing, or 'twins'")
     if not FOLDER.is_dir():
-        sys.exit(f"no folder {FOLDER}: set HDBRIDGE_REAL_RECORDS to that of the measured records")
+        sys.exit("HDBRIDGE_REAL_RECORDS: not set, or no folder; expected the folder of the measured records")
     if sys.argv[1:] != ["twins"]:
         _causes(FOLDER)
     _twins(FOLDER)

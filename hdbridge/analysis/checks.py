@@ -35,11 +35,11 @@ FOLLOWS_SHARE = 0.1
 """Maximum ratio of the deviations between command and motor after and before unwrapping of the command."""
 
 
-def check_records(records: Mapping[Path, Record], ratio: float) -> None:
+def check_records(records: Mapping[Path, Record], ratio: float, stated_by: str = "") -> None:
     """Raises InputError if an axis of this ratio cannot have produced the records, or if it never moved.
 
     Time must increase, angles must be multi-turn, units and ratio must be right, and the motor must move in
-    at least one record. The paths are used in the messages.
+    at least one record. The paths, and the file that states the ratio, are used in the messages.
     """
     for path, record in records.items():
         record.check_values()
@@ -50,7 +50,7 @@ def check_records(records: Mapping[Path, Record], ratio: float) -> None:
         _check_whole(path, record)
         _check_wrapped(path, record)
         for part in observed(record, ratio).record.parts():
-            part.check_ratio(ratio)
+            part.check_ratio(ratio, stated_by)
         _check_speed(path, record)
         _check_turn(path, record, ratio)
     counts = sum(len(each) for each in records.values())

@@ -90,9 +90,10 @@ def diagnose(
     a channel that the model needs.
     """
     recordings = by_name(recording)
-    agreed_ratio(recordings, [(str(model.path or "the model"), model.ratio)])
+    stated_by = str(model.path or "the model")
+    agreed_ratio(recordings, [(stated_by, model.ratio)])
     check_once(list(recordings), [each.record for each in recordings.values()])
-    check_records({name: each.record for name, each in recordings.items()}, model.ratio)
+    check_records({name: each.record for name, each in recordings.items()}, model.ratio, stated_by)
     whole = Recording.joined(list(recordings.values()))
     record, legs = whole.record, whole.segments
     remarks = (

@@ -162,10 +162,12 @@ def calibrate(
     The axis moves within the limits of its axis file, without compensation. Ctrl-C stops it and keeps what
     was measured. A model that does not improve on held-out data is not offered.
     """
+    from hdbridge.axis.model.store import MODELS
     from hdbridge.commissioning.calibration import calibrate
     from hdbridge.commissioning.calibration.motion import motion_test_s
     from hdbridge.commissioning.calibration.validation import validation_s
 
+    MODELS.check_pending(session.files.folder)
     work, axis = measured.of(session), session.axis
     test_s = validation_s(work.plan, axis)
     if work.plan.validation.motion:

@@ -6,10 +6,9 @@ import itertools
 import os
 import signal
 import socket
-import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -270,11 +269,18 @@ def watch(
             for _ in _looks(count, every_s):
                 print(client.state().model_dump_json(), flush=True)
             return
-        with Live(console=console, auto_refresh=False, screen=False) as shown:
+        # Rich shows a live table only on a terminal. A reader of a pipe gets one table after the other.
+        with Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext() as shown:
             for _ in _looks(count, every_s):
                 state = client.state()
                 words = (Text(line) for line in (*_machine_lines(state), *_all_concerns(state)))
-                shown.update(Group(*words, *tables(AXES, axes_rows(state.axes))), refresh=True)
+                table = Group(*words, *tables(AXES, axes_rows(state.axes)))
+                if shown is not None:
+                    shown.update(table, refresh=True)
+                else:
+                    console.print(table)
+                    if console.unread:
+                        return
 
 
 def events(
@@ -292,9 +298,8 @@ def events(
                 say(f"{found.lost} older ones are no longer stored")
             for each in found.events:
                 say(_event_line(each))
-            if not follow:
+            if not follow or console.unread:
                 return
-            sys.stdout.flush()
             time.sleep(0.5)
             found = client.events(found.newest)
 

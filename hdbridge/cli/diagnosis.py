@@ -297,6 +297,7 @@ def improve(
     The axis moves within the limits of its axis file. Ctrl-C stops it and keeps what was measured.
     """
     from hdbridge.axis.model import TransmissionModel
+    from hdbridge.axis.model.store import MODELS
     from hdbridge.commissioning.improvement import Source, improve
     from hdbridge.commissioning.improvement.trial import trial_s
 
@@ -304,6 +305,7 @@ def improve(
     if given and measured.resume is not None:
         raise InputError("--from and --resume exclude each other: leave one of them out")
     recordings = csv.load(given or ())  # refused before anything is connected
+    MODELS.check_pending(session.files.folder)
     work = measured.of(session)
     test_min = trial_s(work.plan, axis, active) / 60
     trial = f"{test_min:.1f} min to step with both models, if something is found"

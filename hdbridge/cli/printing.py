@@ -26,7 +26,11 @@ _FIGURE: Final = re.compile(r"\(?[-+~<]?\d[\d,.]*(e[-+]?\d+)?\)?( (s|%))?|not kn
 class _Console(Console):
     """Console that discards its output once the reader has closed the pipe (`| head`)."""
 
+    unread = False
+    """True once the reader has closed the pipe."""
+
     def on_broken_pipe(self) -> None:
+        self.unread = True
         os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
 
 

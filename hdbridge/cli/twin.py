@@ -104,6 +104,7 @@ def _learned(
     from hdbridge.report.twin import TwinReport
     from hdbridge.twin.twin import TWINS, TwinFile, fit_twin, judge
 
+    TWINS.check_pending(files.folder)
     with measuring(files.axis), progress_bar() as bar:
         task = bar.add_task("fit", total=1.0)
         twin = fit_twin([recording], axis, begun.truth, lambda share: bar.update(task, completed=share))
@@ -201,7 +202,7 @@ def _joined(axis: AxisConfig, recordings: dict[Path, Recording]) -> Recording:
                 f"{path}: no column motor_target_deg; expected the commanded motor angle in each row, "
                 f"because the simulated drive receives the same commands as the real one{name}"
             )
-    check_records({path: each.record for path, each in recordings.items()}, axis.gear.ratio)
+    check_records({path: each.record for path, each in recordings.items()}, axis.gear.ratio, str(axis.path))
     return Recording.joined(list(recordings.values()))
 
 

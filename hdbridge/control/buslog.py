@@ -404,7 +404,7 @@ class _Bus:
         begin_s = float(record.time_s[0])
         record = replace(record, columns={**record.columns, "time_s": record.time_s - begin_s})
         try:
-            record.check_ratio(self._axis.gear.ratio)
+            record.check_ratio(self._axis.gear.ratio, str(self._axis.path))
         except InputError as problem:
             assumed = self.source == "the axis file"
             more = "; the mapping is that of the axis file, the log may use another" if assumed else ""

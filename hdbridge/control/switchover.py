@@ -91,8 +91,8 @@ class Correction:
             raise InputError("a change of the model is under way: wait until it is done")
         if not math.isclose(new.model.ratio, self._now.model.ratio, rel_tol=1e-9):
             raise InputError(
-                f"a model of a gear with ratio {new.model.ratio:g}; this axis runs with "
-                f"{self._now.model.ratio:g}: use a model of this gear"
+                f"{new.model.path or 'the new model'}: a model of a gear with ratio {new.model.ratio:g}; "
+                f"this axis runs with {self._now.model.ratio:g}: use a model of this gear"
             )
         self._new = new
         self._weight = 0.0

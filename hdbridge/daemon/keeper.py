@@ -77,6 +77,8 @@ class Times:
     """Maximum time for the control process to brake all axes and exit."""
     service_stop_s: float = 10.0
     """Maximum time for service and gateway to exit after the control process."""
+    collected_s: float = 10.0
+    """Maximum time until the program that asked for the bus acquires its lock."""
 
 
 SIMULATED: Final = Times(begin_s=600.0, gateway_hung_s=120.0, stop_s=300.0, service_stop_s=120.0)
@@ -246,12 +248,11 @@ class _Process:
 class Loan:
     """Loan of the bus to another program: requested, then begun, and over when the lock is free again."""
 
-    COLLECTED_S: Final = 10.0
-    """Maximum time until the borrower acquires the lock."""
-
-    def __init__(self, lock: InterfaceLock) -> None:
-        self._lock = lock
+    def __init__(self, lock: InterfaceLock, collected_s: float) -> None:
+        """``collected_s`` is the maximum time until the borrower acquires the lock."""
+        self._lock, self._collected_s = lock, collected_s
         self.requested_s: float | None = None
+        self._closings: int | None = None
         self._begun_s = 0.0
         self._collected = False
 
@@ -259,19 +260,24 @@ class Loan:
         """Begins the loan by releasing the lock."""
         self._begun_s, self._collected = now_s, False
         self._lock.release()
+        with suppress(OSError):  # without it, a short loan lasts as long as one that nobody uses
+            self._closings = self._lock.watch_closing()
 
     def is_over(self, now_s: float) -> bool:
         """Reacquires the lock when the borrower has released it or did not come; returns True on success."""
-        if self._lock.holder:
-            self._collected = True
-            return False
-        if not self._collected and now_s - self._begun_s < self.COLLECTED_S:
+        if self._closings is not None:
+            with suppress(BlockingIOError):
+                self._collected |= bool(os.read(self._closings, 4096))
+        if not self._collected and now_s - self._begun_s < self._collected_s:
             return False
         try:
             self._lock.acquire()
         except BusInUseError:
             return False
         self.requested_s = None
+        if self._closings is not None:
+            os.close(self._closings)
+            self._closings = None
         return True
 
 
@@ -292,7 +298,7 @@ class Keeper:
         self._start, self._memory, self._listeners = start, memory, listeners
         self._notifier, self._programs, self._times = notifier, programs, times
         self._budget = Budget(start.machine.limits.restarts_per_minute, 60.0)
-        self._loan = Loan(lock) if lock is not None else None
+        self._loan = Loan(lock, times.collected_s) if lock is not None else None
         self._control = _Process("control", programs.control, Cell.LOOP_COUNT, Cell.LOOP_PID, times.hung_s)
         api = tuple(each.fileno() for each in listeners)
         service = programs.service, Cell.SERVICE_TIME_NS, Cell.SERVICE_PID, times.service_hung_s, api

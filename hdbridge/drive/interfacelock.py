@@ -1,5 +1,6 @@
 """One master per CAN interface and computer: a lock that ends with the process that holds it."""
 
+import ctypes
 import os
 import re
 import tempfile
@@ -20,6 +21,8 @@ except ImportError:  # a system without flock has no lock and no holder to repor
 _SHARED_BY_ALL_USERS: Final = Path("/run/lock")
 _IN_ONE_PROCESS: Final = frozenset({"virtual"})
 """python-can interfaces that are confined to one process and therefore need no lock."""
+_IN_CLOSE: Final = 0x18
+"""inotify: a file was closed, whether it was open for writing or for reading (<sys/inotify.h>)."""
 
 
 class InterfaceLock:
@@ -65,6 +68,21 @@ class InterfaceLock:
         if self._handle is not None:
             os.close(self._handle)
             self._handle = None
+
+    def watch_closing(self) -> int:
+        """Returns a new descriptor (inotify) that is readable once a process has closed the lock file.
+
+        A process closes it when it releases the lock, also by ending. Raises OSError if the system has no
+        descriptor to spare.
+        """
+        libc = ctypes.CDLL(None, use_errno=True)
+        descriptor = int(libc.inotify_init1(os.O_CLOEXEC | os.O_NONBLOCK))
+        if descriptor < 0 or libc.inotify_add_watch(descriptor, os.fsencode(str(self._path)), _IN_CLOSE) < 0:
+            number = ctypes.get_errno()
+            if descriptor >= 0:
+                os.close(descriptor)
+            raise OSError(number, os.strerror(number))
+        return descriptor
 
     def __enter__(self) -> Self:
         self.acquire()

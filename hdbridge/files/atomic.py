@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from hdbridge.errors import InputError, OutputError
+from hdbridge.errors import HdbridgeError, InputError, OutputError
 
 _STANDARD = ("/dev/stdin", "/dev/stdout", "/dev/stderr")
 _DESCRIPTOR = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
@@ -175,6 +175,8 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
                 each.rmdir()
         if isinstance(problem, OSError):
             raise OutputError(f"{folder}: cannot be written: {problem.strerror}") from None
+        if isinstance(problem, HdbridgeError):
+            raise type(problem)(str(problem).replace(str(aside), str(folder))) from None
         raise
     return [folder / name for name in files]
 

@@ -292,9 +292,7 @@ def text_of(path: Path) -> tuple[bytes, str]:
             return content.decode("utf-16").encode(), "UTF-16 text"
         except UnicodeError:
             raise _wrong(f"{path}: UTF-16 text that is damaged; expected CSV in UTF-8") from None
-    for magic, kind in _OTHER_FILES.items():
-        if content.startswith(magic) and b"\0" in content:
-            raise _wrong(f"{path}: {kind}; expected CSV: export the samples as CSV")
+    _check_is_text(path, content)
     content = content.removeprefix(codecs.BOM_UTF8)
     try:
         content.decode()
@@ -307,6 +305,21 @@ def text_of(path: Path) -> tuple[bytes, str]:
                 f"{path}:{line}: neither UTF-8 nor Windows-1252 text; expected CSV in UTF-8"
             ) from None
     return content, ""
+
+
+def _check_is_text(path: Path, content: bytes) -> None:
+    """Raises `InputError` for a null byte, which no text contains, with the kind of file if it is known."""
+    first = content.find(b"\0")
+    if first < 0:
+        return
+    for magic, kind in _OTHER_FILES.items():
+        if content.startswith(magic):
+            raise _wrong(f"{path}: {kind}; expected CSV: export the samples as CSV")
+    line = content.count(b"\n", 0, first) + 1
+    raise _wrong(
+        f"{path}:{line}: a null byte; expected CSV in UTF-8: the file is binary, or its writer lost power: "
+        "then delete the lines from this one on"
+    )
 
 
 def _bounded(file: BinaryIO | gzip.GzipFile) -> bytes:

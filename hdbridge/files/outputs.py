@@ -171,7 +171,11 @@ def _check_folder(output: Output, inputs: Sequence[Path]) -> None:
         existing = existing.parent
     if not existing.is_dir():
         raise InputError(f"{folder}: cannot create this folder: {existing} is not a folder")
-    check_writable(existing / "a file")
+    probe = existing / "a file"
+    try:
+        check_writable(probe)
+    except InputError as problem:
+        raise InputError(f"{folder}: {str(problem).removeprefix(f'{probe}: ')}") from None
 
 
 def _redirected() -> list[tuple[str, os.stat_result]]:

@@ -117,6 +117,10 @@ class _Composer:
             before = self._text[: problem.position]
             line, column = before.count("\n") + 1, len(before) - before.rfind("\n")
             what = f"character U+{ord(self._text[problem.position]):04X} is not allowed in YAML"
+        if "'\\t'" in what:
+            return FileError(
+                f"{self._path}:{line}:{column}: a tab; expected spaces, with which YAML is indented"
+            )
         return FileError(f"{self._path}:{line}:{column}: not YAML: {what}")
 
     def _error(self, event: yaml.Event, message: str) -> FileError:
@@ -311,7 +315,8 @@ class Document:
         node = self._node(at + place)
         field = field_at(model, place)
         what = expected_words(field) if field else error["msg"][0].lower() + error["msg"][1:]
-        hint = _hint(node.value, field.choices()) if isinstance(node.value, str) and field else ""
+        choices = field.choices() if isinstance(node.value, str) and field else []
+        hint = _hint(node.value, choices) if len(choices) > 1 else ""  # a single choice is expected anyway
         return place, f"found {node.found}; expected {what}" + (f"; {hint}" if hint else ""), False
 
     def _line(self, at: Location, message: str, *, key: bool = False) -> str:

@@ -157,6 +157,8 @@ class Record:
     """First row of each concatenated record. The motion of the axis between two records is unknown."""
     origin: Origin | None = None
     """CSV file from which the record was read, and its interpretation; None for any other record."""
+    first_row: int = 0
+    """Row of the source at which the record begins, for messages; not 0 for a part of another record."""
 
     def __post_init__(self) -> None:
         missing = [name for name in REQUIRED if name not in self.columns]
@@ -170,7 +172,7 @@ class Record:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Supports pickling, which the read-only mapping does not."""
-        return type(self), (dict(self.columns), self.source, self.starts)
+        return type(self), (dict(self.columns), self.source, self.starts, None, self.first_row)
 
     @classmethod
     def read_csv(
@@ -298,13 +300,14 @@ class Record:
             )
 
     def _place(self, row: int) -> str:
-        """Returns file and line of a row; without a file, the number of the sample (from 0)."""
+        """Returns file and line of a row; without a file, the number of the sample in the source (from 0)."""
+        row += self.first_row
         if self.origin is not None:
             return self.origin.place(row)
         return f"{self.source}: sample {row}" if self.source else f"sample {row}"
 
-    def check_ratio(self, ratio: float) -> None:
-        """Raises `InputError` if the record's own angles contradict a ratio.
+    def check_ratio(self, ratio: float, stated_by: str = "") -> None:
+        """Raises `InputError` if the record's own angles contradict a ratio, which a file may state.
 
         Small deviations are left to the diagnosis. So is any deviation that, because of short travel, cannot
         be distinguished from the gear's own error.
@@ -324,13 +327,14 @@ class Record:
         cure = remedy(slope * ratio, ratio, WRONG_RATIO, self.origin)
         name = f"{self.source}: " if self.source else ""
         over = f"measured over {travel_deg:.3g} deg of the load"
-        raise InputError(f"{name}{found} ({over}); expected a ratio of {ratio:g}: {cure}")
+        by = f", stated by {stated_by}" if stated_by else ""
+        raise InputError(f"{name}{found} ({over}); expected a ratio of {ratio:g}{by}: {cure}")
 
     def rows(self, first: int, end: int) -> Self:
         """Returns the samples from row ``first`` up to but not including row ``end``."""
         columns = {name: column[first:end] for name, column in self.columns.items()}
         inside = (start - first for start in self.starts if first < start < end)
-        return type(self)(columns, self.source, (0, *inside), self.origin)
+        return type(self)(columns, self.source, (0, *inside), self.origin, self.first_row + first)
 
     def between(self, start_s: float, end_s: float) -> Self:
         """Returns the samples of a time span, including both ends."""

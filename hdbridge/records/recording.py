@@ -285,10 +285,10 @@ def agreed_ratio(recordings: Mapping[Path, Recording], said: Iterable[tuple[str,
         )
     for where, value in known:
         if not 0.0 < value < math.inf:
-            raise InputError(f"{where}: the ratio is {value:g}; expected a number above 0")
+            raise InputError(f"{where}: a ratio of {value:g}; expected a number above 0")
         if abs(value / known[0][1] - 1.0) > 1e-9:
             raise InputError(
-                f"{where} has a ratio of {value:g}, but {known[0][0]} says {known[0][1]:g}; expected one "
-                "gear: correct the wrong one, or leave out the other gear's record"
+                f"{known[0][0]}: a ratio of {known[0][1]:g}, but {where} has {value:g}; expected one gear: "
+                "correct the wrong one, or leave out the other gear's record"
             )
     return known[0][1]

@@ -216,7 +216,7 @@ class Body:
         self.deg = 0.0
 
     def feed(self, shaft_deg: float) -> None:
-        """Updates the shift, given the shaft's angle after one more substep."""
+        """Updates the sum of the reading errors from the shaft's angle after the latest substep."""
         shift_deg = 0.0
         for each in self._errors:
             shift_deg += each.error_deg(shaft_deg)

@@ -148,7 +148,7 @@ def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
 
     Up to `RUN_IN_S` of the recording before a stretch is replayed as its run-in and is not compared.
     """
-    recording.record.check_ratio(axis.gear.ratio)
+    recording.record.check_ratio(axis.gear.ratio, str(axis.path))
     record, legs, held = recording.record, legs_of(recording), held_out_legs(recording)
     begins = [whole.start for whole in continuous(record)]
     unknown = unknown_rows(record, 360.0 / axis.motor_encoder.counts_per_turn)

@@ -398,7 +398,7 @@ def fit_twin(
 
 
 def _wrong(replays: Replays, start: Truth, fitted: Fitted) -> tuple[Finding, ...]:
-    """Names the wrong values of the start, using a few legs; the corrected values come from the fit."""
+    """Returns the values of the initial simulation that differ from the axis, judged by a few legs."""
     few, like = replays.rough, by_law_of(with_sections(start, fitted.parameters), fitted.truth)
     was = scales_by_kind(few.data, misfit_of(replays.data, fitted.residuals), noise_floor(few.data))
     groups = by_cause(fitted.parameters)

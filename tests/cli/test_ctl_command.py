@@ -159,7 +159,14 @@ def test_events_and_marks_are_listed(ctl, tmp_path):
 def test_watch_refreshes_repeatedly(ctl):
     lines = ctl("watch", "--lines", "--count", 3, "--every", 0.05).splitlines()
     assert [messages.MachineState.model_validate_json(each).name for each in lines] == ["cell"] * 3
-    assert "joint-2" in ctl("watch", "--count", 2, "--every", 0.05)
+    assert ctl("watch", "--count", 2, "--every", 0.05).count("joint-2") == 2
+
+
+@pytest.mark.parametrize("line", ["watch", "watch --lines", "events --follow"])
+def test_what_runs_until_ctrl_c_ends_with_its_reader(ctl, unread, line):
+    """As in `hdbridge ctl watch | head`."""
+    ctl("mark", "an event to print")
+    assert "Traceback" not in unread("ctl", *line.split())
 
 
 def test_a_refusal_names_client_user_and_process_with_working_advice(ctl, machine, place):

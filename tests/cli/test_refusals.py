@@ -13,12 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import command_reference
+import numpy as np
 import pytest
 from support.command import run_apart, run_here
 from typer.models import ArgumentInfo
 
 from hdbridge.cli import PANELS, load
 from hdbridge.files.outputs import Kind
+from hdbridge.records.record import Record
 
 PROFILES = Path(__file__).parents[2] / "profiles"
 LONG = "x" * 300
@@ -212,6 +214,31 @@ def test_requests_beyond_the_axis_are_refused_before_connecting(place, words, co
     assert "booted" not in done.stderr
     assert contents(place) == before
     assert Path("/dev/null").is_char_device()
+
+
+@pytest.mark.parametrize(
+    ("words", "pending"),
+    [
+        ("calibrate axis --simulate", "pending.yaml"),
+        ("improve axis --simulate", "pending.yaml"),
+        ("twin axis sweep.csv", "pending-twin.yaml"),
+    ],
+)
+def test_a_profile_that_cannot_be_written_is_refused_before_a_measurement(place, words, pending):
+    """As on a read-only disk: the place of the result is blocked, here by a folder."""
+    (place / "axis" / pending).mkdir()
+    turns = np.abs(np.linspace(-3600.0, 3600.0, 4000))
+    columns = {
+        "time_s": 0.004 * np.arange(4000),
+        "motor_position_deg": turns,
+        "load_position_deg": turns / 50,
+    }
+    Record({**columns, "motor_target_deg": turns}).write_csv(place / "sweep.csv")
+    before = contents(place)
+    done = run_here(place, *words.split(), status=2)
+    assert f"axis/{pending}: cannot be written: it is a folder" in done.stderr
+    assert "booted" not in done.stderr
+    assert contents(place) == before
 
 
 @pytest.mark.parametrize("name", ["axis.yaml", "model.yaml", "truth.yaml"])

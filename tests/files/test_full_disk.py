@@ -2,11 +2,13 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from hdbridge.errors import InputError
-from hdbridge.files.atomic import make_folder
+from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.files.atomic import make_folder, write_folder
+from hdbridge.files.outputs import Kind, Output, check_outputs
 
 SCRIPT = """
 import resource, sys
@@ -34,3 +36,33 @@ def test_the_old_file_remains_and_no_part_of_the_new_one(tmp_path):
 def test_a_folder_that_takes_no_files_is_refused_by_its_own_name():
     with pytest.raises(InputError, match=r"^/proc: cannot write into this folder"):
         make_folder("/proc")
+
+
+@pytest.mark.parametrize("folder", ["/proc/of/mine", "/proc/mine"])
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda folder: write_folder(folder, {"axis.yaml": b"name: mine"}),
+        lambda folder: check_outputs([Output("--record", folder, Kind.FOLDER)]),
+    ],
+)
+def test_an_error_names_what_the_user_named_and_no_temporary_file(folder, write):
+    with pytest.raises(HdbridgeError, match=rf"^{folder}: cannot"):
+        write(Path(folder))
+
+
+NEW = """
+import resource, sys
+from hdbridge.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))  # as on a full disk
+sys.argv = ["hdbridge", "new", sys.argv[1]]
+main()
+"""
+
+
+def test_a_new_axis_on_a_full_disk_names_its_own_file_and_leaves_nothing(tmp_path):
+    asked = [sys.executable, "-B", "-c", NEW, str(tmp_path / "cell" / "mine")]
+    done = subprocess.run(asked, capture_output=True, text=True, check=False)
+    assert done.returncode == 6, done.stderr
+    assert f"hdbridge: {tmp_path}/cell/mine/axis.yaml: cannot be written: " in done.stderr
+    assert list(tmp_path.iterdir()) == []

@@ -113,7 +113,7 @@ def test_bare_csv_files_and_folders_make_one_recording_in_the_order_given(tmp_pa
 @pytest.mark.parametrize("other", [50.001, 49.0, 100.0])
 def test_recordings_of_another_ratio_are_refused_together(other):
     several = {Path("one"): FULL, Path("two"): replace(FULL, ratio=other)}
-    with pytest.raises(InputError, match=f"two has a ratio of {other:g}, but one says 50; expected one gear"):
+    with pytest.raises(InputError, match=f"one: a ratio of 50, but two has {other:g}; expected one gear"):
         agreed_ratio(several, [])
     assert agreed_ratio({Path("one"): FULL}, [("--ratio", 50.0), ("the model", None)]) == 50.0
     with pytest.raises(InputError, match="the ratio of the gear is unknown"):

@@ -3,13 +3,16 @@
 # ruff: noqa: E501  (the table of complaints shows each on one line)
 
 import gzip
+import pickle
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.axis.effects import Channel
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
 from hdbridge.records.record import OPTIONAL, REQUIRED, Record, concatenate
 
@@ -56,6 +59,8 @@ def record(samples: int = 101, ratio: float = 50.0, travel_deg: float = 400.0, *
         (f"{HEAD}\n".encode(), ": 0 samples; expected at least 2"),
         (f"{HEAD},note\n0,1,2,\x81\n".encode("latin-1"), ":2: neither UTF-8 nor Windows-1252 text; expected CSV in UTF-8"),
         (b"PK\x03\x04\x14\x00\x06\x00\x08\x90", ": a ZIP archive, such as an Excel workbook; expected CSV: export the samples as CSV"),
+        (b"\0" * 4096, ":1: a null byte; expected CSV in UTF-8: the file is binary, or its writer lost power: then delete the lines from this one on"),
+        (f"{HEAD}\n0,1,2\n1,1,2\n1,1".encode() + b"\0" * 512, ":4: a null byte; expected CSV in UTF-8: the file is binary, or its writer lost power: then delete the lines from this one on"),
         (b"PAR1\x15\x04\x15\x00\x90", ": a Parquet file; expected CSV: export the samples as CSV"),
         (gzip.compress(f"{HEAD}\n0,1,2\n".encode(), mtime=0)[:-9], ": gzip data are damaged or cut off (Compressed file ended before the end-of-stream marker was reached)"),
     ],
@@ -226,6 +231,28 @@ def test_a_span_of_time_includes_both_ends():
     one = record(samples=11)
     assert one.between(0.004, 0.012).time_s.tolist() == [0.004, 0.008, 0.012]
     assert len(one.between(1.0, 2.0)) == 0
+
+
+def test_a_cut_record_names_the_line_of_the_file(tmp_path):
+    """However often it was cut, and whatever is refused."""
+    path = tmp_path / "record.csv"
+    one = record(samples=40, travel_deg=3.3)
+    load = one.load_position_deg.copy()
+    load[25] = 3e12
+    Record({**one.columns, "load_position_deg": load}).write_csv(path)
+    whole = Record.read_csv(path)
+    cuts = [
+        whole,
+        whole.rows(7, 40),
+        whole.between(whole.time_s[11], whole.time_s[30]),
+        whole.rows(7, 40).rows(3, 30),
+    ]
+    for each in [*cuts, *cuts[-1].parts()]:
+        with pytest.raises(InputError, match=r"record\.csv:27: load_position_deg: 3e\+12; "):
+            diagnose(each, TransmissionModel(50.0, ()))
+    bare = pickle.loads(pickle.dumps(cuts[-1]))
+    with pytest.raises(InputError, match=r"record\.csv: sample 25: load_position_deg: 3e\+12; "):
+        diagnose(bare, TransmissionModel(50.0, ()))
 
 
 def test_a_long_record_takes_the_fast_path(tmp_path, monkeypatch):

@@ -2,11 +2,14 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import hdbridge
 from hdbridge import errors
+
+PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 
 
 def python(program: str) -> str:
@@ -16,8 +19,9 @@ def python(program: str) -> str:
 
 
 def test_importing_it_loads_nothing():
-    heavy = "[each for each in sys.modules if each.startswith(('hdbridge.', 'numpy'))]"
-    assert python(f"import hdbridge, sys; print({heavy})") == "[]"
+    """Neither its own modules nor those of Python, in which Ctrl-C would print a traceback."""
+    program = "import sys; before = set(sys.modules); import hdbridge; print(*set(sys.modules) - before)"
+    assert set(python(program).split()) == {"hdbridge", "__future__"}
 
 
 @pytest.mark.parametrize("name", hdbridge.__all__)
@@ -55,3 +59,26 @@ def test_every_error_is_public():
     kinds = [each for each in vars(errors).values() if isinstance(each, type)]
     raised = {each.__name__ for each in kinds if issubclass(each, errors.HdbridgeError)}
     assert raised <= set(hdbridge.__all__)
+
+
+@pytest.mark.parametrize(
+    "axis", ["'article'", "PROFILE", "str(PROFILE / 'axis.yaml')", "AxisConfig.load(PROFILE)"]
+)
+def test_an_axis_is_simulated_by_name_path_or_content(axis, tmp_path, monkeypatch):
+    """As a first-time user does: in any folder, with nothing but the package."""
+    monkeypatch.chdir(tmp_path)
+    given = eval(axis, {"PROFILE": PROFILE, "AxisConfig": hdbridge.AxisConfig})
+    with hdbridge.simulated(given) as drive:
+        assert (
+            drive.boot().identity["product_code"]
+            == hdbridge.AxisConfig.load(PROFILE).drive.identity.product_code
+        )
+
+
+@pytest.mark.parametrize("axis", ["artikle", "no/such/folder", Path("axis.yml")])
+def test_an_axis_that_does_not_exist_is_refused(axis):
+    with (
+        pytest.raises(hdbridge.InputError, match=r"expected a path or one of: .*article"),
+        hdbridge.simulated(axis),
+    ):
+        pytest.fail("it was simulated")

@@ -3,7 +3,22 @@
 import numpy as np
 import pytest
 
-from hdbridge import AxisConfig, InputError, Record, Recording, TransmissionModel, diagnose, fit, simulated
+from hdbridge import (
+    AxisConfig,
+    Bench,
+    Compensation,
+    InputError,
+    Record,
+    Recording,
+    TransmissionModel,
+    diagnose,
+    fit,
+    simulated,
+)
+from hdbridge.control.compensation import CompensationLimits
+from hdbridge.control.switchover import Correction
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.misfit import prepare
 
 
 @pytest.fixture(scope="module")
@@ -76,15 +91,39 @@ def test_impossible_records_are_refused_by_both(run, model, axis, spoil, complai
 
 
 def test_another_gear_is_refused(run):
-    with pytest.raises(InputError, match="recording 1 has a ratio of 50, but ratio says 100"):
+    with pytest.raises(InputError, match="ratio: a ratio of 100, but recording 1 has 50"):
         fit(run, ratio=100)
-    with pytest.raises(InputError, match="has a ratio of 50, but the model says 100"):
+    with pytest.raises(InputError, match="the model: a ratio of 100, but recording 1 has 50"):
         diagnose(run, TransmissionModel(100.0))
+
+
+def test_a_file_of_another_gear_is_named(run, axis, tmp_path):
+    """By every function that takes a ratio from a file: a model, or an axis file."""
+    wrong = tmp_path / "old gear.yaml"
+    TransmissionModel(100.0).save(wrong)
+    model = TransmissionModel.load(wrong)
+    text = axis.path.read_text().replace("ratio: 50", "ratio: 100")
+    (tmp_path / "axis.yaml").write_text("\n".join(each for each in text.splitlines() if "teeth:" not in each))
+    bare, other = Recording(run.record), AxisConfig.load(tmp_path)
+    with pytest.raises(InputError, match=r"expected a ratio of 100, stated by .*old gear\.yaml"):
+        diagnose(bare, model)
+    with pytest.raises(InputError, match=r"old gear\.yaml: a ratio of 100, but recording 1 has 50"):
+        diagnose(run, model)
+    with pytest.raises(InputError, match=r"expected a ratio of 100, stated by .*axis\.yaml"):
+        fit(bare, axis=other)
+    with pytest.raises(InputError, match=r"expected a ratio of 100, stated by .*axis\.yaml"):
+        prepare(bare, other, Truth.load(axis.path.parent / "truth.yaml"))
+    limits = CompensationLimits(300.0, 1000.0)
+    in_use = Correction(Compensation(TransmissionModel(50.0), limits, axis.drive.cycle_s))
+    with pytest.raises(InputError, match=r"old gear\.yaml: "):
+        in_use.change(Compensation(model, limits, axis.drive.cycle_s))
+    with simulated(axis) as drive, pytest.raises(InputError, match=r"old gear\.yaml: "):
+        Bench(drive, model)
 
 
 @pytest.mark.parametrize("ratio", [0.0, -50.0, np.nan, np.inf])
 def test_an_impossible_ratio_is_refused(run, ratio):
-    with pytest.raises(InputError, match=r"the ratio is .*; expected a number above 0"):
+    with pytest.raises(InputError, match=r"ratio: a ratio of .*; expected a number above 0"):
         fit(run.record, ratio=ratio)
 
 

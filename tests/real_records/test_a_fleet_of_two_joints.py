@@ -14,7 +14,7 @@ from hdbridge.fleet.summary import summarise
 FOLDER = real_records.FOLDER / "cobot"
 pytestmark = pytest.mark.skipif(
     not FOLDER.is_dir(),
-    reason=f"no folder {FOLDER}: set HDBRIDGE_REAL_RECORDS to that of the measured records",
+    reason="HDBRIDGE_REAL_RECORDS is not the folder of the measured records",
 )
 SOURCES = [
     Source(

@@ -1,8 +1,7 @@
 """Published measurements: causes are named and hold on held-out data.
 
-The records are not part of the project (licences; docs/how-well.md names the sources). They are looked
-for in the folder that HDBRIDGE_REAL_RECORDS names, else beside the repository; without them these tests are
-skipped.
+The records are not part of the project (licences; docs/how-well.md names the sources). They are read from the
+folder HDBRIDGE_REAL_RECORDS; without it these tests are skipped.
 """
 
 from pathlib import Path
@@ -38,7 +37,7 @@ UNLIKELY = {
 def measured(name: str) -> list[Path]:
     found = sorted(real_records.FOLDER.glob(name))
     if not found:
-        pytest.skip(f"no {name} in {real_records.FOLDER}: set HDBRIDGE_REAL_RECORDS to another folder")
+        pytest.skip(f"no {name} in the folder HDBRIDGE_REAL_RECORDS")
     return found
 
 

@@ -13,7 +13,7 @@ from hdbridge.twin.translate import translate
 def recordings_of(joint: int) -> list[Recording]:
     found = real_records.joint_recordings(real_records.FOLDER, joint)
     if not found:
-        pytest.skip(f"no cobot-command/joint{joint}-*.csv in {real_records.FOLDER}")
+        pytest.skip(f"no cobot-command/joint{joint}-*.csv in the folder HDBRIDGE_REAL_RECORDS")
     return found
 
 

@@ -44,6 +44,7 @@ def test_the_same_seed_gives_the_same_frames():
         ({"folder": 5}, "folder is 5; expected"),
         ({"beside": "demo"}, "beside is 'demo'; expected another simulated drive"),
         ({"firmware": "level"}, "firmware is 'level'; expected a mapping"),
+        ({"firmware": {"contrlword": "level"}}, "firmware: contrlword: unknown key; keys are controlword, "),
         ({"firmware": {"controlword": 5}}, "firmware: controlword: found 5; expected"),
     ],
 )

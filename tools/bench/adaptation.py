@@ -10,6 +10,7 @@ grows by a fifth, and its second order by 3 arcsec. Each line is one run: three 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from support.adapting import FAULTS, FLOOR_ARCSEC, Work, at_work, truth_of
 from hdbridge.daemon.machinefile import AdaptationSettings
 
 NEIGHBOURS = 8
+LEAST_MIN = 8
+"""Shortest run with as many stepping tests, minutes."""
 ON = AdaptationSettings(mode="on")
 
 
@@ -52,17 +55,19 @@ def measure_fault(name: str, until_s: float) -> None:
         line(f"on, {name} halfway", work, until_s, told)
 
 
+def minutes(text: str) -> float:
+    """Returns the duration of a run given on the command line; 0 for none."""
+    found = float(text)
+    if found and not LEAST_MIN <= found < math.inf:
+        raise argparse.ArgumentTypeError(f"found {text}; expected {LEAST_MIN} or more, or 0 for no run")
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--minutes", type=float, default=60.0, help="axis time without faults, 8 or more; 0: none"
-    )
-    parser.add_argument(
-        "--faulty-minutes",
-        type=float,
-        default=10.0,
-        help="axis time of each run with a fault, 8 or more; 0: none",
-    )
+    for name, default, of in (("--minutes", 60, "without faults"), ("--faulty-minutes", 10, "with a fault")):
+        about = f"axis time of each run {of}: {LEAST_MIN} or more; 0: none (default {default})"
+        parser.add_argument(name, type=minutes, default=default, help=about)
     given = parser.parse_args()
     print(f"Floor {FLOOR_ARCSEC:.2f} arcsec, 1.3 x floor {1.3 * FLOOR_ARCSEC:.2f} arcsec.\n")
     print("| adaptation | minutes | first | largest | last | told |\n|---|---|---|---|---|---|")

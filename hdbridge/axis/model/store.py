@@ -30,6 +30,7 @@ from pydantic import Field
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
+from hdbridge.files.atomic import check_writable
 from hdbridge.files.yamlfile import dump_yaml, read_yaml, write_atomically
 from hdbridge.strictness import Strict
 
@@ -155,8 +156,12 @@ class Store(Generic[K]):
         names = ", ".join(dict.fromkeys(each for version in versions for each in _names(version)))
         raise InputError(
             f"{profile}: there is no {self.noun} '{name}'; "
-            f"expected one of: {names or f'none yet, {self.first}'}"
+            + (f"expected one of: {names}" if names else f"none is stored yet: {self.first}")
         )
+
+    def check_pending(self, profile: Path) -> None:
+        """Raises `InputError` if a pending version cannot be written; to be called before a measurement."""
+        check_writable(profile / self.pending)
 
     def propose(
         self,
@@ -208,8 +213,11 @@ class Store(Generic[K]):
         """Makes a version of the history active, and returns its number; the previous one stays stored."""
         path = self._history(profile).get(version)
         if path is None:
-            numbers = ", ".join(map(str, sorted(self._history(profile)))) or f"none yet, {self.first}"
-            raise InputError(f"{profile}: there is no version {version}; expected one of: {numbers}")
+            numbers = ", ".join(map(str, sorted(self._history(profile))))
+            raise InputError(
+                f"{profile}: there is no version {version}; "
+                + (f"expected one of: {numbers}" if numbers else f"none is stored yet: {self.first}")
+            )
         with _locked(profile):
             self._check(profile, path, identity)
             return self._activate(profile, path.read_bytes(), "activate", reason, date)

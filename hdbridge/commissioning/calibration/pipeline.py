@@ -337,8 +337,9 @@ def fit(
     recordings = by_name(recording)
     said = [("ratio", ratio), (str(axis.path), axis.gear.ratio) if axis else ("axis", None)]
     known = agreed_ratio(recordings, said)
+    stated_by = str(axis.path) if axis and ratio is None else ""
     check_once(list(recordings), [each.record for each in recordings.values()])
-    check_records({name: each.record for name, each in recordings.items()}, known)
+    check_records({name: each.record for name, each in recordings.items()}, known, stated_by)
     if active and axis:
         active.check_ratio(axis)
     return conclude(recordings, known, active, axis=axis, independent_zeros=independent_zeros)

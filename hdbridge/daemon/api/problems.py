@@ -46,7 +46,9 @@ async def _on_validation_error(request: Request, error: RequestValidationError) 
     complaints = []
     for each in error.errors()[:COMPLAINTS_MAXIMUM]:
         place = [part for part in each["loc"] if part != "body"]
-        complaints.append(_printable(complaint({"loc": place, "msg": each["msg"]}, "the body")))
+        complaints.append(
+            _printable(complaint({"type": each["type"], "loc": place, "msg": each["msg"]}, "the body"))
+        )
     malformed = any(each["type"] == "json_invalid" for each in error.errors())
     status = HTTPStatus.BAD_REQUEST if malformed else HTTPStatus.UNPROCESSABLE_ENTITY
     problem = refusal(status, "the request is not valid: nothing was done", "InputError")

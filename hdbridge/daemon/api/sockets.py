@@ -10,6 +10,7 @@ import os
 import socket
 import stat
 import struct
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -94,12 +95,19 @@ def peer_of(connected: socket.socket) -> Peer | None:
 
 
 def daemon_of(connected: socket.socket) -> int:
-    """Returns the process id of the daemon (its keeper) at the other end of a Unix socket."""
+    """Returns the process id of the daemon (its keeper) at the other end of a Unix socket.
+
+    Returns that of the service if the keeper is gone. The service then ends, too.
+    """
     peer = peer_of(connected)
     assert peer is not None
-    if "hdbridge.daemon.serve" not in command_line(peer.pid):
-        return peer.pid
-    return int(Path(f"/proc/{peer.pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[1])
+    if "hdbridge.daemon.serve" in command_line(peer.pid):
+        with suppress(OSError):
+            status = Path(f"/proc/{peer.pid}/stat").read_text(encoding="utf-8")
+            parent = int(status.rpartition(")")[2].split()[1])
+            if "hdbridge" in command_line(parent):
+                return parent
+    return peer.pid
 
 
 def _group(name: str) -> int:

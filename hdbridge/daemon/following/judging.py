@@ -165,7 +165,10 @@ def _largest_changes(before: TransmissionModel, after: TransmissionModel) -> str
 
 
 def _places(observations: Sequence[Observation]) -> tuple[FloatArray, FloatArray]:
-    """Returns columns and mean error of each place; the last column is time from -1 to 1."""
+    """Averages observations of about the same motor angle and state; returns their regressors and errors.
+
+    Time, scaled to -1 to 1, is appended as the last regressor.
+    """
     rows = np.array([each.row for each in observations])
     time_s = np.array([each.time_s for each in observations])
     error = np.array([each.error_arcsec for each in observations])

@@ -135,7 +135,7 @@ class AxisLoop:
     def check(self, kind: CommandKind) -> None:
         """Raises TransitionError if a command is not possible in the current state."""
         if target_of(self.state, kind) is None:
-            raise TransitionError(f"{self.config.name}: {refusal(self.state, kind)}")
+            raise TransitionError(refusal(self.config.name, self.state, kind))
 
     def begin_stream(self, command: Command, group: frozenset[int]) -> None:
         """Follows knots from the next cycle on, together with the other axes of ``group``.

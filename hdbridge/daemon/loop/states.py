@@ -126,10 +126,10 @@ _WAY_OUT: Final = {
     _S.ENABLED: "disable it first",
     _S.STOPPING: "wait until it is disabled",
     _S.LENT: "wait until the service has given it back",
-    _S.QUICK_STOPPED: "remove the cause, then reset it: hdbridge ctl reset AXIS",
-    _S.LATCHED: "remove the cause, then reset it, which verifies the drive again: hdbridge ctl reset AXIS",
+    _S.QUICK_STOPPED: "remove the cause, then reset it: hdbridge ctl reset {axis}",
+    _S.LATCHED: "remove the cause, then reset it, which verifies the drive again: hdbridge ctl reset {axis}",
 }
-"""Advice for a refused command, by state."""
+"""Advice for a refused command to ``axis``, by state."""
 
 
 def target_of(state: AxisState, cause: Cause) -> AxisState | None:
@@ -137,9 +137,10 @@ def target_of(state: AxisState, cause: Cause) -> AxisState | None:
     return _TARGETS.get((state, cause))
 
 
-def refusal(state: AxisState, kind: CommandKind) -> str:
-    """Returns the message for a command that is refused in a state."""
-    return f"{label(kind)} is not possible while the axis is {label(state)}: {_WAY_OUT[state]}"
+def refusal(axis: str, state: AxisState, kind: CommandKind) -> str:
+    """Returns the message for a command to an axis that is refused in a state."""
+    advice = _WAY_OUT[state].format(axis=axis)
+    return f"{axis}: {label(kind)} is not possible while the axis is {label(state)}: {advice}"
 
 
 def label(name: AxisState | CommandKind) -> str:

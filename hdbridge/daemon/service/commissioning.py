@@ -60,7 +60,10 @@ class RelayBus(can.BusABC):
         """Reason with which the current operation is to fail; empty if it is not to fail."""
 
     def interrupt(self, reason: str) -> None:
-        """Makes the current operation fail at its next wait, once, with ``reason``; empty: not any more."""
+        """Makes the current operation fail once, at its next wait, with this reason.
+
+        An empty reason withdraws an interruption that has not taken effect yet.
+        """
         self._interruption = reason
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:

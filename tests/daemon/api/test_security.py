@@ -3,7 +3,10 @@
 import grp
 import logging
 import os
+import signal
 import stat
+import subprocess
+import sys
 
 import httpx
 import pytest
@@ -36,6 +39,32 @@ def test_only_a_dead_socket_is_replaced(tmp_path):
     with pytest.raises(InputError, match="not a socket"):
         unix_socket(path)
     assert path.read_text() == "precious"
+
+
+ORPHAN = """
+import os, sys, time
+from pathlib import Path
+from hdbridge.daemon.api.sockets import unix_socket
+if os.fork():
+    os._exit(0)
+with unix_socket(Path(sys.argv[1])):
+    print(os.getpid(), flush=True)
+    time.sleep(600)
+"""
+
+
+def test_the_service_of_a_killed_daemon_is_named_itself(tmp_path):
+    """It takes a moment to end. Its parent by then, process 1, is no daemon and must not be ended."""
+    path = tmp_path / "cell.sock"
+    asked = [sys.executable, "-c", ORPHAN, path, "hdbridge.daemon.serve"]
+    with subprocess.Popen(asked, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        number = int(process.stdout.readline())
+        try:
+            with pytest.raises(DaemonError, match=rf"end it with 'kill {number}'"):
+                unix_socket(path)
+        finally:
+            os.kill(number, signal.SIGKILL)
 
 
 @pytest.mark.parametrize(

@@ -52,12 +52,12 @@ def test_motion_is_possible_only_while_enabled() -> None:
 
 
 def test_refusals_state_the_remedy() -> None:
-    assert refusal(S.QUICK_STOPPED, CommandKind.ENABLE) == (
-        "enable is not possible while the axis is quick stopped: remove the cause, then reset it: "
-        "hdbridge ctl reset AXIS"
+    assert refusal("arm", S.QUICK_STOPPED, CommandKind.ENABLE) == (
+        "arm: enable is not possible while the axis is quick stopped: remove the cause, then reset it: "
+        "hdbridge ctl reset arm"
     )
-    assert refusal(S.ENABLED, CommandKind.HOME) == (
-        "home is not possible while the axis is enabled: disable it first"
+    assert refusal("arm", S.ENABLED, CommandKind.HOME) == (
+        "arm: home is not possible while the axis is enabled: disable it first"
     )
 
 

@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from support.running import Keeper, gone
 
+from hdbridge.drive.interfacelock import InterfaceLock
+
 PROGRAM = Path(__file__).with_name("standin_keeper.py")
 
 
@@ -123,6 +125,20 @@ def test_a_lent_bus_returns_however_its_borrower_ends(keeper: Callable[..., Kept
     assert kept.names().count("control process died") == 0
     kept.process.send_signal(signal.SIGTERM)
     assert kept.ended() == 0
+
+
+def test_a_bus_that_was_used_for_an_instant_returns_at_once(
+    keeper: Callable[..., Kept], tmp_path: Path
+) -> None:
+    """The keeper waits for a borrower that has not come yet, but not for one that is gone already."""
+    kept = keeper(HDBRIDGE_TEST_COLLECTED_S="inf")
+    kept.until_notified("READY=1")
+    for times in range(1, 4):
+        os.kill(kept.until_begun("service"), signal.SIGUSR1)
+        kept.until(lambda: kept.said.count("bus is lent") == times, "the bus is lent")  # noqa: B023
+        with InterfaceLock("socketcan", "can0", tmp_path):
+            pass
+        kept.until_begun("control", times + 1)
 
 
 def test_an_unused_lent_bus_returns_and_the_daemon_may_end_meanwhile(keeper: Callable[..., Kept]) -> None:
