@@ -9,12 +9,7 @@ grows by a fifth, and its second order by 3 arcsec. Each line is one run: three 
 
 from __future__ import annotations
 
-import argparse
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
-
+from harness import parser
 from support.adapting import FAULTS, FLOOR_ARCSEC, Work, at_work, truth_of
 
 from hdbridge.daemon.machinefile import AdaptationSettings
@@ -53,17 +48,10 @@ def measure_fault(name: str, until_s: float) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--minutes", type=float, default=60.0, help="axis time without faults, 8 or more; 0: none"
-    )
-    parser.add_argument(
-        "--faulty-minutes",
-        type=float,
-        default=10.0,
-        help="axis time of each run with a fault, 8 or more; 0: none",
-    )
-    given = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--minutes", type=float, default=60.0, help="without faults, 8 or more; 0: none")
+    options.add_argument("--faulty-minutes", type=float, default=10.0, help="of each run with a fault")
+    given = options.parse_args()
     print(f"Floor {FLOOR_ARCSEC:.2f} arcsec, 1.3 x floor {1.3 * FLOOR_ARCSEC:.2f} arcsec.\n")
     print("| adaptation | minutes | first | largest | last | told |\n|---|---|---|---|---|---|")
     if given.minutes:
