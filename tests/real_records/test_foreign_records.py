@@ -532,6 +532,28 @@ def test_wrong_options_are_refused_in_one_line(folder: Path, options: list[str],
         assert "\n" not in str(result.exception)
 
 
+def test_diagnose_accepts_a_profile_and_explains_how_to_get_a_model(folder):
+    record = folder / "bench.csv"
+    record.write_text(text())
+    alone = CliRunner().invoke(app, ["diagnose", str(record)])
+    assert "hdbridge fit" in str(alone.exception)
+    assert "--out model.yaml" in str(alone.exception)
+    profile = folder / "axis1"
+    made = CliRunner().invoke(app, ["new", str(profile)], catch_exceptions=False)
+    assert made.exit_code == 0
+    (profile / "model.yaml").unlink(missing_ok=True)
+    without = CliRunner().invoke(app, ["diagnose", str(record), "--model", str(profile)])
+    assert f"hdbridge calibrate {profile}" in str(without.exception)
+    (profile / "model.yaml").write_text((folder / "model.yaml").read_text())
+    for name in (profile, profile / "axis.yaml"):
+        result = CliRunner().invoke(
+            app, ["diagnose", str(record), "--model", str(name)], catch_exceptions=False
+        )
+        assert result.exit_code == 0
+    neither = CliRunner().invoke(app, ["diagnose", str(record), "--model", str(folder / "absent")])
+    assert "no such model file, and no such profile" in str(neither.exception)
+
+
 @pytest.mark.parametrize("compressed", [False, True], ids=["plain", "gzip"])
 def test_a_file_too_large_for_memory_is_refused_before_loading(tmp_path, monkeypatch, compressed):
     monkeypatch.setattr(csvfile, "MAXIMUM_BYTES", 1 << 12)
