@@ -84,7 +84,7 @@ blind: $(READY)  ## a blind suite of diagnoses; resumes after an interruption (B
 bench-realtime: $(READY)  ## instructions of a cycle and of the daemon's loop on PREEMPT_RT (about twenty minutes; root, QEMU)
 	@mkdir -p build/realtime
 	$(CC) -O2 -o build/realtime/master tools/bench/master.c
-	tools/realtime/run.sh $(BIN)/python tools/bench/realtime.py --master build/realtime/master --json build/realtime/figures.json
+	tools/realtime/run.sh $(BIN)/python tools/bench/realtime.py --master build/realtime/master
 
 $(VENV)/.docs: $(READY)
 	$(PIP) --editable '.[docs]'

@@ -44,19 +44,6 @@ def test_bidirectional_repeatability_is_never_below_either_direction():
     assert found.repeatability_arcsec == pytest.approx(4.0 * 10.0 * S)
 
 
-def test_a_pure_reversal_error_affects_only_b_among_the_means():
-    targets = np.repeat(np.arange(0.0, 360.0, 45.0), 10)
-    forward = np.tile([True] * 5 + [False] * 5, 8)
-    found = axis_accuracy(targets, np.where(forward, 20.0, -20.0), forward)
-    assert (found.reversal_arcsec, found.mean_reversal_arcsec, found.systematic_arcsec) == (40.0, 40.0, 40.0)
-    assert (found.range_arcsec, found.systematic_forward_arcsec, found.repeatability_forward_arcsec) == (
-        0.0,
-        0.0,
-        0.0,
-    )
-    assert (found.accuracy_arcsec, found.repeatability_arcsec, found.runs) == (40.0, 40.0, 5)
-
-
 def test_a_target_approached_from_one_side_only_is_refused_with_its_place():
     with pytest.raises(InputError, match=r"target at 90 deg .* 2 times forwards and 0 times backwards"):
         axis_accuracy(TARGET[:6], DEVIATION[:6], FORWARD[:6])
@@ -70,12 +57,6 @@ def test_a_single_target_is_refused():
 def test_arrays_of_different_length_are_refused():
     with pytest.raises(InputError, match="one of each"):
         axis_accuracy(TARGET, DEVIATION[:-1], FORWARD)
-
-
-def test_the_figures_for_machines_carry_their_unit():
-    figures = asdict(axis_accuracy(TARGET, DEVIATION, FORWARD))
-    assert figures["accuracy_arcsec"] == pytest.approx(5.0 + 3.0 + 2.0 * S)
-    assert figures["targets"] == 2
 
 
 @given(st.randoms(use_true_random=False), st.floats(-500.0, 500.0))

@@ -61,9 +61,7 @@ def usual(tmp_path_factory: pytest.TempPathFactory) -> Record:
     members=st.sets(st.sampled_from([*MEMBERS, (0x1400, 5), (0x1400, 3), (0x1802, 5)]), max_size=4),
     mode=st.sampled_from(["csp", "ip"]),
 )
-def test_any_optional_objects_may_be_absent(
-    tmp_path: Path, usual: Record, absent: set[int], members: set[tuple[int, int]], mode: str
-) -> None:
+def test_any_optional_objects_may_be_absent(tmp_path, usual, absent, members, mode):
     absent = absent - {TARGETS[mode]}
     members = {each for each in members if each[0] not in absent and each != (0x60C1, 1)}
     eds = without(without(OWN, *sorted(absent)), *sorted(members))
@@ -134,9 +132,7 @@ def test_a_fixed_mapping_wrong_in_the_eds_is_refused(tmp_path: Path) -> None:
         ("60C2sub2", -4, 50, r"does not permit 50 ms"),
     ],
 )
-def test_partly_fixed_interpolation_period(
-    tmp_path: Path, name: str, value: int, cycle: float, refused: str | None
-) -> None:
+def test_partly_fixed_interpolation_period(tmp_path, name, value, cycle, refused):
     edits = [("cycle_ms: 4 ", f"cycle_ms: {cycle} "), ("heartbeat_ms: 50", "heartbeat_ms: 200")]
     axis = profile_with(tmp_path, fixed(OWN, name, value), *edits)
     if refused:
@@ -161,9 +157,7 @@ READ_ONLY = [
 
 
 @pytest.mark.parametrize("key", READ_ONLY)
-def test_a_read_only_object_is_left_to_the_drive_unless_it_is_right(
-    tmp_path: Path, key: tuple[int, int]
-) -> None:
+def test_a_read_only_object_is_left_to_the_drive_unless_it_is_right(tmp_path, key):
     name = section(*key) if key in ((0x1029, 1), (0x607D, 1), (0x1016, 1), (0x1400, 5)) else section(key[0])
     wanted = next(row.value for row in plan(profile_with(tmp_path, OWN)) if (row.index, row.sub) == key)
     for value in (wanted, wanted + 100):
@@ -220,9 +214,7 @@ def test_equal_limits_count_as_no_limits(tmp_path: Path) -> None:
         ((-9, 6), "ip", r"drive\.mode: ip is not among .*6060h permits -9 to 6\); this drive cannot be used"),
     ],
 )
-def test_the_limits_of_6060h_count_if_6502h_gives_no_value(
-    tmp_path: Path, limits: tuple[int, int], mode: str, refused: str | None
-) -> None:
+def test_the_limits_of_6060h_count_if_6502h_gives_no_value(tmp_path, limits, mode, refused):
     low, high = limits
     limited = stating(OWN, "6060", LowLimit=low, HighLimit=high)
     plan(profile_with(tmp_path, limited))  # 6502h reports both modes

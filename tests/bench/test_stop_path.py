@@ -203,9 +203,7 @@ def test_a_fault_during_the_stop(runner: str) -> None:
 
 
 @pytest.mark.parametrize("act", [request, lambda node: node.faults.raise_error(0x3210)])
-def test_a_drive_that_ignores_the_quick_stop_is_disabled(
-    runner: str, act: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_drive_that_ignores_the_quick_stop_is_disabled(runner, act, monkeypatch):
     with stop(moving, act) as run:
         monkeypatch.setattr(run.node.firmware, "_quick_stop", lambda: None)
         with pytest.raises((KeyboardInterrupt, SafetyStop)):

@@ -157,9 +157,7 @@ def _without(*keys: tuple[int, int]) -> Callable[[DriveNode], None]:
 
 
 @pytest.mark.parametrize(("name", "parts", "check", "text"), WRONG, ids=[row[0] for row in WRONG])
-def test_each_fault_is_found_and_its_key_named(
-    case: Callable[..., Any], name: str, parts: dict[str, Any], check: str, text: str
-) -> None:
+def test_each_fault_is_found_and_its_key_named(case, name, parts, check, text):
     verdicts = case(**parts).run(until=check)
     assert failures(verdicts)[0] == check
     assert text in "".join(verdicts[check].remedies)

@@ -48,9 +48,7 @@ OLD = {
 }
 
 
-def file(
-    ratio: float, motor: int, load: int, motor_direction: int = 1, load_direction: int = 1
-) -> AxisConfig:
+def file(ratio, motor, load, motor_direction=1, load_direction=1):
     return axis(
         teeth="",
         ratio=f"ratio: {ratio}\n",
@@ -79,9 +77,7 @@ def opposite(way: Turned) -> Turned:
     signs=st.tuples(st.sampled_from([1, -1]), st.sampled_from([1, -1])),
     backwards=st.booleans(),
 )
-def test_any_correct_file_passes(
-    ratio: int, motor: int, load: int, signs: tuple[int, int], backwards: bool
-) -> None:
+def test_any_correct_file_passes(ratio, motor, load, signs, backwards):
     one = file(ratio, motor, load, *signs)
     way = turned(one, one, -360.0 if backwards else 360.0)
     verdict = judge_turn(one, way, opposite(way))
@@ -116,13 +112,7 @@ def test_a_wrong_direction_is_always_reported_as_direction(ratio: int, signs: tu
         ((50, 8000, 2_880_000), (50, 8000, 1 << 20), LOAD_COUNTS, 1 << 20, (MOTOR_COUNTS, RATIO)),
     ],
 )
-def test_most_likely_key_is_reported_first(
-    said: tuple[float, int, int],
-    true: tuple[float, int, int],
-    key: str,
-    expected: float,
-    confirmed: tuple[str, ...],
-) -> None:
+def test_most_likely_key_is_reported_first(said, true, key, expected, confirmed):
     by, real = file(*said), file(*true)
     way = turned(real, by, 360.0 * max(1, round(said[0] / 50)))
     verdict = judge_turn(by, way, opposite(way), frozenset(confirmed))

@@ -170,9 +170,7 @@ FORMATS = {".log": 2e-6, ".asc": 2e-6, ".blf": 2e-6, ".trc": 2e-4, ".log.gz": 2e
 
 
 @pytest.mark.parametrize(("suffix", "time_s"), FORMATS.items())
-def test_a_log_of_another_master_becomes_an_ordinary_recording(
-    tmp_path: Path, logged: Logged, suffix: str, time_s: float
-) -> None:
+def test_a_log_of_another_master_becomes_an_ordinary_recording(tmp_path, logged, suffix, time_s):
     path = logged.write(tmp_path / f"bus{suffix}")
     said = run("record", "import", path, ARTICLE, "--out", tmp_path / "made")
     assert "PDO mapping by the log's SDO traffic: 1A1h: 60E4h:01 int32, 6041h:00 uint16" in said
@@ -202,9 +200,7 @@ def test_an_mf4_log_without_its_reader_names_the_extra(tmp_path: Path) -> None:
         import_log(tmp_path / "bus.mf4", AXIS)
 
 
-def test_without_6062h_the_target_is_the_command(
-    tmp_path: Path, without_demand: Logged, logged: Logged
-) -> None:
+def test_without_6062h_the_target_is_the_command(tmp_path, without_demand, logged):
     """Axis and seed are the same as with 6062h; the drive reaches the target sent two cycles before."""
     recording = import_log(without_demand.write(tmp_path / "bus.log"), AXIS)
     target = recording.record.motor_target_deg
@@ -283,9 +279,7 @@ REFUSED: dict[str, tuple[Callable[[can.Message], bool], str]] = {
 
 
 @pytest.mark.parametrize(("skip", "expected"), REFUSED.values(), ids=REFUSED.keys())
-def test_a_log_without_the_axis_is_refused_in_one_line(
-    tmp_path: Path, logged: Logged, skip: Callable[[can.Message], bool], expected: str
-) -> None:
+def test_a_log_without_the_axis_is_refused_in_one_line(tmp_path, logged, skip, expected):
     path = logged.write(tmp_path / "bus.log", skip=skip)
     with pytest.raises(InputError) as caught:
         run("record", "import", path, ARTICLE, "--out", tmp_path / "made")

@@ -4,22 +4,6 @@ import pytest
 
 from tests.cli.conftest import refused
 
-
-@pytest.mark.parametrize(
-    ("old", "new", "texts"),
-    [
-        ("ratio: 50", "ratio: [", ("axis.yaml:", "expected")),
-        ("100, circular_spline: 102", "80, circular_spline: 82", ("40", "41", "100 and 102")),
-        ("hdbridge-402.eds", "nowhere.eds", ("axis.yaml:", "nowhere.eds", "expected an EDS file")),
-    ],
-)  # fmt: skip
-def test_a_wrong_axis_file_is_refused(hdbridge, profile, tmp_path, old, new, texts):
-    folder = profile(old, new)
-    done = hdbridge("step", folder, "--json", "out.json", status=2)
-    refused(done, *texts)
-    assert not (tmp_path / "out.json").exists()
-
-
 COMPLIANCE = """\
   - effect: compliance
     parameters: {c1_arcsec_per_nm: 16, c2_arcsec_per_nm: 12, c3_arcsec_per_nm: 9, torque1_nm: 7,
@@ -34,12 +18,6 @@ def test_a_model_needing_unavailable_channels_is_refused_for_compensation(hdbrid
     refused(
         hdbridge("step", folder, "--simulate", status=2), "'compliance' needs load_torque_nm", "axis.yaml"
     )
-
-
-def test_an_object_that_the_eds_does_not_have_is_refused_without_a_drive(hdbridge, profile):
-    torque = "load_torque: {source: {index: 0x2155, type: int32}, newton_metres_per_count: 0.001}"
-    done = hdbridge("check", profile("limits:  ", torque + "\nlimits:  "), status=2)
-    refused(done, "axis.yaml:42:24: load_torque.source.index", "has no object 2155h:00")
 
 
 def test_truth_without_simulation(hdbridge, profile):

@@ -8,7 +8,6 @@ import pytest
 
 from hdbridge.axis.effects import Hysteresis, Motion, MotorOrder, Start, Synchronous
 from hdbridge.axis.model import TransmissionModel
-from tests.cli.conftest import refused
 
 RATIO = 50.0
 GEAR = TransmissionModel(
@@ -68,45 +67,6 @@ def test_a_model_from_a_foreign_csv_file(hdbridge, tmp_path):
     assert result["offered"] is None
     assert result["held_out"]["improves"] is True
     assert result["recordings"] == [name]
-
-
-def test_a_record_without_reversals_reports_its_limits(hdbridge, tmp_path):
-    name = write(tmp_path / "one-way.csv", motor_path(0, 3600))
-    done = hdbridge("fit", name, "--ratio", 50, "--out", "model.yaml")
-    assert "hysteresis" in done.stdout
-    assert "reversal" in done.stdout
-    model = TransmissionModel.load(tmp_path / "model.yaml")
-    assert [each.name for each in model.effects] == ["synchronous"]
-
-
-def test_records_that_cannot_be_used_are_refused(hdbridge, tmp_path):
-    name = write(tmp_path / "theirs.csv", motor_path(*BOTH_WAYS))
-    refused(hdbridge("fit", name, status=2), name, "--ratio")
-    refused(hdbridge("fit", name, "--ratio", 80, "--out", "model.yaml", status=2), name, "80", "ratio")
-    refused(hdbridge("fit", name, "--ratio", 80, "--axis", "article", status=2), "50", "80")
-    short = write(tmp_path / "short.csv", motor_path(0, 9))
-    refused(hdbridge("fit", short, "--ratio", 50, status=2), "short.csv", "expected at least")
-    lacking = write(tmp_path / "lacking.csv", motor_path(0, 90), columns=("time_s", "motor_position_deg"))
-    refused(hdbridge("fit", lacking, "--ratio", 50, status=2), "lacking.csv", "load_position_deg")
-    assert not (tmp_path / "model.yaml").exists()
-
-
-def test_plans_that_cannot_be_run_are_refused_before_anything_moves(hdbridge, profile, tmp_path):
-    refused(
-        hdbridge("calibrate", profile.folder, "--simulate", "--plan", "quik", status=2),
-        "quik",
-        "did you mean 'quick'",
-    )
-    (tmp_path / "own.yaml").write_text(
-        "schema: hdbridge.plan/1\nname: own\nprocedures:\n  - {procedure: dance}\n"
-    )
-    refused(
-        hdbridge("calibrate", profile.folder, "--simulate", "--plan", "own.yaml", status=2),
-        "own.yaml:4",
-        "sweep",
-    )
-    refused(hdbridge("calibrate", profile.folder, "--simulate", "--resume", "nowhere", status=2), "nowhere")
-    assert not (tmp_path / "recordings").exists()
 
 
 def test_an_axis_with_too_little_travel_cannot_be_calibrated(hdbridge, profile):

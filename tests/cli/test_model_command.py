@@ -99,28 +99,3 @@ def test_every_command_without_a_model_advises_the_next_step(hdbridge, propose, 
     assert done.stderr.rstrip().count("hdbridge model commit ") == 1
     hdbridge("model", "discard", folder)
     assert "calibrate first: hdbridge calibrate profile" in hdbridge(*asked, status=2).stderr
-
-
-def test_discard_leaves_the_active_model(hdbridge, propose):
-    folder = propose(41.0)
-    hdbridge("model", "commit", folder)
-    propose(42.0)
-    hdbridge("model", "discard", folder)
-    assert not (folder / "pending.yaml").exists()
-    assert offset(folder) == 41.0
-    for action in ("discard", "commit"):
-        done = hdbridge("model", action, folder, status=2)
-        assert "no pending model" in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "word"),
-    [("product_code: 0x402", "product_code: 0x403", "drive"), ("name: article", "name: another", "axis")],
-)
-def test_a_model_of_another_axis_is_not_committed(hdbridge, propose, profile, old, new, word):
-    folder = propose(41.0)
-    profile(old, new)
-    done = hdbridge("model", "commit", folder, status=2)
-    assert f"provenance.{word}" in done.stderr
-    assert not (folder / "model.yaml").exists()
-    assert (folder / "pending.yaml").exists()

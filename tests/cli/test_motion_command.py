@@ -5,14 +5,10 @@ import re
 from dataclasses import replace
 
 import pytest
-from support.exercised import booted
 from support.raised import raised_profile
 
-from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import LeadFilter, Response
-from hdbridge.commissioning.calibration.motion import motion_test
-from hdbridge.errors import InputError
 from hdbridge.report.motion import PATH_COLUMNS
 
 OF_ANOTHER_CYCLE = Response(
@@ -103,14 +99,3 @@ def test_a_model_without_orders_and_a_proposal_without_a_measurement_are_refused
     assert "no motor order" in done.stderr
     done = hdbridge("motion", "article", "--simulate", "--no-measure", "--propose", status=2)
     assert "--no-measure" in done.stderr
-
-
-def test_a_response_of_another_cycle_is_refused_before_anything_moves(fast):
-    axis = AxisConfig.load(fast)
-    model = replace(TransmissionModel.load(fast / "model.yaml"), response=OF_ANOTHER_CYCLE)
-    with booted(axis, fast / "truth.yaml") as (drive, _):
-        clock = drive.link.clock
-        booted_s = clock.now()
-        with pytest.raises(InputError, match="measured with a cycle of 3 ms"):
-            motion_test(drive, model, measure=False)
-        assert clock.now() == booted_s

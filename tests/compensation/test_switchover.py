@@ -109,32 +109,6 @@ def test_the_new_model_starts_in_the_state_given_by_the_path(its, way):
     assert correction.memory_known
 
 
-@given(st.lists(st.sampled_from(list(Scheme)[:4]), min_size=1, max_size=4), speeds)
-def test_schemes_are_changed_the_same_way(schemes, way):
-    whole = model()
-    correction = Correction(made(Scheme.BOTH.of(whole)))
-    load = last = 0.0
-    for scheme in schemes:
-        correction.change(Compensation(scheme.of(whole), LIMITS, PERIOD))
-        for place in places([*way, (1.0, 60)], load):
-            load = place
-            correction.command(load)
-            assert abs(correction.correction_arcsec - last) <= STEP * (1.0 + 1e-9)
-            last = correction.correction_arcsec
-        assert not correction.changing
-    if schemes[-1] is Scheme.NONE:
-        assert correction.correction_arcsec == pytest.approx(0.0, abs=1e-9)
-
-
-def test_without_a_change_it_equals_the_compensation():
-    compensation = made(model())
-    correction = Correction(compensation)
-    assert correction.command == compensation.command
-    assert correction.hold == compensation.hold
-    correction.change(Compensation(model(), LIMITS, PERIOD))
-    assert correction.command != compensation.command
-
-
 def test_a_change_takes_the_ramps_time():
     correction = Correction(made(model(offset=10.0)))
     correction.change(Compensation(model(), LIMITS, PERIOD))

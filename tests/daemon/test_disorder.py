@@ -263,7 +263,7 @@ class Disorder(RuleBasedStateMachine):
         can_id=st.one_of(st.integers(0, 0x7FF), st.sampled_from([0, 0x601, 0x602])),
         data=st.binary(max_size=8),
     )
-    def outgoing(self, can_id: int, data: bytes) -> None:
+    def outgoing(self, can_id, data):
         # The invariants do not cover a node that the service has reconfigured; they cover restarts and reads.
         if 0x600 <= can_id < 0x680 and data and data[0] >> 5 not in (2, 3, 4):
             data = b"\x40" + data[1:]

@@ -118,9 +118,7 @@ def log() -> Iterator[logging.Logger]:
     root.propagate = before[2]
 
 
-def test_the_log_is_json_without_a_terminal(
-    log: logging.Logger, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_log_is_json_without_a_terminal(log, tmp_path, capsys):
     begin_log(LogSettings(file=tmp_path / "log"))
     _log.info("begun", {"axes": 2})
     _log.debug("detail", {})
@@ -139,9 +137,7 @@ def test_the_control_process_logs_once(log: logging.Logger, capsys: pytest.Captu
     assert json.loads(line)["conditions"] == "none"
 
 
-def test_the_journal_gets_the_priority(
-    log: logging.Logger, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_journal_gets_the_priority(log, monkeypatch, capsys):
     monkeypatch.setenv("JOURNAL_STREAM", "8:1")
     begin_log(LogSettings())
     _log.warning("odd", {})

@@ -108,9 +108,7 @@ def test_systemd_accepts_the_unit(folder: Path, tmp_path: Path, user: bool) -> N
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_unit_is_shown_written_and_removed(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_unit_is_shown_written_and_removed(folder, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     unit = tmp_path / "config/systemd/user/hdbridge-cell.service"
 

@@ -52,9 +52,7 @@ class RawMaster(FrameMaster):
 
     # PDO
 
-    def cycle(
-        self, word: int = 0x0F, target: int | None = None, period_s: float = PERIOD_S
-    ) -> tuple[int, ...]:
+    def cycle(self, word=0x0F, target=None, period_s=PERIOD_S):
         """Runs SYNC, both TPDOs, RPDO and one period of time; returns (status, actual, torque, load,
         demand).
         """

@@ -10,7 +10,6 @@ from pathlib import Path
 import canopen
 import pytest
 
-from hdbridge.device.dictionary import Dictionary
 from hdbridge.errors import InputError
 from hdbridge.sim.lockstep import lockstep_bench
 from tests.device.conftest import RawMaster
@@ -24,11 +23,6 @@ def sections() -> RawConfigParser:
     parser.optionxform = str
     parser.read(EDS)
     return parser
-
-
-@pytest.fixture(scope="module")
-def declared() -> canopen.ObjectDictionary:
-    return canopen.import_od(str(EDS), 5)
 
 
 def test_canopen_reads_it_without_a_complaint(caplog):
@@ -53,24 +47,6 @@ def test_sub_numbers_are_right(sections):
     for name in compound:
         subs = [other for other in sections.sections() if other.startswith(name + "sub")]
         assert int(sections[name]["SubNumber"]) == len(subs), name
-
-
-def test_identifiers_follow_the_node_id(declared):
-    assert declared[0x1400][1].default == 0x205
-    assert declared[0x1801][1].default == 0x285
-    assert declared[0x1014].default == 0x085
-
-
-@pytest.mark.parametrize(
-    "content", [None, b"", b"[1000]\n", b"\xff\xfe\x00", b"[1000]\nParameterName=x\nDataType=zz\n"]
-)
-def test_an_invalid_eds_is_refused_in_one_line(tmp_path, content):
-    path = tmp_path / "bad.eds"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(InputError, match=r"bad\.eds") as caught:
-        Dictionary(path, 1)
-    assert "\n" not in str(caught.value)
 
 
 NO_OBJECT, NO_SUBINDEX, READ_ONLY = 0x06020000, 0x06090011, 0x06010002

@@ -21,13 +21,6 @@ def test_identifiers_that_are_not_for_pdos_are_refused(master, value):
     assert master.write(0x1800, 1, value, 4) == RANGE
 
 
-def test_a_target_is_reached_one_period_after_the_sync_that_takes_it(master):
-    master.enable_csp()
-    master.cycle(0x0F, 50)
-    positions = [master.cycle(0x0F, 50)[1] for _ in range(3)]
-    assert positions == [0, 50, 50]
-
-
 def test_tpdos_of_one_sync_are_consistent(master):
     master.enable_csp()
     for k in range(1, 20):

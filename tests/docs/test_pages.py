@@ -54,41 +54,6 @@ def run(text, tmp_path):
     return pages.run(tmp_path / "page.md", tmp_path / "page")
 
 
-def test_variables_folders_and_files_persist_between_commands(tmp_path):
-    page = """# Page
-```sh
-mkdir folder && cd folder   # with a remark
-WORD=word
-cat > file <<'END'
-$ one
-
-two
-END
-```
-
-<!-- run first: printf 'three\\n' >> file -->
-```console
-$ echo $WORD \\
-    again
-word again
-$ cat file
-...
-two
-three
-```
-
-```python
-print(open("file").read())
-```
-
-<!-- output -->
-```text
-two
-```
-"""
-    assert run(page, tmp_path)[0] == []
-
-
 @pytest.mark.parametrize(
     ("block", "complaint"),
     [

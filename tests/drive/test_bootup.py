@@ -51,9 +51,7 @@ def test_without_a_reset_no_boot_up_message_is_awaited(drive: Drive, sent: Any) 
     assert [data for can_id, data in sent if can_id == 0] == [b"\x80\x01", b"\x01\x01"]
 
 
-def test_an_absent_drive_is_named_within_a_bounded_time(
-    drive: Drive, slave: Any, clock: Any, axis: AxisConfig
-) -> None:
+def test_an_absent_drive_is_named_within_a_bounded_time(drive, slave, clock, axis):
     slave.node.faults.silent = True
     with pytest.raises(DriveError, match=r"node 1 on virtual:test-.*no other node.*drive\.node_id") as caught:
         drive.boot()
@@ -84,16 +82,12 @@ def booting(slave: Any, clock: Any, boot_up_s: float | None, sdo_s: float) -> No
 @pytest.mark.parametrize(
     ("boot_up_s", "sdo_s"), [(0.1, 1.0), (0.1, 3.5), (1.9, 5.2), (2.8, 5.0), (3.4, 6.8), (None, 3.0)]
 )
-def test_a_drive_that_answers_seconds_after_its_boot_up_message(
-    slave: Any, bus: Any, axis: AxisConfig, clock: Any, boot_up_s: float | None, sdo_s: float
-) -> None:
+def test_a_drive_that_answers_seconds_after_its_boot_up_message(slave, bus, axis, clock, boot_up_s, sdo_s):
     booting(slave, clock, boot_up_s, sdo_s)
     assert Drive(bus, axis, clock, slave.od).boot().state is State.SWITCH_ON_DISABLED
 
 
-def test_a_drive_that_boots_but_never_answers_is_reported_as_heard(
-    drive: Drive, slave: Any, bus: Any, clock: Any
-) -> None:
+def test_a_drive_that_boots_but_never_answers_is_reported_as_heard(drive, slave, bus, clock):
     booting(slave, clock, 0.5, 1e9)
     with pytest.raises(DriveError, match=r"does not answer \(heard of it: its boot-up message\); ") as caught:
         drive.boot()
@@ -132,9 +126,7 @@ def test_an_absent_drive_lists_the_present_nodes(drive: Drive, slave: Any, clock
         ((0x60E6, 1), 1_000_000, r"load_encoder\.counts_per_turn.* is 2880000"),
     ],
 )
-def test_another_drive_or_another_scale_is_refused(
-    drive: Drive, slave: Any, key: tuple[int, int], value: int, text: str
-) -> None:
+def test_another_drive_or_another_scale_is_refused(drive, slave, key, value, text):
     slave.values[key] = value
     with pytest.raises(IdentityError, match=text) as caught:
         drive.boot()
@@ -155,9 +147,7 @@ def test_a_feed_that_does_not_scale(bus: Any, slave: Any, clock: Any, build_axis
         Drive(bus, build_axis(drive__feed_scales=False), clock, slave.od).boot()
 
 
-def test_missing_mandatory_objects_are_refused_before_anything_is_sent(
-    slave: Any, bus: Any, axis: Any, clock: Any, sent: Any
-) -> None:
+def test_missing_mandatory_objects_are_refused_before_anything_is_sent(slave, bus, axis, clock, sent):
     with pytest.raises(
         InputError, match=r"drive\.eds: hdbridge-402\.eds lacks 6040h:00 controlword, .* more"
     ):
@@ -207,9 +197,7 @@ def stated(bus: Any, clock: Any, slave: Any, build_axis: Callable[..., AxisConfi
 
 
 @pytest.mark.parametrize(("key", "field"), WRITTEN)
-def test_a_value_that_is_not_kept_is_detected(
-    stated: Drive, slave: Any, key: tuple[int, int], field: str
-) -> None:
+def test_a_value_that_is_not_kept_is_detected(stated, slave, key, field):
     slave.scripts[key] = holding(77)
     with pytest.raises(DriveError, match=f"{key[0]:04X}h:{key[1]:02X} .*but reads back 77") as caught:
         stated.boot()
@@ -230,9 +218,7 @@ def refusing(code: int, held: int = 0) -> Callable[[bytes], list[bytes]]:
 
 @pytest.mark.parametrize("key", [(0x605A, 0), (0x605D, 0), (0x605B, 0), (0x6007, 0), (0x1029, 1)])
 @pytest.mark.parametrize("code", [0x06090030, 0x06090031, 0x06010002, 0x08000000])
-def test_a_default_refused_by_the_drive_is_left_to_it(
-    drive: Drive, slave: Any, key: tuple[int, int], code: int
-) -> None:
+def test_a_default_refused_by_the_drive_is_left_to_it(drive, slave, key, code):
     slave.scripts[key] = refusing(code, held=5)
     report = drive.boot()
     (note,) = report.notes
@@ -323,9 +309,7 @@ def test_the_bit_that_forbids_rtr_is_left_to_the_drive(drive: Drive, slave: Any)
     assert slave.values[0x1800, 1] == 0x4000_0181
 
 
-def test_load_encoder_on_a_separate_node(
-    bus: Any, clock: Any, slave: Any, channel: str, build_axis: Callable[..., AxisConfig]
-) -> None:
+def test_load_encoder_on_a_separate_node(bus, clock, slave, channel, build_axis):
     source = {"index": 0x60E4, "subindex": 1, "type": "int32", "node": 2}
     with can.Bus(interface="virtual", channel=channel, ignore_config=True) as other_bus:
         motor = IdealMotor(5000)

@@ -43,7 +43,7 @@ def test_no_frame_is_longer_than_the_worst_case(length: int, data: st.DataObject
 
 
 @pytest.mark.parametrize("length", range(9))
-def test_the_worst_case_frame_exists(length: int) -> None:
+def test_the_worst_case_frame_exists(length):
     # Five equal bits, then alternating runs of four: each stuff bit begins the next run.
     bits, value = [0] * 5, 1
     while len(bits) < 34 + 8 * length:

@@ -48,9 +48,7 @@ def test_in_csp_power_is_left_to_the_cycle(drive: Drive, slave: Any) -> None:
     assert (can_id, struct.unpack("<Hi", data)) == (0x201, (0x06, 1000))
 
 
-def test_before_the_boot_nothing_is_enabled(
-    bus: Any, clock: Any, slave: Any, axis: AxisConfig, sent: Any
-) -> None:
+def test_before_the_boot_nothing_is_enabled(bus, clock, slave, axis, sent):
     with Drive(bus, axis, clock, slave.od) as drive, pytest.raises(TransitionError, match="boot"):
         drive.enable()
     assert sent == []
@@ -113,9 +111,7 @@ def test_a_profile_move_arrives(drive: Drive, slave: Any, clock: Any, sent: Any)
 
 
 @pytest.mark.parametrize("target", [math.nan, math.inf, -math.inf, 400.01, -1e9])
-def test_impossible_targets_are_refused_before_anything_is_sent(
-    drive: Drive, slave: Any, target: float
-) -> None:
+def test_impossible_targets_are_refused_before_anything_is_sent(drive, slave, target):
     drive.enable(Mode.PP)
     before = list(slave.sdo_order)
     with pytest.raises(InputError, match="nothing was sent"):
@@ -224,9 +220,7 @@ def test_leaving_disables_and_ends_operation(bus: Any, clock: Any, slave: Any, a
 
 
 @pytest.fixture
-def session(
-    bus: Any, clock: Any, slave: Any, axis: AxisConfig
-) -> Callable[[Callable[[Drive], object]], None]:
+def session(bus, clock, slave, axis):
     """Opens and enables a drive, acts on it, and leaves."""
 
     def run(do: Callable[[Drive], object]) -> None:

@@ -41,9 +41,7 @@ def test_frames_become_values(axis: AxisConfig) -> None:
     assert image.power.state is State.OPERATION_ENABLED
 
 
-def test_heartbeats_are_awaited_for_two_periods_and_sent_twice_in_the_drives_time_out(
-    build_axis: Callable[..., AxisConfig],
-) -> None:
+def test_heartbeats_are_awaited_for_two_periods_and_sent_twice_in_the_drives_time_out(build_axis):
     image = ProcessImage(build_axis(drive__heartbeat_ms=80))
     assert image.heartbeat_timeout_s == pytest.approx(0.16)
     assert image.heartbeat_period_s == pytest.approx(0.04)
@@ -70,9 +68,7 @@ def test_positions_continue_beyond_their_32_bits_from_the_reading_at_boot_up(axi
     assert (image.motor_counts, image.load_counts, image.demand_counts) == (END + 5, END + 3, END + 7)
 
 
-def test_without_6062h_the_earlier_target_continues_beyond_its_32_bits(
-    other: Callable[[str], ProcessImage],
-) -> None:
+def test_without_6062h_the_earlier_target_continues_beyond_its_32_bits(other):
     image = other(without(OWN, 0x6062))
     image.seed(END - 10, 0, 0x0040)
     image.accept(0x181, tpdo1(0x0027, -END + 5))
@@ -82,9 +78,7 @@ def test_without_6062h_the_earlier_target_continues_beyond_its_32_bits(
 
 
 @given(length=st.integers(0, 64).filter(lambda length: length != 8))
-def test_a_frame_of_the_wrong_length_changes_nothing(
-    length: int, build_axis: Callable[..., AxisConfig]
-) -> None:
+def test_a_frame_of_the_wrong_length_changes_nothing(length, build_axis):
     image = ProcessImage(build_axis())
     image.accept(0x181, tpdo1(0x0040, 100))
     with pytest.raises(PdoLengthError):
@@ -107,9 +101,7 @@ def test_a_second_node_may_send_the_load_position(build_axis: Callable[..., Axis
 
 @pytest.mark.parametrize("direction", [1, -1])
 @given(deg=st.floats(-20_000, 20_000))
-def test_scaling_follows_the_direction(
-    direction: int, deg: float, build_axis: Callable[..., AxisConfig]
-) -> None:
+def test_scaling_follows_the_direction(direction, deg, build_axis):
     image = ProcessImage(build_axis(motor_encoder__direction=direction))
     counts = image.target_counts_for(deg)
     assert counts == round(direction * deg * 8000 / 360)
@@ -117,9 +109,7 @@ def test_scaling_follows_the_direction(
 
 
 @pytest.mark.parametrize("direction", [1, -1])
-def test_limits_are_ordered_and_leave_room_for_the_compensation(
-    direction: int, build_axis: Callable[..., AxisConfig]
-) -> None:
+def test_limits_are_ordered_and_leave_room_for_the_compensation(direction, build_axis):
     axis = build_axis(
         motor_encoder__direction=direction, limits__position_min_deg=-10, limits__position_max_deg=90
     )
@@ -132,9 +122,7 @@ def test_limits_are_ordered_and_leave_room_for_the_compensation(
 
 
 @given(counts=st.integers(-(2**33), 2**33) | st.sampled_from(ENDS) | st.floats() | st.none())
-def test_only_targets_within_the_limits_are_packed(
-    counts: object, build_axis: Callable[..., AxisConfig]
-) -> None:
+def test_only_targets_within_the_limits_are_packed(counts, build_axis):
     image = ProcessImage(build_axis())
     least, greatest = image.limits_counts
     if isinstance(counts, int) and least <= counts <= greatest:
@@ -193,9 +181,7 @@ STATES = st.sampled_from([0x00, 0x40, 0x21, 0x23, 0x27, 0x07, 0x0F, 0x08, 0xFF])
     seen=st.lists(st.tuples(STATES, st.sampled_from(["go", "stop", "off", ""])), max_size=20),
     halt=st.booleans(),
 )
-def test_in_ip_no_other_word_than_enable_operation_has_the_bit(
-    build_axis: Callable[..., AxisConfig], seen: list[tuple[int, str]], halt: bool
-) -> None:
+def test_in_ip_no_other_word_than_enable_operation_has_the_bit(build_axis, seen, halt):
     image = ProcessImage(build_axis(drive__mode="ip"))
     image.halt = halt
     for status, wish in seen:
@@ -251,9 +237,7 @@ def test_the_statusword_is_read_from_any_tpdo(other: Callable[[str], ProcessImag
     assert (image.statusword, image.load_counts) == (0x1237, 5)
 
 
-def test_without_6062h_the_demand_is_the_earlier_target(
-    other: Callable[[str], ProcessImage],
-) -> None:
+def test_without_6062h_the_demand_is_the_earlier_target(other):
     """A target sent after SYNC k is taken at SYNC k+1, and reached at SYNC k+2."""
     image = other(without(OWN, 0x6062))
     image.seed(1000, 0, 0x0027)
@@ -274,9 +258,7 @@ def test_without_6077h_the_torque_is_unknown(other: Callable[[str], ProcessImage
     assert math.isnan(image.torque_permille)
 
 
-def test_positions_of_another_width_are_followed_over_their_wrap(
-    other: Callable[[str], ProcessImage],
-) -> None:
+def test_positions_of_another_width_are_followed_over_their_wrap(other):
     image = other(stating(stating(OWN, "6064", DataType="0x0003"), "6062", DataType="0x0003"))
     for counts in (32_760, -32_766):
         image.accept(0x181, struct.pack("<Hhhh", 0x0027, counts, 0, counts))

@@ -4,13 +4,12 @@ durand brings its own SDO server, NMT, heartbeat, SYNC and PDO handling; only th
 here. Its notifier thread is replaced by a poll, so that the test is in lockstep.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from support.foreign_slaves import NODE_ID, DurandDrive, durand_drive
 
-from hdbridge.axis import AxisConfig
 from hdbridge.drive import Drive, Mode, State, load_eds, objects
 
 
@@ -27,9 +26,7 @@ def clock(peer: DurandDrive) -> Any:
 
 
 @pytest.fixture
-def drive(
-    peer: DurandDrive, clock: Any, tmp_path: Any, build_axis: Callable[..., AxisConfig]
-) -> Iterator[Drive]:
+def drive(peer, clock, tmp_path, build_axis):
     eds = tmp_path / "durand.eds"
     eds.write_text(peer.node.eds.content)
     axis = build_axis(drive__node_id=NODE_ID)

@@ -177,9 +177,7 @@ def test_mandatory_objects_must_be_mappable_or_mapped(laid_out: Any, index: int)
     split=st.booleans(),
     swapped=st.booleans(),
 )
-def test_any_order_and_split_of_fixed_mappings_carries_everything(
-    laid_out: Any, pieces: list[int], cuts: list[int], split: bool, swapped: bool
-) -> None:
+def test_any_order_and_split_of_fixed_mappings_carries_everything(laid_out, pieces, cuts, split, swapped):
     edges = sorted({0, *cuts, 5})
     parts = [pieces[a:b] for a, b in pairwise(edges)]
     parts = [part for each in parts for part in _in_eight_bytes(each)][:4]

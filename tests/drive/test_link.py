@@ -109,9 +109,7 @@ def test_bus_off_is_the_end_of_the_link(closing: deque[can.BusABC]) -> None:
         link.send(1, b"")
 
 
-def test_setting_back_the_wall_clock_does_not_extend_a_wait(
-    closing: deque[can.BusABC], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_setting_back_the_wall_clock_does_not_extend_a_wait(closing, monkeypatch):
     walls = iter(range(10_000, 0, -100))
     monkeypatch.setattr("can.bus.time", lambda: float(next(walls)))
     link = link_to(closing, FakeBus())
@@ -140,9 +138,7 @@ def test_opening_an_unknown_interface() -> None:
     ("interface", "module", "package"),
     [("udp_multicast", "msgpack", "msgpack"), ("slcan", "serial", "pyserial")],
 )
-def test_a_missing_package_is_reported_with_its_install_command(
-    monkeypatch: pytest.MonkeyPatch, interface: str, module: str, package: str
-) -> None:
+def test_a_missing_package_is_reported_with_its_install_command(monkeypatch, interface, module, package):
     def refuse(**options: object) -> None:
         raise can.CanInterfaceNotImplementedError(f"{module} not installed")
 

@@ -3,7 +3,6 @@
 import os
 import pwd
 import re
-from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from hdbridge.drive.interfacelock import InterfaceLock, holders
 from hdbridge.drive.link import open_bus
 from hdbridge.errors import BusError, BusInUseError
 from hdbridge.files.profile import bundled_profile
-from hdbridge.sim.lockstep import VirtualClock, lockstep_bench, simulated_bench
+from hdbridge.sim.lockstep import lockstep_bench, simulated_bench
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
 
@@ -28,9 +27,7 @@ SDO_REQUEST = (0x601, b"\x40\x00\x10\0\0\0\0\0")
 
 
 @contextmanager
-def bench(
-    *frames: tuple[int, bytes], period_s: float = 0.1
-) -> Iterator[tuple[can.BusABC, VirtualClock, can.BusABC]]:
+def bench(*frames, period_s=0.1):
     """Provides the master's end of a bus on which another node sends ``frames``, and a witness of the sent
     frames.
     """

@@ -70,9 +70,3 @@ def test_a_pdo_has_at_most_eight_bytes_and_no_object_twice() -> None:
         PdoCodec([entry, entry])
     with pytest.raises(InputError, match="as many values"):
         PdoCodec([entry]).pack([1, 2])
-
-
-def test_type_names() -> None:
-    assert IntegerType.named("uint24").bits == 24
-    with pytest.raises(InputError, match="float32"):
-        IntegerType.named("float32")

@@ -35,17 +35,13 @@ def test_values_come_from_the_axis_file(axis: AxisConfig) -> None:
 @pytest.mark.parametrize(
     ("cycle_ms", "period"), [(1, (1, -3)), (2.5, (25, -4)), (0.5, (5, -4)), (255, (255, -3))]
 )
-def test_the_cycle_as_mantissa_and_exponent(
-    build_axis: Callable[..., AxisConfig], cycle_ms: float, period: tuple[int, int]
-) -> None:
+def test_the_cycle_as_mantissa_and_exponent(build_axis, cycle_ms, period):
     written = values(build_axis(drive__cycle_ms=cycle_ms, drive__heartbeat_ms=600))
     assert (written[1, 0x60C2, 1], written[1, 0x60C2, 2]) == period
 
 
 @given(low=st.floats(-1000, 900), width=st.floats(1, 1000), direction=st.sampled_from([1, -1]))
-def test_a_reversed_encoder_swaps_the_ends(
-    build_axis: Callable[..., AxisConfig], low: float, width: float, direction: int
-) -> None:
+def test_a_reversed_encoder_swaps_the_ends(build_axis, low, width, direction):
     axis = build_axis(
         limits__position_min_deg=low,
         limits__position_max_deg=low + width,
@@ -82,9 +78,7 @@ def test_a_row_reads_like_a_sentence(axis: AxisConfig) -> None:
     assert all(row.why for row in plan(axis))
 
 
-def test_a_window_of_less_than_a_count_would_switch_supervision_off(
-    build_axis: Callable[..., AxisConfig],
-) -> None:
+def test_a_window_of_less_than_a_count_would_switch_supervision_off(build_axis):
     with pytest.raises(InputError, match="6065h means no supervision"):
         plan(build_axis(drive__following_error_deg=0.01))
 

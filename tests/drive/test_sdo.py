@@ -1,7 +1,6 @@
 """The SDO client against nodes that answer late, wrongly, too much, or not at all."""
 
 import struct
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -93,9 +92,7 @@ def test_a_late_answer_is_not_used_for_another_object(client: SdoClient, slave: 
         (0x0123_4567, "vendor-specific.*manual"),
     ],
 )
-def test_an_abort_is_reported_with_a_remedy_and_not_retried(
-    client: SdoClient, slave: Any, code: int, text: str
-) -> None:
+def test_an_abort_is_reported_with_a_remedy_and_not_retried(client, slave, code, text):
     calls = []
 
     def refuse(request: bytes) -> list[bytes]:
@@ -120,9 +117,7 @@ def test_an_abort_is_reported_with_a_remedy_and_not_retried(
     ],
     ids=["0 bytes", "1 byte", "4 bytes", "7 bytes", "too few for the type", "of a download"],
 )  # fmt: skip
-def test_an_invalid_answer_is_an_error_not_a_crash(
-    client: SdoClient, slave: Any, answer: Callable[[bytes], bytes], text: str
-) -> None:
+def test_an_invalid_answer_is_an_error_not_a_crash(client, slave, answer, text):
     slave.scripts[0x6064, 0] = lambda request: [answer(request)]
     with pytest.raises(SdoError, match=text):
         client.read(0x6064)
@@ -131,9 +126,7 @@ def test_an_invalid_answer_is_an_error_not_a_crash(
 @pytest.mark.parametrize(
     ("data", "value"), [(b"\xfe\xff\xff\xff", -2), (b"\x06\0\0\0", 6), (b"\x06\0\1\0", None)]
 )
-def test_four_bytes_for_a_shorter_object(
-    client: SdoClient, slave: Any, data: bytes, value: int | None
-) -> None:
+def test_four_bytes_for_a_shorter_object(client, slave, data, value):
     slave.scripts[0x605A, 0] = lambda request: [expedited(request, data)]
     if value is None:
         with pytest.raises(SdoError, match="answered 4 bytes"):

@@ -7,16 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
 from hdbridge.axis.effects import (
     Hysteresis,
     HysteresisMemory,
     Moment,
     Motion,
-    MotorOrder,
     Start,
-    Synchronous,
 )
 from hdbridge.axis.effects.orders import waves
 
@@ -41,12 +38,6 @@ def test_waves_of_any_order_are_its_cosine_and_sine(numbers, first_rad):
     for number, wave in zip(numbers, waves(angle_rad, numbers), strict=True):
         # An angle of 2e6 rad has 2e6 * 1e-16 rad of rounding.
         assert wave == pytest.approx(np.exp(1j * number * angle_rad), abs=1e-8)
-
-
-def test_an_order_may_stand_only_once():
-    order = MotorOrder(order=2, amplitude_arcsec=1, phase_deg=0)
-    with pytest.raises(ValidationError, match="only once"):
-        Synchronous(orders=(order, order))
 
 
 ARTICLE = Hysteresis(offset_arcsec=40, width_deg=20, exponent=1.6)
@@ -90,17 +81,6 @@ def test_law_follows_the_formula_between_reversals():
     error = ARTICLE.predict(Motion(path))
     expected = [0.0, 40.0, *[40 - 80 * rise_of(min(d / 20, 1.0), 1.6) for d in (2, 5, 10, 21)]]
     np.testing.assert_allclose(error, expected, atol=1e-9)
-
-
-def test_saturation_is_not_a_relay():
-    """After a reversal from saturation, the error leaves the offset gradually; taken literally, the law would
-    jump by 80 arcsec.
-    """
-    tracker = ARTICLE.tracker()
-    for angle in (0.0, 100.0):
-        tracker.advance(angle, Moment())
-    first_count = tracker.peek(100.0 - 360 / 8000, Moment())
-    assert 40 - first_count == pytest.approx(4.9, abs=0.1)
 
 
 def test_direction_holds_at_rest():

@@ -92,6 +92,11 @@ def test_an_eccentric_disc_has_no_third_order():
         MotorEncoderEccentricity(orders=(MotorOrder(order=3, amplitude_arcsec=1, phase_deg=0),))
 
 
+def test_an_order_may_stand_only_once():
+    with pytest.raises(ValidationError, match="only once"):
+        Synchronous(orders=(ORDER_4, ORDER_4))
+
+
 def test_new_motor_orders_are_sought_outside_the_model():
     model = [
         Synchronous(orders=tuple(MotorOrder(order=k, amplitude_arcsec=1, phase_deg=0) for k in (1, 2, 4)))

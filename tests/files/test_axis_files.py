@@ -82,14 +82,6 @@ def test_a_wrong_file_gets_one_exact_line(folder, wanted, given, expected):
     assert str(caught.value) == f"{folder / 'axis.yaml'}:{expected}"
 
 
-def test_without_limits_there_is_no_axis(folder):
-    with pytest.raises(
-        InputError,
-        match=r"axis\.yaml:1:1: key 'limits' is missing; expected a mapping \(limits of the axis\)$",
-    ):
-        load(folder, GOOD.split("limits:", maxsplit=1)[0])
-
-
 def test_a_missing_eds_is_one_line_with_both_places(folder):
     with pytest.raises(InputError) as caught:
         load(folder, GOOD.replace("test.eds", "other.eds"))
@@ -144,14 +136,6 @@ def test_another_bus_keeps_everything_else(folder):
         axis.eds_path,
         axis.path,
     )
-
-
-@pytest.mark.parametrize("name", ["article", "demo"])
-def test_the_bundled_profiles_are_right(name):
-    axis = AxisConfig.load(bundled_profile(name))
-    assert axis.name == name
-    assert axis.gear.ratio == 50
-    assert axis.eds_path.parent == bundled_folder("eds")
 
 
 def test_an_unknown_profile_lists_the_known_ones():

@@ -2,7 +2,6 @@
 
 # ruff: noqa: E501  (the table of complaints shows each on one line)
 
-import math
 import os
 import signal
 import subprocess
@@ -165,7 +164,7 @@ SCALARS = (
     )
 )
 def test_dumped_values_read_back_exactly(data):
-    assert document_from_text(dump_yaml(data), "t.yaml").data == data
+    assert repr(document_from_text(dump_yaml(data), "t.yaml").data) == repr(data)  # 0.0 == -0.0
 
 
 def test_a_dump_is_block_style_in_the_order_given():
@@ -186,12 +185,6 @@ def test_numpy_numbers_and_enums_are_dumped_as_plain_values():
     assert document_from_text(dump_yaml(data), "t.yaml").data == {
         "a": 0.1, "b": 3, "c": [1.0, 2.0], "d": [1, 2], "e": "red",
     }  # fmt: skip
-
-
-def test_signed_zero_and_infinities_survive():
-    data = document_from_text(dump_yaml({"a": -0.0, "b": math.inf, "c": -math.inf}), "t.yaml").data
-    assert math.copysign(1, data["a"]) == -1
-    assert (data["b"], data["c"]) == (math.inf, -math.inf)
 
 
 def test_positions_count_characters_not_bytes():

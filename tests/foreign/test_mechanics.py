@@ -12,7 +12,6 @@ from foreign.mechanics import (
     DT_S,
     BoucWen,
     MaxwellSlip,
-    Plant,
     energy_j,
     hysteresis,
     plant_of,
@@ -41,9 +40,7 @@ def lossless(mechanics):
     )
 
 
-def advance(
-    plant: Plant, seconds: float, torque_nm: float = 0.0, brake_nm: float = 0.0, every: int = 1
-) -> np.ndarray:
+def advance(plant, seconds, torque_nm=0.0, brake_nm=0.0, every=1):
     """Advances a plant; returns rows of motor angle, motor speed, load angle, load speed and energy."""
     rows = []
     for at in range(round(seconds / DT_S)):

@@ -168,9 +168,7 @@ def test_acceleration_effects_are_independent_of_the_sampling_rate(rate_hz: floa
 
 
 @pytest.mark.parametrize("rate_hz", [50.0, 100.0])
-def test_a_record_that_begins_and_ends_in_motion_has_its_visible_acceleration(
-    rate_hz: float,
-) -> None:
+def test_a_record_that_begins_and_ends_in_motion_has_its_visible_acceleration(rate_hz):
     """The acceleration is proportional to time, and needs no correction, neither inside nor at the ends."""
     time = np.arange(0.0, 1.0, 1.0 / rate_hz)
     command = 200.0 * time + 300.0 * time**3

@@ -29,18 +29,6 @@ def all_fitted(motor_deg, error_arcsec, orders):
     return spectrum(orders, orders, system(motor_deg, error_arcsec, orders))
 
 
-def test_a_stepping_test_shows_each_order_where_it_is():
-    """As a function of the sample number, order 6 would appear at 2.26 and order 8 at 0.26 per motor turn."""
-    motor = np.arange(240) * 43.56
-    truth = [(1, 4.9, -126.8), (2, 9.33, -132.1), (6, 3.18, -127.0), (8, 1.87, 124.3)]
-    found = all_fitted(motor, waves(motor, truth) + 12.0, motor_orders(10))
-    lines = {each.order.number: each for each in found}
-    for order, amplitude, phase in truth:
-        assert lines[order].amplitude_arcsec == pytest.approx(amplitude, abs=1e-6)
-        assert lines[order].phase_deg == pytest.approx(phase, abs=1e-5)
-    assert lines[5].amplitude_arcsec < 1e-6
-
-
 def test_indistinguishable_orders_are_named():
     motor = np.arange(200) * 45.0 + 1e-6
     found = all_fitted(motor, waves(motor, [(1, 3.0, 0.0)]), motor_orders(9))

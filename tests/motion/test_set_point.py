@@ -76,9 +76,7 @@ def _seen(set_point: SetPoint) -> tuple:
     return tuple(getattr(set_point, each) for each in names)
 
 
-def follow(
-    set_point: SetPoint, limits: MotionLimits, period_s: float, steps: int, check_jerk: bool = True
-) -> None:
+def follow(set_point, limits, period_s, steps, check_jerk=True):
     """Runs steps of the set-point, and checks the invariants after each."""
     for _ in range(steps):
         last, last_acceleration, mode = set_point.position_deg, set_point.acceleration_deg_s2, set_point.mode

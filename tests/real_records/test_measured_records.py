@@ -53,9 +53,7 @@ def names(found: Diagnosis) -> dict[str, tuple[str, ...]]:
 
 
 @pytest.mark.parametrize("joint", [4, 5])
-def test_a_robot_joint_is_named_and_the_names_predict_the_recording_left_out(
-    joints: dict[int, list[Record]], joint: int
-) -> None:
+def test_a_robot_joint_is_named_and_the_names_predict_the_recording_left_out(joints, joint):
     out, *others = joints[joint]
     found = diagnose(concatenate(others), NOTHING, independent_zeros=True)
     named = names(found)
@@ -77,9 +75,7 @@ def test_a_robot_joint_is_named_and_the_names_predict_the_recording_left_out(
 
 
 @pytest.mark.parametrize(("joint", "most"), [(4, 1.1), (5, 1.2)])
-def test_findings_predict_a_held_out_recording_like_a_regression(
-    joints: dict[int, list[Record]], joint: int, most: float
-) -> None:
+def test_findings_predict_a_held_out_recording_like_a_regression(joints, joint, most):
     """The goal is a ratio of 1.1 for both joints; joint 5 exceeds it, because its speed term is not accepted
     in four recordings of a second each.
     """
@@ -92,9 +88,7 @@ def test_findings_predict_a_held_out_recording_like_a_regression(
 @pytest.mark.parametrize(
     ("joint", "cause", "least_arcsec"), [(4, "channel_skew", 14.0), (5, "compliance", 10.0)]
 )
-def test_half_the_samples_with_or_without_the_command_name_the_same(
-    folder: str, joint: int, cause: str, least_arcsec: float
-) -> None:
+def test_half_the_samples_with_or_without_the_command_name_the_same(folder, joint, cause, least_arcsec):
     whole = [Record.read_csv(each) for each in measured(f"{folder}/joint{joint}-*.csv")]
     halves = [
         Record({name: values[::2] for name, values in each.columns.items()}, each.source) for each in whole
@@ -107,9 +101,7 @@ def test_half_the_samples_with_or_without_the_command_name_the_same(
     assert found.extended.rms_arcsec < 0.45 * found.baseline.rms_arcsec
 
 
-def test_different_zeros_are_reported_without_a_cause(
-    joints: dict[int, list[Record]], tmp_path: Path
-) -> None:
+def test_different_zeros_are_reported_without_a_cause(joints, tmp_path):
     NOTHING.save(tmp_path / "model.yaml")
     records = [each.source for each in joints[4]]
     command = ["diagnose", *records, "--model", str(tmp_path / "model.yaml")]

@@ -53,9 +53,7 @@ def said(program: str, *arguments: object, **environment: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-def test_layout_names_are_unique_and_stable_between_processes(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_layout_names_are_unique_and_stable_between_processes(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["", "16", "32"])
     exec(NAME, {})
     small, large = capsys.readouterr().out.splitlines()

@@ -146,7 +146,7 @@ def test_maxwell_slip_forgets_closed_excursions(back_deg: float) -> None:
     )
 
 
-def test_the_article_s_law_forgets_all_but_the_last_reversal() -> None:
+def test_the_article_s_law_forgets_all_but_the_last_reversal():
     # A new branch starts at the excursion's end, so its value follows from that point alone.
     law = rolling()
     along_from(law, 0.0, 60.0)

@@ -55,9 +55,7 @@ def fingerprint(truth: Truth) -> str:
         ("demo", 0.5, "9b295d54d14b6536", "c8d5cf5377dbfd9c"),
     ],
 )
-def test_without_causes_records_are_unchanged(
-    profile: str, substep_ms: float, without_teeth: str, expected: str
-) -> None:
+def test_without_causes_records_are_unchanged(profile, substep_ms, without_teeth, expected):
     truth = Truth.load(PROFILES / profile).model_copy(update={"substep_ms": substep_ms})
     assert fingerprint(truth) == expected
     gear = truth.gear.model_copy(update={"motor_orders": ()})

@@ -205,9 +205,7 @@ def drives() -> Iterator[Drives]:
 
 
 @pytest.fixture
-def simulated(
-    interface: str, drives: Drives, request: pytest.FixtureRequest
-) -> Iterator[subprocess.Popen[str]]:
+def simulated(interface, drives, request):
     yield drives.running(interface)
     if "may_configure" in request.fixturenames:  # the interface has been taken away from it
         drives.end()

@@ -96,14 +96,7 @@ class VcanBench:
 
 
 @pytest.fixture
-def bench(
-    interface: str,
-    profile: Path,
-    intruder: can.BusABC,
-    may_configure: Callable[..., None],
-    tmp_path: Path,
-    request: pytest.FixtureRequest,
-) -> Iterator[VcanBench]:
+def bench(interface, profile, intruder, may_configure, tmp_path, request):
     character = request.param
     own = Path(shutil.copytree(profile, tmp_path / "axis"))
     text = (own / "axis.yaml").read_text()

@@ -2,18 +2,16 @@
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
 
 from hdbridge.daemon.api.guard import Policy
-from hdbridge.daemon.api.metrics import Metrics
 from hdbridge.daemon.api.server import ApiServer, Listener
 from hdbridge.daemon.api.sockets import tcp_socket, unix_socket
-from hdbridge.daemon.service.bridge import ServiceBridge
 from support.fake_bridge import FakeBridge
 from support.patience import until
 
@@ -76,17 +74,3 @@ def running(server: ApiServer) -> Iterator[None]:
         server.stop()
         thread.join()
         assert not thread.is_alive(), "the server has not ended"
-
-
-@asynccontextmanager
-async def served_in_loop(bridge: ServiceBridge, path: Path) -> AsyncIterator[None]:
-    """Serves a real service at a Unix socket, in its own event loop, until the end of the block."""
-    metrics = Metrics(bridge)
-    bridge.core.add_sink(metrics)
-    server = ApiServer(bridge, [Listener(unix_socket(path), Policy())], metrics)
-    serving = asyncio.ensure_future(server.run())
-    try:
-        yield
-    finally:
-        server.stop()
-        await serving

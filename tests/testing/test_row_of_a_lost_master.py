@@ -38,9 +38,7 @@ def test_a_drive_without_watchdogs_fails_the_row(program: Program, drive: Simula
 
 
 @pytest.mark.parametrize("ignored", ["by option 6007h", "by its firmware"])
-def test_a_drive_that_only_reports_the_lost_master_fails_the_row(
-    program: Program, drive: SimulatedDrive, ignored: str
-) -> None:
+def test_a_drive_that_only_reports_the_lost_master_fails_the_row(program, drive, ignored):
     if ignored == "by option 6007h":
         program.put(0x6007, 0, 0, 2)
     else:

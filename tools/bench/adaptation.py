@@ -11,11 +11,8 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
-from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
-
+from harness import parser
 from support.adapting import FAULTS, FLOOR_ARCSEC, Work, at_work, truth_of
 
 from hdbridge.daemon.machinefile import AdaptationSettings
@@ -64,11 +61,11 @@ def minutes(text: str) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options = parser(__doc__)
     for name, default, of in (("--minutes", 60, "without faults"), ("--faulty-minutes", 10, "with a fault")):
         about = f"axis time of each run {of}: {LEAST_MIN} or more; 0: none (default {default})"
-        parser.add_argument(name, type=minutes, default=default, help=about)
-    given = parser.parse_args()
+        options.add_argument(name, type=minutes, default=default, help=about)
+    given = options.parse_args()
     print(f"Floor {FLOOR_ARCSEC:.2f} arcsec, 1.3 x floor {1.3 * FLOOR_ARCSEC:.2f} arcsec.\n")
     print("| adaptation | minutes | first | largest | last | told |\n|---|---|---|---|---|---|")
     if given.minutes:

@@ -1,6 +1,6 @@
 """Runs the conformance suite on the nodes of docs/gateway.md, in simulated time.
 
-    python tools/bench/conformance.py [--only gateway,slave,drive,durand,canopen] [--failures]
+    python tools/bench/conformance.py
 
 `gateway` is the complete chain: outer bus, gateway, daemon, inner bus and a simulated axis with its model.
 Prints a row for each node: checks, passed, failed, not applicable.
@@ -8,9 +8,7 @@ Prints a row for each node: checks, passed, failed, not applicable.
 
 from __future__ import annotations
 
-import argparse
 import logging
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
@@ -22,8 +20,7 @@ from typing import Any
 
 import can
 from can.interfaces.virtual import VirtualBus
-
-sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
+from harness import parser
 from support.conformance import EDS, gateway_slave, simulated_drive
 from support.foreign_slaves import durand_drive, local_node
 from support.gateway import NODE, GatewayBench, gateway_bench
@@ -117,20 +114,16 @@ def results_of(name: str, folder: Path) -> list[Result]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", default="gateway,slave,drive,durand,canopen")
-    parser.add_argument("--failures", action="store_true")
-    options = parser.parse_args()
+    parser(__doc__).parse_args()
     logging.disable(logging.CRITICAL)
-    for name in options.only.split(","):
+    for name in ("gateway", "slave", "drive", "durand", "canopen"):
         with tempfile.TemporaryDirectory(prefix="conformance-") as folder:
             results = results_of(name, Path(folder))
         counts = Counter(each.verdict for each in results)
         print(f"| {name} | {len(results)} | " + " | ".join(str(counts[each]) for each in Verdict) + " |")
-        if options.failures:
-            for each in results:
-                if each.verdict is Verdict.FAIL:
-                    print(f"    {each.check.id}: found {each.found}, expected {each.expected}")
+        for each in results:
+            if each.verdict is Verdict.FAIL:
+                print(f"    {each.check.id}: found {each.found}, expected {each.expected}")
 
 
 if __name__ == "__main__":

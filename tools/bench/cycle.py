@@ -1,6 +1,6 @@
 """CPU time of one control cycle, compared with a bare exchange of the same frames and with canopen.
 
-    python tools/bench/cycle.py [--interface virtual|socketcan]... [--channel vcan0] [--json FILE]
+    python tools/bench/cycle.py [--interface virtual|socketcan]...
 
 One run measures, in interleaved blocks, the CPU time of the thread (`time.thread_time`) per cycle of
 
@@ -22,7 +22,6 @@ Without --interface, all interfaces of this machine are measured.
 
 from __future__ import annotations
 
-import argparse
 import math
 import struct
 import subprocess
@@ -37,7 +36,7 @@ from pathlib import Path
 import can
 import canopen
 from can.interfaces.virtual import VirtualBus
-from harness import PROFILE, block_us, in_turn, keep, medians, parser, undisturbed, verdict
+from harness import CHANNEL, PROFILE, block_us, in_turn, medians, parser, undisturbed, verdict
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
@@ -116,7 +115,7 @@ class AnsweringBus(VirtualBus):
 
 
 @contextmanager
-def answering_kernel(channel: str, *node_ids: int) -> Iterator[can.BusABC]:
+def answering_kernel(*node_ids: int) -> Iterator[can.BusABC]:
     """Opens a bus on which the kernel's CAN gateway answers.
 
     It answers SYNC with TPDOs, and the master's heartbeat with those of the drives.
@@ -124,7 +123,7 @@ def answering_kernel(channel: str, *node_ids: int) -> Iterator[can.BusABC]:
     rules = [("080", f"{reply.arbitration_id:X}.8.{reply.data.hex()}") for reply in answers(*node_ids)]
     rules += [("77F", f"{0x700 + node_id:X}.1.0500000000000000") for node_id in node_ids]
     commands = [
-        ["-s", channel, "-d", channel, "-e", "-i", "-f", f"{can_id}:7FF", "-m", f"SET:ILD:{reply}"]
+        ["-s", CHANNEL, "-d", CHANNEL, "-e", "-i", "-f", f"{can_id}:7FF", "-m", f"SET:ILD:{reply}"]
         for can_id, reply in rules
     ]
     done = []
@@ -132,7 +131,7 @@ def answering_kernel(channel: str, *node_ids: int) -> Iterator[can.BusABC]:
         for command in commands:
             subprocess.run(["cangw", "-A", *command], check=True)
             done.append(command)
-        with can.Bus(interface="socketcan", channel=channel, ignore_config=True) as bus:
+        with can.Bus(interface="socketcan", channel=CHANNEL, ignore_config=True) as bus:
             yield bus
     finally:
         for command in done:
@@ -325,41 +324,32 @@ def report(result: dict[str, float], where: str) -> str:
     return "\n".join(lines)
 
 
-def measure(
-    interface: str, options: argparse.Namespace, axis: AxisConfig, model: TransmissionModel
-) -> Result:
+def measure(interface: str, blocks: int, cycles: int) -> Result:
     """Returns a description of the interface, and the median of each variant."""
-    node_id, blocks, cycles = axis.drive.node_id, options.blocks, options.cycles
+    axis, model = AxisConfig.load(PROFILE), TransmissionModel.load(PROFILE / "model.yaml")
+    node_id = axis.drive.node_id
     if interface == "virtual":
         with AnsweringBus(node_id) as bus:
             result = run(Variants(bus, axis, model), blocks, cycles, bus.answer, time.thread_time)
             bus.queue.queue.clear()
         return "the virtual bus", result
-    with answering_kernel(options.channel, node_id) as bus:
+    with answering_kernel(node_id) as bus:
         result = run(Variants(bus, axis, model), blocks, cycles, None, time.perf_counter)
-    return f"SocketCAN ({options.channel})", result
+    return f"SocketCAN ({CHANNEL})", result
 
 
-def main() -> int:
+def main() -> None:
     given = parser(__doc__, blocks=21, cycles=500)
     given.add_argument("--interface", choices=("virtual", "socketcan"), action="append")
-    given.add_argument("--channel", default="vcan0", help="of socketcan")
-    given.add_argument("--profile", type=Path, default=PROFILE)
     options = given.parse_args()
     warnings.simplefilter("ignore")
-    axis = AxisConfig.load(options.profile)
-    model = TransmissionModel.load(options.profile / "model.yaml")
     interfaces = options.interface or ["virtual"]
-    if not options.interface and Path(f"/sys/class/net/{options.channel}").exists():
+    if not options.interface and Path(f"/sys/class/net/{CHANNEL}").exists():
         interfaces.append("socketcan")
-    results = []
     for interface in interfaces:
-        where, result = measure(interface, options, axis, model)
+        where, result = measure(interface, options.blocks, options.cycles)
         print(report(result, where), end="\n\n")
-        results.append({"where": where, "unit": "us", **result})
-    keep(results, options.json)
-    return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

@@ -1,6 +1,6 @@
 """CPU time of one cycle of the daemon's control loop, compared with the bench's cycle on the same bus.
 
-    python tools/bench/daemon_loop.py [--axes 1,2,6] [--blocks 21] [--cycles 500] [--json FILE]
+    python tools/bench/daemon_loop.py [--axes 1,2,6] [--blocks 21] [--cycles 500]
 
 One run measures, in interleaved blocks, the CPU time of the thread (`time.thread_time`) of
 
@@ -20,7 +20,7 @@ from functools import partial
 
 import can
 from cycle import AnsweringBus, NeverSleeping
-from harness import PROFILE, Busy, block_us, in_turn, keep, medians, parser, undisturbed, verdict
+from harness import PROFILE, Busy, block_us, in_turn, medians, parser, undisturbed, verdict
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment
@@ -43,7 +43,7 @@ from hdbridge.enums import Scheme
 from hdbridge.motion import SetPoint
 
 GOAL = 1.3
-STATUS_OFF, STATUS_READY, STATUS_ON = 0x0250, 0x0231, 0x0233
+STATUS_OFF = 0x0250
 
 
 def configs_of(count: int, cycle_ms: float | None = None) -> list[AxisConfig]:
@@ -180,16 +180,14 @@ def report(result: dict[str, float]) -> str:
     return "\n".join([*lines, "", verdict("one axis", ratio, GOAL, "the bench's own cycle")])
 
 
-def main() -> int:
+def main() -> None:
     given = parser(__doc__, blocks=21, cycles=500)
     given.add_argument("--axes", default="1,2,6", help="numbers of axes, comma-separated")
     options = given.parse_args()
     warnings.simplefilter("ignore")
-    result = measure([int(each) for each in options.axes.split(",")], options.blocks, options.cycles)
-    print(report(result))
-    keep({"unit": "us", **result}, options.json)
-    return 0
+    counts = [int(each) for each in options.axes.split(",")]
+    print(report(measure(counts, options.blocks, options.cycles)))
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

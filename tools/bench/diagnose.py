@@ -1,6 +1,6 @@
 """Time and memory of a diagnosis as a function of the number of samples.
 
-.venv/bin/python tools/bench/diagnose.py [samples ...]
+    python tools/bench/diagnose.py [SAMPLES ...]
 
 One axis (ratio 50) with two hidden causes runs a bench plan; the record is repeated until there are enough
 samples. CPU time is that of one thread if OMP_NUM_THREADS=1 is set.
@@ -9,13 +9,10 @@ samples. CPU time is that of one thread if OMP_NUM_THREADS=1 is set.
 from __future__ import annotations
 
 import resource
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+from harness import parser
 from support import plant
 
 from hdbridge.analysis.diagnosis import diagnose
@@ -40,10 +37,11 @@ def record(samples: int) -> Record:
 
 def main() -> None:
     """Prints a line for each number of samples."""
-    sizes = [int(float(each)) for each in sys.argv[1:]] or [32_000, 100_000, 300_000, 1_000_000]
+    given = parser(__doc__)
+    given.add_argument("samples", type=int, nargs="*", default=[32_000, 100_000, 300_000, 1_000_000])
     model = TransmissionModel.from_text(plant.model_text(1))
     before: tuple[int, float] | None = None
-    for size in sizes:
+    for size in given.parse_args().samples:
         measured = record(size)
         begun, cpu = time.perf_counter(), time.process_time()
         result = diagnose(measured, model)

@@ -1,6 +1,6 @@
 """Endurance run of the daemon: growth of its processes, cost of its clients, accounting of missed cycles.
 
-    python tools/bench/endurance.py [--minutes 30] [--every SECONDS] [--idle SECONDS] [--json FILE]
+    python tools/bench/endurance.py [--minutes 30]
 
 Runs `hdbridge run --simulate` with all its processes and the recorder; first without clients, then with four
 that poll, five that read live samples, a live page, and one that moves (the story of `clients.py`).
@@ -28,14 +28,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
-from harness import PROFILE, keep, parser
+from harness import PROFILE, parser
 from support.running import Daemon, running
 
 from hdbridge.client import Client
 from hdbridge.daemon.memory import Cell, Memory
 
 CONTROL = "control"
+EVERY_S, IDLE_S = 20.0, 60.0
+"""Time between two looks, and time without clients, s."""
 MACHINE = """schema: hdbridge.machine/1
 name: endurance
 axes: [{profile: article}]
@@ -168,7 +169,7 @@ def turn_us(memory: Memory, pid: int, work: Callable[[], object]) -> float:
     return 1e6 * (Cost.of(pid).cpu_s - before.cpu_s) / (memory.status[Cell.LOOP_COUNT] - turns)
 
 
-def run(minutes: float, every_s: float, idle_s: float) -> tuple[list[Growth], dict[str, Any]]:
+def run(minutes: float) -> tuple[list[Growth], dict[str, Any]]:
     """Runs the processes; returns their growth and the account of cycles."""
     rows: list[dict[str, Cost]] = []
     accounts = Accounts()
@@ -186,7 +187,7 @@ def run(minutes: float, every_s: float, idle_s: float) -> tuple[list[Growth], di
             while (now_s := time.monotonic()) < begin_s + 60.0 * minutes:
                 accounts.take(*reader.read())
                 if now_s >= due_s:
-                    due_s += every_s
+                    due_s += EVERY_S
                     rows.append({name: Cost.of(pid) for name, pid in pids.items()})
                     memories = (f"{name} {cost.rss_kb} kB" for name, cost in rows[-1].items())
                     print(f"{(now_s - begin_s) / 60.0:6.1f} min ", *memories, flush=True)
@@ -194,7 +195,7 @@ def run(minutes: float, every_s: float, idle_s: float) -> tuple[list[Growth], di
                     raise SystemExit(f"a process was started again: {daemon.events[-20:]}")
                 time.sleep(1.0)
 
-        idle_us = turn_us(memory, pids[CONTROL], lambda: time.sleep(idle_s))
+        idle_us = turn_us(memory, pids[CONTROL], lambda: time.sleep(IDLE_S))
         accounts.take(*reader.read())
         seen = stack.enter_context(clients(daemon.socket))
         first_turn, begin_s = memory.status[Cell.LOOP_COUNT], time.monotonic()
@@ -229,14 +230,10 @@ def run(minutes: float, every_s: float, idle_s: float) -> tuple[list[Growth], di
 def main() -> int:
     given = parser(__doc__)
     given.add_argument("--minutes", type=float, default=30.0)
-    given.add_argument("--every", type=float, default=20.0, help="seconds between two looks")
-    given.add_argument("--idle", type=float, default=60.0, help="seconds without clients")
-    options = given.parse_args()
-    growths, found = run(options.minutes, options.every, options.idle)
+    growths, found = run(given.parse_args().minutes)
     print(f"  {'':<34} {'first':>10} {'2nd quarter':>12} {'last quarter':>13}")
     print(*growths, sep="\n")
     print(json.dumps(found, indent=2))
-    keep(found, options.json)
     return int(not found["accounts"]["balanced"] or any(each.grows for each in growths))
 
 

@@ -8,7 +8,6 @@ FLEET is a folder of `hdbridge fleet simulate`, OUT the result of a run over it.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from collections import Counter
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from harness import parser
 from scipy.special import logit
 
 from hdbridge.analysis.findings import Parameter
@@ -174,16 +174,12 @@ def _count(
 
 def main() -> None:
     """Prints the requested figures."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    kinds = parser.add_subparsers(dest="kind", required=True)
-    for name in ("score", "prior"):
-        each = kinds.add_parser(name)
-        each.add_argument("fleet", type=Path)
-        each.add_argument("out", type=Path)
-    kinds.choices["score"].add_argument("--limit", type=float, default=10.0)
-    given = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("kind", choices=("score", "prior"))
+    options.add_argument("fleet", type=Path)
+    options.add_argument("out", type=Path)
+    options.add_argument("--limit", type=float, default=10.0, help="arcsec; of score")
+    given = options.parse_args()
     if given.kind == "score":
         score(given.fleet, given.out, given.limit)
     else:

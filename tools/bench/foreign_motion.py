@@ -19,10 +19,8 @@ evaluates.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -32,10 +30,9 @@ from typing import Any
 
 import numpy as np
 import yaml
-
-sys.path.append(str(Path(__file__).resolve().parents[1]))
 from foreign.bench import foreign_bench
 from foreign.servos import STRUCTURES
+from harness import parser
 from random_axes import calibration, simulated
 from support.raised import ARTICLE, raised_axis
 
@@ -274,12 +271,12 @@ def _spread(values: np.ndarray) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("file", type=Path)
-    parser.add_argument("--kinds", nargs="+", default=[*STRUCTURES, "simulated"])
-    parser.add_argument("--seeds", default="0-4", help="first and last")
-    parser.add_argument("--retuned", action="store_true", help="change the position gain afterwards")
-    given = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("file", type=Path)
+    options.add_argument("--kinds", nargs="+", default=[*STRUCTURES, "simulated"])
+    options.add_argument("--seeds", default="0-4", help="first and last")
+    options.add_argument("--retuned", action="store_true", help="change the position gain afterwards")
+    given = options.parse_args()
     first, last = map(int, given.seeds.split("-"))
     if given.retuned:
         for number in range(first, last + 1):

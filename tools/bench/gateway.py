@@ -1,6 +1,6 @@
 """Stepping test by another master through the gateway, compared with the same test by a client of the daemon.
 
-    python tools/bench/gateway.py [--steps 60] [--outer-ms 4,10] [--faults]
+    python tools/bench/gateway.py [--steps 60] [--faults]
 
 Both step the simulated axis of the article, compensated by its model, in simulated time, from the same seed.
 The master is the PLC-like one of the tests; it sends a jerk-limited path in cyclic synchronous position mode.
@@ -11,16 +11,13 @@ table of faults on the outer bus, with the time to stop.
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
+from harness import parser
 from support.gateway import COUNTS_PER_DEG, GatewayBench, gateway_bench
 from support.gateway_faults import ROWS, measure
 from support.service import play
@@ -124,19 +121,16 @@ def print_faults() -> None:
         print(f"| {row.name} | {codes} | {ms(seen.stands_s)} | {ms(seen.unpowered_s)} |", flush=True)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--steps", type=int, default=60)
-    parser.add_argument("--outer-ms", default="4,10")
-    parser.add_argument("--faults", action="store_true")
-    given = parser.parse_args()
+def main() -> None:
+    options = parser(__doc__)
+    options.add_argument("--steps", type=int, default=60)
+    options.add_argument("--faults", action="store_true")
+    given = options.parse_args()
     if given.faults:
         print_faults()
-        return 0
+        return
     reference = 0.0
-    for outer_ms in (None, *map(float, given.outer_ms.split(","))):
+    for outer_ms in (None, 4.0, 10.0):
         with (
             tempfile.TemporaryDirectory() as folder,
             gateway_bench(Path(folder), 1e-3 * (outer_ms or 4.0)) as bench,
@@ -161,8 +155,7 @@ def main() -> int:
             f"set-point {lag_s / period_s:.2f} inner cycles behind an ideal drive",
             flush=True,
         )
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

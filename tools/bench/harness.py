@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
+import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from hdbridge.errors import SafetyStop
 
-PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
+ROOT = Path(__file__).resolve().parents[2]
+PROFILE = ROOT / "profiles" / "article"
+CHANNEL = "vcan0"
 ATTEMPTS = 20
+sys.path += [str(ROOT / "tests"), str(ROOT / "tools")]  # for the imports after that of this module
 
 
 class Busy(Exception):  # noqa: N818 - what happened
@@ -55,18 +57,11 @@ class Waking:
 def parser(text: str | None, *, blocks: int = 0, cycles: int = 0) -> argparse.ArgumentParser:
     """Returns a parser of the common options; ``blocks`` and ``cycles`` are defaults, 0 omits an option."""
     made = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
-    made.add_argument("--json", type=Path, help="write the figures for machines")
     if blocks:
         made.add_argument("--blocks", type=int, default=blocks, help="blocks per variant")
     if cycles:
         made.add_argument("--cycles", type=int, default=cycles, help="cycles per block, for one axis")
     return made
-
-
-def keep(result: Any, path: Path | None) -> None:
-    """Writes the figures if a file was named."""
-    if path is not None:
-        path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 
 
 def block_us(work: Callable[[], object], cycles: int, timer: Callable[[], float] = time.thread_time) -> float:

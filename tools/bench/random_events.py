@@ -9,7 +9,6 @@ with exit status 1.
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 import tempfile
@@ -18,7 +17,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
+from harness import parser
 from support.disorder import draw, play_story
 from support.slave_events import play_events
 
@@ -36,11 +35,11 @@ def story(stack: str, seed: int) -> Any:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--stack", choices=PER_STORY, default="slave")
-    parser.add_argument("--events", type=int, default=100_000)
-    parser.add_argument("--seed", type=int, default=1)
-    options = parser.parse_args()
+    given = parser(__doc__)
+    given.add_argument("--stack", choices=PER_STORY, default="slave")
+    given.add_argument("--events", type=int, default=100_000)
+    given.add_argument("--seed", type=int, default=1)
+    options = given.parse_args()
     per_story, broken = PER_STORY[options.stack], 0
     total: Counter[str] = Counter()
     stories = math.ceil(options.events / per_story)

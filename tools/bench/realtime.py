@@ -36,7 +36,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ from typing import Any
 import numpy as np
 from cycle import Variants, answering_kernel
 from daemon_loop import bench_cycle, configs_of
-from harness import PROFILE, Waking, keep, parser
+from harness import CHANNEL, PROFILE, Waking, parser
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.buscycle import BusCycle
@@ -107,9 +107,9 @@ def timed(name: str, cycle: Callable[[], object], clock: Waking, cycles: int, pe
     return Figures.of(name, 1e6 * np.array(clock.late_s), 1e6 * np.array(clock.busy_s), 1e6 * period_s)
 
 
-def in_c(master: Path, channel: str, cycles: int, period_s: float) -> Figures:
+def in_c(master: Path, cycles: int, period_s: float) -> Figures:
     """Measures the same exchange in C."""
-    command = [str(master), channel, f"{1e6 * period_s:.0f}", str(cycles)]
+    command = [str(master), CHANNEL, f"{1e6 * period_s:.0f}", str(cycles)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     late_ns, busy_ns = np.array([line.split() for line in done.stdout.splitlines()], dtype=float).T
     return Figures.of("a master in C", 1e-3 * late_ns, 1e-3 * busy_ns, 1e6 * period_s)
@@ -264,13 +264,13 @@ def check(controller: Controller) -> None:
         raise SystemExit(f"{controller.cycle.skipped} periods were skipped")
 
 
-def measured(axes: int, cycle_ms: float, turns: int, channel: str) -> tuple[Figures, dict[str, Any]]:
+def measured(axes: int, cycle_ms: float, turns: int) -> tuple[Figures, dict[str, Any]]:
     """Measures the loop with this number of axes; returns figures and the service's observations."""
     configs = configs_of(axes, cycle_ms)
     model = TransmissionModel.load(PROFILE / "model.yaml")
     clock = Waking()
     with ExitStack() as stack:
-        bus = stack.enter_context(answering_kernel(channel, *range(1, axes + 1)))
+        bus = stack.enter_context(answering_kernel(*range(1, axes + 1)))
         memory = stack.enter_context(Memory.create(axes, configs[0].drive.cycle_s))
         cycle = BusCycle(Link(bus, clock), clock, memory.period_s, bitrate_bps=1_000_000)
         controller = Controller(cycle, [(each, None) for each in configs], memory)
@@ -296,20 +296,20 @@ def measured(axes: int, cycle_ms: float, turns: int, channel: str) -> tuple[Figu
     return figures, seen
 
 
-def of_bench(cycle_ms: float, turns: int, channel: str) -> Figures:
+def of_bench(cycle_ms: float, turns: int) -> Figures:
     """Measures the bench's cycle on the path of a move, alone on the processor."""
     (axis,) = configs_of(1, cycle_ms)
     clock = Waking()
-    with answering_kernel(channel, 1) as bus, prepare_realtime():
+    with answering_kernel(1) as bus, prepare_realtime():
         turn, _ = bench_cycle(bus, TransmissionModel.load(PROFILE / "model.yaml"), axis, clock)
         return timed("bench's cycle, compensated", turn, clock, turns, axis.drive.cycle_s)
 
 
-def of_exchanges(kinds: list[str], master: Path | None, cycles: int, channel: str) -> list[Figures]:
+def of_exchanges(kinds: list[str], master: Path | None, cycles: int) -> list[Figures]:
     """Measures the exchanges of `cycle.py`, and the one in C."""
     (axis,) = configs_of(1, FAST_MS)
     model, clock, figures = TransmissionModel.load(PROFILE / "model.yaml"), Waking(), []
-    with answering_kernel(channel, axis.drive.node_id) as bus:
+    with answering_kernel(axis.drive.node_id) as bus:
         variants = Variants(bus, axis, model, clock)
         for kind in kinds:
             name, loop = EXCHANGES[kind]
@@ -318,13 +318,12 @@ def of_exchanges(kinds: list[str], master: Path | None, cycles: int, channel: st
                 figures.append(timed(name, partial(loop, variants), clock, cycles, variants.period_s))
             print(f"measured: {name}", flush=True)
         if master is not None:
-            figures.append(in_c(master, channel, cycles, variants.period_s))
+            figures.append(in_c(master, cycles, variants.period_s))
     return figures
 
 
 def main() -> int:
     given = parser(__doc__, cycles=20_000)
-    given.add_argument("--channel", default="vcan0")
     given.add_argument("--master", type=Path, help="the compiled master.c")
     given.add_argument(
         "--only", choices=(*EXCHANGES, "bench", *LOOPS), action="append", help="measure these only"
@@ -335,21 +334,18 @@ def main() -> int:
     warnings.simplefilter("ignore")
     if options.serve is not None:
         return serve(options.serve, options.axes)
-    wanted, cycles, channel = options.only or (*EXCHANGES, "bench", *LOOPS), options.cycles, options.channel
-    fast = of_exchanges([each for each in EXCHANGES if each in wanted], options.master, cycles, channel)
+    wanted, cycles = options.only or (*EXCHANGES, "bench", *LOOPS), options.cycles
+    fast = of_exchanges([each for each in EXCHANGES if each in wanted], options.master, cycles)
     if "bench" in wanted:
-        fast.append(of_bench(FAST_MS, cycles, channel))
+        fast.append(of_bench(FAST_MS, cycles))
     print(table(fast, 1e-3 * FAST_MS), flush=True)
-    results = [{**asdict(each), "cycle_ms": FAST_MS} for each in fast]
     for kind, (axes, cycle_ms) in LOOPS.items():
         if kind in wanted:
-            figures, seen = measured(axes, cycle_ms, cycles, channel)
+            figures, seen = measured(axes, cycle_ms, cycles)
             print(table([figures], 1e-3 * cycle_ms), flush=True)
             events = ", ".join(f"{count} {name}" for name, count in sorted(seen["told"].items()))
             print(f"the service saw {seen['samples']} samples and lost none; events: {events}", flush=True)
             print(*seen["refused"], sep="\n")
-            results.append({**asdict(figures), "cycle_ms": cycle_ms, **seen})
-    keep(results, options.json)
     return 0
 
 

@@ -1,8 +1,8 @@
 """Cost of the flight recorder: CPU time per message, fraction of a core, bytes per hour.
 
-    python tools/bench/recorder.py [--axes 1 6] [--seconds 120] [--rate 250] [--json FILE]
+    python tools/bench/recorder.py [--seconds 120]
 
-For each number of axes, a machine in motion is recorded, second by second as in the daemon, onto the disk of
+For one axis and for six, a machine in motion is recorded, second by second as in the daemon, onto the disk of
 the temporary folder. The axes alternately move and rest; angles are whole counts, and the load encoder is
 noisy. CPU time is that of the thread, without that of the disk.
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import keep, parser
+from harness import parser
 
 from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.memory import sample_dtype
@@ -23,27 +23,27 @@ from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.flightlog import Batch, FlightLog
 from hdbridge.daemon.recorder.reading import read
 
-RATIO = 50.0
+RATIO, RATE_HZ = 50.0, 250
 MOTOR_COUNTS, LOAD_COUNTS = 8_000, 2_880_000
 
 
-def at_work(seconds: int, rate: int, axes: int) -> Any:
+def at_work(seconds: int, axes: int) -> Any:
     """Returns samples of axes that alternately move for 2 s and rest for 1 s."""
     random = np.random.default_rng(1)
-    count = seconds * rate
+    count = seconds * RATE_HZ
     samples = np.zeros(count, sample_dtype(axes))
     samples["sequence"] = samples["cycle"] = 1 + np.arange(count)
-    samples["time_ns"] = (1 + np.arange(count)) * (10**9 // rate) + random.integers(-50_000, 50_000, count)
+    samples["time_ns"] = (1 + np.arange(count)) * (10**9 // RATE_HZ) + random.integers(-50_000, 50_000, count)
     samples["late_us"] = random.gamma(2.0, 30.0, count)
     samples["busy_us"] = random.gamma(20.0, 20.0, count)
     samples["bus_load"] = 0.2
-    time_s = np.arange(count) / rate
+    time_s = np.arange(count) / RATE_HZ
     for place in range(axes):
         axis = samples["axes"][:, place]
         phase = (time_s + 0.5 * place) % 3.0
         speed = np.where(phase < 2.0, 10.0 * np.sin(np.pi * phase / 2.0) ** 2, 0.0)
         speed *= np.where((time_s + 0.5 * place) // 3.0 % 2, -1.0, 1.0)
-        target = np.cumsum(speed) / rate
+        target = np.cumsum(speed) / RATE_HZ
         axis["state"], axis["power"], axis["fault"], axis["statusword"] = 3, 4, 255, 0x1237
         axis["mode"] = speed != 0.0
         axis["flags"] = 1 | 2 | 8
@@ -64,36 +64,34 @@ def _counted(angle_deg: Any, counts: int) -> Any:
     return np.round(angle_deg * counts / 360.0) * 360.0 / counts
 
 
-def as_recorded(samples: Any, rate: int, folder: Path) -> tuple[float, int]:
+def as_recorded(samples: Any, folder: Path) -> tuple[float, int]:
     """Returns the recorder's CPU time, s, and the number of bytes written."""
     axes = samples["axes"].shape[1]
-    about = About("bench", 1.0 / rate, tuple(AxisAbout(f"axis{each}", RATIO) for each in range(axes)))
+    about = About("bench", 1.0 / RATE_HZ, tuple(AxisAbout(f"axis{each}", RATIO) for each in range(axes)))
     settings = RecorderSettings(free_mb=0.0, file_s=86_400.0, file_mb=4000.0)
     log = FlightLog(folder, settings, about)
     begun = time.thread_time()
-    batch = max(rate // 50, 1)
-    for first in range(0, len(samples), rate):
-        for at in range(first, first + rate, batch):
-            log.put(Batch(samples[at : at + batch]))
+    for first in range(0, len(samples), RATE_HZ):
+        for at in range(first, first + RATE_HZ, RATE_HZ // 50):
+            log.put(Batch(samples[at : at + RATE_HZ // 50]))
         log.flush()
     log.close()
     taken = time.thread_time() - begun
     return taken, sum(each.stat().st_size for each in folder.iterdir())
 
 
-def measured(axes: int, seconds: int, rate: int) -> dict[str, float]:
+def measured(axes: int, seconds: int) -> dict[str, float]:
     """Returns all figures for a machine with this number of axes."""
-    samples = at_work(seconds, rate, axes)
+    samples = at_work(seconds, axes)
     messages = len(samples) * (1 + axes)
     with tempfile.TemporaryDirectory() as folder:
-        taken_s, size = as_recorded(samples, rate, Path(folder))
+        taken_s, size = as_recorded(samples, Path(folder))
         (path,) = Path(folder).iterdir()
         begun = time.thread_time()
         read(path)
         reading_s = time.thread_time() - begun
     return {
         "axes": axes,
-        "rate_hz": rate,
         "us_per_message": 1e6 * taken_s / messages,
         "percent_of_core": 100.0 * taken_s / seconds,
         "mb_per_hour": 3600.0 * size / seconds / 1e6,
@@ -104,14 +102,10 @@ def measured(axes: int, seconds: int, rate: int) -> dict[str, float]:
 def main() -> None:
     """Measures the recorder for each number of axes and prints the figures."""
     given = parser(__doc__)
-    given.add_argument("--axes", type=int, nargs="+", default=[1, 6])
     given.add_argument("--seconds", type=int, default=120)
-    given.add_argument("--rate", type=int, default=250)
-    options = given.parse_args()
-    results = [measured(axes, options.seconds, options.rate) for axes in options.axes]
-    for each in results:
-        print(", ".join(f"{name} {value:.3g}" for name, value in each.items()))
-    keep(results, options.json)
+    seconds = given.parse_args().seconds
+    for axes in (1, 6):
+        print(", ".join(f"{name} {value:.3g}" for name, value in measured(axes, seconds).items()))
 
 
 if __name__ == "__main__":

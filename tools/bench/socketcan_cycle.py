@@ -1,6 +1,6 @@
 """Punctuality of the control cycle on SocketCAN; master and simulated drive are two processes.
 
-    tools/socketcan.sh .venv/bin/python tools/bench/socketcan_cycle.py [--cycles 5000] [--json FILE]
+    tools/socketcan.sh .venv/bin/python tools/bench/socketcan_cycle.py [--cycles 5000]
 
 First an empty loop with the same number of periods is timed; the periods that it misses are due neither to
 the bus nor to the drive. Then `hdbridge simulate` is started, the drive is booted and enabled over the bus,
@@ -17,9 +17,8 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
-from harness import PROFILE, keep, parser
+from harness import CHANNEL, PROFILE, parser
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
@@ -40,10 +39,10 @@ BOOT_ATTEMPTS = 20
 
 
 @contextmanager
-def simulated_drive(profile: Path, channel: str) -> Iterator[None]:
+def simulated_drive() -> Iterator[None]:
     """Runs `hdbridge simulate` in its own process for the duration of the block."""
-    command = [sys.executable, "-m", "hdbridge", "simulate", str(profile)]
-    process = subprocess.Popen([*command, "--interface", "socketcan", "--channel", channel])
+    command = [sys.executable, "-m", "hdbridge", "simulate", str(PROFILE)]
+    process = subprocess.Popen([*command, "--interface", "socketcan", "--channel", CHANNEL])
     try:
         yield
     finally:
@@ -105,32 +104,29 @@ def measure(drive: Drive, model: TransmissionModel, cycles: int) -> dict[str, ob
 
 def main() -> int:
     given = parser(__doc__)
-    given.add_argument("--channel", default="vcan0")
     given.add_argument("--cycles", type=int, default=5000)
-    given.add_argument("--profile", type=Path, default=PROFILE)
-    options = given.parse_args()
-    axis = AxisConfig.load(options.profile)
-    bus = axis.bus.model_copy(update={"interface": "socketcan", "channel": options.channel})
-    model = TransmissionModel.load(options.profile / "model.yaml")
+    wanted = given.parse_args().cycles
+    axis = AxisConfig.load(PROFILE)
+    bus = axis.bus.model_copy(update={"interface": "socketcan", "channel": CHANNEL})
+    model = TransmissionModel.load(PROFILE / "model.yaml")
     clock = MonotonicClock()
     with prepare_realtime():
-        empty = wake_ups(axis.drive.cycle_s, options.cycles * axis.drive.cycle_s, clock)
+        empty = wake_ups(axis.drive.cycle_s, wanted * axis.drive.cycle_s, clock)
     with (
-        simulated_drive(options.profile, options.channel),
+        simulated_drive(),
         prepare_realtime() as realtime,
         open_bus(bus) as opened,
         Drive(opened, axis, clock) as drive,
     ):
         boot(drive)
-        result = measure(drive, model, options.cycles)
+        result = measure(drive, model, wanted)
     result["conditions"] = str(realtime)
     late = empty.histogram.later_than_us(round(1e6 * LATE * axis.drive.cycle_s))
     result["empty_loop"] = {"begun_late": late, "skipped": empty.skipped, **empty.histogram.as_dict()}
     for name, value in result.items():
         print(f"{name:>26}: {value}")
-    keep(result, options.json)
     good = not result["missed_periods"] and not result["cycles_without_all_tpdos"] and not result["stopped"]
-    return 0 if good and result["cycles"] == options.cycles else 1
+    return 0 if good and result["cycles"] == wanted else 1
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
 import asyncio
 import copy
-from collections.abc import Iterable, Iterator
-from contextlib import AsyncExitStack, suppress
+from collections.abc import AsyncIterator, Iterable, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from itertools import combinations
 from math import comb
 from pathlib import Path
@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 import yaml
-from support.api import served_in_loop
 from support.daemon import stepped_daemon
 from support.service import Service, article_profiles, play
 from support.two_channels import CHANNELS
@@ -19,8 +18,13 @@ from support.two_channels import CHANNELS
 from hdbridge import Client
 from hdbridge.axis import AxisConfig
 from hdbridge.client.sync import Axis
+from hdbridge.daemon.api.guard import Policy
+from hdbridge.daemon.api.metrics import Metrics
+from hdbridge.daemon.api.server import ApiServer, Listener
+from hdbridge.daemon.api.sockets import unix_socket
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.serve import follow
+from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.errors import DaemonError, HdbridgeError, InputError
 from hdbridge.files.yamlfile import document_from_text
 
@@ -136,6 +140,20 @@ def content(machine: Machine) -> str:
     return str((axes, machine.bus, machine.realtime, machine.api, machine.lease_s, machine.recorder))
 
 
+@asynccontextmanager
+async def served(bridge: ServiceBridge, path: Path) -> AsyncIterator[None]:
+    """Serves a real service at a Unix socket, in its own event loop, until the end of the block."""
+    metrics = Metrics(bridge)
+    bridge.core.add_sink(metrics)
+    server = ApiServer(bridge, [Listener(unix_socket(path), Policy())], metrics)
+    serving = asyncio.ensure_future(server.run())
+    try:
+        yield
+    finally:
+        server.stop()
+        await serving
+
+
 def call_everything(machine: Machine, folder: Path) -> list[str]:
     """Makes every client call to the real service; returns complaints about unreadable answers."""
     complaints: list[str] = []
@@ -160,7 +178,7 @@ def call_everything(machine: Machine, folder: Path) -> list[str]:
         async with AsyncExitStack() as stack:
             bridge = await stack.enter_async_context(service.ready(simulated=True))
             follow(bridge, stack)
-            await stack.enter_async_context(served_in_loop(bridge, path))
+            await stack.enter_async_context(served(bridge, path))
             await asyncio.to_thread(program, path)
 
     configs = [each.config for each in machine.axes]

@@ -41,9 +41,7 @@ def test_a_changing_gear_is_followed_within_the_floor(left_alone: list[float]) -
 @pytest.mark.parametrize(
     ("fault", "at_s", "until_s"), [("drift", 30.0, 67.0), ("jump", 30.0, 55.0), ("noise x 10", 45.0, 67.0)]
 )
-def test_a_load_encoder_that_fails_freezes_the_adaptation(
-    fault: str, at_s: float, until_s: float, left_alone: list[float]
-) -> None:
+def test_a_load_encoder_that_fails_freezes_the_adaptation(fault, at_s, until_s, left_alone):
     """Excessive noise counts as a failure only after the normal noise level is known."""
     with at_work(CHANGING, QUICK) as work:
         work.until(at_s)

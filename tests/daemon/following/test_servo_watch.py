@@ -45,9 +45,7 @@ class Seen(NamedTuple):
     state: messages.AdaptationState
 
 
-def seen(
-    profile: Path, mode: AdaptationMode = AdaptationMode.ON, stuck: bool = False, **servo: float
-) -> Seen:
+def seen(profile, mode=AdaptationMode.ON, stuck=False, **servo):
     """Returns verdicts and refinements over moves in both directions, with these servo parameters."""
     axis = AxisConfig.load(profile)
     model = replace(TransmissionModel.load(profile / "model.yaml"), response=measured_response(profile))
@@ -117,9 +115,7 @@ def without_lag(response: Response) -> np.ndarray:
     ("mode", "stuck"),
     [(AdaptationMode.OFF, False), (AdaptationMode.ON, True), (AdaptationMode.OBSERVE, False)],
 )
-def test_refinement_needs_a_trusted_encoder_and_permission(
-    profile: Path, mode: AdaptationMode, stuck: bool
-) -> None:
+def test_refinement_needs_a_trusted_encoder_and_permission(profile, mode, stuck):
     found = seen(profile, mode, stuck, position_gain_per_s=130.0)
     assert Verdict.RETUNED in found.verdicts
     assert not found.responses
@@ -134,9 +130,7 @@ def test_refinement_needs_a_trusted_encoder_and_permission(
     gain=st.floats(0.3, 3.0),
     phase_deg=st.floats(-90.0, 90.0),
 )
-def test_gain_and_phase_changes_are_detected_but_a_pure_delay_is_not(
-    speed: float, later_ms: float, gain: float, phase_deg: float
-) -> None:
+def test_gain_and_phase_changes_are_detected_but_a_pure_delay_is_not(speed, later_ms, gain, phase_deg):
     """The motor follows its set-points with a gain, a phase, and its lag."""
     ratio, orders = 50.0, (2, 4)
     stored = Response(

@@ -118,9 +118,7 @@ def test_full_disk_then_killed_keeper(tmp_path: Path) -> None:
         (("article", "--interface", "socketcan", "--channel", "can99"), 3, "can99"),
     ],
 )
-def test_invalid_arguments_are_refused(
-    tmp_path: Path, arguments: tuple[str, ...], status: int, said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_invalid_arguments_are_refused(tmp_path, arguments, status, said, monkeypatch):
     if status == 2:  # before it begins any process, and so in this one
         for each in ("XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
             monkeypatch.setenv(each, str(tmp_path))

@@ -172,9 +172,7 @@ def test_a_dead_or_hanging_gateway_is_replaced(keeper: Callable[..., Kept]) -> N
 @pytest.mark.parametrize(
     ("number", "how"), [(signal.SIGKILL, "ended by SIGKILL"), (signal.SIGTERM, "exit status 0")]
 )
-def test_a_repeatedly_dying_control_process_ends_the_daemon(
-    keeper: Callable[..., Kept], number: signal.Signals, how: str
-) -> None:
+def test_a_repeatedly_dying_control_process_ends_the_daemon(keeper, number, how):
     """SIGTERM to the control process alone counts as a crash, because only the keeper ends the daemon."""
     kept = keeper()
     kept.until_notified("READY=1")
@@ -189,9 +187,7 @@ def test_a_repeatedly_dying_control_process_ends_the_daemon(
 
 
 @pytest.mark.parametrize(("kind", "status"), [("CONTROL", 3), ("SERVICE", 2), ("SERVICE", 1)])
-def test_a_child_that_cannot_start_ends_the_daemon(
-    keeper: Callable[..., Kept], kind: str, status: int
-) -> None:
+def test_a_child_that_cannot_start_ends_the_daemon(keeper, kind, status):
     kept = keeper(**{f"HDBRIDGE_TEST_{kind}": str(status)})
     assert kept.ended() == status
     assert "ready" not in kept.names()

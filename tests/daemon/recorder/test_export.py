@@ -115,16 +115,6 @@ def test_a_time_span_can_be_chosen(tmp_path):
     assert len(record) == 251
 
 
-@pytest.mark.parametrize(
-    ("axis", "complaint"),
-    [("nose", "no axis 'nose'; expected --axis with one of: demo, tilt"), (None, "which axis?")],
-)
-def test_an_unknown_axis_is_refused(tmp_path, axis, complaint):
-    with pytest.raises(InputError, match="expected --axis") as error:
-        exported(flown(tmp_path, samples(250, axes=2), axes=2), axis)
-    assert complaint in str(error.value)
-
-
 def test_an_export_without_enabled_samples_is_refused(tmp_path):
     made = samples(250)
     made["axes"]["state"] = 1

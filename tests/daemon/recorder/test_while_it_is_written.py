@@ -100,9 +100,7 @@ def test_a_recording_removed_meanwhile_is_omitted(folder: Path, command: tuple[s
 
 
 @pytest.mark.parametrize("moment", [1, 2, 3, 4])
-def test_renaming_during_the_listing_neither_duplicates_nor_drops_recordings(
-    folder: Path, moment: int
-) -> None:
+def test_renaming_during_the_listing_neither_duplicates_nor_drops_recordings(folder, moment):
     looks = 0
 
     def hook(event: str, path: Path) -> None:

@@ -1,6 +1,5 @@
 """Every kind of motion through the daemon leaves the ripple of the filtered correction."""
 
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
@@ -52,12 +51,7 @@ async def coordinated(bridge: ServiceBridge, token: str) -> None:
     await bridge.coordinated(token, {"axis1": FAR_DEG, "axis2": -20.0}, speed=SPEED_DEG_S / 130.0)
 
 
-async def ripple(
-    service: Service,
-    bridge: ServiceBridge,
-    token: str,
-    motion: Callable[[ServiceBridge, str], Awaitable[None]],
-) -> float:
+async def ripple(service, bridge, token, motion):
     reader = service.daemon.memory.reader()
     await motion(bridge, token)
     samples, lost = reader.read()

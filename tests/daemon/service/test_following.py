@@ -65,9 +65,7 @@ async def test_an_unwritable_folder_is_reported_and_the_axis_works(service: Serv
 
 
 @pytest.mark.parametrize("service", [{"axes": 2}], indirect=True)
-async def test_each_axis_is_watched_in_its_own_thread_that_ends(
-    service: Service, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_each_axis_is_watched_in_its_own_thread_that_ends(service, caplog):
     with caplog.at_level(logging.ERROR):
         async with service.enabled() as (bridge, _, token), AsyncExitStack() as stack:
             follow(bridge, stack)

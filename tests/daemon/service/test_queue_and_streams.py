@@ -159,9 +159,7 @@ async def test_a_starved_stream_brakes_and_reports_it(service: Service) -> None:
         ([point(0.0, 0.0, 1.0)], "begin at rest"),
     ],
 )
-async def test_bad_set_points_are_refused_before_anything_moves(
-    service: Service, points: list[StreamPoint], words: str
-) -> None:
+async def test_bad_set_points_are_refused_before_anything_moves(service, points, words):
     async with service.enabled() as (bridge, axis, token):
         await axis.motion.move(token, 0.0)
         stream = await axis.motion.stream(token)

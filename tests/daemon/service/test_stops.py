@@ -1,9 +1,6 @@
 """Every kind of stop: report to clients, and recovery without power unless requested."""
 
-from collections.abc import Callable
-
 import pytest
-from support.daemon import SteppedDaemon
 from support.service import Service, until
 
 from hdbridge.cli.ctl import _event_line as printed
@@ -31,9 +28,7 @@ def said_once(bridge: ServiceBridge, fault: messages.Fault | None, *more: str) -
     ],
     ids=["of the drive", "on the bus"],
 )
-async def test_a_quick_stop_is_latched_until_a_reset(
-    service: Service, spoil: Callable[[SteppedDaemon], None], fault: Fault
-) -> None:
+async def test_a_quick_stop_is_latched_until_a_reset(service, spoil, fault):
     """`daemon.loop.test_reliability` has each fault."""
     async with service.enabled() as (bridge, axis, token):
         await axis.motion.move(token, 100.0, wait=False)
