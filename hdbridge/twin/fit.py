@@ -82,8 +82,8 @@ LATEST_S = 0.1
 
 
 def start_of(truth: Truth, data: Data) -> Truth:
-    """Returns the truth with inertias and friction from the equation of motion, and with command filter and
-    dead time from the lag behind the demand.
+    """Returns the truth with load inertia and friction from the equation of motion, and with command filter
+    and dead time from the lag behind the demand.
 
     If the recording holds its highest torque for some rows, this torque becomes the drive's torque limit.
     """

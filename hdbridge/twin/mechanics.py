@@ -1,4 +1,4 @@
-"""Inertias and friction of an axis, by regression of the measured torque on the measured motion.
+"""Load inertia and friction of an axis, by regression of the measured torque on the measured motion.
 
 The equation of motion holds whatever servo supplies the torque (Swevers, Verdonck and De Schutter, IEEE
 Control Systems 27, 2007):
@@ -7,7 +7,8 @@ Control Systems 27, 2007):
              + (Coulomb friction + rise * exp(-(speed / Stribeck speed)^2)) * sign(speed)
              + viscous friction * speed + constant
 
-Angles and torque pass the same low-pass filter. A fit starts at these values. On nine axes whose servos the
+Angles and torque pass the same low-pass filter. The motor's inertia is only a nuisance, because below the
+load's resonance both shafts accelerate alike. A fit starts at the other values. On nine axes whose servos the
 simulated drive does not have, the load inertia was 1 % low to 15 % high, and the Coulomb friction 1 % low to
 8 % high.
 """
@@ -36,11 +37,11 @@ SLOWEST_RAD_S: Final = 0.3
 """Minimum motor speed over the length of the filter; below it, a sticking motor may carry any torque."""
 SHOWN: Final = 2.0
 """Minimum value that the motion shows, in standard errors."""
-NAMES: Final = "motor inertia", "load inertia", "Coulomb friction", "viscous friction"
+NAMES: Final = "load inertia", "Coulomb friction", "viscous friction"
 
 
 def measured_mechanics(data: Data) -> dict[str, float]:
-    """Returns inertias and friction by parameter name, without those that the motion does not show.
+    """Returns load inertia and friction by parameter name, without those that the motion does not show.
 
     The standard errors are those of independent legs. Held-out legs are not used.
     """
@@ -60,8 +61,8 @@ def measured_mechanics(data: Data) -> dict[str, float]:
 
 
 def _regressors(piece: Piece, data: Data) -> tuple[FloatArray, Mask]:
-    """Returns the terms of the equation of motion as columns, shape (n, 7), torque first; and the mask of the
-    rows in steady motion.
+    """Returns the terms of the equation of motion as columns, shape (n, 7): the torque, those of `NAMES`, and
+    the others; and the mask of the rows in steady motion.
     """
     commands, ratio = piece.commands, data.axis.gear.ratio
     step_s = commands.cycle_s
@@ -77,10 +78,10 @@ def _regressors(piece: Piece, data: Data) -> tuple[FloatArray, Mask]:
     table = np.stack(
         [
             _filtered(torque_nm, width),
-            _acceleration(motor, width, step_s),
             _acceleration(np.radians(piece.measured[LOAD] / ARCSEC_PER_DEG), width, step_s) / ratio,
             way,
             speed,
+            _acceleration(motor, width, step_s),
             np.ones_like(speed),
             way * np.exp(-(near**2)),
         ],
