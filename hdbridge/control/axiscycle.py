@@ -6,8 +6,9 @@ next RPDOs; it neither waits nor sends. An axis is
 * *silent*: it receives no RPDO. TPDOs are accepted when they arrive, and nothing is judged as a fault. This
   is the state before `AxisCycle.begin`, after `AxisCycle.silence`, and after a reaction of `Reaction.LATCH`.
 * *speaking*: it receives an RPDO in every period, its TPDOs are awaited, and every fault is judged.
-* *stopped*: speaking, with a latched quick stop. The quick stop is sent until the motor is at rest, while
-  the other axes continue. After that, or after its time-out, its TPDOs are no longer awaited.
+* *stopped*: speaking, with a quick stop that a fault or `AxisCycle.quick_stop` has latched. The quick stop is
+  sent until the motor is at rest, while the other axes continue. After that, or after its time-out, its TPDOs
+  are no longer awaited.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from hdbridge.drive.link import Frame, new_tuple
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.pdo import PdoLengthError
 from hdbridge.drive.plausibility import Plausibility
+from hdbridge.drive.standstill import Standstill
 from hdbridge.drive.states import FAULTS, State
 from hdbridge.drive.supervision import ROWS, Event, Fault, Reaction, Supervision
 from hdbridge.drive.traffic import Traffic
@@ -36,8 +38,6 @@ OBEY_S: Final = 0.25
 """Maximum time from the command of a quick stop until the drive leaves 'operation enabled'.
 
 A drive that takes longer loses its voltage."""
-STILL_CYCLES: Final = 3
-"""Number of cycles without motion after which a quick stop counts as completed."""
 _ENABLED: Final = State.OPERATION_ENABLED
 _POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 _NOT_STOPPED: Final = (State.OPERATION_ENABLED, State.UNKNOWN)
@@ -104,13 +104,16 @@ class AxisCycle:
         self._last: Feedback | None = None
         self._good_cycle = 0
         self._commanded = False
-        self._handled_stop: Event | None = None
-        self._left = self._still = 0
+        self._ordered = False
+        """True from `quick_stop` until `begin`."""
+        self._handled_stop: Event | bool = False
+        self._standstill = Standstill(axis)
+        self._left = 0
         self._disobeyed = False
         """True if the drive was still in 'operation enabled' `OBEY_S` after the command."""
         braking_s = axis.limits.velocity_deg_s / axis.limits.acceleration_deg_s2
         timeout_s = max(stop_timeout_s, 2.0 * braking_s)
-        self._stop_cycles = max(int(timeout_s / axis.drive.cycle_s), STILL_CYCLES + 1)
+        self._stop_cycles = int(timeout_s / axis.drive.cycle_s)
         self._obey_cycles = int(OBEY_S / axis.drive.cycle_s)
 
     def begin(self) -> None:
@@ -122,6 +125,7 @@ class AxisCycle:
         """
         self.flushing = True
         self.pending.clear()
+        self._ordered = False
         self.silent = self.supervision.reaction is Reaction.LATCH
         prepared = self.image.power.aim is _ENABLED
         self._last = self._feedback(self.feedback.cycle, self.feedback.time_s, True) if prepared else None
@@ -136,35 +140,44 @@ class AxisCycle:
         self._commanded = False
         self.changed()
 
+    def quick_stop(self) -> None:
+        """Latches a quick stop by command, which is watched like that of a fault; `begin` releases it."""
+        self._ordered = True
+        self.image.power.quick_stop()
+
+    @property
+    def _stop(self) -> Event | bool:
+        """Latched stop, by a fault or by command (True); False while the axis may run."""
+        return self.supervision.stop or self._ordered
+
     @property
     def stopping(self) -> bool:
         """True while a quick stop is under way: neither confirmed by the drive nor timed out."""
-        stop = self.supervision.stop
-        if stop is None or self.supervision.reaction is Reaction.LATCH:
+        if self.silent or not self._stop:
             return False
-        return stop is not self._handled_stop or not self._over()
+        return self._stop is not self._handled_stop or not self._over()
 
     @property
     def confirmed(self) -> bool:
         """True if, after a quick stop, the drive has left 'operation enabled' and the motor stood still."""
-        stop = self.supervision.stop
-        return stop is not None and stop is self._handled_stop and self._still >= STILL_CYCLES
+        return bool(self._stop) and self._stop is self._handled_stop and self._standstill.reached
+
+    @property
+    def outcome(self) -> str:
+        """What a completed quick stop has shown of the drive, to be appended to its reason; usually empty."""
+        if self.silent or self.stopping:
+            return ""
+        if not self.confirmed:
+            return "; the drive did not confirm it: its own watchdogs have to stop it"
+        return "; the drive did not obey it, so its voltage was disabled" * self._disobeyed
 
     @property
     def stopped(self) -> SafetyStop | None:
-        """Latched stop as an error, complete once `stopping` is over; None while the axis may run."""
-        supervision = self.supervision
-        if supervision.stop is None:
+        """Stop by a fault as an error, complete once `stopping` is over; None while the axis may run."""
+        if self.supervision.stop is None:
             return None
-        stop = supervision.error()
-        if supervision.reaction is not Reaction.QUICK_STOP or self.stopping:
-            return stop
-        if self.confirmed:
-            disobeyed = "; the drive did not obey it, so its voltage was disabled" * self._disobeyed
-            return SafetyStop(f"{stop.text}{disobeyed}", stop.hint)
-        return SafetyStop(
-            f"{stop.text}; the drive did not confirm it: its own watchdogs have to stop it", stop.hint
-        )
+        stop = self.supervision.error()
+        return SafetyStop(f"{stop.text}{self.outcome}", stop.hint)
 
     # ---------------------------------------------------------------- for the bus
 
@@ -178,7 +191,7 @@ class AxisCycle:
 
         Also decides whether the following cycles wait for them.
         """
-        self.awaited = not self.silent and (self.supervision.stop is None or self.stopping)
+        self.awaited = not self.silent and (not self._stop or self.stopping)
         self._awaited_channels = self.image.awaited_channels()
         return self.image.tpdo_ids, tuple(self._awaited_channels)
 
@@ -236,7 +249,7 @@ class AxisCycle:
         """
         image, supervision = self.image, self.supervision
         self.last_sent_s = now
-        stop = supervision.stop
+        stop = supervision.stop or self._ordered
         if stop is not self._handled_stop:
             self._note(stop)
         if self._channels:
@@ -245,20 +258,19 @@ class AxisCycle:
         enabled = power.state is _ENABLED
         if complete and self._last is not None and (enabled or power.aim is _ENABLED):
             complete = self._believable(self._last, count, enabled=enabled)
-        before = self.feedback
         if complete:
             self.feedback = feedback = self._last = self._feedback(count, time_s, True)
             self._good_cycle = count
         else:
             feedback = self.stale(count, time_s)
-        if power.dropped is not None and stop is None:
+        if power.dropped is not None and not stop:
             self._fell_out()
-        if now - self._traffic.heard_s > image.heartbeat_timeout_s and (stop is None or not self._over()):
+        if now - self._traffic.heard_s > image.heartbeat_timeout_s and not (stop and self._over()):
             silent_ms = 1e3 * (now - self._traffic.heard_s)
             self.pending.append((Fault.HEARTBEAT_LOST, f"for {silent_ms:.0f} ms"))
 
         data = None
-        if enabled and stop is None:
+        if enabled and not stop:
             try:
                 command = self.command
                 target = command(feedback) if callable(command) else command
@@ -266,8 +278,8 @@ class AxisCycle:
             except self._refused as error:
                 what = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
                 self.pending.append((Fault.BAD_TARGET, what))
-        if self.pending or not supervision.quiet:
-            return self._react(count, data, before)
+        if self.pending or stop or not supervision.quiet:
+            return self._react(count, data, bool(stop))
         if data is None:
             data = self._idle()
         self._commanded = enabled and power.aim is _ENABLED
@@ -313,18 +325,16 @@ class AxisCycle:
             image.demand_counts, image.torque_permille, fresh, image.readings,
         ))  # fmt: skip
 
-    def _react(self, count: int, data: Frames | None, before: Feedback) -> Frames | None:
+    def _react(self, count: int, data: Frames | None, stopping: bool) -> Frames | None:
         """Completes a cycle with a new fault, with a fault in the cycle before, or with a latched stop."""
-        power, stop = self.image.power, self.supervision.stop
-        reaction = self._judge(count)
-        if reaction is Reaction.QUICK_STOP:
-            data = None
-        if stop is not None:
-            self._count_stop_cycle(before)
-        if reaction is Reaction.QUICK_STOP:
-            self._stop_drive()
-        if reaction is Reaction.LATCH:
+        power = self.image.power
+        if self._judge(count) is Reaction.LATCH:
             return self.image.pack_rpdo_stop() if self._drive_runs else None
+        if stopping:
+            self._count_stop_cycle()
+        if self._stop:
+            data = None
+            self._stop_drive()
         self._commanded = power.state is State.OPERATION_ENABLED and power.aim is State.OPERATION_ENABLED
         return data if data is not None else self._idle()
 
@@ -393,25 +403,25 @@ class AxisCycle:
 
     def _over(self) -> bool:
         """Returns True if the latched quick stop is confirmed or timed out."""
-        return self._still >= STILL_CYCLES or self._left == 0
+        return self._standstill.reached or self._left == 0
 
-    def _note(self, stop: Event | None) -> None:
-        """Handles a stop that was latched or released since the last cycle; a latched stop starts braking."""
+    def _note(self, stop: Event | bool) -> None:
+        """Handles a stop that was latched or released since the last cycle."""
         self._handled_stop = stop
-        self._still, self._left, self._disobeyed = 0, self._stop_cycles, False
-        if stop is not None:
-            self.image.power.quick_stop()
+        self._standstill.restart()
+        self._left, self._disobeyed = self._stop_cycles, False
         self.changed()
 
-    def _count_stop_cycle(self, before: Feedback) -> None:
+    def _count_stop_cycle(self) -> None:
         """Counts one cycle of the quick stop."""
         if self._over():
             return
         feedback = self.feedback
         self._left -= 1
-        halted = feedback.fresh and self.image.power.state not in _STILL_DRIVEN
-        kept = halted and abs(feedback.motor_counts - before.motor_counts) <= 1
-        self._still = self._still + 1 if kept else 0
+        if feedback.fresh and self.image.power.state not in _STILL_DRIVEN:
+            self._standstill.take(feedback.motor_counts, feedback.time_s)
+        else:
+            self._standstill.restart()
         waited = self._stop_cycles - self._left
         if feedback.fresh and waited >= self._obey_cycles and self.image.power.state in _NOT_STOPPED:
             self._disobeyed = True

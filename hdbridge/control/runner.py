@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Final
 
-from hdbridge.control.axiscycle import STILL_CYCLES
 from hdbridge.control.cycle import Command, Cycle
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.feedback import ENABLE_TIMEOUT_S, STOP_TIMEOUT_S, Feedback
 from hdbridge.drive.link import Link
-from hdbridge.drive.states import State
+from hdbridge.drive.standstill import Standstill
+from hdbridge.drive.states import OFF, State
 from hdbridge.drive.supervision import Supervision
 from hdbridge.errors import HdbridgeError, TransitionError
-
-_STANDING: Final = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON, State.FAULT)
 
 
 class AxisRunner:
@@ -55,7 +52,7 @@ class AxisRunner:
             yield self._until_enabled()
             if self._running:
                 self.image.power.go(State.SWITCH_ON_DISABLED)
-                self._until_standstill()
+                self._until_off()
         except BaseException:
             with suppress(HdbridgeError):
                 self.brake()
@@ -81,8 +78,11 @@ class AxisRunner:
 
     def stop(self) -> list[Feedback]:
         """Quick-stops the axis and runs cycles until the motor is at rest; returns their feedback."""
-        self.image.power.quick_stop()
-        return self._until_standstill()
+        axis, seen = self.cycle.axes[0], list[Feedback]()
+        axis.quick_stop()
+        while axis.stopping:
+            seen.append(self.cycle.tick())
+        return seen
 
     @property
     def _running(self) -> bool:
@@ -100,15 +100,10 @@ class AxisRunner:
             f"'{self.image.power.state.value}'; look at its enable input, its supply and its fault history"
         )
 
-    def _until_standstill(self) -> list[Feedback]:
-        """Runs cycles until the motor rests with power off or in quick stop, or until the time-out."""
-        seen: list[Feedback] = []
-        still = 0
+    def _until_off(self) -> None:
+        """Runs cycles until the motor stands still without power, or until the time-out."""
+        standstill = Standstill(self.axis)
         for _ in range(math.ceil(STOP_TIMEOUT_S / self.cycle.period_s)):
-            before = self.image.motor_counts
-            seen.append(self.cycle.tick())
-            rests = self.image.power.state in _STANDING and abs(self.image.motor_counts - before) <= 1
-            still = still + 1 if rests else 0
-            if still >= STILL_CYCLES:
+            feedback = self.cycle.tick()
+            if standstill.take(feedback.motor_counts, feedback.time_s) and self.image.power.state in OFF:
                 break
-        return seen

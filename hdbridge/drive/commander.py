@@ -17,6 +17,7 @@ from hdbridge.drive.link import Link
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.sdo import SdoClient
+from hdbridge.drive.standstill import STANDSTILL_S, Standstill
 from hdbridge.drive.states import FAULTS, Command, State, controlword_for, decode, states_on_the_way
 from hdbridge.errors import RESET, DriveError, TransitionError
 
@@ -24,8 +25,6 @@ STEP_TIMEOUT_S: Final = 1.0
 """Maximum duration of one state transition or change of mode; s."""
 BRAKE_TIMEOUT_S: Final = 3.0
 POLL_S: Final = 0.005
-_STILL_COUNTS: Final = 2
-_STILL_POLL_S: Final = 0.02
 _MAY_BE_ENABLED: Final = (State.SWITCHED_ON, State.OPERATION_ENABLED)
 
 
@@ -169,19 +168,14 @@ class Commander:
         return actual
 
     def wait_for_standstill(self) -> bool:
-        """Waits until two readings of the position, 20 ms apart, differ by at most two counts.
-
-        Returns False on time-out.
-        """
+        """Waits until the motor stands still; returns False on time-out."""
         deadline_s = self.link.now() + BRAKE_TIMEOUT_S
-        last = self.sdo.fetch(objects.POSITION_ACTUAL)
-        while self.link.now() < deadline_s:
-            self.pause(_STILL_POLL_S)
-            position = self.sdo.fetch(objects.POSITION_ACTUAL)
-            if abs(wrap_int32(position - last)) <= _STILL_COUNTS:
-                return True
-            last = position
-        return False
+        standstill = Standstill(self.axis)
+        while not standstill.take(self.sdo.fetch(objects.POSITION_ACTUAL), self.link.now()):
+            if self.link.now() >= deadline_s:
+                return False
+            self.pause(STANDSTILL_S)
+        return True
 
     def quick_stop(self) -> State:
         """Commands a quick stop and waits until the drive reacts; returns the resulting state."""

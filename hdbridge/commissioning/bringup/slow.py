@@ -28,6 +28,7 @@ from hdbridge.drive.feedback import STOP_TIMEOUT_S, Feedback
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.monitor import Emergency
 from hdbridge.drive.objects import COB_EMCY
+from hdbridge.drive.standstill import Standstill
 from hdbridge.drive.states import FAULTS, State, decode
 from hdbridge.drive.supervision import Event
 from hdbridge.errors import SafetyStop
@@ -267,16 +268,20 @@ class SlowAxis(AxisRunner):
     ) -> Silence:
         """Waits for standstill, and reads the position by SDO, because the drive may no longer send PDOs."""
         sdo, clock = self._drive.sdo, self.link.clock
-        last = sdo.fetch(objects.POSITION_ACTUAL)
-        stands = False
+        standstill = Standstill(self.axis)
         end_s = clock.now() + STOP_TIMEOUT_S
-        while not stands and clock.now() < end_s:
+        while True:
+            last = sdo.fetch(objects.POSITION_ACTUAL)
+            if standstill.take(last, clock.now()) or clock.now() >= end_s:
+                break
             pause(0.05)
-            position = sdo.fetch(objects.POSITION_ACTUAL)
-            stands, last = abs(wrap_int32(position - last)) <= 2, position
         way = wrap_int32(last - wrap_int32(start_counts))
         return Silence(
-            noticed_s, event, sdo.fetch(objects.STATUSWORD), stands, abs(self.axis.motor_encoder.degrees(way))
+            noticed_s,
+            event,
+            sdo.fetch(objects.STATUSWORD),
+            standstill.reached,
+            abs(self.axis.motor_encoder.degrees(way)),
         )
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Final
 
 from hdbridge.axis import AxisConfig
-from hdbridge.control.axiscycle import STILL_CYCLES, AxisCycle
+from hdbridge.control.axiscycle import AxisCycle
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Report
 from hdbridge.daemon.loop.feeds import KnotFeed, OuterFeed
 from hdbridge.daemon.loop.follower import Follower
@@ -92,8 +92,6 @@ class AxisLoop:
         """Reason for stopping, if the supervision did not report one."""
         self.stop_reported = True
         """True if the axis is at rest and its stop was reported; False only in QUICK_STOPPED and LATCHED."""
-        self._last_counts = self._still_turns = 0
-        """Motor counts in the last cycle of a stop, and the number of consecutive cycles at standstill."""
         self._handlers: dict[CommandKind, Callable[[Command], None]] = {
             CommandKind.VERIFIED: self._verified,
             CommandKind.RELEASE: self._silence,
@@ -175,10 +173,8 @@ class AxisLoop:
         if state not in MAY_MOVE:
             self._end_motion()
         if state in STOPPED:
-            self.image.power.quick_stop()  # overrides any power target: only ENABLE leads back to power
+            self.cycle.quick_stop()
             self.stop_reported = False
-            self._still_turns = 0
-            self._turns_left = self._turns(STOP_TIMEOUT_S)
         self._report(EventKind.STATE, 0, state)
         for kind, (during, done) in _MULTI_TURN_COMMANDS.items():
             if state is done:
@@ -254,9 +250,7 @@ class AxisLoop:
         if self.state in (*MAY_MOVE, AxisState.LENT):
             self._why = "quick stop by command: latched"
         if self.state is AxisState.LENT:
-            # The next RPDO overrides the controlword that the service sends by SDO.
-            self.image.power.quick_stop()
-            self.cycle.begin()
+            self.cycle.begin()  # the next RPDO overrides the controlword that the service sends by SDO
 
     def _reset(self, command: Command) -> None:
         quick_stopped = self.state is AxisState.QUICK_STOPPED
@@ -419,32 +413,15 @@ class AxisLoop:
 
     def _after_stop(self) -> None:
         """Reports a stop once the axis is at rest or the time-out has passed."""
-        if self.supervision.stop is None and self.state is AxisState.QUICK_STOPPED:
-            if not self._quick_stop_over():
-                return
-        elif self.cycle.stopping:
+        if self.cycle.stopping:
             return
         self.stop_reported = True
         stop = self.supervision.stop
         code = FAULT_INDEX[stop.fault] if stop is not None else NO_FAULT
         error = self.cycle.stopped
         explained = error is not None and error.hint == EXPLAINED_HINT
-        text = error.text if error is not None else self._why
+        text = error.text if error is not None else f"{self._why}{self.cycle.outcome}"
         self._report(EventKind.STOPPED, int(explained), code, text)
-
-    def _quick_stop_over(self) -> bool:
-        """Returns True if a commanded quick stop is over: the motor is at rest or the time-out has passed."""
-        counts, before = self.cycle.feedback.motor_counts, self._last_counts
-        self._last_counts = counts
-        driven = self.image.power.state is State.OPERATION_ENABLED
-        self._still_turns = self._still_turns + 1 if not driven and abs(counts - before) <= 1 else 0
-        self._turns_left -= 1
-        if self._turns_left > 0:
-            return self._still_turns >= STILL_CYCLES
-        if driven:
-            self._why += "; the drive did not obey it, so its voltage is disabled"
-            self.image.power.power_off()
-        return True
 
     # ---------------------------------------------------------------- the sample of a cycle
 

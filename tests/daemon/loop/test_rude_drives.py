@@ -45,21 +45,53 @@ def moving() -> Iterator[tuple[SteppedDaemon, RudeDrive]]:
         yield daemon, node
 
 
+def stop(daemon: SteppedDaemon, *, by_command: bool) -> None:
+    """Quick-stops the axis by command, or by a fault of the bus."""
+    if by_command:
+        daemon.post(CommandKind.QUICK_STOP)
+    else:
+        daemon.interfere(0x080)
+
+
 @pytest.mark.parametrize("coasts", [False, True])
 @pytest.mark.parametrize("by_command", [False, True])
 def test_a_drive_that_ignores_a_quick_stop_loses_its_voltage(coasts: bool, by_command: bool) -> None:
     with moving() as (daemon, node):
         node.ways.ignores_quick_stop, node.ways.coasts = True, coasts
-        if by_command:
-            daemon.post(CommandKind.QUICK_STOP)
-        else:
-            daemon.interfere(0x080)
-        daemon.run(0.4 if coasts or not by_command else 2.1)
+        stop(daemon, by_command=by_command)
+        daemon.run(0.4)
         assert node.state == OFF
         daemon.until(lambda: bool(daemon.reported(EventKind.STOPPED)))
         (stopped,) = daemon.reported(EventKind.STOPPED)
         assert "did not obey it" in stopped.text
         assert daemon.states == [AxisState.QUICK_STOPPED]
+
+
+@pytest.mark.parametrize("by_command", [False, True])
+def test_a_quick_stop_that_a_drive_never_reports_is_not_confirmed(by_command: bool) -> None:
+    with moving() as (daemon, node):
+        node.ways.words.extend([0x1237] * 1000)
+        stop(daemon, by_command=by_command)
+        daemon.until(lambda: bool(daemon.reported(EventKind.STOPPED)))
+        (stopped,) = daemon.reported(EventKind.STOPPED)
+        assert "did not confirm it" in stopped.text
+        assert node.state == OFF
+
+
+@pytest.mark.parametrize("by_command", [False, True])
+def test_the_noise_of_a_fine_encoder_is_not_motion(by_command: bool) -> None:
+    axis = article_axis(1)
+    fine = axis.motor_encoder.model_copy(update={"counts_per_turn": 1 << 24})
+    with stepped_daemon([axis.model_copy(update={"motor_encoder": fine})], character=RUDE) as daemon:
+        (node,) = daemon.nodes
+        assert isinstance(node, RudeDrive)
+        daemon.verify()
+        daemon.enable()
+        node.ways.jumps.extend([0, 8] * 1000)
+        stop(daemon, by_command=by_command)
+        daemon.run(0.2)
+        (stopped,) = daemon.reported(EventKind.STOPPED)
+        assert "did not" not in stopped.text
 
 
 @settings(max_examples=12, phases=[Phase.generate])
@@ -86,9 +118,9 @@ def test_a_fault_while_enabling_is_left_only_by_a_reset(turns: int, heals: bool)
         daemon.run(0.5)
         assert node.powered == powered
         assert daemon.states == [AxisState.QUICK_STOPPED]
-        stop = daemon.axes[0].supervision.stop
-        assert stop is not None
-        assert stop.fault is Fault.DRIVE_FAULT
+        fault = daemon.axes[0].supervision.stop
+        assert fault is not None
+        assert fault.fault is Fault.DRIVE_FAULT
 
 
 @settings(max_examples=12, phases=[Phase.generate])
