@@ -16,6 +16,7 @@ from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
 from hdbridge.drive.image import HALT_BIT, ProcessImage
 from hdbridge.drive.objects import Address
 from hdbridge.drive.sdo import ABSENT, SdoAbortError, SdoClient
+from hdbridge.drive.standstill import noise_counts
 from hdbridge.drive.states import HOLD, State, decode
 from hdbridge.drive.writes import motor_rate
 from hdbridge.errors import DriveError, HdbridgeError, InputError
@@ -32,7 +33,9 @@ FAILED: Final = 0x2000
 HOMED: Final = ACKNOWLEDGED | TARGET_REACHED
 STALE_READINGS: Final = 50
 """Number of statusword readings, at least `POLL_S` apart, after which a drive has cleared the bits of an
-earlier action."""
+earlier action, unless the new one has ended at once."""
+AT_PLACE: Final = frozenset({35, 37})
+"""Homing methods that take the current position as home, without motion."""
 TOWARDS_SWITCH: Final = 0.1
 """Default speed of a homing run towards the switch, as a fraction of the axis's velocity limit."""
 TOWARDS_ZERO: Final = 0.02
@@ -151,7 +154,8 @@ def run_move(commander: Commander, move: ProfileMove) -> None:
         commander.control(ENABLED | CHANGE_AT_ONCE)
         _wait(commander, doing, "room for the next set-point", _has_room, STEP_TIMEOUT_S)
         what = f"arrival at {move.load_deg:g} deg"
-        if _end(commander, doing, what, before, TARGET_REACHED, timeout_s) & FAILED:
+        place = target_counts, abs(axis.motor_encoder.counts(axis.drive.following_error_deg))
+        if _end(commander, doing, what, before, TARGET_REACHED, timeout_s, place) & FAILED:
             raise DriveError(
                 f"{commander.name}: following error moving to {move.load_deg:g} deg; check that the axis "
                 "moves freely, or lower the acceleration"
@@ -175,7 +179,9 @@ def run_homing(commander: Commander, homing: Homing) -> None:
         before = commander.statusword()
         commander.control(ENABLED | START_HOMING)
         doing = f"homing by method {homing.method}"
-        word = _end(commander, doing, f"the end of {doing}", before, HOMED, homing.timeout_s)
+        offset = values[objects.HOME_OFFSET], noise_counts(commander.axis)
+        place = offset if homing.method in AT_PLACE else None
+        word = _end(commander, doing, f"the end of {doing}", before, HOMED, homing.timeout_s, place)
         if word & FAILED:
             raise DriveError(
                 f"{commander.name}: {doing} failed (statusword {word:04X}h); check the home and limit "
@@ -214,21 +220,36 @@ def _wait(commander: Commander, doing: str, what: str, done: Callable[[int], boo
     return word
 
 
-def _end(commander: Commander, doing: str, what: str, before: int, bits: int, timeout_s: float) -> int:
+def _end(
+    commander: Commander,
+    doing: str,
+    what: str,
+    before: int,
+    bits: int,
+    timeout_s: float,
+    place: tuple[int, float] | None,
+) -> int:
     """Waits for the end of an action: all of ``bits`` set, or `FAILED`.
 
     ``before`` is the statusword before the action was started. If it shows the end of an earlier action, the
     drive must clear those bits first. Some drives take 50 ms for this, and an action that ends at once never
-    shows cleared bits. After `STALE_READINGS` readings, bits that are still set therefore end the wait.
+    shows cleared bits. After `STALE_READINGS` readings, bits that are still set therefore end the wait if
+    they report a failure, or if the motor is at the ``place`` where the action ends (counts and tolerance;
+    None if it is not known). Raises `TransitionError` if the drive does not show the start otherwise.
     """
 
     def over(word: int) -> bool:
         return word & bits == bits or bool(word & FAILED)
 
+    def ended_at_once(word: int) -> bool:
+        if word & FAILED or place is None:
+            return bool(word & FAILED)
+        return abs(commander.sdo.fetch(objects.POSITION_ACTUAL) - place[0]) <= place[1]
+
     if over(before):
         readings = count(1)
-        cleared = lambda word: not over(word) or next(readings) >= STALE_READINGS  # noqa: E731
-        _wait(commander, doing, f"the start of {doing}", cleared, timeout_s)
+        begun = lambda word: not over(word) or (next(readings) >= STALE_READINGS and ended_at_once(word))  # noqa: E731
+        _wait(commander, doing, f"the start of {doing} in the statusword", begun, STEP_TIMEOUT_S)
     return _wait(commander, doing, what, over, timeout_s)
 
 

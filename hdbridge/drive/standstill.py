@@ -13,12 +13,18 @@ _NOISE_COUNTS: Final = 2
 _ROUNDING_S: Final = 1e-6
 
 
+def noise_counts(axis: AxisConfig) -> float:
+    """Returns the largest movement of the motor encoder at standstill; counts."""
+    return max(
+        abs(axis.motor_encoder.counts(_NOISE_ARCSEC / ARCSEC_PER_DEG * axis.gear.ratio)), _NOISE_COUNTS
+    )
+
+
 class Standstill:
     """Follows the readings of one motor encoder; the first reading begins a new wait."""
 
     def __init__(self, axis: AxisConfig) -> None:
-        noise = abs(axis.motor_encoder.counts(_NOISE_ARCSEC / ARCSEC_PER_DEG * axis.gear.ratio))
-        self._noise_counts = max(noise, _NOISE_COUNTS)
+        self._noise_counts = noise_counts(axis)
         self.restart()
 
     def restart(self) -> None:

@@ -65,6 +65,21 @@ def test_enable_operation_is_not_sent_to_a_drive_that_stopped_by_itself() -> Non
         assert node.powered == 1
 
 
+@pytest.mark.parametrize(
+    ("method", "counts", "starts"), [(34, 0, False), (35, 5000, False), (35, 0, True), (37, 0, True)]
+)
+def test_homing_is_over_only_if_the_drive_shows_its_start(method: int, counts: int, starts: bool) -> None:
+    """Statusword bits 10 and 12 are always set."""
+    with booted() as (drive, node):
+        node.ways.reached, node.motor_counts = 0x1400, counts
+        if starts:
+            assert drive.home(method).motor_counts == 0
+        else:
+            with pytest.raises(TransitionError, match="the start of homing by method"):
+                drive.home(method)
+            assert node.state != ENABLED
+
+
 def test_a_drive_that_is_not_enabled_in_time_has_no_power_on_the_bench() -> None:
     with booted(ignores_enable=True) as (drive, node):
         bench = Bench(drive)

@@ -13,7 +13,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.device.behaviour import Behaviour
 from hdbridge.device.node import DriveNode
 from hdbridge.drive import Drive, Mode, State
-from hdbridge.errors import DriveError
+from hdbridge.errors import DriveError, TransitionError
 from hdbridge.sim.truth import Truth
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
@@ -69,6 +69,15 @@ def test_a_move_ends_only_on_arrival(delay_ms: float, places_deg: list[float]) -
     with drive_that_shows_late(delay_ms) as (drive, _):
         for place_deg in (*places_deg, places_deg[-1]):
             assert drive.move_to(place_deg).motor_deg == pytest.approx(50.0 * place_deg, abs=0.1)
+
+
+def test_a_drive_that_has_always_reached_its_target_has_not_arrived() -> None:
+    with drive_that_shows_late(0.0) as (drive, node):
+        node.dictionary[0x6041, 0].bind(lambda: node.firmware.statusword() | 0x0400)
+        assert drive.move_to(0.0).motor_counts == pytest.approx(0, abs=2)
+        with pytest.raises(TransitionError, match="the start of moving to 30 deg"):
+            drive.move_to(30.0)
+        assert drive.state() is not State.OPERATION_ENABLED
 
 
 @pytest.mark.parametrize("delay_ms", DELAYS_MS)
