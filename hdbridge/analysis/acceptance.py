@@ -58,7 +58,7 @@ def robust_chi_square(
     shape = [i for i in own if fitted.parameters[i].shape and not free]
     effect = fitted.hypothesis.effects[place]
     asked = evident(effect) if only is None else [only]
-    kept = np.setdiff1d(np.arange(len(fitted.parameters)), shape)
+    kept = np.setdiff1d(np.arange(fitted.count()), shape)
     coefficients = effect.coefficients()[asked]
     own = np.searchsorted(kept, [i for i in own if not fitted.parameters[i].shape])[asked].tolist()
     columns = fitted.tangent[:, kept]
@@ -138,7 +138,7 @@ def gate_of_change(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gat
     fit = Linearised(columns, without.residual, known)
     turns = estimator.turn_discrepancy(without.hypothesis.effects, without.hypothesis.start)
     laws = np.hstack([law_discrepancies(estimator, without.hypothesis), turns])
-    robust = block_robust(estimator, fit, [len(without.parameters)], np.zeros(1), laws=laws)
+    robust = block_robust(estimator, fit, [without.count()], np.zeros(1), laws=laws)
     needed = estimator.scales.robust
     return Gate(robust, needed, "may be errors of the turning points" if robust < needed else "")
 
@@ -177,7 +177,7 @@ def _changes(estimator: Estimator, fitted: Fitted, place: int) -> bool:
             return False
         refitted = [i for i in own if i == own[number] or fitted.parameters[i].shape]
         columns = np.hstack([fitted.tangent[:, own[[number]]], estimator.weighted(changing[estimator.index])])
-        others = np.setdiff1d(np.arange(len(fitted.parameters)), refitted)
+        others = np.setdiff1d(np.arange(fitted.count()), refitted)
         gram, moment = fitted.linearised.of(others).left(columns)
         step = np.linalg.lstsq(gram, moment, rcond=1e-10)[0]
         along = float(effect.coefficients()[number]) + np.cumsum(step)

@@ -220,7 +220,7 @@ def _freed(
 ) -> _Change | None:
     """Returns a change of any other part if the fit has freed it from its calibration (`calibrated`)."""
     estimator, own = search.estimator, precise.places(place)
-    if not len(own) or np.all(precise.linearised.known[own, 0] != 0.0):
+    if not len(own) or np.all(precise.information[own] != 0.0):
         return None
     change = _change(estimator, precise, place, given)
     peak = 0.5 * float(np.ptp(change))

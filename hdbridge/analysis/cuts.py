@@ -10,12 +10,16 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from hdbridge.analysis.readings import coarse, spread
-from hdbridge.axis.effects import BoolArray, FloatArray, IntArray
+from hdbridge.axis.effects import FloatArray
 from hdbridge.records.record import Record
 from hdbridge.units import ARCSEC_PER_DEG
+
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
 
 FASTEST_DEG_S2 = 1e6
 """Upper limit of the motor acceleration: a small servo motor at peak torque (17,000 rad/s^2). A motor with a

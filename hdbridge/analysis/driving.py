@@ -12,6 +12,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from hdbridge.analysis.readings import (
@@ -22,7 +23,7 @@ from hdbridge.analysis.readings import (
     reading_of,
     trimmed_deviation,
 )
-from hdbridge.axis.effects import BoolArray, FloatArray
+from hdbridge.axis.effects import FloatArray
 
 REVERSAL_DEG = 0.3
 """Minimum travel on either side of a reversal, motor degrees. It is less than the width of the narrowest loop
@@ -76,6 +77,8 @@ def reversals(driving_deg: FloatArray, jitter_deg: float) -> int:
 
 # Driving angle, speed and acceleration of one record.
 
+
+BoolArray = NDArray[np.bool_]
 
 CHATTER_COUNTS = 2.6
 """Minimum backward travel of a reversal of a measured angle, counts. Noise of a third of a count makes a

@@ -138,7 +138,7 @@ def held_out(estimator: Estimator, before: Fitted, after: Fitted) -> Gain | None
 
     Returns None if the record is too short.
     """
-    parts = _Parts.of(estimator, len(after.parameters))
+    parts = _Parts.of(estimator, after.count())
     return None if parts is None else parts.gain(parts.unseen(before), parts.unseen(after))
 
 
@@ -157,7 +157,7 @@ def of_written(
     increase due to leaving out repetitions from its fit.
     """
     others = [*others]
-    parts = _Parts.of(estimator, len(fitted.parameters))
+    parts = _Parts.of(estimator, fitted.count())
     if parts is None:
         return [None] * len(others)
     effects = [each.tidied(estimator.data.ratio) for each in fitted.hypothesis.effects]

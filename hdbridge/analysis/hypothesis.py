@@ -23,7 +23,6 @@ from hdbridge.analysis.linear import (
     Linearised,
     Nuisances,
     Prior,
-    Products,
     Terms,
     about_zeros,
     solve_symmetric,
@@ -32,7 +31,7 @@ from hdbridge.analysis.linear import (
 from hdbridge.analysis.noise import White
 from hdbridge.analysis.nuisances import COUNTS, zeros
 from hdbridge.analysis.prepared import Observed
-from hdbridge.analysis.regressors import Regressors, counts
+from hdbridge.analysis.regressors import Regressors
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.separable import Separable, Solution, unit
 from hdbridge.axis.effects import Channel, Effect, FloatArray, IntArray, Motion, Moves, Part, Start
@@ -112,6 +111,15 @@ class Fitted:
         """Tangent matrix: weighted derivatives of the prediction by the parameters, shape (m, p)."""
         return self.linearised.columns
 
+    @property
+    def information(self) -> FloatArray:
+        """Prior information (inverse variance) of each parameter, shape (p,)."""
+        return self.linearised.known[:, 0]
+
+    def count(self) -> int:
+        """Returns the number of columns of the tangent matrix."""
+        return len(self.parameters)
+
     def free(self) -> int:
         """Returns the number of parameters that affect this record."""
         return self._solution.free()
@@ -143,7 +151,6 @@ class Estimator:
         self._regressors = Regressors([data.full.motion], self.at_points, len(self.index))
         self._noise: dict[object, FloatArray] = {}
         self._free_loops: dict[Start, Nuisances] = {}
-        self._products = {each: Products() for each in Start}
         # The median is subtracted, because an encoder's zero is arbitrary.
         self.level = float(np.median(self.observed))
         self.loop_sign = 1.0
@@ -314,22 +321,18 @@ class Estimator:
         """Fits a hypothesis, starting from its own parameters; the result is never worse than the start.
 
         ``moves`` selects the shape parameters to fit. Initially all calibrated parts have their priors. Parts
-        whose deviation (`strain`) exceeds the cost of a change are freed one by one. One step of the fit is
-        enough to choose the next part.
+        whose deviation (`strain`) exceeds the cost of a change are freed one by one.
         """
-        parts, costs, steps = list(self.calibrated), 0.0, effort.steps
+        parts, costs = list(self.calibrated), 0.0
         while True:
-            fitted = self._with_parts(hypothesis, parts, costs, moves, replace(effort, steps=steps))
-            hypothesis, effects = fitted.hypothesis, fitted.hypothesis.effects
+            fitted = self._with_parts(hypothesis, parts, costs, moves, effort)
+            effects = fitted.hypothesis.effects
             most = max(parts, key=lambda each: each.strain(effects) - each.change_cost, default=None)
-            if most is not None and most.strain(effects) > most.change_cost:
-                parts.remove(most)
-                costs += most.change_cost
-                steps = min(effort.steps, 2)
-            elif steps == effort.steps:
+            if most is None or most.strain(effects) <= most.change_cost:
                 return fitted
-            else:
-                steps = effort.steps
+            parts.remove(most)
+            costs += most.change_cost
+            hypothesis = fitted.hypothesis
 
     def lawful(self, fitted: Fitted) -> Fitted:
         """Refits without a free-form loop, which a model cannot contain."""
@@ -377,18 +380,17 @@ class Estimator:
         effort: Effort,
     ) -> Fitted:
         """Fits with the priors of ``parts``, and adds the ``costs`` of the freed parts to chi square."""
-        start, own = hypothesis.start, hypothesis.nuisances
+        start = hypothesis.start
         prior, offset = self._prior(hypothesis, parts)
         costs += offset
         terms = Terms(
             self.observed - self.level,
-            lambda effect: self._regressors.of_unit(effect, (start,)),
+            lambda effect: self.columns(effect, start),
             White(self.weight),
-            self.unknown if own is None else self.unknown.and_also(own),
+            self._nuisances(hypothesis),
             prior,
             self._sign,
             moves,
-            self._products[start],
         )
         found = Separable(terms).fit(hypothesis.effects, effort)
         return Fitted(
@@ -400,6 +402,11 @@ class Estimator:
             found,
             self.weight,
         )
+
+    def _nuisances(self, hypothesis: Hypothesis) -> Nuisances:
+        """Returns the nuisances common to all hypotheses, followed by those of this one."""
+        own = hypothesis.nuisances
+        return self.unknown if own is None else self.unknown.and_also(own)
 
     def _sign(self, effect: Effect) -> float:
         """Returns the sign required of an effect's coefficients; 0 for either sign."""
@@ -450,8 +457,6 @@ class Estimator:
         points = replace(data.points, motion=replace(data.points.motion, load_deg=data.mean(load_deg)))
         self.data = replace(data, full=full, points=points)
         self._regressors.along([full.motion])
-        for each in self._products.values():
-            each.forget(lambda key: isinstance(key, Effect) and counts(key))
 
 
 def with_memory(effects: Sequence[Effect]) -> list[Effect]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, wraps
-from itertools import compress, count
+from itertools import compress
 from typing import NamedTuple, ParamSpec, Protocol, TypeVar
 
 import numpy as np
@@ -23,8 +23,6 @@ SEEN = 1e-9
 """Minimum eigenvalue of a determined direction, relative to the largest eigenvalue of the scaled matrix."""
 SUSPECT = 1e-6
 """Squared diagonal element of the Cholesky factor below which eigenvalues are used instead."""
-MOST_KEYS = 2000
-"""Maximum number of effects whose products are cached."""
 
 
 P = ParamSpec("P")
@@ -213,8 +211,6 @@ class Nuisances:
     """Columns, shape (b, q)."""
     names: tuple[str, ...]
     prior: tuple[Prior, ...]
-    key: object = field(default_factory=object)
-    """Identity of the columns, for caches that must not keep them."""
 
     def and_also(self, other: Nuisances) -> Nuisances:
         """Returns these columns followed by those of ``other``."""
@@ -237,41 +233,6 @@ def unknown(columns: FloatArray | BoolArray, names: Sequence[str]) -> Nuisances:
     return Nuisances(np.asarray(columns, dtype=np.float64), tuple(names), (FREE,) * len(names))
 
 
-class Products:
-    """Products of columns, weighted by the inverse covariance of the noise.
-
-    They are cached for all fits with the same rows and weighting.
-    """
-
-    def __init__(self) -> None:
-        self._numbers: dict[object, int] = {}
-        self._number = count()
-        self._blocks: dict[tuple[int, int], FloatArray] = {}
-
-    def gram(self, keys: Sequence[object], parts: Sequence[FloatArray], weighting: Weighting) -> FloatArray:
-        """Returns the Gram matrix of the columns of all ``parts``, which ``keys`` identify."""
-        if len(self._numbers) > MOST_KEYS:
-            self._numbers.clear()
-            self._blocks.clear()
-        own = [self._numbers.setdefault(each, next(self._number)) for each in keys]
-        # Columns without any product come first, so that only these are weighted.
-        for at, number in sorted(enumerate(own), key=lambda each: (each[1], each[1]) in self._blocks):
-            lacking = [other for other, each in enumerate(own) if (each, number) not in self._blocks]
-            if lacking:
-                weighted = weighting.apply(parts[at])
-                for other in lacking:
-                    block = parts[other].T @ weighted
-                    self._blocks[own[other], number] = block
-                    self._blocks[number, own[other]] = block.T
-        return np.concatenate(
-            [np.concatenate([self._blocks[one, other] for other in own], axis=1) for one in own]
-        )
-
-    def forget(self, changed: Callable[[object], bool]) -> None:
-        """Removes the columns whose keys ``changed`` selects."""
-        self._numbers = {each: number for each, number in self._numbers.items() if not changed(each)}
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Terms:
     """Inputs of a fit; arrays have m rows."""
@@ -279,7 +240,7 @@ class Terms:
     observed: FloatArray
     """Observations, arcsec, shape (m,)."""
     columns: Columns
-    """Function that returns the columns (m, p) of an effect with unit coefficients (`separable.unit`)."""
+    """Function that returns an effect's columns (m, p), which do not depend on its coefficients."""
     weighting: Weighting
     nuisances: Nuisances
     prior: Mapping[tuple[int, str], Prior] = field(default_factory=dict)
@@ -288,8 +249,6 @@ class Terms:
     """Function that returns the required sign of an effect's coefficients; 0 permits either sign."""
     moves: frozenset[Moves] = LOCAL
     """Kinds of shape parameters to fit; all others stay fixed."""
-    products: Products = field(default_factory=Products)
-    """Cache, which fits with the same rows, columns and weighting can share."""
 
     def known(self, columns: Sequence[Column]) -> FloatArray:
         """Returns the prior mean and information of each column, nuisances first, shape (p, 2)."""

@@ -23,7 +23,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize
 
 from hdbridge.analysis.blocks import Blocks
-from hdbridge.axis.effects import FloatArray, IntArray
+from hdbridge.axis.effects import BoolArray, FloatArray, IntArray
 
 PIECES = 16
 PIECE_BLOCKS = 250
@@ -155,10 +155,14 @@ class Precision:
     K^-1 = w - w H (P + H' w H)^-1 H' w. The bracket is banded.
     """
 
-    def __init__(self, noise: NoiseModel, blocks: Blocks) -> None:
-        self.weight: FloatArray = 1.0 / noise.white_variance(blocks)
+    def __init__(self, noise: NoiseModel, blocks: Blocks, left_out: BoolArray | None = None) -> None:
+        """Treats the blocks in ``left_out`` as not observed."""
+        weight = 1.0 / noise.white_variance(blocks)
+        if left_out is not None:
+            weight = np.where(left_out, 0.0, weight)
+        self.weight: FloatArray = weight
         self._noise, self._blocks = noise, blocks
-        self._log_determinant = float(np.sum(np.log(self.weight[self.weight > 0])))
+        self._log_determinant = float(np.sum(np.log(weight[weight > 0])))
         chains: dict[str, tuple[float, _Chain]] = {}
         if noise.slow_arcsec > 0:
             chain = _along(blocks, blocks.time_s, blocks.duration_s, noise.slow_s)

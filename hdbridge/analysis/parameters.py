@@ -42,7 +42,7 @@ class Confounded(NamedTuple):
 def confounded(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[Confounded]:
     """Yields causes that, at typical size, would be undetected in the presence of the effect at ``place``."""
     effects, scales = fitted.hypothesis.effects, estimator.scales
-    held = zip(fitted.parameters, fitted.linearised.known[:, 0].tolist(), strict=True)
+    held = zip(fitted.parameters, fitted.information.tolist(), strict=True)
     known = {each.effect for each, information in held if information}  # held by their calibration
     if place in known:
         return
@@ -57,14 +57,14 @@ def confounded(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[Con
         claimed = noise * np.sum(columns**2, axis=0)
         seen, axes = np.linalg.eigh(left.T @ left - np.diag(claimed))
         if seen[0] < scales.enter + scales.penalty:
-            moved = np.zeros((len(fitted.parameters), len(seen)))
+            moved = np.zeros((fitted.count(), len(seen)))
             moved[own] = shift @ axes / np.sqrt(1.0 + np.maximum(seen, 0.0))
             yield Confounded(other.name, moved)
 
 
 def systematic(estimator: Estimator, fitted: Fitted) -> FloatArray:
     """Returns the covariance of all parameters due to systematic errors, shape (p, p)."""
-    added = np.zeros((len(fitted.parameters), len(fitted.parameters)))
+    added = np.zeros((fitted.count(), fitted.count()))
     for place, effect in enumerate(fitted.hypothesis.effects):
         shift = fitted.linearised.taken_over(estimator.law_discrepancy(effect, fitted.hypothesis.start))
         added += shift @ shift.T
@@ -158,7 +158,7 @@ def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
     tangent, residual = fitted.tangent, fitted.residual
     directions, known = fitted.linearised.directions, fitted.linearised.known
     inverse = directions @ directions.T
-    best = inverse * max(float(residual @ residual) / max(len(residual) - len(fitted.parameters), 1), 0.25)
+    best = inverse * max(float(residual @ residual) / max(len(residual) - fitted.count(), 1), 0.25)
     influence = tangent @ inverse
     moved = influence * residual[:, np.newaxis] + inverse @ known[:, 1] / len(residual)  # about their mean
     of_prior = inverse @ np.diag(np.maximum(known[:, 0], 0.0)) @ inverse

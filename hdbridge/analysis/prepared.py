@@ -200,7 +200,7 @@ class Samples:
 
     def along(self, chain: Chain) -> Motion:
         """Returns the motion over the rows of a chain."""
-        return of_each(self.motion, lambda values: values[chain.rows])
+        return motion_at(self.motion, chain.rows)
 
     def delayed(self, delay_s: float) -> Samples:
         """Corrects a delayed load reading: replaces the motor angle by its value ``delay_s`` earlier."""
@@ -211,6 +211,11 @@ class Samples:
         motor.setflags(write=False)
         error = self.error_arcsec + (self.motor_deg - motor) / self.ratio * ARCSEC_PER_DEG
         return replace(self, motion=replace(self.motion, motor_deg=motor), error_arcsec=error)
+
+
+def motion_at(motion: Motion, rows: slice | IntArray) -> Motion:
+    """Returns a motion restricted to some of its samples."""
+    return of_each(motion, lambda values: values[rows])
 
 
 def of_each(motion: Motion, change: Callable[[FloatArray], FloatArray]) -> Motion:

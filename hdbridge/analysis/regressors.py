@@ -32,25 +32,17 @@ class Regressors:
 
     def columns(self, effect: Effect, starts: Starts) -> FloatArray:
         """Returns the columns of an effect, arcsec, shape (rows, p); read-only."""
+        if not (effect.shape or effect.carries or effect.curved) and not _counts(effect):
+            # These columns are the same in every fit.
+            pieces = [self._of_piece(unit(each), starts) for each in effect.pieces()]
+            return pieces[0] if len(pieces) == 1 else side_by_side(pieces, self._rows)
         # Columns do not depend on an effect's own coefficients. They do depend on the loop and orders that
         # an effect contains as fields.
-        return self.of_unit(unit(effect), starts)
-
-    def of_unit(self, effect: Effect, starts: Starts) -> FloatArray:
-        """Returns the columns of an effect with unit coefficients (`unit`)."""
-        key = (effect, starts)
-        known = self._recent.get(key)
-        if known is not None:
+        key = (unit(effect), starts)
+        if key in self._recent:
             self._recent.move_to_end(key)
-            return known
-        if effect.shape or effect.carries or effect.curved or counts(effect):
-            columns = self._made(effect, starts)
-        else:  # these columns are the same in every fit
-            pieces = [self._of_piece(unit(each), starts) for each in effect.pieces()]
-            if len(pieces) == 1:
-                return pieces[0]
-            columns = side_by_side(pieces, self._rows)
-        self._recent[key] = columns
+            return self._recent[key]
+        self._recent[key] = columns = self._made(effect, starts)
         if len(self._recent) > KEPT:
             self._recent.popitem(last=False)
         return columns
@@ -70,7 +62,7 @@ class Regressors:
     def along(self, motions: Sequence[Motion]) -> None:
         """Replaces the motions by others that differ only in the predicted load angle."""
         self.motions = tuple(motions)
-        for each in [each for each in self._recent if counts(each[0])]:
+        for each in [each for each in self._recent if _counts(each[0])]:
             del self._recent[each]
 
     def _of_piece(self, piece: Effect, starts: Starts) -> FloatArray:
@@ -84,6 +76,6 @@ class Regressors:
         return self._mean(parts[0] if len(parts) == 1 else np.concatenate(parts))
 
 
-def counts(effect: Effect) -> bool:
+def _counts(effect: Effect) -> bool:
     """Returns True if the effect depends on the predicted load angle, which a fit updates."""
     return Channel.LOAD_ANGLE in effect.channels

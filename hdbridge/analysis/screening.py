@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hdbridge.analysis.hypothesis import Estimator, Fitted
-from hdbridge.analysis.linear import Linearised, side_by_side
+from hdbridge.analysis.linear import Linearised
 from hdbridge.analysis.readings import median_deviation
 from hdbridge.axis.effects import (
     CATALOGUE,
@@ -77,7 +77,7 @@ class Screen:
         for block in blocks:
             self._slices.append(slice(at, at + block.shape[1]))
             at += block.shape[1]
-        self._matrix = side_by_side(blocks, len(estimator.index))
+        self._matrix = np.hstack(blocks) if blocks else np.empty((len(estimator.index), 0))
         self._grams = [block.T @ block for block in blocks]
 
     def scores(self, fit: Linearised, causes: Linearised) -> list[Score]:

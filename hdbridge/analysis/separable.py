@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 
@@ -30,18 +31,13 @@ def unit(effect: Effect) -> Effect:
     return effect.fitted(np.ones(len(effect.coefficients()))) if not effect.curved else effect
 
 
-def tangent(
-    columns: Columns, effect: Effect, shape: Shape, central: bool = False, length: float = DIFFERENCE
-) -> tuple[FloatArray, float]:
-    """Returns the derivative of an effect with respect to one shape, (m,), and the step of differentiation.
-
-    The derivative is one-sided unless ``central``. The step is ``length``, or less if the effect changes too
-    much within it.
-    """
+def tangent(columns: Columns, effect: Effect, shape: Shape, central: bool = False) -> FloatArray:
+    """Returns the derivative of an effect with respect to one shape, (m,); one-sided unless ``central``."""
     coefficients = effect.coefficients()
     here = shape_value(effect, shape.name)
-    predicted = _predicted(columns(unit(effect)), coefficients)
+    predicted = _predicted(columns(effect), coefficients)
     size = float(predicted @ predicted)
+    length = DIFFERENCE
 
     def change(sign: float) -> tuple[FloatArray, float]:
         there = (
@@ -53,8 +49,7 @@ def tangent(
         moved_by = np.log(there / here) if shape.logarithmic else there - here
         if not moved_by:
             return np.zeros(len(predicted)), 0.0
-        moved_effect = effect.fitted(coefficients, {shape.name: there})
-        there_predicted = _predicted(columns(unit(moved_effect)), coefficients)
+        there_predicted = _predicted(columns(effect.fitted(coefficients, {shape.name: there})), coefficients)
         there_predicted -= predicted
         return there_predicted, moved_by
 
@@ -64,9 +59,9 @@ def tangent(
         up, rise = change(1.0)
     if rise and not central:
         up /= rise
-        return up, length
+        return up
     down, fall = change(-1.0)
-    return np.asarray((up - down) / ((rise - fall) or 1.0)), length
+    return np.asarray((up - down) / (rise - fall)) if rise != fall else np.zeros(len(predicted))
 
 
 def _predicted(columns: FloatArray, coefficients: FloatArray) -> FloatArray:
@@ -134,17 +129,31 @@ EXCHANGES = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Fixed:
+    """Columns that do not depend on free shapes: of the nuisances, then of the effects at ``places``."""
+
+    places: tuple[int, ...]
+    units: tuple[Effect, ...]
+    matrix: FloatArray
+    weighted: FloatArray
+    gram: FloatArray
+    right: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Point:
     """Fit of the coefficients for given shapes."""
 
-    units: tuple[Effect, ...]
-    """Effects with unit coefficients (`unit`), which determine the columns."""
+    given: tuple[Effect, ...]
+    """Effects from which the columns were computed."""
     effects: tuple[Effect, ...]
     """Same effects with fitted coefficients."""
-    parts: tuple[FloatArray, ...]
-    """Columns of the nuisances, then of each effect."""
+    fixed: _Fixed
+    moving: tuple[int, ...]
+    """Indices of the effects whose columns form ``matrix``, in the same order."""
+    matrix: FloatArray
     gram: FloatArray
-    """Gram matrix of all linear columns plus the prior information."""
+    """Gram matrix of all linear columns (fixed ones first) plus the prior information."""
     coefficients: FloatArray
     inside: BoolArray
     """False for coefficients held at zero because of their sign constraint."""
@@ -161,7 +170,7 @@ class Solution:
     chi_square: float
     """Chi square, including priors."""
     columns: tuple[Column, ...]
-    """Parameter of each column: nuisances, then coefficients, then shapes."""
+    """Parameter of each column: nuisances, then coefficients (fixed columns first), then shapes."""
     residual: FloatArray
     """Observation minus fit, shape (m,)."""
     at_bound: tuple[tuple[int, str], ...]
@@ -172,7 +181,7 @@ class Solution:
     @cached_property
     def jacobian(self) -> FloatArray:
         """Derivatives with respect to all parameters, shape (m, p)."""
-        linear = side_by_side(self._point.parts, len(self.residual))
+        linear = side_by_side([self._point.fixed.matrix, self._point.matrix], len(self.residual))
         linear[:, ~self._point.inside] = 0.0
         if linear.shape[1] == len(self.columns):
             return linear
@@ -211,15 +220,13 @@ class Solution:
 
 
 class Separable:
-    """Fits effects to one data set."""
+    """Fits effects to one data set; caches all results that do not depend on shapes."""
 
     def __init__(self, terms: Terms) -> None:
         self.terms = terms
         self._right = terms.weighting.apply(terms.observed)
         self._total = float(terms.observed @ self._right)
-        self._moments: dict[object, FloatArray] = {}
-        self._lengths: dict[tuple[int, str], float] = {}
-        """Last step of differentiation of each shape, with which the next tangent begins."""
+        self._fixed: _Fixed | None = None
 
     def fit(self, effects: Sequence[Effect], effort: Effort | None = None) -> Solution:
         """Fits effects, starting from their own parameters; the result is never worse than the start."""
@@ -232,8 +239,8 @@ class Separable:
             system = self._system(here, where, tangents)
             step, promised = self._step(here, where, system, damping)
             small = promised < enough
-            if small and tuple(map(unit, refreshed(here.effects))) == here.units:
-                break  # the copies of model parts that the effects contain agree with the fit
+            if small and self._stands(here, refreshed(here.effects)):
+                break
             for _ in range(TRIES):
                 there = self._at(refreshed(moved(here.effects, where, step)))
                 better = there.chi_square < here.chi_square
@@ -268,23 +275,24 @@ class Separable:
         ]
         result = np.empty((len(where), len(self.terms.observed))).T
         for at, (place, shape) in enumerate(where):
-            length = self._lengths.get((place, shape.name), DIFFERENCE)
-            found = tangent(self.terms.columns, effects[place], shape, central, length)
-            result[:, at], self._lengths[place, shape.name] = found
+            result[:, at] = tangent(self.terms.columns, effects[place], shape, central)
         return where, result
 
     def _at(self, effects: Sequence[Effect]) -> _Point:
         """Fits the coefficients, with the shapes fixed."""
         terms = self.terms
-        units = tuple(map(unit, effects))
-        keys = (terms.nuisances.key, *units)
-        parts = (terms.nuisances.columns, *map(terms.columns, units))
-        gram = terms.products.gram(keys, parts, terms.weighting)
-        for key, part in zip(keys, parts, strict=True):
-            if key not in self._moments:
-                self._moments[key] = part.T @ self._right
-        right = np.concatenate([self._moments[each] for each in keys])
-        columns, size = self._linear(effects), len(gram)
+        fixed = self._fixed_of(effects)
+        moving = tuple(place for place in range(len(effects)) if place not in fixed.places)
+        matrix = side_by_side([terms.columns(effects[place]) for place in moving], len(terms.observed))
+        split, size = len(fixed.gram), len(fixed.gram) + matrix.shape[1]
+        gram, right = np.empty((size, size)), np.empty(size)
+        gram[:split, :split], right[:split] = fixed.gram, fixed.right
+        if matrix.shape[1]:
+            gram[:split, split:] = fixed.weighted.T @ matrix
+            gram[split:, :split] = gram[:split, split:].T
+            gram[split:, split:] = matrix.T @ terms.weighting.apply(matrix)
+            right[split:] = matrix.T @ self._right
+        columns = self._linear(effects, fixed.places, moving)
         mean, information = terms.known(columns).T
         signs = {place: terms.sign(effect) for place, effect in enumerate(effects)}
         sign = np.array([signs.get(each.effect, 0.0) for each in columns])
@@ -302,15 +310,55 @@ class Separable:
         chi_square = self._total + float(information @ mean**2)
         chi_square += float(coefficients @ (gram @ coefficients) - 2.0 * (right @ coefficients))
         chi_square += self._of_shapes(effects)
-        own = _split(coefficients, parts)[1:]
-        fitted = tuple(each.fitted(values) for each, values in zip(effects, own, strict=True))
-        return _Point(units, fitted, parts, gram, coefficients, inside, chi_square)
+        result = list(effects)
+        at = len(terms.nuisances.names)
+        for place in (*fixed.places, *moving):
+            count = len(effects[place].coefficients())
+            result[place] = effects[place].fitted(coefficients[at : at + count])
+            at += count
+        return _Point(
+            tuple(effects), tuple(result), fixed, moving, matrix, gram, coefficients, inside, chi_square
+        )
 
-    def _linear(self, effects: Sequence[Effect]) -> list[Column]:
+    def _fixed_of(self, effects: Sequence[Effect]) -> _Fixed:
+        """Returns the columns of effects without free shapes, from the cache if they have not changed."""
+        units = {
+            place: unit(effect)
+            for place, effect in enumerate(effects)
+            if not free_shapes(effect, self.terms.moves)
+        }
+        old = self._fixed
+        if old is not None:
+            same = all(
+                place in units and units[place] == each
+                for place, each in zip(old.places, old.units, strict=True)
+            )
+            if same:
+                return old
+            # Effects whose columns have changed are excluded, because these will change again at the next
+            # step.
+            known = set(old.units)
+            places = tuple(place for place, each in units.items() if each in known) or tuple(units)
+        else:
+            places = tuple(units)
+        parts = [self.terms.nuisances.columns, *(self.terms.columns(effects[place]) for place in places)]
+        matrix = side_by_side(parts, len(self.terms.observed))
+        weighted = self.terms.weighting.apply(matrix)
+        self._fixed = _Fixed(
+            places,
+            tuple(units[place] for place in places),
+            matrix,
+            weighted,
+            matrix.T @ weighted,
+            matrix.T @ self._right,
+        )
+        return self._fixed
+
+    def _linear(self, effects: Sequence[Effect], *places: tuple[int, ...]) -> list[Column]:
         """Lists the parameters of the linear columns, nuisances first."""
         columns = [Column(-1, name) for name in self.terms.nuisances.names]
-        for place, effect in enumerate(effects):
-            columns += [Column(place, str(number)) for number in range(len(effect.coefficients()))]
+        for place in chain(*places):
+            columns += [Column(place, str(number)) for number in range(len(effects[place].coefficients()))]
         return columns
 
     def _of_shapes(self, effects: Sequence[Effect]) -> float:
@@ -329,7 +377,7 @@ class Separable:
         if not where:
             return np.empty((0, 0)), np.empty(0)
         weighted = self.terms.weighting.apply(tangents)
-        cross = np.concatenate([each.T @ weighted for each in here.parts])[here.inside]
+        cross = np.concatenate([here.fixed.matrix.T @ weighted, here.matrix.T @ weighted])[here.inside]
         inner = tangents.T @ weighted
         slope = tangents.T @ self._right - cross.T @ here.coefficients[here.inside]
         known = [self.terms.prior.get((place, each.name), FREE) for place, each in where]
@@ -367,15 +415,19 @@ class Separable:
         step[~free] = 0.0
         return step, float(slope @ step)
 
+    def _stands(self, here: _Point, effects: Sequence[Effect]) -> bool:
+        """Returns True if the copies of model parts that the effects contain agree with the fit."""
+        return all(unit(one) == unit(other) for one, other in zip(here.given, effects, strict=True))
+
     def _solution(self, here: _Point) -> Solution:
-        columns, edge = self._linear(here.effects), []
+        columns, edge = self._linear(here.effects, here.fixed.places, here.moving), []
         for place, effect in enumerate(here.effects):
             for each in free_shapes(effect, self.terms.moves):
                 columns.append(Column(place, each.name, True, each.logarithmic))
                 if shape_value(effect, each.name) in {each.lower, each.upper}:
                     edge.append((place, each.name))
-        own = _split(here.coefficients, here.parts)
-        predicted = sum(part @ values for part, values in zip(here.parts, own, strict=True))
+        split = here.fixed.matrix.shape[1]
+        predicted = here.fixed.matrix @ here.coefficients[:split] + here.matrix @ here.coefficients[split:]
         return Solution(
             here.effects,
             here.coefficients[: len(self.terms.nuisances.names)],
@@ -386,8 +438,3 @@ class Separable:
             self,
             here,
         )
-
-
-def _split(coefficients: FloatArray, parts: Sequence[FloatArray]) -> list[FloatArray]:
-    """Divides coefficients among the matrices of their columns."""
-    return np.split(coefficients, np.cumsum([each.shape[1] for each in parts[:-1]]))

@@ -216,7 +216,7 @@ def _seen(
     def passes(view: _View) -> bool:
         columns = np.column_stack([tangent, weight * view.predicted_arcsec])
         fit = Linearised(columns, residual, known)
-        own = [len(fitted.parameters)]
+        own = [fitted.count()]
         return block_robust(estimator, fit, own, np.zeros(1), rows, discrepancies) > scales.robust
 
     sizes = [estimator.half_span(each.predicted_arcsec) for each in views]
@@ -231,7 +231,10 @@ def _seen(
 
 def _standing(estimator: Estimator, residual: FloatArray) -> float:
     """Returns the typical step between neighbouring block means at rest, arcsec, which is slow noise."""
-    still = (estimator.data.points.speed_deg_s == 0.0)[estimator.index]
+    speed = estimator.motion.motor_speed_deg_s
+    if speed is None:
+        return 0.0
+    still = (speed == 0.0)[estimator.index]
     if np.count_nonzero(still) < FEW:
         return 0.0
     number = np.floor((estimator.time_s[still] - estimator.time_s[0]) / BLOCK_S).astype(np.intp)

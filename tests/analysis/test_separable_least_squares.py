@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from hdbridge.analysis.linear import FREE, Nuisances, Prior, Products, Terms
+from hdbridge.analysis.linear import FREE, Nuisances, Prior, Terms
 from hdbridge.analysis.noise import White
 from hdbridge.analysis.separable import Separable
 from hdbridge.axis.effects import (
@@ -127,28 +127,3 @@ def test_nested_parameters_are_updated_during_the_fit() -> None:
     found = Separable(data).fit((half, DirectionPhase(orders=half.orders, shift_deg=1.0)))
     assert found.effects[1].coefficients() == pytest.approx([4.0], abs=0.05)
     assert found.effects[0].coefficients() == pytest.approx(RIPPLE.coefficients(), abs=0.1)
-
-
-def test_fits_that_share_their_products_do_not_influence_each_other() -> None:
-    """Neither an earlier fit of other effects changes a result, nor an effect whose columns have changed."""
-    phase = DirectionPhase(orders=RIPPLE.orders, shift_deg=4.0)
-    data = terms((RIPPLE, LOOP, phase))
-    other = replace(data, nuisances=Nuisances(TIME_S[:, np.newaxis], ("ramp",), (FREE,)))
-    faster = replace(MOTION, motor_deg=1.1 * MOTION.motor_deg)
-    for each in ((RIPPLE, LOOP), (LOOP, RIPPLE, phase), (RIPPLE,)):
-        Separable(data).fit(each)
-        Separable(other).fit(each)
-    data.products.forget(lambda key: isinstance(key, Synchronous))
-    changed = replace(
-        data,
-        columns=lambda effect: effect.columns(
-            faster if isinstance(effect, Synchronous) else MOTION, Start.FORWARD
-        ),
-    )
-    for given in (changed, other):
-        shared, own = (
-            Separable(each).fit((RIPPLE, LOOP)) for each in (given, replace(given, products=Products()))
-        )
-        assert shared.chi_square == pytest.approx(own.chi_square, rel=1e-9)
-        assert shared.residual == pytest.approx(own.residual, abs=1e-6)
-        data.products.forget(lambda key: isinstance(key, Synchronous))

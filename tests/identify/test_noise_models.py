@@ -68,12 +68,11 @@ def test_the_banded_inverse_is_the_dense_one(white, slow, slow_s, place, place_d
 def test_the_score_is_the_derivative_of_the_likelihood(values, locked, branches, seed):
     rng = np.random.default_rng(seed)
     blocks = replace(mixed_blocks(rng, locked)[0], moving=rng.random(40) < 0.6, blur=0.1 * rng.random(40))
-    blocks = replace(blocks, count=np.where(rng.random(40) < 0.2, 0.0, blocks.count))
-    residual = 2.0 * rng.normal(size=40)
+    out, residual = rng.random(40) < 0.2, 2.0 * rng.normal(size=40)
     scale = np.array([1.0, 1.0, 1.0, 5.0, 1.0, 10.0, float(branches), 10.0])
 
     def precision(logarithms):
-        return Precision(NoiseModel(*(scale * np.exp(logarithms)).tolist()), blocks)
+        return Precision(NoiseModel(*(scale * np.exp(logarithms)).tolist()), blocks, out)
 
     at, step = np.log(values), 1e-3 * np.eye(8)
     likelihoods = [[precision(at + s * e).log_likelihood(residual) for s in (1, -1)] for e in step]
@@ -81,16 +80,15 @@ def test_the_score_is_the_derivative_of_the_likelihood(values, locked, branches,
     assert precision(at).score(residual) == pytest.approx(expected, rel=1e-3, abs=1e-3)
 
 
-def test_blocks_without_samples_have_no_influence():
+def test_excluded_blocks_have_no_influence():
     rng = np.random.default_rng(1)
     blocks, _ = blocks_of(30, rng)
     out = np.zeros(30, dtype=bool)
     out[10:20] = True
-    blocks = replace(blocks, count=np.where(out, 0.0, blocks.count))
     noise = NoiseModel(1.0, 1.0, 0.8, 5.0)
-    weighted = Precision(noise, blocks).apply(np.where(out, 1e6, 1.0))
+    weighted = Precision(noise, blocks, out).apply(np.where(out, 1e6, 1.0))
     assert weighted[out] == pytest.approx(np.zeros(10))
-    assert weighted == pytest.approx(Precision(noise, blocks).apply(np.ones(30)))
+    assert weighted == pytest.approx(Precision(noise, blocks, out).apply(np.ones(30)))
 
 
 def test_a_wander_is_found_next_to_white_noise():
