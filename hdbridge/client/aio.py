@@ -528,6 +528,6 @@ def _failure(address: Address, problem: Exception) -> HdbridgeError:
         return DaemonError(f"{address}: no daemon answers ({problem}); start it with 'hdbridge run'")
     what = "did not answer in time" if isinstance(problem, httpx.TimeoutException) else "disconnected"
     return DaemonError(
-        f"{address}: the daemon {what} ({problem or type(problem).__name__}); the outcome is unknown: "
+        f"{address}: the daemon {what} ({str(problem) or type(problem).__name__}); the outcome is unknown: "
         f"check the state first"
     )

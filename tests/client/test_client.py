@@ -264,3 +264,22 @@ def test_missing_extra_is_named(missing):
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, env={**os.environ}
     )
     assert "pip install 'hdbridge[daemon]'" in done.stdout
+
+
+def test_a_connection_that_breaks_is_described(tmp_path):
+    """The daemon is killed before it has read the request; the system's error has no text of its own."""
+    path = tmp_path / "broken.sock"
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+
+        def break_off() -> None:
+            connected, _ = listener.accept()
+            with connected:
+                connected.recv(1)  # the rest of the request is unread
+
+        breaking = threading.Thread(target=break_off)
+        breaking.start()
+        with pytest.raises(DaemonError, match=r"the daemon disconnected \(\w.*\)"), Client(path) as client:
+            client.state()
+        breaking.join()
