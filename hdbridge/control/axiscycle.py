@@ -164,7 +164,7 @@ class AxisCycle:
 
     @property
     def outcome(self) -> str:
-        """What a completed quick stop has shown of the drive, to be appended to its reason; usually empty."""
+        """Describes a drive that did not obey or confirm a completed quick stop; otherwise empty."""
         if self.silent or self.stopping:
             return ""
         if not self.confirmed:
@@ -249,7 +249,7 @@ class AxisCycle:
         """
         image, supervision = self.image, self.supervision
         self.last_sent_s = now
-        stop = supervision.stop or self._ordered
+        stop = self._stop
         if stop is not self._handled_stop:
             self._note(stop)
         if self._channels:

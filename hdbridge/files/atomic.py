@@ -56,11 +56,14 @@ def write_atomically(path: Path | str, content: str | bytes) -> None:
         raise OutputError(f"{path}: cannot be written: {problem.strerror}") from None
 
 
-def check_writable(path: Path | str) -> None:
+def check_writable(path: Path | str, named: Path | str = "") -> None:
     """Raises `InputError` if a file cannot be written here; to be called before a long measurement.
+
+    The message names ``named`` in place of the path, if given.
 
     It creates a temporary file, so a read-only file system or a name that is too long is also detected.
     """
+    named = named or path
     try:
         if is_stream(path):
             number = descriptor_of(path)
@@ -69,24 +72,24 @@ def check_writable(path: Path | str) -> None:
                 if number is None
                 else fcntl.fcntl(number, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY
             ):
-                raise InputError(f"{path}: cannot be written: no permission")
+                raise InputError(f"{named}: cannot be written: no permission")
             return
         target = Path(path).resolve()
         if target.is_dir():
-            raise InputError(f"{path}: cannot be written: it is a folder; expected the name of a file")
+            raise InputError(f"{named}: cannot be written: it is a folder; expected the name of a file")
         if target.exists() and not target.is_file():
             raise InputError(
-                f"{path}: cannot be written: it is neither a file nor a pipe nor a character device"
+                f"{named}: cannot be written: it is neither a file nor a pipe nor a character device"
             )
         if not target.parent.is_dir():
-            raise InputError(f"{path}: cannot be written: there is no folder {target.parent}")
+            raise InputError(f"{named}: cannot be written: there is no folder {target.parent}")
         if not os.access(target.parent, os.W_OK | os.X_OK):
-            raise InputError(f"{path}: cannot be written: the folder {target.parent} does not permit it")
+            raise InputError(f"{named}: cannot be written: the folder {target.parent} does not permit it")
         _try_out(target)
     except OSError as problem:
-        raise InputError(f"{path}: cannot be written: {problem.strerror}") from None
+        raise InputError(f"{named}: cannot be written: {problem.strerror}") from None
     except RuntimeError:  # Python 3.11 and 3.12 report a loop of symbolic links by this
-        raise InputError(f"{path}: cannot be written: its symbolic links form a loop") from None
+        raise InputError(f"{named}: cannot be written: its symbolic links form a loop") from None
 
 
 def _try_out(target: Path) -> None:

@@ -171,11 +171,7 @@ def _check_folder(output: Output, inputs: Sequence[Path]) -> None:
         existing = existing.parent
     if not existing.is_dir():
         raise InputError(f"{folder}: cannot create this folder: {existing} is not a folder")
-    probe = existing / "a file"
-    try:
-        check_writable(probe)
-    except InputError as problem:
-        raise InputError(f"{folder}: {str(problem).removeprefix(f'{probe}: ')}") from None
+    check_writable(existing / "a file", named=folder)
 
 
 def _redirected() -> list[tuple[str, os.stat_result]]:

@@ -23,9 +23,8 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 
 from hdbridge.analysis.linear import counted, sandwich, solve_symmetric
 from hdbridge.axis.effects import FloatArray
-from hdbridge.twin.misfit import Data, Mask, Piece
-from hdbridge.twin.parameters import FOLLOWING, LOAD, STRIBECK_RAD_S, TORQUE
-from hdbridge.twin.replay import demand_deg
+from hdbridge.twin.misfit import Data, Mask, Piece, motor_deg
+from hdbridge.twin.parameters import LOAD, STRIBECK_RAD_S, TORQUE
 from hdbridge.units import ARCSEC_PER_DEG
 
 FILTER_S: Final = 0.006
@@ -67,7 +66,7 @@ def _regressors(piece: Piece, data: Data) -> tuple[FloatArray, Mask]:
     commands, ratio = piece.commands, data.axis.gear.ratio
     step_s = commands.cycle_s
     width = max(FILTER_S / step_s, 1.0)
-    motor = np.radians(demand_deg(commands, data.axis) - piece.measured[FOLLOWING])
+    motor = np.radians(motor_deg(piece, data.axis))
     torque_nm = piece.measured[TORQUE]
     if commands.torque_on_load_nm is not None:
         outer_nm = commands.torque_on_load_nm[commands.lead :]

@@ -131,6 +131,11 @@ class Data:
         return tuple(kind for each in self.pieces for kind in each.kind)
 
 
+def motor_deg(piece: Piece, axis: AxisConfig) -> FloatArray:
+    """Returns the measured motor angle of each row; degrees."""
+    return np.asarray(demand_deg(piece.commands, axis) - piece.measured[FOLLOWING], dtype=np.float64)
+
+
 def held_out_legs(recording: Recording) -> tuple[Segment, ...]:
     """Returns the legs excluded from a fit: every `HELD_OUT`-th of its kind."""
     seen: dict[str, int] = {}
@@ -600,9 +605,8 @@ def misfit_of(
 
 def signals_of(data: Data) -> dict[str, FloatArray]:
     """Returns the measured signals by channel, in its unit; for the load, its error without its mean."""
-    demanded_deg = np.concatenate([demand_deg(each.commands, data.axis) for each in data.pieces])
-    motor_deg = demanded_deg - data.measured[FOLLOWING]
-    error = data.measured[LOAD] - ARCSEC_PER_DEG / data.axis.gear.ratio * motor_deg
+    turned_deg = np.concatenate([motor_deg(each, data.axis) for each in data.pieces])
+    error = data.measured[LOAD] - ARCSEC_PER_DEG / data.axis.gear.ratio * turned_deg
     return {**data.measured, LOAD: _about(np.mean, error, data)}
 
 

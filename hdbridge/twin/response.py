@@ -21,9 +21,8 @@ from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.motor import TrueResponse
 from hdbridge.twin.fit import MAX_MISFIT_RATIO, Fitted
-from hdbridge.twin.misfit import Data, Piece, Replays, misfit
+from hdbridge.twin.misfit import Data, Piece, Replays, misfit, motor_deg
 from hdbridge.twin.parameters import FOLLOWING, TORQUE
-from hdbridge.twin.replay import demand_deg
 
 SPEED_S: Final = 0.4
 """Length of the responses to the speed. A load that rings at 15 Hz with a damping ratio of 0.06 decays to a
@@ -61,8 +60,9 @@ def _added(truth: Truth, data: Data, found: dict[str, FloatArray], ridge: float,
     for piece, part in zip(data.pieces, data.parts, strict=True):
         rows = piece.counts[channel] & ~piece.out
         if channel == FOLLOWING:
-            turned = np.radians(demand_deg(piece.commands, data.axis) - piece.measured[channel])
-            turned = turned + np.radians(found[channel][part])  # the simulated motor
+            turned = np.radians(motor_deg(piece, data.axis)) + np.radians(
+                found[channel][part]
+            )  # the simulated motor
             speed = np.gradient(turned, piece.commands.time_s)
             tables.append(_lagged(speed, lengths[0])[rows])
             wanted.append(-np.radians(found[channel][part][rows]))

@@ -194,7 +194,7 @@ def serve(fd: int, axes: int) -> int:
     """Runs as the service until standard input is closed; prints the observations as JSON."""
     with Memory.attach(fd) as memory:
         samples, events = memory.reader(), memory.event_reader()
-        seen: dict[str, Any] = {"samples": 0, "lost": 0, "told": {}, "refused": []}
+        seen: dict[str, Any] = {"samples": 0, "lost": 0, "events": {}, "refused": []}
         model = TransmissionModel.load(PROFILE / "model.yaml")
         clients = [
             Clients(memory, axis, CompensationSetting(model.bound_to(config), Scheme.EXTENDED))
@@ -207,12 +207,12 @@ def serve(fd: int, axes: int) -> int:
         while not select.select([sys.stdin], [], [], POLL_S)[0]:
             now = time.monotonic()
             arrays, lost = samples.read()
-            told, missed = events.read()
+            arrived, missed = events.read()
             seen["samples"] += len(arrays)
             seen["lost"] += lost + missed
-            for event in told:
+            for event in arrived:
                 name = event.kind.name
-                seen["told"][name] = seen["told"].get(name, 0) + 1
+                seen["events"][name] = seen["events"].get(name, 0) + 1
                 if event.kind in (EventKind.REFUSED, EventKind.STREAM_REFUSED, EventKind.STOPPED):
                     seen["refused"].append(event.text)
                 enabled += event.kind is EventKind.STATE and event.code == AxisState.ENABLED
@@ -343,7 +343,7 @@ def main() -> int:
         if kind in wanted:
             figures, seen = measured(axes, cycle_ms, cycles)
             print(table([figures], 1e-3 * cycle_ms), flush=True)
-            events = ", ".join(f"{count} {name}" for name, count in sorted(seen["told"].items()))
+            events = ", ".join(f"{count} {name}" for name, count in sorted(seen["events"].items()))
             print(f"the service saw {seen['samples']} samples and lost none; events: {events}", flush=True)
             print(*seen["refused"], sep="\n")
     return 0
