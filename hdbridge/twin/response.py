@@ -60,10 +60,8 @@ def _added(truth: Truth, data: Data, found: dict[str, FloatArray], ridge: float,
     for piece, part in zip(data.pieces, data.parts, strict=True):
         rows = piece.counts[channel] & ~piece.out
         if channel == FOLLOWING:
-            turned = np.radians(motor_deg(piece, data.axis)) + np.radians(
-                found[channel][part]
-            )  # the simulated motor
-            speed = np.gradient(turned, piece.commands.time_s)
+            simulated_deg = motor_deg(piece, data.axis) + found[channel][part]
+            speed = np.gradient(np.radians(simulated_deg), piece.commands.time_s)
             tables.append(_lagged(speed, lengths[0])[rows])
             wanted.append(-np.radians(found[channel][part][rows]))
         else:
