@@ -24,7 +24,7 @@ from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.pdo import PdoLengthError
 from hdbridge.drive.plausibility import Plausibility
 from hdbridge.drive.standstill import Standstill
-from hdbridge.drive.states import FAULTS, State
+from hdbridge.drive.states import FAULTS, OFF, State
 from hdbridge.drive.supervision import ROWS, Event, Fault, Reaction, Supervision
 from hdbridge.drive.traffic import Traffic
 from hdbridge.drive.writes import drive_master_timeout_s
@@ -104,6 +104,8 @@ class AxisCycle:
         self._last: Feedback | None = None
         self._good_cycle = 0
         self._commanded = False
+        self._may_run = True
+        """False once the drive was off and power was not requested since."""
         self._ordered = False
         """True from `quick_stop` until `begin`."""
         self._handled_stop: Event | bool = False
@@ -130,6 +132,7 @@ class AxisCycle:
         prepared = self.image.power.aim is _ENABLED
         self._last = self._feedback(self.feedback.cycle, self.feedback.time_s, True) if prepared else None
         self._commanded = False
+        self._may_run = prepared or self.image.power.state not in OFF
         self.image.forget_channels()
         self.changed()
 
@@ -224,7 +227,7 @@ class AxisCycle:
         if self._commanded and word is not None:
             self.image.power.observe(word)
             if self.image.power.dropped is not None:
-                self._fell_out()
+                self._changed_state()
 
     def hear(self, frame: Frame) -> None:
         """Interprets a frame of the axis that the cycle does not wait for, and records its faults."""
@@ -263,8 +266,10 @@ class AxisCycle:
             self._good_cycle = count
         else:
             feedback = self.stale(count, time_s)
-        if power.dropped is not None and not stop:
-            self._fell_out()
+        if not enabled:
+            self._may_run = power.aim is _ENABLED or (self._may_run and power.state not in OFF)
+        if (enabled and not self._may_run) or (power.dropped is not None and not stop):
+            self._changed_state()
         if now - self._traffic.heard_s > image.heartbeat_timeout_s and not (stop and self._over()):
             silent_ms = 1e3 * (now - self._traffic.heard_s)
             self.pending.append((Fault.HEARTBEAT_LOST, f"for {silent_ms:.0f} ms"))
@@ -383,7 +388,7 @@ class AxisCycle:
             self.pending.append((Fault.FOLLOWING_ERROR, lag))
         return True
 
-    def _fell_out(self) -> None:
+    def _changed_state(self) -> None:
         power = self.image.power
         state = power.dropped or power.state
         fault = state in FAULTS

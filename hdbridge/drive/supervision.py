@@ -43,7 +43,7 @@ class Fault(Enum):
     EMERGENCY = "the drive sent an emergency message"
     MASTER_LOST = "the drive reports that it missed its master"
     DRIVE_FAULT = "the drive reports a fault"
-    DROPPED_OUT = "the drive left 'operation enabled' on its own"
+    DROPPED_OUT = "the drive changed its power state on its own"
     BOOT_UP = "a node restarted"
     NMT_CHANGE = "a node is not operational"
     HEARTBEAT_LOST = "the drive's heartbeat is missing"

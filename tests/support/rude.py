@@ -40,6 +40,8 @@ class Ways:
     resumes: bool = False
     """Applies its last RPDO again at each SYNC."""
     ignores_enable: bool = False
+    powers_itself: bool = False
+    """Goes to *operation enabled* after each SYNC, whatever the controlword."""
     guards: bool = False
     """Sends no heartbeat."""
     mode_delay_s: float = 0.0
@@ -258,6 +260,8 @@ class RudeDrive:
                 self._rpdo = None
             self._values[0x607A, 0] = target
             self._control(word)
+        if self.ways.powers_itself:
+            self.state = ENABLED
         self._move()
         if self.ways.stale_tpdos and self._sent:
             self.ways.stale_tpdos -= 1

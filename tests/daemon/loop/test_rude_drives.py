@@ -14,9 +14,10 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from support.characters import RUDE
 from support.daemon import SteppedDaemon, article_axis, stepped_daemon
-from support.rude import ENABLED, OFF, RudeDrive
+from support.rude import ENABLED, OFF, STOPPED, RudeDrive
 
 from hdbridge.axis import Source
+from hdbridge.daemon.loop.faultlog import FAULT_INDEX
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind
 from hdbridge.drive.supervision import Fault
@@ -25,6 +26,8 @@ AFTER_TURNS = st.integers(0, 8)
 """Cycles from the command to enable until a drive is enabled, and some more."""
 PLAUSIBLE_COUNTS = 400
 """Largest error of a position that the supervision accepts: vibration, and the highest speed in a cycle."""
+
+DROPPED_OUT = FAULT_INDEX[Fault.DROPPED_OUT]
 
 
 @contextmanager
@@ -92,6 +95,22 @@ def test_the_noise_of_a_fine_encoder_is_not_motion(by_command: bool) -> None:
         daemon.run(0.2)
         (stopped,) = daemon.reported(EventKind.STOPPED)
         assert "did not" not in stopped.text
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_drive_that_powers_itself_is_stopped_and_reported(stopped: bool) -> None:
+    with verified() as (daemon, node):
+        if stopped:
+            stop(daemon, by_command=False)
+            daemon.until(lambda: bool(daemon.reported(EventKind.STOPPED)))
+        node.ways.powers_itself = True
+        daemon.turn(3)
+        node.ways.powers_itself = False
+        daemon.turn(2)
+        assert node.state == STOPPED
+        assert daemon.states == [AxisState.QUICK_STOPPED]
+        texts = [each.text for each in daemon.reported(EventKind.FAULT) if each.code == DROPPED_OUT]
+        assert texts == ["it went to 'operation enabled'"]
 
 
 @settings(max_examples=12, phases=[Phase.generate])
