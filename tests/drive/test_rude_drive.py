@@ -48,7 +48,16 @@ def test_a_drive_that_stopped_while_its_answer_was_lost_is_not_enabled_again() -
         node._values[0x605A, 0] = 6  # it stays in quick stop active
         drive.enable(Mode.HM)
         drive.wait(0.05)
-        node.ways.mute_sdo.extend((False, True))  # the statusword is answered, the controlword is not
+        reply = node._reply
+
+        def lost(answer: bytes) -> None:
+            if answer[0] == 0x60:  # the controlword was obeyed
+                node._reply = reply  # type: ignore[method-assign]
+                node.miss_master()
+            else:
+                reply(answer)
+
+        node._reply = lost  # type: ignore[method-assign]
         with pytest.raises(SdoError, match="one attempt"):
             drive._commander.control(0x000F)
         assert node.state != ENABLED
@@ -63,6 +72,15 @@ def test_enable_operation_is_not_sent_to_a_drive_that_stopped_by_itself() -> Non
         with pytest.raises(DriveError, match="quick stop active"):
             drive._commander.control(0x001F)
         assert node.powered == 1
+
+
+def test_a_drive_hears_its_master_while_an_answer_is_awaited() -> None:
+    with booted() as (drive, node):
+        drive.enable(Mode.PP)
+        drive.wait(0.05)
+        node.ways.mute_sdo.append(True)
+        drive.state()
+        assert node.state == ENABLED
 
 
 @pytest.mark.parametrize(

@@ -164,7 +164,8 @@ def test_quick_stop_is_latched_until_reset(enabled: SteppedDaemon) -> None:
     assert "still stopping" in enabled.order(K.RESET).text
     assert enabled.reported(E.STOPPED) == []
     enabled.run(1.0)
-    assert {word for word, _ in sent} == {0x02}
+    assert {word for word, _ in sent} == {0x02, 0x00}
+    assert {word for word, _ in sent[-20:]} == {0x00}, "the drive is off"
     (stopped,) = enabled.reported(E.STOPPED)
     assert "quick stop by command" in stopped.text
     for kind in (K.ENABLE, K.MOVE, K.VERIFIED, K.HOME):
