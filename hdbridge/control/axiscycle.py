@@ -16,11 +16,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from hdbridge.cia301 import NmtState
+from hdbridge.cia301 import NmtCommand
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import Frames, ProcessImage
 from hdbridge.drive.link import Frame, new_tuple
 from hdbridge.drive.monitor import NetworkMonitor
+from hdbridge.drive.objects import COB_NMT
 from hdbridge.drive.pdo import PdoLengthError
 from hdbridge.drive.plausibility import Plausibility
 from hdbridge.drive.standstill import Standstill
@@ -210,16 +211,15 @@ class AxisCycle:
         return power.aim is _ENABLED or power.state in _POWERED
 
     def stop_before_sync(self) -> Frames | None:
-        """Returns RPDOs with a quick stop if a fault noticed before SYNC stops the axis, else None.
+        """Returns the frames that stop the drive if a fault noticed before SYNC stops the axis, else None.
 
         A drive holds the last RPDO until SYNC. If it has stopped on its own in the meantime, the set-point
-        in that RPDO would set it in motion again. A drive that has restarted gets no RPDO at all.
+        in that RPDO would set it in motion again.
         """
-        reaction = max(ROWS[fault].first for fault, _ in self.pending)
-        if reaction < Reaction.QUICK_STOP or (reaction is Reaction.LATCH and not self._drive_runs):
+        if max(ROWS[fault].first for fault, _ in self.pending) < Reaction.QUICK_STOP:
             return None
         self.image.power.quick_stop()
-        return self.image.pack_rpdo_stop()
+        return self._stop_frames()
 
     def check_statusword(self, frame: Frame) -> None:
         """Checks the statusword of a TPDO that came too early or too late to be used."""
@@ -334,7 +334,7 @@ class AxisCycle:
         """Completes a cycle with a new fault, with a fault in the cycle before, or with a latched stop."""
         power = self.image.power
         if self._judge(count) is Reaction.LATCH:
-            return self.image.pack_rpdo_stop() if self._drive_runs else None
+            return self._stop_frames()
         if stopping:
             self._count_stop_cycle()
         if self._stop:
@@ -350,11 +350,12 @@ class AxisCycle:
             self._latch()
         return reaction
 
-    @property
-    def _drive_runs(self) -> bool:
-        """True unless the drive itself, and not only another node of the axis, must be verified again."""
-        drive = self.monitor.watch(self.image.node_id)
-        return not drive.restarted and drive.nmt_state in (None, NmtState.OPERATIONAL)
+    def _stop_frames(self) -> Frames:
+        """Returns RPDOs with a quick stop, or an NMT command that ends the PDOs of a drive that restarted."""
+        image = self.image
+        if self.monitor.watch(image.node_id).restarted:
+            return ((COB_NMT, bytes((NmtCommand.PRE_OPERATIONAL, image.node_id))),)
+        return image.pack_rpdo_stop()
 
     def _latch(self) -> None:
         """Stops the set-points of the axis, and withdraws the request to enable it."""

@@ -158,7 +158,11 @@ class Drive:
         if mode is cyclic:
             self.image.power.go(State.OPERATION_ENABLED)
         else:
-            self._commander.walk(State.OPERATION_ENABLED)
+            try:
+                self._commander.walk(State.OPERATION_ENABLED)
+            except BaseException:
+                self.power_off()
+                raise
 
     def prepare(self) -> Positions:
         """Prepares for power in the cyclic mode while a control cycle already runs; returns the positions.
@@ -311,6 +315,7 @@ class Drive:
     def power_off(self) -> list[str]:
         """Stops and disables a drive that may be unable to answer; returns the problems as text."""
         self._mode = None
+        self.image.power.power_off()
         try:
             self._power_off()
         except HdbridgeError as error:

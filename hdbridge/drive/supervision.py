@@ -25,7 +25,7 @@ class Reaction(IntEnum):
     QUICK_STOP = 2
     """Command a quick stop until the drive reports it; latched."""
     LATCH = 3
-    """Send no more RPDOs, except for a last quick stop to a drive that has not restarted itself.
+    """Send no more RPDOs after a last quick stop; a drive that restarted is put into PRE-OPERATIONAL instead.
 
     Latched until the drive has been verified again, from identity to limits."""
 

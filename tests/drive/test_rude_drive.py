@@ -11,6 +11,8 @@ from support.spoilt import SpoiltBus
 
 from hdbridge.control.bench import Bench
 from hdbridge.drive import Drive, Mode
+from hdbridge.drive.sdo import SdoAbortError
+from hdbridge.drive.states import State
 from hdbridge.errors import DriveError, SdoError, TransitionError
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import VirtualClock
@@ -72,6 +74,29 @@ def test_enable_operation_is_not_sent_to_a_drive_that_stopped_by_itself() -> Non
         with pytest.raises(DriveError, match="quick stop active"):
             drive._commander.control(0x001F)
         assert node.powered == 1
+
+
+@pytest.mark.parametrize("mode", [Mode.PP, Mode.HM, None])
+def test_a_refused_transfer_while_enabling_leaves_no_power(mode: Mode | None) -> None:
+    for answers in range(30):
+        with booted() as (drive, node):
+            node.ways.mangles_sdo.extend(
+                [
+                    "",
+                ]
+                * answers
+                + ["abort"]
+            )
+            try:
+                drive.enable(mode)
+            except SdoAbortError:
+                assert node.state == OFF
+                assert drive.image.power.aim is not State.OPERATION_ENABLED
+            else:
+                break
+            finally:
+                node.ways.mangles_sdo.clear()
+    assert answers > 8
 
 
 def test_a_drive_hears_its_master_while_an_answer_is_awaited() -> None:
