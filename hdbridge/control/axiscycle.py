@@ -16,15 +16,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from hdbridge.cia301 import NmtState
+from hdbridge.cia301 import NmtCommand
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import Frames, ProcessImage
 from hdbridge.drive.link import Frame, new_tuple
 from hdbridge.drive.monitor import NetworkMonitor
+from hdbridge.drive.objects import COB_NMT
 from hdbridge.drive.pdo import PdoLengthError
 from hdbridge.drive.plausibility import Plausibility
 from hdbridge.drive.standstill import Standstill
-from hdbridge.drive.states import FAULTS, State
+from hdbridge.drive.states import FAULTS, OFF, State
 from hdbridge.drive.supervision import ROWS, Event, Fault, Reaction, Supervision
 from hdbridge.drive.traffic import Traffic
 from hdbridge.drive.writes import drive_master_timeout_s
@@ -104,6 +105,8 @@ class AxisCycle:
         self._last: Feedback | None = None
         self._good_cycle = 0
         self._commanded = False
+        self._may_run = True
+        """False once the drive was off and power was not requested since."""
         self._ordered = False
         """True from `quick_stop` until `begin`."""
         self._handled_stop: Event | bool = False
@@ -130,6 +133,7 @@ class AxisCycle:
         prepared = self.image.power.aim is _ENABLED
         self._last = self._feedback(self.feedback.cycle, self.feedback.time_s, True) if prepared else None
         self._commanded = False
+        self._may_run = prepared or self.image.power.state not in OFF
         self.image.forget_channels()
         self.changed()
 
@@ -207,16 +211,15 @@ class AxisCycle:
         return power.aim is _ENABLED or power.state in _POWERED
 
     def stop_before_sync(self) -> Frames | None:
-        """Returns RPDOs with a quick stop if a fault noticed before SYNC stops the axis, else None.
+        """Returns the frames that stop the drive if a fault noticed before SYNC stops the axis, else None.
 
         A drive holds the last RPDO until SYNC. If it has stopped on its own in the meantime, the set-point
-        in that RPDO would set it in motion again. A drive that has restarted gets no RPDO at all.
+        in that RPDO would set it in motion again.
         """
-        reaction = max(ROWS[fault].first for fault, _ in self.pending)
-        if reaction < Reaction.QUICK_STOP or (reaction is Reaction.LATCH and not self._drive_runs):
+        if max(ROWS[fault].first for fault, _ in self.pending) < Reaction.QUICK_STOP:
             return None
         self.image.power.quick_stop()
-        return self.image.pack_rpdo_stop()
+        return self._stop_frames()
 
     def check_statusword(self, frame: Frame) -> None:
         """Checks the statusword of a TPDO that came too early or too late to be used."""
@@ -224,7 +227,7 @@ class AxisCycle:
         if self._commanded and word is not None:
             self.image.power.observe(word)
             if self.image.power.dropped is not None:
-                self._fell_out()
+                self._changed_state()
 
     def hear(self, frame: Frame) -> None:
         """Interprets a frame of the axis that the cycle does not wait for, and records its faults."""
@@ -263,8 +266,10 @@ class AxisCycle:
             self._good_cycle = count
         else:
             feedback = self.stale(count, time_s)
-        if power.dropped is not None and not stop:
-            self._fell_out()
+        if not enabled:
+            self._may_run = power.aim is _ENABLED or (self._may_run and power.state not in OFF)
+        if (enabled and not self._may_run) or (power.dropped is not None and not stop):
+            self._changed_state()
         if now - self._traffic.heard_s > image.heartbeat_timeout_s and not (stop and self._over()):
             silent_ms = 1e3 * (now - self._traffic.heard_s)
             self.pending.append((Fault.HEARTBEAT_LOST, f"for {silent_ms:.0f} ms"))
@@ -329,7 +334,7 @@ class AxisCycle:
         """Completes a cycle with a new fault, with a fault in the cycle before, or with a latched stop."""
         power = self.image.power
         if self._judge(count) is Reaction.LATCH:
-            return self.image.pack_rpdo_stop() if self._drive_runs else None
+            return self._stop_frames()
         if stopping:
             self._count_stop_cycle()
         if self._stop:
@@ -345,11 +350,12 @@ class AxisCycle:
             self._latch()
         return reaction
 
-    @property
-    def _drive_runs(self) -> bool:
-        """True unless the drive itself, and not only another node of the axis, must be verified again."""
-        drive = self.monitor.watch(self.image.node_id)
-        return not drive.restarted and drive.nmt_state in (None, NmtState.OPERATIONAL)
+    def _stop_frames(self) -> Frames:
+        """Returns RPDOs with a quick stop, or an NMT command that ends the PDOs of a drive that restarted."""
+        image = self.image
+        if self.monitor.watch(image.node_id).restarted:
+            return ((COB_NMT, bytes((NmtCommand.PRE_OPERATIONAL, image.node_id))),)
+        return image.pack_rpdo_stop()
 
     def _latch(self) -> None:
         """Stops the set-points of the axis, and withdraws the request to enable it."""
@@ -383,7 +389,7 @@ class AxisCycle:
             self.pending.append((Fault.FOLLOWING_ERROR, lag))
         return True
 
-    def _fell_out(self) -> None:
+    def _changed_state(self) -> None:
         power = self.image.power
         state = power.dropped or power.state
         fault = state in FAULTS

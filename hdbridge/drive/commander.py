@@ -1,8 +1,8 @@
 """Commands the drive by SDO, outside the control cycle: walks through its power states and waits for the
 statusword.
 
-While waiting, it fulfils the master's duties: it processes heartbeats and emergencies, and sends the master's
-own heartbeat, because the drive stops without it.
+While waiting, it fulfils the master's duties: it processes heartbeats and emergencies, and `MasterHeartbeat`
+sends the master's own heartbeat, because the drive stops without it.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from hdbridge.cia301 import NmtState, wrap_int32
 from hdbridge.drive import objects
 from hdbridge.drive.emergencies import error_name
 from hdbridge.drive.image import ProcessImage
-from hdbridge.drive.link import Link
+from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.sdo import SdoClient
@@ -28,6 +28,29 @@ POLL_S: Final = 0.005
 _MAY_BE_ENABLED: Final = (State.SWITCHED_ON, State.OPERATION_ENABLED)
 
 
+class MasterHeartbeat:
+    """Heartbeat of the master outside the control cycle, sent while its user waits for frames."""
+
+    def __init__(self, link: Link, image: ProcessImage) -> None:
+        self._link, self._image = link, image
+        self._due_s = 0.0
+        self.on = False
+        """True while the drive monitors the master, which must then not pause the heartbeat."""
+
+    def recv(self, deadline_s: float) -> Frame | None:
+        """Receives like `Link.recv`, and sends the heartbeat whenever it is due."""
+        link = self._link
+        if not self.on:
+            return link.recv(deadline_s)
+        while True:
+            if link.now() >= self._due_s:
+                link.send(self._image.heartbeat_id, bytes((NmtState.OPERATIONAL,)))
+                self._due_s = link.now() + self._image.heartbeat_period_s
+            frame = link.recv(min(deadline_s, self._due_s))
+            if frame is not None or link.now() >= deadline_s:
+                return frame
+
+
 class Commander:
     """SDO access to the statusword and the controlword of one drive."""
 
@@ -37,7 +60,6 @@ class Commander:
         self.sdo = sdo
         self.image = image
         self.axis = image.axis
-        self._heartbeat_due_s = 0.0
 
     @property
     def name(self) -> str:
@@ -45,7 +67,6 @@ class Commander:
         return f"node {self.sdo.node_id} on {self.link.name}"
 
     def statusword(self) -> int:
-        self._beat()
         return self.sdo.fetch(objects.STATUSWORD)
 
     def state(self) -> State:
@@ -68,25 +89,14 @@ class Commander:
             raise DriveError(
                 f"{self.name}: is in '{state.value}' before 'enable operation'; look at its error display"
             )
-        self._beat()
         self.sdo.store(objects.CONTROLWORD, controlword, attempts=1 if enables else None)
 
     def pause(self, duration_s: float) -> None:
-        """Waits, receiving frames and sending the master's heartbeat when due."""
+        """Waits, and receives frames meanwhile."""
         end_s = self.link.now() + duration_s
-        while True:
-            self._beat()
-            frame = self.link.recv(min(end_s, self._heartbeat_due_s))
-            if frame is not None:
+        while self.link.now() < end_s:
+            if (frame := self.sdo.recv(end_s)) is not None:
                 self.monitor.dispatch(frame)
-            if self.link.now() >= end_s:
-                return
-
-    def _beat(self) -> None:
-        now_s = self.link.now()
-        if now_s >= self._heartbeat_due_s:
-            self.link.send(self.image.heartbeat_id, bytes((NmtState.OPERATIONAL,)))
-            self._heartbeat_due_s = now_s + self.image.heartbeat_period_s
 
     def wait_for(
         self, what: str, done: Callable[[int], bool], timeout_s: float, *, allow_fault: bool = False

@@ -22,7 +22,7 @@ from hdbridge.cia301 import NmtCommand
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.drive import modes, objects
 from hdbridge.drive.bootup import BootReport, BootUp
-from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
+from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander, MasterHeartbeat
 from hdbridge.drive.dictionary import dictionary_of, find
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
@@ -69,12 +69,17 @@ class Drive:
         self.monitor = NetworkMonitor(axis.drive.node_id)
         od = dictionary_of(axis) if od is None else od
         self.image = ProcessImage(axis, od)
-        self.sdo = SdoClient(self.link, self.monitor, axis.drive.node_id, od, sdo_timeout_s)
+        self._heartbeat = MasterHeartbeat(self.link, self.image)
+        self.sdo = SdoClient(
+            self.link, self.monitor, axis.drive.node_id, od, sdo_timeout_s, recv=self._heartbeat.recv
+        )
         self._clients = {axis.drive.node_id: self.sdo}
         encoder = axis.load_encoder.source.node
         if encoder is not None:
             self.monitor.watch(encoder)
-            self._clients[encoder] = SdoClient(self.link, self.monitor, encoder, None, sdo_timeout_s)
+            self._clients[encoder] = SdoClient(
+                self.link, self.monitor, encoder, None, sdo_timeout_s, recv=self._heartbeat.recv
+            )
         self._commander = Commander(self.link, self.monitor, self.sdo, self.image)
         self._mode: Mode | None = None
         self._touched = False
@@ -106,6 +111,7 @@ class Drive:
         self._touched = True
         self.report = None
         self._mode = None
+        self._heartbeat.on = False
         self.report = BootUp(self.link, self.monitor, self.axis, self._clients, self._heard).run(reset=reset)
         for note in self.report.notes:
             _log.warning("boot-up", {"node": self.axis.drive.node_id, "note": note})
@@ -152,7 +158,11 @@ class Drive:
         if mode is cyclic:
             self.image.power.go(State.OPERATION_ENABLED)
         else:
-            self._commander.walk(State.OPERATION_ENABLED)
+            try:
+                self._commander.walk(State.OPERATION_ENABLED)
+            except BaseException:
+                self.power_off()
+                raise
 
     def prepare(self) -> Positions:
         """Prepares for power in the cyclic mode while a control cycle already runs; returns the positions.
@@ -305,6 +315,7 @@ class Drive:
     def power_off(self) -> list[str]:
         """Stops and disables a drive that may be unable to answer; returns the problems as text."""
         self._mode = None
+        self.image.power.power_off()
         try:
             self._power_off()
         except HdbridgeError as error:
@@ -353,10 +364,17 @@ class Drive:
         """
         if self.can_set(objects.HEARTBEAT_CONSUMER):
             self.sdo.store(objects.HEARTBEAT_CONSUMER, master_heartbeat(self.axis) if expected else 0)
+        self._heartbeat.on = expected
 
     def _power_off(self) -> None:
         quick = SdoClient(
-            self.link, self.monitor, self.axis.drive.node_id, self.sdo.od, _CLOSING_TIMEOUT_S, attempts=2
+            self.link,
+            self.monitor,
+            self.axis.drive.node_id,
+            self.sdo.od,
+            _CLOSING_TIMEOUT_S,
+            2,
+            self._heartbeat.recv,
         )
         commander = Commander(self.link, self.monitor, quick, self.image)
         state = commander.state()

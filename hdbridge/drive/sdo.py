@@ -11,7 +11,7 @@ It must not be used in the control cycle.
 
 import logging
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Final
 
 from canopen.objectdictionary import ObjectDictionary
@@ -73,6 +73,7 @@ class _Channel(CanopenSdoClient):
     def __init__(self, link: Link, monitor: NetworkMonitor, node_id: int, od: ObjectDictionary) -> None:
         super().__init__(COB_SDO_REQUEST + node_id, COB_SDO_ANSWER + node_id, od)  # type: ignore[no-untyped-call]
         self.link = link
+        self.recv: Callable[[float], Frame | None] = link.recv
         self.monitor = monitor
         self.timeout_s = DEFAULT_TIMEOUT_S
         self.transfer_ends_s = 0.0
@@ -94,7 +95,7 @@ class _Channel(CanopenSdoClient):
         self.send_request(sdo_request)
         deadline_s = min(self.link.now() + self.timeout_s, self.transfer_ends_s)
         # The second condition ends the wait on a bus that is never idle.
-        while (frame := self.link.recv(deadline_s)) is not None and frame.time_s <= deadline_s:
+        while (frame := self.recv(deadline_s)) is not None and frame.time_s <= deadline_s:
             if frame.can_id != self.tx_cobid:
                 self._set_aside(frame)
                 continue
@@ -142,7 +143,8 @@ class _Channel(CanopenSdoClient):
 class SdoClient:
     """Reads and writes the objects of one node. Not thread-safe; not for the control cycle.
 
-    ``od`` is the node's object dictionary; None if the types of CiA 301 and CiA 402 suffice.
+    ``od`` is the node's object dictionary; None if the types of CiA 301 and CiA 402 suffice. ``recv`` is used
+    in place of `Link.recv`.
     """
 
     def __init__(
@@ -153,12 +155,14 @@ class SdoClient:
         od: ObjectDictionary | None = None,
         timeout_s: float = DEFAULT_TIMEOUT_S,
         attempts: int = DEFAULT_ATTEMPTS,
+        recv: Callable[[float], Frame | None] | None = None,
     ) -> None:
         self.node_id = node_id
         self.od = ObjectDictionary() if od is None else od  # type: ignore[no-untyped-call]
         self.attempts = attempts
         self._channel = _Channel(link, monitor, node_id, self.od)
         self._channel.timeout_s = timeout_s
+        self.recv = self._channel.recv = recv if recv is not None else link.recv
 
     @property
     def unsolicited_answers(self) -> int:

@@ -25,7 +25,7 @@ class Reaction(IntEnum):
     QUICK_STOP = 2
     """Command a quick stop until the drive reports it; latched."""
     LATCH = 3
-    """Send no more RPDOs, except for a last quick stop to a drive that has not restarted itself.
+    """Send no more RPDOs after a last quick stop; a drive that restarted is put into PRE-OPERATIONAL instead.
 
     Latched until the drive has been verified again, from identity to limits."""
 
@@ -43,7 +43,7 @@ class Fault(Enum):
     EMERGENCY = "the drive sent an emergency message"
     MASTER_LOST = "the drive reports that it missed its master"
     DRIVE_FAULT = "the drive reports a fault"
-    DROPPED_OUT = "the drive left 'operation enabled' on its own"
+    DROPPED_OUT = "the drive changed its power state on its own"
     BOOT_UP = "a node restarted"
     NMT_CHANGE = "a node is not operational"
     HEARTBEAT_LOST = "the drive's heartbeat is missing"

@@ -253,7 +253,7 @@ _JUMP = "an encoder moved faster than the axis can"
 _OWN_ID = "another node sends with an identifier of this master"
 _CHANNEL = "a load torque or temperature did not arrive, or is implausible"
 _AWAY = "the CAN interface went away"
-_DROPPED_OUT = "the drive left 'operation enabled' on its own"
+_DROPPED_OUT = "the drive changed its power state on its own"
 
 _ROWS: Final = (
     Row("lost_tpdo", "The next `count` TPDOs are not sent.",

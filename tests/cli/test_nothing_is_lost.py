@@ -6,21 +6,23 @@ import resource
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
+from support import patience
 from support.command import run_apart, started
 
 from hdbridge.records.recording import Recording
 
+TERMINAL = {"FORCE_COLOR": "1", "NO_COLOR": "1", "TERM": "xterm"}
+"""Makes a command show its progress bar, which appears with the first step, on a pipe as well."""
 LONG = ("step", "article", "--simulate", "--count", 400, "--step-deg", 20)
 
 
-def booted(folder, *arguments):
-    """A command whose drive is booted."""
-    process = started(folder, *arguments)
+def until(said, folder, *arguments, **options):
+    """Starts a command and returns it once it has printed this on standard error."""
+    process = started(folder, *arguments, **options)
     assert process.stderr is not None
-    while "booted" not in (line := process.stderr.readline()):
+    while said not in (line := process.stderr.readline()):
         assert line, "it ended early"
     return process
 
@@ -28,8 +30,7 @@ def booted(folder, *arguments):
 @pytest.mark.usefixtures("at_a_terminal")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_a_termination_signal_stops_in_order_and_keeps_the_measurement(tmp_path, number):
-    process = booted(tmp_path, *LONG, "--record", "kept")
-    time.sleep(1.0)
+    process = until(" %", tmp_path, *LONG, "--record", "kept", env=TERMINAL)
     process.send_signal(number)
     _, errors = process.communicate()
     assert process.returncode == 130, errors
@@ -42,11 +43,9 @@ def test_a_termination_signal_stops_in_order_and_keeps_the_measurement(tmp_path,
 
 def test_results_of_finished_schemes_are_printed_and_written(tmp_path):
     outputs = ("--record", "kept", "--json", "figures.json", "--html", "page.html")
-    process = booted(tmp_path, "step", "article", "--simulate", "--count", 40, *outputs)
+    process = until("booted", tmp_path, "step", "article", "--simulate", "--count", 40, *outputs)
     first = tmp_path / "kept" / "stepping-none.csv.gz"
-    while not first.exists():
-        assert process.poll() is None
-        time.sleep(0.01)
+    patience.until(lambda: first.exists() or process.poll() is not None)
     process.send_signal(signal.SIGINT)
     printed, errors = process.communicate()
     assert process.returncode == 130, errors

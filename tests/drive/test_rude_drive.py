@@ -11,6 +11,8 @@ from support.spoilt import SpoiltBus
 
 from hdbridge.control.bench import Bench
 from hdbridge.drive import Drive, Mode
+from hdbridge.drive.sdo import SdoAbortError
+from hdbridge.drive.states import State
 from hdbridge.errors import DriveError, SdoError, TransitionError
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import VirtualClock
@@ -48,7 +50,16 @@ def test_a_drive_that_stopped_while_its_answer_was_lost_is_not_enabled_again() -
         node._values[0x605A, 0] = 6  # it stays in quick stop active
         drive.enable(Mode.HM)
         drive.wait(0.05)
-        node.ways.mute_sdo.extend((False, True))  # the statusword is answered, the controlword is not
+        reply = node._reply
+
+        def lost(answer: bytes) -> None:
+            if answer[0] == 0x60:  # the controlword was obeyed
+                node._reply = reply  # type: ignore[method-assign]
+                node.miss_master()
+            else:
+                reply(answer)
+
+        node._reply = lost  # type: ignore[method-assign]
         with pytest.raises(SdoError, match="one attempt"):
             drive._commander.control(0x000F)
         assert node.state != ENABLED
@@ -63,6 +74,38 @@ def test_enable_operation_is_not_sent_to_a_drive_that_stopped_by_itself() -> Non
         with pytest.raises(DriveError, match="quick stop active"):
             drive._commander.control(0x001F)
         assert node.powered == 1
+
+
+@pytest.mark.parametrize("mode", [Mode.PP, Mode.HM, None])
+def test_a_refused_transfer_while_enabling_leaves_no_power(mode: Mode | None) -> None:
+    for answers in range(30):
+        with booted() as (drive, node):
+            node.ways.mangles_sdo.extend(
+                [
+                    "",
+                ]
+                * answers
+                + ["abort"]
+            )
+            try:
+                drive.enable(mode)
+            except SdoAbortError:
+                assert node.state == OFF
+                assert drive.image.power.aim is not State.OPERATION_ENABLED
+            else:
+                break
+            finally:
+                node.ways.mangles_sdo.clear()
+    assert answers > 8
+
+
+def test_a_drive_hears_its_master_while_an_answer_is_awaited() -> None:
+    with booted() as (drive, node):
+        drive.enable(Mode.PP)
+        drive.wait(0.05)
+        node.ways.mute_sdo.append(True)
+        drive.state()
+        assert node.state == ENABLED
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,8 @@ class Ways:
     resumes: bool = False
     """Applies its last RPDO again at each SYNC."""
     ignores_enable: bool = False
+    powers_itself: bool = False
+    """Goes to *operation enabled* after each SYNC, whatever the controlword."""
     guards: bool = False
     """Sends no heartbeat."""
     mode_delay_s: float = 0.0
@@ -59,7 +61,8 @@ class Ways:
     mute_sdo: deque[bool] = field(default_factory=deque)
     """True for each coming SDO request that it obeys but does not answer."""
     mangles_sdo: deque[str] = field(default_factory=deque)
-    """For each coming SDO answer: ``twice``, ``before`` (after the answer before), or ``toggle``."""
+    """For each coming SDO answer: ``twice``, ``before`` (after the answer before), ``toggle``, ``abort``, or
+    nothing."""
 
 
 class RudeDrive:
@@ -258,6 +261,8 @@ class RudeDrive:
                 self._rpdo = None
             self._values[0x607A, 0] = target
             self._control(word)
+        if self.ways.powers_itself:
+            self.state = ENABLED
         self._move()
         if self.ways.stale_tpdos and self._sent:
             self.ways.stale_tpdos -= 1
@@ -360,7 +365,8 @@ class RudeDrive:
         if self.ways.mute_sdo and self.ways.mute_sdo.popleft():
             return
         way = self.ways.mangles_sdo.popleft() if self.ways.mangles_sdo else ""
-        frames = {"twice": [answer, answer], "before": [before, answer]}.get(way, [answer])
+        abort = struct.pack("<B3sI", 0x80, answer[1:4], 0x08000000)
+        frames = {"twice": [answer, answer], "before": [before, answer], "abort": [abort]}.get(way, [answer])
         for frame in filter(None, frames):
             self._send(0x580 + self.node_id, frame)
 

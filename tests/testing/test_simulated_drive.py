@@ -8,7 +8,8 @@ import can
 import pytest
 from support.patience import until
 
-from hdbridge.errors import BusError, HdbridgeError, InputError
+from hdbridge.drive.interfacelock import InterfaceLock
+from hdbridge.errors import BusError, BusInUseError, HdbridgeError, InputError
 from hdbridge.testing import simulated_drive
 
 
@@ -223,10 +224,21 @@ def test_a_real_interface_is_not_taken_down():
         drive.fault("bus_down")
 
 
-def test_drives_take_turns_on_a_real_bus():
+def test_drives_take_turns_on_a_real_bus(monkeypatch):
     """Workers of pytest-xdist share vcan0 in this way: the second drive waits for the first to end."""
     bus = "udp_multicast:239.74.163.9"
     order = []
+    refused = threading.Event()
+
+    class Lock(InterfaceLock):
+        def acquire(self) -> None:
+            try:
+                super().acquire()
+            except BusInUseError:
+                refused.set()
+                raise
+
+    monkeypatch.setattr("hdbridge.testing.line.InterfaceLock", Lock)
 
     def second() -> None:
         with simulated_drive("article", bus=bus):
@@ -235,7 +247,7 @@ def test_drives_take_turns_on_a_real_bus():
     with simulated_drive("article", bus=bus):
         thread = threading.Thread(target=second)
         thread.start()
-        time.sleep(0.2)
+        until(lambda: refused.is_set() or order)
         order.append("first")
     thread.join()
     assert order == ["first", "second"]

@@ -170,7 +170,6 @@ class Follower:
 
     def use_model(self, model: TransmissionModel) -> None:
         """Switches to another model, which the control process uses from now on."""
-        self.health.restart()
         self._servo.use(model.response)
 
     def _refine(self, adaptation: Adaptation) -> None:

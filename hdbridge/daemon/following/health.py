@@ -310,7 +310,7 @@ class EncoderHealth:
         self.restart()
 
     def restart(self) -> None:
-        """Forgets the last samples, for example after a change of the predicting model."""
+        """Forgets the last samples, because the next ones do not continue them."""
         self._tail: SampleArray | None = None
         """Last samples, which are evaluated again with the next ones."""
         self._constant: tuple[float, float] | None = None

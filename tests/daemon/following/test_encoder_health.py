@@ -33,12 +33,17 @@ def model_of(offset=31.6, second=13.7, phase=161.5):
 MODEL = model_of()
 
 
-def judged(samples, follower=None, batch=50):
-    """Returns the encoder's states over the samples, each at its first occurrence."""
+def judged(samples, follower=None, batch=50, exchanged=False):
+    """Returns the encoder's states over the samples, each at its first occurrence.
+
+    If ``exchanged``, the model is replaced after each batch.
+    """
     follower = follower or Follower(AXIS, MODEL)
     seen = []
     for first in range(0, len(samples), batch):
         follower.take(samples[first : first + batch])
+        if exchanged:
+            follower.use_model(MODEL)
         status = follower.health.status
         if not seen or status.fault is not seen[-1][1].fault:
             seen.append((first * PERIOD_S, status))
@@ -70,6 +75,7 @@ def faulty(change, **options):
     return samples
 
 
+@pytest.mark.parametrize("exchanged", [False, True])
 @pytest.mark.parametrize(
     ("fault", "change", "within_s"),
     [
@@ -84,8 +90,8 @@ def faulty(change, **options):
         (EncoderFault.DRIFTING, lambda load, time_s: load + 6.0 / 60.0 * time_s / 3600.0, 180.0),
     ],
 )
-def test_faults_are_named_with_figures_and_not_too_early(fault, change, within_s):
-    seen = judged(faulty(change)[: FAULT + int((within_s + 1.0) / PERIOD_S)])
+def test_faults_are_named_with_figures_and_not_too_early(fault, change, within_s, exchanged):
+    seen = judged(faulty(change)[: FAULT + int((within_s + 1.0) / PERIOD_S)], exchanged=exchanged)
     assert [each.fault for _, each in seen][:2] == [None, fault]
     at_s, status = seen[1]
     assert FAULT_S - 0.2 <= at_s <= FAULT_S + within_s

@@ -3,8 +3,9 @@
 `tests/daemon/test_disorder.py` draws sequences of them.
 """
 
+import errno
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import can
@@ -14,9 +15,10 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from support.characters import RUDE
 from support.daemon import SteppedDaemon, article_axis, stepped_daemon
-from support.rude import ENABLED, OFF, RudeDrive
+from support.rude import ENABLED, OFF, STOPPED, RudeDrive
 
 from hdbridge.axis import Source
+from hdbridge.daemon.loop.faultlog import FAULT_INDEX
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind
 from hdbridge.drive.supervision import Fault
@@ -25,6 +27,11 @@ AFTER_TURNS = st.integers(0, 8)
 """Cycles from the command to enable until a drive is enabled, and some more."""
 PLAUSIBLE_COUNTS = 400
 """Largest error of a position that the supervision accepts: vibration, and the highest speed in a cycle."""
+
+CYCLE_COUNTS = 100
+"""Motion in one cycle at the highest speed, counts."""
+STOPS = (AxisState.QUICK_STOPPED, AxisState.LATCHED)
+DROPPED_OUT = FAULT_INDEX[Fault.DROPPED_OUT]
 
 
 @contextmanager
@@ -92,6 +99,149 @@ def test_the_noise_of_a_fine_encoder_is_not_motion(by_command: bool) -> None:
         daemon.run(0.2)
         (stopped,) = daemon.reported(EventKind.STOPPED)
         assert "did not" not in stopped.text
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_drive_that_powers_itself_is_stopped_and_reported(stopped: bool) -> None:
+    with verified() as (daemon, node):
+        if stopped:
+            stop(daemon, by_command=False)
+            daemon.until(lambda: bool(daemon.reported(EventKind.STOPPED)))
+        node.ways.powers_itself = True
+        daemon.turn(3)
+        node.ways.powers_itself = False
+        daemon.turn(2)
+        assert node.state == STOPPED
+        assert daemon.states == [AxisState.QUICK_STOPPED]
+        texts = [each.text for each in daemon.reported(EventKind.FAULT) if each.code == DROPPED_OUT]
+        assert texts == ["it went to 'operation enabled'"]
+
+
+Disturbance = Callable[[SteppedDaemon, RudeDrive], object]
+
+
+def emergencies(daemon: SteppedDaemon, number: int) -> None:
+    for code in range(0x2300, 0x2300 + number):
+        daemon.interfere(0x081, struct.pack("<HB5x", code, 1))
+
+
+def error_frames(daemon: SteppedDaemon, number: int) -> None:
+    for _ in range(number):
+        frame = can.Message(arbitration_id=0x40, is_error_frame=True, is_extended_id=False)
+        daemon.intruder.send(frame)
+
+
+def restarts(node: RudeDrive) -> None:
+    """Restarts the communication only, and goes on with the last RPDO."""
+    node.ways.starts_itself = node.ways.keeps_power = node.ways.resumes = True
+    node.restart(everything=False)
+
+
+HARMLESS: dict[str, Disturbance] = {
+    "error frames": lambda daemon, _: error_frames(daemon, 50),
+    "emergency storm": lambda daemon, _: emergencies(daemon, 200),
+    "end of all errors": lambda daemon, _: daemon.interfere(0x081, bytes(8)),
+    "each TPDO twice": lambda _, node: setattr(node, "duplicate_tpdos", 200),
+    "a late TPDO": lambda _, node: setattr(node, "hold_tpdos", 1),
+    "a lost TPDO": lambda _, node: setattr(node, "drop_tpdos", 1),
+    "jumps by the range of 6064h": lambda _, node: node.ways.jumps.extend([1 << 32, 0, -(1 << 32)]),
+}
+STOPPING: dict[str, Disturbance] = {
+    "interface down": lambda daemon, _: setattr(daemon.bus, "down", errno.ENETDOWN),
+    "pre-operational heartbeat": lambda daemon, _: daemon.interfere(0x701, b"\x7f"),
+    "stopped heartbeat": lambda daemon, _: daemon.interfere(0x701, b"\x04"),
+    "false boot-up message": lambda daemon, _: daemon.interfere(0x701, b"\0"),
+    "pre-operational": lambda _, node: node.leave_operational(),
+    "restart": lambda _, node: node.restart(),
+    "restart with power": lambda _, node: restarts(node),
+    "no TPDO any more": lambda _, node: setattr(node, "drop_tpdos", 10**6),
+    "late TPDOs": lambda _, node: setattr(node, "hold_tpdos", 3),
+    "jump by half the range of 6064h": lambda _, node: node.ways.jumps.append(1 << 31),
+    **{
+        f"one statusword {word:02X}h": lambda _, node, word=word: node.ways.words.append(word)  # type: ignore[misc]
+        for word in (0x00, 0x40, 0x21, 0x23, 0x07, 0x0F, 0x08, 0xFFFF)
+    },
+}
+
+
+@pytest.mark.parametrize("name", HARMLESS)
+def test_what_is_harmless_does_not_stop_a_move(name: str) -> None:
+    with moving() as (daemon, node):
+        HARMLESS[name](daemon, node)
+        daemon.run(0.5)
+        moved = daemon.move(0.0)
+        daemon.until(lambda: daemon.ended(moved), 30.0)
+        assert daemon.states == [AxisState.ENABLED]
+
+
+@pytest.mark.parametrize("name", STOPPING)
+def test_what_stops_a_move_stops_it_for_good(name: str) -> None:
+    with moving() as (daemon, node):
+        powered, before = node.powered, node.motor_counts
+        STOPPING[name](daemon, node)
+        daemon.run(0.1)
+        stopped = node.motor_counts
+        daemon.run(1.0)
+        daemon.bus.down = None
+        daemon.run(1.0)
+        assert node.powered == powered
+        assert node.motor_counts == stopped
+        assert abs(stopped - before) <= 2 * CYCLE_COUNTS
+        assert daemon.states[0] in STOPS
+        assert node.state != ENABLED or node.nmt != 5
+        (event,) = daemon.reported(EventKind.STOPPED)
+        assert event.text
+
+
+@pytest.mark.parametrize("frames", [300, 600])
+def test_a_flood_of_emergencies_stops_a_move(frames: int) -> None:
+    with moving() as (daemon, node):
+        for _ in range(3):
+            emergencies(daemon, frames)
+            daemon.turn()
+        daemon.run(0.2)
+        assert daemon.states == [AxisState.QUICK_STOPPED]
+        assert node.state != ENABLED
+
+
+def test_bus_off_stops_a_move() -> None:
+    """Its only sign is an error frame of SocketCAN."""
+    with stepped_daemon(1, character=RUDE) as daemon:
+        daemon.bus.channel_info = "socketcan channel 'vcan0'"
+        daemon.begin_again()
+        daemon.verify()
+        daemon.enable()
+        daemon.move(300.0)
+        daemon.run(0.5)
+        (node,) = daemon.nodes
+        before = node.motor_counts
+        error_frames(daemon, 1)
+        daemon.run(1.0)
+        assert [
+            each.kind for each in daemon.events if each.kind in (EventKind.BUS_DOWN, EventKind.BUS_UP)
+        ] == [
+            EventKind.BUS_DOWN,
+            EventKind.BUS_UP,
+        ]
+        assert node.motor_counts == before
+        assert daemon.states == [AxisState.LATCHED]
+
+
+@pytest.mark.parametrize("resumes", [False, True])
+@pytest.mark.parametrize("dead_s", [0.0, 0.02, 1.0])
+def test_an_axis_does_not_move_after_the_death_of_its_master(dead_s: float, resumes: bool) -> None:
+    with moving() as (daemon, node):
+        node.ways.resumes = resumes
+        before = node.motor_counts
+        daemon.hang(dead_s)
+        daemon.begin_again()
+        daemon.run(0.5)
+        assert node.motor_counts == before
+        assert node.powered == 1
+        daemon.drives.clear()
+        daemon.verify()
+        assert node.state == OFF
+        assert node.motor_counts == before
 
 
 @settings(max_examples=12, phases=[Phase.generate])

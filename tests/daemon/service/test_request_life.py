@@ -15,7 +15,7 @@ from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind
 from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.drive.objects import Mode
-from hdbridge.errors import HdbridgeError, LeaseError
+from hdbridge.errors import HdbridgeError, LeaseError, RefusedError
 
 STEPS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
 """Numbers of steps of the event loop after which a request is stopped."""
@@ -144,3 +144,33 @@ def test_a_service_that_cannot_stop_a_lent_drive_has_it_booted_without_power(tmp
         (node,) = service.daemon.nodes
         assert isinstance(node, RudeDrive)
         play(taken_over())
+
+
+def test_two_clients_that_take_the_lease_from_each_other_move_the_axis_only_in_turn(tmp_path: Path) -> None:
+    async def fight() -> None:
+        async with service.enabled() as (bridge, axis, _):
+
+            async def client(name: str, target_deg: float, pause_s: float) -> None:
+                for _ in range(12):
+                    token = bridge.lease.take(name, force=True)
+                    with suppress(LeaseError, RefusedError):
+                        await axis.motion.move(token, target_deg)
+                        assert abs(axis.state().load_position_deg - target_deg) < 0.1
+                        assert bridge.lease.holds(token)
+                    await axis.core.timing.sleep(pause_s)
+                    if not bridge.lease.holds(token):
+                        with pytest.raises(LeaseError):
+                            await axis.motion.move(token, 50.0)
+
+            await asyncio.gather(client("one", 3.0, 0.05), client("two", -3.0, 0.07))
+            bridge.lease.take("nobody", force=True)
+            await axis.core.timing.sleep(1.0)
+            before = node.motor_counts
+            await axis.core.timing.sleep(1.0)
+            assert node.motor_counts == before
+            assert abs(axis.state().load_position_deg) < 3.1
+
+    with stepped_service(tmp_path, character=RUDE) as service:
+        (node,) = service.daemon.nodes
+        assert isinstance(node, RudeDrive)
+        play(fight())
