@@ -7,6 +7,7 @@ therefore checked in the same way.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +17,8 @@ from hdbridge.errors import InputError
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import free_parameters
-from hdbridge.twin.misfit import CHANNELS, Replays, Values, coarse, noise_floor, prepare
+from hdbridge.twin.mechanics import COMPARED, measured_mechanics
+from hdbridge.twin.misfit import CHANNELS, Data, Replays, Values, coarse, noise_floor, prepare
 from hdbridge.twin.naming import GROWN, OF_REPLAY, Finding, explain, findings, growth, scales_by_kind, shifted
 from hdbridge.twin.parameters import BY_NAME, Parameter, by_cause, coordinates
 from hdbridge.units import figure
@@ -26,6 +28,8 @@ CHECK_S = 17.0
 NOTICEABLE = 2.5
 """Change of a parameter that a recording must reveal, in units of the parameter's least change. If the
 recording does not reveal it, the parameter's cause is reported as not observable."""
+Z_SCORE = 3.0
+"""Minimum change of a measured parameter, in standard errors, and maximum that cannot be excluded."""
 WARMTH = "temperature"
 OWN = ("load friction", WARMTH, "current limit", "velocity feed-forward")
 """Parameters that a check fits in addition to those fitted for a twin. The temperature is left out if both
@@ -92,7 +96,8 @@ def check(
             f"the truth '{twin.name}' has no uncertainty (provenance.fit); expected a twin that "
             "was fitted: make one with hdbridge twin"
         )
-    data = coarse(prepare(recording, axis, twin), CHECK_S)
+    whole = prepare(recording, axis, twin)
+    data = coarse(whole, CHECK_S)
     floor, noise = noise_floor(data), about["noise"]
     scale = {name: max(noise.get(name, 0.0), floor[name]) for name in CHANNELS}
     was = scales_by_kind(data, about.get("misfit", {}), scale)
@@ -102,14 +107,37 @@ def check(
     )
     parameters = free_parameters(twin, [each for each in OWN if not (known_warmth and each == WARMTH)])
     groups = by_cause(parameters)
+    ratio = Values.of(twin) is Values.REPLAY
+    shown = _factors(about, whole) if ratio else {}
+    settled = {BY_NAME[name].cause for name in shown}
     with Replays(data, workers) as replays:
-        unseen = tuple(cause for cause, own in groups.items() if not _shows(replays, twin, own, was))
-        ratio = Values.of(twin) is Values.REPLAY
-        found = explain(replays, twin, parameters, was, progress, OF_REPLAY if ratio else 0.0)
+        unseen = tuple(
+            cause
+            for cause, own in groups.items()
+            if cause not in settled and not _shows(replays, twin, own, was)
+        )
+        found = explain(replays, twin, parameters, was, progress, OF_REPLAY if ratio else 0.0, shown)
     changes = findings(found, groups, twin, ratio=ratio)
     blind = len(unseen) == len(groups)
     unseen = tuple(each for each in unseen if each not in found.causes)
     return Check(changes, found.growth_before, found.growth_after, unseen, blind)
+
+
+def _factors(about: Mapping[str, Any], data: Data) -> dict[str, float]:
+    """Returns the factors by which measured parameters have changed since the twin was made.
+
+    A factor is 1 if a noticeable change is improbable. Parameters for which neither is certain are left out.
+    """
+    found, now = {}, measured_mechanics(data, about.get("speed_rad_s", 0.0))
+    for name, (value, error) in about.get("mechanics", {}).items():
+        if name in COMPARED and name in now:
+            factor, relative = now[name].value / value, math.hypot(now[name].relative, error / value)
+            size, least = abs(math.log(factor)), BY_NAME[name].least_change
+            if size > max(least, Z_SCORE * relative):
+                found[name] = factor
+            elif size + Z_SCORE * relative < NOTICEABLE * least:
+                found[name] = 1.0
+    return found
 
 
 def _shows(replays: Replays, twin: Truth, own: Sequence[Parameter], was: Mapping[str, Any]) -> bool:

@@ -598,9 +598,13 @@ def misfit_of(
     found: dict[str, dict[str, float]] = {}
     for name, inside in (rows or data.counts).items():
         for kind in dict.fromkeys(kinds[inside].tolist()):
-            each = rms(residuals[name][inside & (kinds == kind)])
-            found.setdefault(name, {})[kind] = float(f"{each:.6g}")
+            found.setdefault(name, {})[kind] = rounded(rms(residuals[name][inside & (kinds == kind)]))
     return found
+
+
+def rounded(value: float) -> float:
+    """Rounds to six significant digits."""
+    return float(f"{value:.6g}")
 
 
 def signals_of(data: Data) -> dict[str, FloatArray]:

@@ -23,7 +23,15 @@ from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import Fitted, fitted_rows, legs_of_rows, solve
 from hdbridge.twin.misfit import CHANNELS, Data, Misfit, Replays, Scales
-from hdbridge.twin.parameters import Parameter, at_coordinates, by_cause, coordinates, free_value
+from hdbridge.twin.parameters import (
+    BY_NAME,
+    Parameter,
+    at_coordinates,
+    by_cause,
+    coordinates,
+    free_value,
+    with_values,
+)
 from hdbridge.units import figure
 
 # ----------------------------------------------------------------
@@ -120,19 +128,24 @@ def explain(
     was: Mapping[str, Any],
     progress: Callable[[float], None] = lambda _: None,
     least: float = 0.0,
+    shown: Mapping[str, float] | None = None,
 ) -> Explained:
     """Names causes until the misfit of ``base`` is back at ``was`` (`scales_by_kind`).
 
     In each round every other cause is fitted together with the named causes. The best is named if it explains
     at least the fraction `EXPLAINED` of the remaining growth, and the fraction ``least`` of the whole growth.
     Causes made superfluous by a later one are dropped. A rival of the last cause is a cause that is not
-    significantly worse.
+    significantly worse. ``shown`` contains the factors by which parameters are known to have changed. Their
+    causes are named first if a factor is not 1, and not at all otherwise.
     """
     data, groups = replays.data, by_cause(parameters)
     legs = legs_of_rows(data, fitted_rows(data, everything=True))
     (here,) = replays([base])
     grown = growth(data, here, was)
-    named, rivals = list[str](), tuple[str, ...]()
+    shown = shown or {}
+    settled = {BY_NAME[name].cause for name in shown}
+    known = {BY_NAME[name].cause: None for name, factor in shown.items() if factor != 1.0}
+    named, rivals = list(known), tuple[str, ...]()
     best, now = base, grown
 
     def fitted(causes: Sequence[str], start: Truth) -> Fitted:
@@ -142,11 +155,16 @@ def explain(
             linear=False,
         )  # fmt: skip
 
-    while max(now.values(), default=0.0) > GROWN and len(named) < len(groups):
+    if named:
+        values = {name: factor * free_value(base, BY_NAME[name]) for name, factor in shown.items()}
+        fit = fitted(named, with_values(base, values))
+        best, now = fit.truth, growth(data, fit.residuals, was)
+    others = [each for each in groups if each not in settled]
+    while max(now.values(), default=0.0) > GROWN and others:
         fits: dict[str, Fitted] = {}
-        for cause in (each for each in groups if each not in named):
+        for cause in others:
             fits[cause] = fitted([*named, cause], _nearest(replays, best, groups[cause], was))
-            progress((len(named) + len(fits) / len(groups)) / (len(named) + 1))
+            progress((len(named) + len(fits) / len(others)) / (len(named) + 1))
         cause, fit = min(fits.items(), key=lambda each: each[1].cost)
         after = growth(data, fit.residuals, was)
         if _excess(now) - _excess(after) < max(EXPLAINED * _excess(now), least * _excess(grown)):
@@ -157,7 +175,8 @@ def explain(
             if other is not fit and not worse_than_chance(fit.vector, other.vector - fit.vector, legs)
         )
         named, best, now = [*named, cause], fit.truth, after
-    for cause in named[:-1]:
+        others.remove(cause)
+    for cause in named[len(known) : -1]:
         rest = [each for each in named if each != cause]
         back = at_coordinates(best, groups[cause], coordinates(base, groups[cause]))
         fit = fitted(rest, back)

@@ -48,6 +48,7 @@ from hdbridge.twin.fit import (
     legs_of_rows,
     values_in,
 )
+from hdbridge.twin.mechanics import measured_mechanics, rms_speed_rad_s
 from hdbridge.twin.misfit import (
     CHANNELS,
     MOST_SCATTER,
@@ -63,6 +64,7 @@ from hdbridge.twin.misfit import (
     noise_floor,
     noise_in_motion,
     prepare,
+    rounded,
     with_load_noise,
 )
 from hdbridge.twin.naming import Finding, InseparableSet, explain, findings, inseparable_sets, scales_by_kind
@@ -415,11 +417,14 @@ def _compared(whole: Recording, axis: AxisConfig, truth: Truth) -> Comparison:
 
 def with_knowledge(fitted: Fitted, data: Data, values: Values = Values.AXIS) -> Truth:
     """Returns the fitted truth with its intervals, and with the data for a later check in its provenance."""
-    intervals = fitted.intervals()
+    intervals, speed_rad_s = fitted.intervals(), rounded(rms_speed_rad_s(data))
+    measured = measured_mechanics(data, speed_rad_s)
     about: dict[str, Any] = {
         "parameters": [each.name for each in fitted.parameters],
-        "noise": {name: float(f"{fitted.scales.noise[name]:.6g}") for name in CHANNELS},
+        "noise": {name: rounded(fitted.scales.noise[name]) for name in CHANNELS},
         "misfit": misfit_of(data, fitted.residuals),
+        "mechanics": {name: [rounded(each.value), rounded(each.error)] for name, each in measured.items()},
+        "speed_rad_s": speed_rad_s,
     }
     truth = with_load_noise(fitted.truth, fitted.residuals[LOAD])
     return truth.model_copy(

@@ -110,7 +110,7 @@ def test_a_part_is_added_if_the_axis_has_it(
 def test_a_torque_limit_is_fitted_where_a_replay_without_it_leaves_more() -> None:
     limited = with_values(TRUTH, {LIMIT: LIMIT_PERCENT})
     with Replays(prepare(recorded(limited), AXIS, TRUTH), 1) as replays:
-        read = start_of(TRUTH, replays.data).servo.torque_limit_percent
+        read = start_of(TRUTH, replays.data, {}).servo.torque_limit_percent
         assert read == pytest.approx(LIMIT_PERCENT, rel=0.01)
         found = fitted(replays, with_values(TRUTH, {LIMIT: read}))
         found = with_limit(replays, found, TRUTH)
@@ -122,7 +122,9 @@ def test_a_torque_limit_is_fitted_where_a_replay_without_it_leaves_more() -> Non
 
 def test_a_peak_torque_is_not_a_limit() -> None:
     with Replays(prepare(recorded(), AXIS, TRUTH), 1) as replays:
-        assert start_of(TRUTH, replays.data).servo.torque_limit_percent == TRUTH.servo.torque_limit_percent
+        assert (
+            start_of(TRUTH, replays.data, {}).servo.torque_limit_percent == TRUTH.servo.torque_limit_percent
+        )
         highest_nm = max(float(np.max(np.abs(each.measured["motor torque"]))) for each in replays.data.pieces)
         within = with_values(TRUTH, {LIMIT: 100.0 * highest_nm / TRUTH.motor.rated_torque_nm})
         usual = with_limit(replays, fitted(replays, within), TRUTH)

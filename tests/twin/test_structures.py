@@ -16,6 +16,7 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import compare
 from hdbridge.twin.fit import MOST_DEAD_CYCLES, fit, start_of, starts
+from hdbridge.twin.mechanics import measured_mechanics
 from hdbridge.twin.misfit import (
     CHANNELS,
     Data,
@@ -118,7 +119,7 @@ def test_a_twin_follows_a_foreign_servo_and_is_never_worse_than_a_plain_fit(stru
     data = prepare(fitted, axis, start(axis, foreign))
     with Replays(data, 1) as replays:
         found = fit(replays)
-    plain = plain_fit(data, start_of(data.base, data))
+    plain = plain_fit(data, start_of(data.base, data, measured_mechanics(data)))
     assert misfit(data, found.residuals) < 1.02 * misfit(data, residuals(data, plain))
     twin, reference = (shares(other, axis, each) for each in (found.truth, plain))
     assert twin["following_error"] < max(0.05, 1.02 * reference["following_error"])
