@@ -1124,7 +1124,7 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
     while near(best):
         # The expected scales are used, because the residuals of a wrong simulation do not estimate the noise
         # and would reduce the weight of the very channel that shows the error.
-        whole = continued(replays, best, STEPS, known=expected(data), linear=False)
+        whole = continued(replays, best, STEPS, known=expected(data), near=best, linear=False)
         whole = _ended(replays, whole)
         if polished is not None and misfit(data, polished.residuals) <= misfit(data, whole.residuals):
             break
@@ -1152,7 +1152,13 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
 def _wider(fitted: Fitted, more: tuple[Parameter, ...]) -> Fitted:
     """Returns a start for a fit with more parameters, whose prior is about their present values."""
     prior = np.append(fitted.prior, coordinates(fitted.truth, more))
-    return replace(fitted, parameters=(*fitted.parameters, *more), prior=prior)
+    unknown = np.zeros((len(fitted.jacobian), len(more)))
+    return replace(
+        fitted,
+        parameters=(*fitted.parameters, *more),
+        prior=prior,
+        jacobian=np.concatenate([fitted.jacobian, unknown], axis=1),
+    )
 
 
 def values_in(fitted: Fitted, left: Sequence[ChannelResidual]) -> Values:
