@@ -8,13 +8,12 @@ from typing import Final, Self
 
 from hdbridge.cia301 import NmtCommand
 from hdbridge.conformance.drive import MODES
-from hdbridge.conformance.steps import control, has_bits, holds, reads, stays, waits
+from hdbridge.conformance.steps import control, has_bits, holds, parametrised, reads, reset_node, stays, waits
 from hdbridge.conformance.tester import (
     ENABLING,
     Decorator,
     NodeTester,
     NotApplicableError,
-    Step,
     Table,
     expedited,
     pack,
@@ -51,13 +50,13 @@ def _position(t: NodeTester) -> int:
     return t.read(0x6064, signed=True)
 
 
-def _stands(t: NodeTester, duration_s: float = 0.1, within: float = 0.1) -> None:
-    """Fails if the axis moves by more than the fraction ``within`` of the test distance."""
+def _stands(t: NodeTester, duration_s: float = 0.1) -> None:
+    """Fails if the axis moves by more than a tenth of the test distance."""
     start, end_s = _position(t), t.now + duration_s
     while t.now < end_s:
         t.wait(0.01)
         moved = abs(_position(t) - start)
-        t.true(moved <= max(2.0, within * t.travel), f"the axis moves: {moved} units", "standstill")
+        t.true(moved <= max(2.0, 0.1 * t.travel), f"the axis moves: {moved} units", "standstill")
 
 
 def _moved_at_most(t: NodeTester, before: int, most: float, now: int | None = None) -> None:
@@ -133,21 +132,16 @@ def _reset_fault(t: NodeTester, word: int = 0x80) -> None:
 # ---------------------------------------------------------------- transitions
 
 
-def _in(state: State) -> Step:
-    """Brings the drive to a power state, at rest."""
-    return lambda t: _bring(t, state)
+_in = parametrised(_bring)
 
 
-def _leads(word: int, state: State) -> Step:
+@parametrised
+def _leads(t: NodeTester, word: int, state: State) -> None:
     """A controlword leads to a state without motion."""
-
-    def step(t: NodeTester) -> None:
-        before = _position(t)
-        t.control(word)
-        t.reaches(state)
-        _moved_at_most(t, before, t.travel)
-
-    return step
+    before = _position(t)
+    t.control(word)
+    t.reaches(state)
+    _moved_at_most(t, before, t.travel)
 
 
 CHECKS.rows(
@@ -386,9 +380,9 @@ def _limited(t: NodeTester, here: int, side: int, distance: int) -> Callable[[in
     return within
 
 
-def _arrives(t: NodeTester, target: int, timeout_s: float = 10.0) -> None:
+def _arrives(t: NodeTester, target: int) -> None:
     """Waits until the drive reports target reached and the axis is at the target; fails on time-out."""
-    end_s = t.now + timeout_s
+    end_s = t.now + 10.0
     while not t.read(0x6041) & _REACHED or abs(_position(t) - target) > _window(t):
         if t.now > end_s:
             t.fail(f"position {_position(t)}, statusword {t.read(0x6041):04X}h", f"{target}, target reached")
@@ -405,18 +399,14 @@ def _(t: NodeTester) -> None:
     _moved_at_most(t, before, 0.5 * t.travel)
 
 
-def _begins(distances: int) -> Step:
-    return lambda t: _begin_move(t, distances)
+_begins = parametrised(_begin_move)
 
 
 def _put_target(t: NodeTester) -> None:
     t.put(0x607A, 0, _ahead(t, 3), 4)
 
 
-def _stands_long(t: NodeTester) -> None:
-    _stands(t, 0.3)
-
-
+_stands_long = parametrised(_stands)(0.3)
 CHECKS.rows(
     _PP,
     ("402.pp.move", "A new set-point is reached", _enable_slowly, lambda t: _arrives(t, _begin_move(t, 2))),
@@ -557,7 +547,7 @@ def _ends_the_move(name: str, text: str, act: Callable[[NodeTester], None]) -> N
 
 
 def _resets(t: NodeTester) -> None:
-    t.reset(NmtCommand.RESET_NODE)
+    reset_node(t)
     t.reaches(_DISABLED)
 
 

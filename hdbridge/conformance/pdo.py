@@ -7,13 +7,12 @@ from statistics import median
 from typing import Any, Final
 
 from hdbridge.cia301 import NmtCommand
-from hdbridge.conformance.steps import has_bits, refuses, writes
+from hdbridge.conformance.steps import has_bits, parametrised, refuses, writes
 from hdbridge.conformance.tester import (
     ABSENT,
     PDO_INVALID,
     RANGE,
     NodeTester,
-    Step,
     Table,
     abort_code,
     abort_codes,
@@ -114,15 +113,12 @@ for _first in (_TPDO, _RPDO):
         _transmission_type(_first, _value, allowed=False)
 
 
-def _is_fixed(first: int, sub: int, change: Callable[[int], bytes]) -> Step:
+@parametrised
+def _is_fixed(t: NodeTester, first: int, sub: int, change: Callable[[int], bytes]) -> None:
     """An entry of a PDO that exists cannot be changed."""
-
-    def step(t: NodeTester) -> None:
-        t.map_pdo(first, (t.scratch() if first == _RPDO else _REGISTER,), 255)
-        t.require(first, sub)
-        t.refuses(expedited(first, sub, change(t.read(first, sub))), "change while the PDO exists")
-
-    return step
+    t.map_pdo(first, (t.scratch() if first == _RPDO else _REGISTER,), 255)
+    t.require(first, sub)
+    t.refuses(expedited(first, sub, change(t.read(first, sub))), "change while the PDO exists")
 
 
 CHECKS.rows(
@@ -413,22 +409,21 @@ class _Reception:
         return found
 
 
+@parametrised
 def _received(
+    t: NodeTester,
+    /,
     when: str = "after the RPDO",
     act: Callable[[_Reception], None] = _Reception.send,
     transmission: int = 255,
     *,
     taken: bool = False,
     **options: Any,
-) -> Step:
+) -> None:
     """``act`` makes the object hold the value sent if ``taken``, else the original one."""
-
-    def step(t: NodeTester) -> None:
-        rpdo = _Reception(t, transmission, **options)
-        act(rpdo)
-        rpdo.holds(rpdo.value if taken else rpdo.before, when)
-
-    return step
+    rpdo = _Reception(t, transmission, **options)
+    act(rpdo)
+    rpdo.holds(rpdo.value if taken else rpdo.before, when)
 
 
 def _send_and_sync(rpdo: _Reception) -> None:
@@ -539,15 +534,14 @@ def _(t: NodeTester) -> None:
     t.equal(_syncs(t, can_id, 2), [0, 0], "TPDOs at the old SYNC")
 
 
-def _counted(transmission: int, expected: list[int], timers: dict[int, int] | None = None) -> Step:
+@parametrised
+def _counted(
+    t: NodeTester, transmission: int, expected: list[int], timers: dict[int, int] | None = None
+) -> None:
     """Numbers of TPDOs at the SYNCs of a counter from 1 on, which overflows at 10."""
-
-    def step(t: NodeTester) -> None:
-        t.write(0x1019, 0, 10, 1)
-        can_id = _sent(t, (_REGISTER,), transmission, timers=timers)
-        t.equal(_syncs(t, can_id, len(expected), 1), expected, "TPDOs at the counters from 1 on")
-
-    return step
+    t.write(0x1019, 0, 10, 1)
+    can_id = _sent(t, (_REGISTER,), transmission, timers=timers)
+    t.equal(_syncs(t, can_id, len(expected), 1), expected, "TPDOs at the counters from 1 on")
 
 
 CHECKS.rows(

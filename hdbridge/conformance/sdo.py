@@ -9,7 +9,7 @@ from typing import Final
 from canopen.objectdictionary import datatypes
 
 from hdbridge.cia301 import NmtCommand
-from hdbridge.conformance.steps import aborts, refuses, sends_nmt, waits
+from hdbridge.conformance.steps import aborts, parametrised, refuses, sends_nmt, waits
 from hdbridge.conformance.tester import (
     ABSENT,
     COMMAND,
@@ -82,34 +82,28 @@ def _number(t: NodeTester) -> tuple[int, int, int]:
 # ---------------------------------------------------------------- upload
 
 
-def _is_expedited(index: int, size: int) -> Step:
-    return lambda t: t.equal(
-        t.answer(upload_request(index))[:4],
-        bytes((0x43 | (4 - size) << 2,)) + _mux(index, 0),
-        "command and multiplexer",
-    )
+@parametrised
+def _is_expedited(t: NodeTester, index: int, size: int) -> None:
+    expected = bytes((0x43 | (4 - size) << 2,)) + _mux(index, 0)
+    t.equal(t.answer(upload_request(index))[:4], expected, "command and multiplexer")
 
 
-def _answers(duration_s: float, expected: int, send: Callable[[NodeTester, bytes], object]) -> Step:
+@parametrised
+def _answers(
+    t: NodeTester, duration_s: float, expected: int, send: Callable[[NodeTester, bytes], object]
+) -> None:
     """A request that ``send`` sends has this number of answers."""
-
-    def step(t: NodeTester) -> None:
-        answers = t.heard_after(0x580 + t.node_id, duration_s, lambda: send(t, upload_request(0x1000)))
-        t.equal(len(answers), expected, "number of answers")
-
-    return step
+    answers = t.heard_after(0x580 + t.node_id, duration_s, lambda: send(t, upload_request(0x1000)))
+    t.equal(len(answers), expected, "number of answers")
 
 
-def _repeats(count: int, act: Step = lambda _: None) -> Step:
-    """So many uploads of 1000h, each after ``act``, result in the same value."""
-
-    def step(t: NodeTester) -> None:
-        first = t.upload(0x1000)
-        for _ in range(count):
-            act(t)
-            t.equal(t.upload(0x1000), first, "1000h")
-
-    return step
+@parametrised
+def _repeats(t: NodeTester, count: int, act: Step = lambda _: None) -> None:
+    """Repeated uploads of 1000h, each after ``act``, return the same value."""
+    first = t.upload(0x1000)
+    for _ in range(count):
+        act(t)
+        t.equal(t.upload(0x1000), first, "1000h")
 
 
 def _is_usual(t: NodeTester) -> None:
@@ -232,11 +226,11 @@ CHECKS.rows(
     ("sdo.abort.const", "Download to sub-index 0 of 1018h is abort 06010002h",
      aborts(expedited(0x1018, 0, b"\x04"), READ_ONLY)),
     ("sdo.abort.write-only", "Upload of a write-only object is abort 06010001h",
-     lambda t: t.aborts(_write_only(t), WRITE_ONLY, "request")),
+     lambda t: t.aborts(_write_only(t), WRITE_ONLY)),
     ("sdo.abort.too-long", "A download of too many bytes is abort 06070010h or 06070012h",
-     lambda t: t.aborts(_too_long(t), LENGTH, "request")),
+     lambda t: t.aborts(_too_long(t), LENGTH)),
     ("sdo.abort.too-short", "A download of too few bytes is abort 06070010h or 06070013h",
-     lambda t: t.aborts(_too_short(t), LENGTH, "request")),
+     lambda t: t.aborts(_too_short(t), LENGTH)),
     ("sdo.abort.command", "A command specifier that does not exist is abort 05040001h",
      aborts(b"\xe0\0\x10\0" + bytes(4), COMMAND)),
     ("sdo.abort.long-segmented", "A segmented download of too many bytes is refused at its start",
@@ -260,23 +254,18 @@ def _(t: NodeTester) -> None:
 # ---------------------------------------------------------------- download
 
 
-def _downloads(request: Callable[[int, int, bytes], list[bytes]]) -> Step:
+@parametrised
+def _downloads(t: NodeTester, request: Callable[[int, int, bytes], list[bytes]]) -> None:
     """The requests of ``request`` write a different value, which is read back; the old one is restored."""
-
-    def step(t: NodeTester) -> None:
-        index, sub, size = _number(t)
-        before = t.upload(index, sub)
-        value = ((int.from_bytes(before, "little") + 100) & 0x7FFF).to_bytes(size, "little")
-        for place, each in enumerate(request(index, sub, value)):
-            answer = t.answer(each)
-            t.true(
-                answer[0] != 0x80, f"request {place + 1}: {answer.hex(' ')}", "the download is carried out"
-            )
-        found = t.upload(index, sub)
-        t.download(index, sub, before)
-        t.equal(found, value, f"{index:04X}h")
-
-    return step
+    index, sub, size = _number(t)
+    before = t.upload(index, sub)
+    value = ((int.from_bytes(before, "little") + 100) & 0x7FFF).to_bytes(size, "little")
+    for place, each in enumerate(request(index, sub, value)):
+        answer = t.answer(each)
+        t.true(answer[0] != 0x80, f"request {place + 1}: {answer.hex(' ')}", "the download is carried out")
+    found = t.upload(index, sub)
+    t.download(index, sub, before)
+    t.equal(found, value, f"{index:04X}h")
 
 
 def _last_segment(data: bytes) -> bytes:
@@ -467,8 +456,9 @@ def _block_download(t: NodeTester, *, crc: bool, spoil: int = 0, skipped: bool =
     return t.answer(struct.pack("<BH5x", 0xC1 | (7 - size) << 2, (crc_hqx(data, 0) ^ spoil) if crc else 0))
 
 
-def _downloaded(*, crc: bool = True, skipped: bool = False) -> Step:
-    return lambda t: t.equal(_block_download(t, crc=crc, skipped=skipped)[0], 0xA1, "command of the end")
+@parametrised
+def _downloaded(t: NodeTester, *, crc: bool = True, skipped: bool = False) -> None:
+    t.equal(_block_download(t, crc=crc, skipped=skipped)[0], 0xA1, "command of the end")
 
 
 def _crc_is_checked(t: NodeTester) -> None:
