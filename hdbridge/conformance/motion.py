@@ -224,25 +224,28 @@ CHECKS.rows(
 # ---------------------------------------------------------------- option codes
 
 
-def _lost_master(code: int, states: tuple[State, ...], text: str) -> None:
-    @check(f"402.option.6007.{code}", f"6007h = {code}: a lost heartbeat {text}", _OPTIONS, 0x6007)
-    def _(t: NodeTester) -> None:
-        mode = _some_mode(t)
-        t.disable()
-        _select(t, mode)
-        t.write(0x6007, 0, code, 2)
-        t.write(0x1029, 1, 1, 1) if t.has(0x1029, 1) else None
-        t.be_supervised(300)
-        _enable_and_beat(t)
-        _lose_master(t, *states)
-        if not code:
-            t.stays(_ENABLED, 0.1)
+@parametrised
+def _lost_master(t: NodeTester, code: int, *states: State) -> None:
+    mode = _some_mode(t)
+    t.disable()
+    _select(t, mode)
+    t.write(0x6007, 0, code, 2)
+    t.write(0x1029, 1, 1, 1) if t.has(0x1029, 1) else None
+    t.be_supervised(300)
+    _enable_and_beat(t)
+    _lose_master(t, *states)
+    if not code:
+        t.stays(_ENABLED, 0.1)
 
 
-_lost_master(0, (_ENABLED,), "changes nothing")
-_lost_master(1, (_FAULT,), "is a fault")
-_lost_master(2, (_DISABLED,), "disables the voltage")
-_lost_master(3, (_STOPPED, _DISABLED), "is a quick stop")
+CHECKS.rows(
+    _OPTIONS,
+    *((f"402.option.6007.{code}", f"6007h = {code}: a lost heartbeat {text}", 0x6007,
+       _lost_master(code, *states))
+      for code, text, *states in (
+          (0, "changes nothing", _ENABLED), (1, "is a fault", _FAULT), (2, "disables the voltage", _DISABLED),
+          (3, "is a quick stop", _STOPPED, _DISABLED))),
+)  # fmt: skip
 
 
 def _stopping(index: int, code: int, word: int, state: State, name: str) -> None:

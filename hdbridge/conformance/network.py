@@ -131,6 +131,14 @@ CHECKS.rows(
 
 
 @parametrised
+def _no_pdo(t: NodeTester, command: NmtCommand) -> None:
+    can_id = t.map_pdo(0x1800, ((0x1001, 0, 8),), 1)
+    t.enter(command)
+    found = [t.heard_after(can_id, 0.02, t.sync) for _ in range(3)]
+    t.equal(sum(map(len, found)), 0, "number of TPDOs")
+
+
+@parametrised
 def _answers_sdo(t: NodeTester, expected: str) -> None:
     t.equal("an answer" if t.ask(upload_request(0x1000)) else "no answer", expected)
 
@@ -141,20 +149,10 @@ CHECKS.rows(
        _enters(command), _answers_sdo("an answer")) for command in (_PRE, _START)),
     ("nmt.sdo.stopped", "SDO requests are not answered in STOPPED", _enters(_STOP),
      _answers_sdo("no answer")),
+    *((f"nmt.pdo.{ENTERED[command].lower()}", f"No PDO is sent in {ENTERED[command]}", _no_pdo(command))
+      for command in (_PRE, _STOP)),
 )  # fmt: skip
 
-
-def _no_pdo(command: NmtCommand) -> None:
-    @check(f"nmt.pdo.{ENTERED[command].lower()}", f"No PDO is sent in {ENTERED[command]}", _BOOT)
-    def _(t: NodeTester) -> None:
-        can_id = t.map_pdo(0x1800, ((0x1001, 0, 8),), 1)
-        t.enter(command)
-        found = [t.heard_after(can_id, 0.02, t.sync) for _ in range(3)]
-        t.equal(sum(map(len, found)), 0, "number of TPDOs")
-
-
-_no_pdo(_PRE)
-_no_pdo(_STOP)
 
 # ---------------------------------------------------------------- heartbeat
 
@@ -251,19 +249,12 @@ def _(t: NodeTester) -> None:
     t.true(0x8130 in codes, f"EMCY codes {codes}", "8130h")
 
 
-def _behaviour(value: int, command: NmtCommand) -> None:
-    state, clause = ENTERED[command], "CiA 301, object 1029h"
-
-    CHECKS.add(
-        f"error-behaviour.{value}", f"1029h:01 = {value}: after a lost heartbeat {state}", clause,
-        (0x1029, 1), writes(0x1029, 1, value, 1), _enters(_START), lose_heartbeat, _is_in(command),
-        sends_nmt(_PRE), _beat,
-    )  # fmt: skip
-
-
-_behaviour(0, _PRE)
-_behaviour(1, _START)
-_behaviour(2, _STOP)
+CHECKS.rows(
+    "CiA 301, object 1029h",
+    *((f"error-behaviour.{value}", f"1029h:01 = {value}: after a lost heartbeat {ENTERED[command]}",
+       (0x1029, 1), writes(0x1029, 1, value, 1), _enters(_START), lose_heartbeat, _is_in(command),
+       sends_nmt(_PRE), _beat) for value, command in enumerate((_PRE, _START, _STOP))),
+)  # fmt: skip
 
 # ---------------------------------------------------------------- node guarding
 
