@@ -320,7 +320,7 @@ class AxisConfig(OtherChannels):
         if node is not None and node in {self.drive.node_id, self.drive.master_node_id}:
             owner = "drive.node_id" if node == self.drive.node_id else "drive.master_node_id"
             raise wrong(
-                f"node {node} is {owner}; expected another, or no key where the drive sends the reading",
+                f"node {node} is {owner}; expected another, or no key if the drive sends the reading",
                 "load_encoder", "source", "node",
             )  # fmt: skip
         self._check_channels()

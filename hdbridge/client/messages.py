@@ -103,7 +103,7 @@ STATUS: Final[dict[type[HdbridgeError], tuple[int, str]]] = {
     errors.BusError: (503, "The bus is not there"),
     errors.IdentityError: (409, "Not the drive of the axis file"),
     errors.TransitionError: (409, "Not in this state"),
-    errors.SdoError: (502, "The drive did not take or give the object"),
+    errors.SdoError: (502, "The drive refused access to the object"),
     errors.DriveError: (502, "The drive refused"),
     errors.SafetyStop: (409, "Stopped by the supervision"),
     errors.OutputError: (507, "A result could not be written"),
@@ -278,7 +278,7 @@ class ActivateModel(Request):
     """Activate a model of the axis's history, also during motion; the change is ramped."""
 
     version: Annotated[int, Field(strict=True, ge=1, le=10**9)] | Literal["pending", "active"] = Field(
-        description="its number in `hdbridge model log`; `pending` commits the one that waits, `active` "
+        description="its number in `hdbridge model log`; `pending` commits the pending one, `active` "
         "reads the active one again",
         examples=[4],
     )
@@ -609,7 +609,7 @@ class AxisState(Report):
     advice: list[str] = Field(
         default=[],
         description="verdict of the load-encoder watch",
-        examples=[["recalibrate: the residual left what the model's intervals allow"]],
+        examples=[["recalibrate: the residual exceeds the model's intervals"]],
     )
     queued: int = Field(0, ge=0, description="waiting way points")
 

@@ -66,7 +66,7 @@ CHECKS.rows(
      holds(0x1003, 0, 1)),
     ("emcy.history.clear", "Writing 0 to 1003h:00 clears the history", 0x1003, lose_heartbeat,
      _clear_history, holds(0x1003, 0, 0)),
-    ("emcy.history.write", "Writing anything else to 1003h:00 is abort 06090030h", 0x1003,
+    ("emcy.history.write", "Any other value written to 1003h:00 is refused with abort 06090030h", 0x1003,
      aborts(expedited(0x1003, 0, b"\x01"), RANGE, "1003h:00 = 1")),
 )  # fmt: skip
 

@@ -182,7 +182,7 @@ CHECKS.rows(
 
 @check(
     "402.fault.reset.edge",
-    "Bit 7 that is held does not reset a fault: only a rising edge of bit 7 resets a fault", _STATES,
+    "A fault is reset by a rising edge of bit 7, not while bit 7 is held", _STATES,
     _in(_FAULT), control(0x00),
 )  # fmt: skip
 def _(t: NodeTester) -> None:
@@ -243,13 +243,13 @@ CHECKS.rows(
     *((f"402.option.6007.{code}", f"6007h = {code}: a lost heartbeat {text}", 0x6007,
        _lost_master(code, *states))
       for code, text, *states in (
-          (0, "changes nothing", _ENABLED), (1, "is a fault", _FAULT), (2, "disables the voltage", _DISABLED),
-          (3, "is a quick stop", _STOPPED, _DISABLED))),
+          (0, "changes nothing", _ENABLED), (1, "leads to a fault", _FAULT),
+          (2, "disables the voltage", _DISABLED), (3, "leads to a quick stop", _STOPPED, _DISABLED))),
 )  # fmt: skip
 
 
 def _stopping(index: int, code: int, word: int, state: State, name: str) -> None:
-    text = f"{name} of a move with {index:04X}h = {code}: {state.value}"
+    text = f"{index:04X}h = {code}: {name} during a move leads to {state.value}"
 
     @check(f"402.option.{index:04X}.{code}", text, _OPTIONS, index)
     def _(t: NodeTester) -> None:
@@ -275,18 +275,18 @@ def _set_if_supported(t: NodeTester, index: int, value: int, before: int, size: 
 
 
 for _index, _codes, _word, _state, _name in (
-    (0x605A, (0, 1, 2), 0x02, _DISABLED, "Quick stop"),
-    (0x605A, (5, 6), 0x02, _STOPPED, "Quick stop"),
-    (0x605B, (0, 1), 0x06, _READY, "Shutdown"),
-    (0x605C, (0, 1), 0x07, _SWITCHED_ON, "Disable operation"),
-    (0x605D, (1, 2), 0x10F, _ENABLED, "Halt"),
+    (0x605A, (0, 1, 2), 0x02, _DISABLED, "quick stop"),
+    (0x605A, (5, 6), 0x02, _STOPPED, "quick stop"),
+    (0x605B, (0, 1), 0x06, _READY, "shutdown"),
+    (0x605C, (0, 1), 0x07, _SWITCHED_ON, "disable operation"),
+    (0x605D, (1, 2), 0x10F, _ENABLED, "halt"),
 ):
     for _code in _codes:
         _stopping(_index, _code, _word, _state, _name)
 
 
 def _reaction(code: int) -> None:
-    text = f"A fault in a move with 605Eh = {code} ends in fault, at rest"
+    text = f"605Eh = {code}: a fault during a move leads to fault, at rest"
 
     @check(f"402.option.605E.{code}", text, _OPTIONS, 0x605E, 0x6007)
     def _(t: NodeTester) -> None:
@@ -420,7 +420,7 @@ CHECKS.rows(
      _begins(2), control(0x0F), waits(0.05), has_bits(0x6041, _BIT_12, 0, "bit 12")),
     ("402.pp.target-alone", "A target without a new set-point moves nothing", _enable_slowly, _put_target,
      control(0x0F), _stands_long),
-    ("402.pp.stale", "A target from before enabling moves nothing", _select_slowly, _put_target,
+    ("402.pp.stale", "A target written before enabling moves nothing", _select_slowly, _put_target,
      NodeTester.walk, _stands_long),
 )  # fmt: skip
 
@@ -432,7 +432,7 @@ def _(t: NodeTester) -> None:
     _arrives(t, target)
 
 
-@_pp("held", "Bit 4 that is held does not start a second move")
+@_pp("held", "Holding bit 4 does not start a second move")
 def _(t: NodeTester) -> None:
     target = _begin_move(t, 2)
     _arrives(t, target)
@@ -441,7 +441,7 @@ def _(t: NodeTester) -> None:
     _stands(t, 0.3)
 
 
-@_pp("relative", "A relative set-point counts from the one before")
+@_pp("relative", "A relative set-point is added to the previous set-point")
 def _(t: NodeTester) -> None:
     first = _begin_move(t, 1)
     _arrives(t, first)
@@ -451,7 +451,7 @@ def _(t: NodeTester) -> None:
     _arrives(t, first + distance)
 
 
-@_pp("again", "A set-point where the axis is already is acknowledged and reached")
+@_pp("again", "A set-point at the present position is acknowledged and reached")
 def _(t: NodeTester) -> None:
     target = _begin_move(t, 1)
     _arrives(t, target)
@@ -515,7 +515,7 @@ def _(t: NodeTester) -> None:
     t.stays(_ENABLED)
 
 
-@_pp("halt.end", "When halt ends the move is continued")
+@_pp("halt.end", "The move continues when halt ends")
 def _(t: NodeTester) -> None:
     target = _begin_move(t, 4)
     t.control(0x11F)
@@ -684,9 +684,7 @@ def _(t: NodeTester) -> None:
     _stands(t)
 
 
-@check(
-    "402.csp.lost-heartbeat", "A lost heartbeat stops the axis and takes it out of operation enabled", _CSP
-)
+@check("402.csp.lost-heartbeat", "A lost heartbeat stops the axis and ends operation enabled", _CSP)
 def _(t: NodeTester) -> None:
     t.require(0x6007)
     stream = _Stream(t)
@@ -747,7 +745,7 @@ def _home(t: NodeTester, offset: int) -> None:
 
 
 def _homing(method: int) -> None:
-    text = f"Homing method {method} makes the present position 607Ch, without motion"
+    text = f"Homing method {method} sets the present position to 607Ch, without motion"
 
     @check(f"402.homing.{method}", text, _HM, 0x607C)
     def _(t: NodeTester) -> None:

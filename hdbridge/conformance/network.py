@@ -82,7 +82,9 @@ def _(t: NodeTester) -> None:
     t.equal(t.read(0x1017), before, "1017h")
 
 
-@check("nmt.reset-communication.application", "Reset communication leaves application objects alone", _BOOT)
+@check(
+    "nmt.reset-communication.application", "Reset communication does not change application objects", _BOOT
+)
 def _(t: NodeTester) -> None:
     index, sub, bits = t.scratch()
     value = t.change(index, sub, bits)
@@ -187,7 +189,7 @@ def _all_beats(t: NodeTester, what: str, expected: int, value: Callable[[bytes],
 
 CHECKS.rows(
     _HEARTBEAT,
-    ("heartbeat.period", "Heartbeats come with the period of 1017h", _period(100)),
+    ("heartbeat.period", "The heartbeat period is that of 1017h", _period(100)),
     ("heartbeat.period.other", "A new value of 1017h changes the period", 0x1017, writes(0x1017, 0, 100, 2),
      waits(0.25), _period(250)),
     ("heartbeat.off", "1017h = 0 ends the heartbeat", parametrised(_beats)(50), puts(0x1017, 0, 0, 2),
@@ -226,13 +228,13 @@ CHECKS.rows(
      no_emergency(0.0, lambda t: _beat(t, 8, 0.05))),
     ("consumer.off", "1016h with time 0 supervises nothing", NodeTester.be_supervised, _beat,
      puts(0x1016, 1, MASTER << 16, 4), no_emergency(0.4)),
-    ("consumer.loss", "A lost heartbeat is EMCY 8130h within the consumer time", lose_heartbeat),
-    ("consumer.recovery", "A heartbeat that returns ends the error", lose_heartbeat,
+    ("consumer.loss", "A lost heartbeat leads to EMCY 8130h within the consumer time", lose_heartbeat),
+    ("consumer.recovery", "The error ends when heartbeats return", lose_heartbeat,
      lambda t: t.equal(t.emergencies_after(0.0, lambda: _beat(t))[-1:], [0], "last EMCY code")),
 )  # fmt: skip
 
 
-@check("consumer.loss.time", "The EMCY comes when the consumer time is over", _CONSUMER)
+@check("consumer.loss.time", "The EMCY is sent when the consumer time has expired", _CONSUMER)
 def _(t: NodeTester) -> None:
     t.be_supervised(200)
     _beat(t, 3)
@@ -251,7 +253,7 @@ def _(t: NodeTester) -> None:
 
 CHECKS.rows(
     "CiA 301, object 1029h",
-    *((f"error-behaviour.{value}", f"1029h:01 = {value}: after a lost heartbeat {ENTERED[command]}",
+    *((f"error-behaviour.{value}", f"1029h:01 = {value}: a lost heartbeat leads to {ENTERED[command]}",
        (0x1029, 1), writes(0x1029, 1, value, 1), _enters(_START), lose_heartbeat, _is_in(command),
        sends_nmt(_PRE), _beat) for value, command in enumerate((_PRE, _START, _STOP))),
 )  # fmt: skip
@@ -299,13 +301,14 @@ CHECKS.rows(
     *((f"guarding.{name}", text, 0x100C, 0x100D, *steps) for name, text, *steps in (
         ("answer", "A remote frame is answered with the NMT state",
          _answers_with_state),
-        ("state", "The answer in OPERATIONAL has the state 05h", sends_nmt(_START),
+        ("state", "The answer in OPERATIONAL contains the state 05h", sends_nmt(_START),
          lambda t: t.equal(_guard(t)[0] & 0x7F, 0x05, "state")),
         ("toggle", "The toggle bit changes with every answer", _toggle_bits),
         ("toggle.first", "The first toggle bit after a reset is 0", _guard, NodeTester.reset,
          lambda t: t.equal(_guard(t)[0] >> 7, 0, "toggle bit")),
         ("idle", "Life guarding waits for the first remote frame", _limit_life, no_emergency(0.5)),
         ("regular", "Remote frames in time cause no error", _limit_life, no_emergency(0.0, _keep_guarding)),
-        ("loss", "No remote frame for the node life time is EMCY 8130h", _limit_life, _lost_guarding),
+        ("loss", "No remote frame within the node life time leads to EMCY 8130h", _limit_life,
+         _lost_guarding),
     )),
 )  # fmt: skip

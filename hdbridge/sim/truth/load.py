@@ -23,7 +23,7 @@ class TrueStribeck(Strict):
     breakaway_nm: float = Field(
         ge=0, le=1e6, description="friction at rest, in place of the Coulomb friction"
     )
-    speed_rad_s: float = Field(gt=0, le=100, description="load speed by which it has come down to 1/e")
+    speed_rad_s: float = Field(gt=0, le=100, description="load speed at which it has fallen to 1/e")
 
 
 class TrueThinning(Strict):
@@ -64,7 +64,8 @@ class TrueLoad(Strict):
     gravity: TrueGravity | None = Field(None, description="a mass on the axis; without it: balanced")
     vibration: tuple[TrueVibration, ...] = Field((), max_length=16, description="shaking from outside")
     torque_sense: Literal[1, -1] = Field(
-        1, description="sign of the reported torque: 1 pushes the load forward, -1 is what the gear delivers"
+        1,
+        description="sign of the reported torque: 1: it pushes the load forward, -1: the gear delivers it",
     )
     encoder: TrueLoadEncoder = Field(description="encoder at the load")
 

@@ -16,7 +16,7 @@ class TrueMotorStribeck(Strict):
     rise: float = Field(
         ge=0, le=10, description="fraction of the Coulomb friction by which it is higher at rest"
     )
-    speed_rad_s: float = Field(gt=0, le=1_000, description="motor speed by which that has come down to 1/e")
+    speed_rad_s: float = Field(gt=0, le=1_000, description="motor speed at which that has fallen to 1/e")
 
 
 class TrueMotor(Strict):

@@ -30,7 +30,10 @@ class TrueTemperature(Strict):
     resistance_k_per_w: float = Field(1.0, ge=0, le=1_000, description="warming per watt of losses")
     time_constant_s: float = Field(1_200.0, gt=0, le=1e6, description="time constant of the warming")
     copper_loss_w: float = Field(
-        0.0, ge=0, le=1e5, description="loss in the winding at rated torque; it goes with the torque squared"
+        0.0,
+        ge=0,
+        le=1e5,
+        description="loss in the winding at rated torque, proportional to the torque squared",
     )
     zero_drift_arcsec_per_k: float = Field(
         0.0, ge=-3_600, le=3_600, description="shift of the gear's output per kelvin above ambient"
