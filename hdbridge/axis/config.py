@@ -94,7 +94,7 @@ class DriveConfig(Strict):
     )
     halt_option: int = Field(1, ge=1, le=4, description="605Dh: how a halt brakes")
     shutdown_option: int = Field(
-        0, ge=-32768, le=32767, description="605Bh: reaction to 'shutdown' under power; 0 switches it off"
+        0, ge=-32768, le=32767, description="605Bh: reaction to 'shutdown' under power; 0 switches power off"
     )
     disable_option: int = Field(
         1, ge=-32768, le=32767, description="605Ch: reaction to 'disable operation'; 1 brakes first"

@@ -155,7 +155,7 @@ _limit("upper", "max", 1)
 
 @_check(
     "defaults", "After a reset the communication parameters have the defaults of the EDS",
-    "the defaults of the EDS (parameters that were saved differ)",
+    "the defaults of the EDS (saved parameters may differ)",
 )  # fmt: skip
 def _(t: NodeTester) -> Iterator[str]:
     entries = [

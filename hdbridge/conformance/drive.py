@@ -256,7 +256,7 @@ def _(t: NodeTester) -> None:
     scale = feed * shaft * turns / (increments * motor * driven)
     offset = t.read(0x607C, signed=True) if t.has(0x607C) else 0
     internal, actual = t.read(0x6063, signed=True), t.read(0x6064, signed=True)
-    t.need(abs(internal) > 1000, "the axis is too near to zero to see a scale")
+    t.need(abs(internal) > 1000, "the axis is too close to zero to check the scale")
     t.true(
         abs(abs(actual - offset) - abs(internal) * scale) <= 2 + 0.001 * abs(internal) * scale,
         f"6064h = {actual} at 6063h = {internal}", f"{internal * scale:.0f}",

@@ -147,7 +147,7 @@ class TrueGear(Strict):
     )
     rate_dependence: TrueRate | None = Field(None, description="hysteresis by speed; without it: none")
     wear: TrueWear | None = Field(None, description="lost motion by the travel; without it: none")
-    ageing: TrueAgeing | None = Field(None, description="what hours of work change; without it: nothing")
+    ageing: TrueAgeing | None = Field(None, description="changes with hours of work; without it: none")
     creep: tuple[TrueCreep, ...] = Field((), max_length=16, description="elements that yield in time")
     teeth: int | None = Field(None, ge=3, le=100_000, description="teeth of the output; else twice the ratio")
     jumps: tuple[TrueJump, ...] = Field((), description="teeth jumped, each at its time")
