@@ -196,7 +196,7 @@ class Knot(NamedTuple):
 
 
 class OuterKnot(NamedTuple):
-    """Set-point of the gateway: the load's position at a time, with linear motion from the one before."""
+    """Set-point of the gateway: the load's position at a time, with linear motion from the previous one."""
 
     series: int
     """Number of the series; set-points of other series are discarded."""
