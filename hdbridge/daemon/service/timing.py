@@ -38,9 +38,10 @@ class SimulatedClock:
         turns: Callable[[], int],
         period_s: float,
         real_s: Callable[[], float] = time.monotonic,
+        hang_s: float = HANG_S,
     ) -> None:
         """``turns`` returns the number of the loop's cycles of ``period_s``; ``real_s`` returns real time."""
-        self._turns, self._period_s, self._real_s = turns, period_s, real_s
+        self._turns, self._period_s, self._real_s, self._hang_s = turns, period_s, real_s, hang_s
         self._lock = threading.Lock()
         self._now_s = self._read_s = real_s()
         self._turned, self._credit_s, self._idle_s = turns(), CREDIT_S, 0.0
@@ -56,7 +57,7 @@ class SimulatedClock:
                 self._turned, self._idle_s = turned, 0.0
             else:
                 self._idle_s += passed_s
-            if self._idle_s < HANG_S:
+            if self._idle_s < self._hang_s:
                 passed_s = min(passed_s, self._credit_s)
             self._now_s += passed_s
             self._credit_s = min(max(self._credit_s - passed_s, 0.0), CREDIT_S)
